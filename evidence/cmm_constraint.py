@@ -8,40 +8,31 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from loopcal.mechanism.model import Mechanism
-from loopcal.papers.cmm_constraint_2011 import layouts
-from loopcal.papers.cmm_constraint_2011.calibrations import (
+from loopcal.papers.cmm_constraint_2011 import steps
+from loopcal.papers.cmm_constraint_2011.steps import (
+    ALIGNED,
     BEFORE,
+    ERRORS,
+    FRAMES,
     LINES,
     LS,
     METHODS,
+    NOISES,
+    ONE,
     PRIOR,
+    SWEEPS,
+    TEN,
     Cell,
+    Study,
     calibrate_fifty,
     calibrate_grid,
+    compare_estimates,
     compute_rank_correlation,
-)
-from loopcal.papers.cmm_constraint_2011.forms import ERRORS, NOISES, compare_estimates
-from loopcal.papers.cmm_constraint_2011.layouts import (
-    ONE,
-    TEN,
+    draw_true_machines,
     evaluate_arrangement,
     list_printed,
-    rank_candidates,
-)
-from loopcal.papers.cmm_constraint_2011.machines import (
-    ALIGNED,
-    AXES,
-    FRAMES,
-    GROUPS,
-    MEASURES,
-    POINTS,
-    SWEEPS,
-    Study,
-    compute_spread,
-    draw_true_machines,
-    load_machine,
     plan_points,
+    rank_candidates,
 )
 from loopcal.planning.plane_line_planning import PlaneLineGroups
 from loopcal.typing import FloatArray
@@ -69,15 +60,12 @@ def time_linearization(planned: PlaneLineGroups, design: FloatArray) -> float:
     return time.process_time() - began
 
 
-def optimize_from_start(robot: Mechanism, seed: int) -> tuple[Study, list]:
+def optimize_from_start(seed: int) -> tuple[Study, list]:
     """Run coordinate exchange from one random start; return the study and its row."""
     began = time.process_time()
-    study = plan_points(robot, GROUPS, POINTS, AXES, seed, SWEEPS)
+    study = plan_points(seed=seed, sweeps=SWEEPS)
     spent = time.process_time() - began
-    before, after = (
-        compute_spread(rows)
-        for rows in (study.planned.linearize(study.first), study.optimized.rows)
-    )
+    before, after = study.spreads
     cost = spent / time_linearization(study.planned, study.first) if seed == SEED else None
     return study, [seed, before, after, before / after, spent, cost]
 
@@ -93,27 +81,22 @@ MEDIANS = {
 
 def list_medians(c: Cell) -> list[float]:
     """Return errors of position in each frame and of parameters: before, LS and MAP."""
-    return [
-        float(c.compute_median(m)[MEASURES.index(name)])
-        for name in MEDIANS.values()
-        for m in (BEFORE, LS, PRIOR)
-    ]
+    return [c.compute_median(m, name) for name in MEDIANS.values() for m in (BEFORE, LS, PRIOR)]
 
 
 def compare_weights(study: Study) -> list[list[Any]]:
     """Return errors by LS and MAP for each weighting of the rows, and the ratio of LS to that as
     printed.
     """
-    cells = layouts.compare_weights(study, SEED, DRAWS)
-    position, parameters = (
-        MEASURES.index(name) for name in ("position, aligned [mm]", "parameters without gauge [mm]")
-    )
-    first = cells["printed"].compute_median(LS)[position]
+    ten = evaluate_arrangement(TEN, study, SEED, DRAWS)
+    cells = steps.compare_weights(ten, SEED, DRAWS)
+    position, parameters = "position, aligned [mm]", "parameters without gauge [mm]"
+    first = cells["printed"].compute_median(LS, position)
     return [
         [
             WEIGHT_NAMES[w],
-            *(float(c.compute_median(m)[i]) for i in (position, parameters) for m in (LS, PRIOR)),
-            float(c.compute_median(LS)[position] / first),
+            *(c.compute_median(m, name) for name in (position, parameters) for m in (LS, PRIOR)),
+            c.compute_median(LS, position) / first,
         ]
         for w, c in cells.items()
     ]
@@ -166,22 +149,16 @@ def collect() -> dict[str, Any]:
     """Collect the 3 x 4 cells, five starts, one plane and ten, weights, interpretations of
     figure 5, and fifty points.
     """
-    robot = load_machine()
-    study, first = optimize_from_start(robot, SEED)
-    starts = [
-        first,
-        *(optimize_from_start(robot, seed)[1] for seed in range(SEED + 1, SEED + STARTS)),
-    ]
+    study, first = optimize_from_start(SEED)
+    starts = [first, *(optimize_from_start(seed)[1] for seed in range(SEED + 1, SEED + STARTS))]
     cells = calibrate_grid(study, SEED, DRAWS, lambda _: None)
     rows = [
-        [given, noise, *list_medians(c), c.count_worse(PRIOR, 2), c.failed]
+        [given, noise, *list_medians(c), c.count_worse(PRIOR, "position, aligned [mm]"), c.failed]
         for (given, noise), c in cells.items()
     ]
     ten, one = (
         cells["1", "0.01"],
-        evaluate_arrangement(
-            ONE, plan_points(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW_DRAWS
-        ),
+        evaluate_arrangement(ONE, plan_points(1, 100, seed=SEED, sweeps=1), SEED, FEW_DRAWS),
     )
     placed = [
         ["ten planes, a line each", first[1], first[2], *_pair(ten), DRAWS],
@@ -298,6 +275,4 @@ def make_table(columns: list[str], formats: list[str], rows: list[list[Any]]) ->
 
 def _pair(c: Cell) -> list[float]:
     """Return the aligned position errors by LS and MAP."""
-    return [
-        float(c.compute_median(m)[MEASURES.index("position, aligned [mm]")]) for m in (LS, PRIOR)
-    ]
+    return [c.compute_median(m, "position, aligned [mm]") for m in (LS, PRIOR)]

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from loopcal.papers.tsvd_2016.draw_tables import to_document
-from loopcal.papers.tsvd_2016.draws import draw_machines
+from loopcal.papers.tsvd_2016.results import to_document
+from loopcal.papers.tsvd_2016.steps import draw_machines
 
 DRAWS, SEED = 50, 0
 

@@ -470,27 +470,18 @@ def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None
     order.
     """
     from loopcal.measure.observations import Observations
-    from loopcal.papers.hexapod_42.published import (
-        MM,
-        TO_PRINTED,
-        load_nominal_machine,
-        read_published,
-    )
-    from loopcal.papers.hexapod_42.steps import ORDER, Study, to_measurements
-    from loopcal.papers.hexapod_42.study import round_to_degrees
+    from loopcal.papers.hexapod_42 import steps
 
-    printed, robot = read_published(), load_nominal_machine()
-    study = Study(robot, robot, round_to_degrees(printed.nominal_poses), ORDER)
-    values = printed.measured_poses.values / TO_PRINTED
-    sigma = printed.measured_poses.unit * np.array([MM] * 3 + [1.0] * 3) / np.sqrt(12.0)
-    right = to_measurements(study, values, sigma)
+    setup, printed = steps.make_setup(), steps.PRINTED.table("table_4", "PP")
+    robot, values, sigma = setup.robot, printed.values * steps.TO_SI, steps.find_rounding(printed)
+    right = steps.to_measurements(setup, values, sigma)
     assert not compare_conventions(robot, right).is_refused
-    kind = Pose(f"euler-{printed.order}").with_tool(robot.tool)
+    kind = Pose(f"euler-{steps.PRINTED.find('rotation', 'order')}").with_tool(robot.tool)
     rows = Observations.from_sigma(
         kind, np.arange(len(values)), np.roll(values, 3, axis=1), np.roll(sigma, 3, axis=1)
     )
     result = compare_conventions(robot, replace(right, observations=(rows,)))
-    assert has_slip(result, "orientation-form", form=f"euler-{ORDER}")
+    assert has_slip(result, "orientation-form", form=f"euler-{steps.ORDER}")
     assert result.misfit > 100.0 * result.other_misfit
 
 

@@ -816,14 +816,13 @@ def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Rep
     poses.
     """
     from loopcal.papers.hexapod_42 import steps
-    from loopcal.papers.hexapod_42.noise_study import to_si
 
-    study, _ = _hexapod_42()
-    measured = steps.draw_measured_poses(study, None if noise is None else to_si(noise), 0)
-    result = steps.iterate(study, measured, iterations)
-    off = result.compute_parameter_errors(study.truth)
+    setup = steps.make_setup()
+    measured = steps.draw_measured_poses(setup, None if noise is None else steps.to_si(noise), 0)
+    result = steps.iterate(setup, measured, iterations)
+    off = result.compute_parameter_errors(setup.truth)
     return {
-        "commanded": study.commanded.q,
+        "commanded": setup.commanded.q,
         "actual": measured,
         "conditions": result.conditions,
         # what exact poses leave in the end is rounding: errors as shares of the first
@@ -836,14 +835,12 @@ def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Rep
 
 def report_hexapod_42_table_4() -> Report:
     """Ask which Euler order and which odd row explain the printed poses."""
-    from loopcal.papers.hexapod_42 import table_4_study
+    from loopcal.papers.hexapod_42 import steps
 
-    study, printed = _hexapod_42()
-    measured = printed.measured_poses.values / np.array([1e3] * 3 + [1.0] * 3)
-    orders = table_4_study.rank_euler_orders(
-        study.robot, study.truth, study.poses[2:], measured[2:]
-    )
-    odd = table_4_study.search_outliers(study, printed, measured)
+    setup, printed = steps.make_setup(), steps.PRINTED.table("table_4", "PP")
+    measured = printed.values / np.array([1e3] * 3 + [1.0] * 3)
+    orders = steps.rank_euler_orders(setup, setup.poses[2:], measured[2:])
+    odd = steps.search_outliers(setup, printed)
     return {
         "order": orders[0].formula,
         "position": [o.position for o in orders[:6]],
@@ -857,31 +854,14 @@ def report_hexapod_42_methods(trials: int) -> Report:
     """Compare methods on the stated noise, but least squares over all legs: ten narrow poses hardly
     determine it.
     """
-    from loopcal.papers.hexapod_42 import noise_study
+    from loopcal.papers.hexapod_42 import steps
 
-    result = [
-        m
-        for m in noise_study.compare_methods(_hexapod_42()[0], 0, trials)
-        if not m.method.startswith("all legs")
-    ]
+    methods = steps.compare_methods(steps.make_setup(), 0, trials)
+    result = {name: m for name, m in methods.items() if not name.startswith("all legs")}
     return {
-        "names": [m.method for m in result],
-        "errors": [[m.parameters, m.narrow, m.wide] for m in result],
+        "names": list(result),
+        "errors": [[m.parameters, m.narrow, m.wide] for m in result.values()],
     }
-
-
-def _hexapod_42() -> tuple[Any, Any]:
-    from loopcal.papers.hexapod_42.published import (
-        load_nominal_machine,
-        make_true_machine,
-        read_published,
-    )
-    from loopcal.papers.hexapod_42.steps import Study
-    from loopcal.papers.hexapod_42.study import round_to_degrees
-
-    printed, machine = read_published(), load_nominal_machine()
-    truth = make_true_machine(machine, printed.errors.values * 1e-3)
-    return Study(machine, truth, round_to_degrees(printed.nominal_poses)), printed
 
 
 def report_tsvd_2016(name: str, five: bool) -> Report:
@@ -889,23 +869,21 @@ def report_tsvd_2016(name: str, five: bool) -> Report:
     the printed noise.
     """
     from loopcal.estimate.published_steps import penalize_ridge, penalize_truncated
-    from loopcal.papers.tsvd_2016 import cases
-    from loopcal.papers.tsvd_2016.steps import iterate, linearize
+    from loopcal.papers.tsvd_2016 import steps
 
-    measured = cases.measure_case(name, 0)
+    measured = steps.measure_case(name, 0)
     measured = measured.five if five else measured
     p = len(measured.robot.parameters)
-    nominal = measured.robot.parameters.nominal[None]
-    s = linearize(measured, nominal, np.zeros(1, dtype=np.int64))[0].singular_values[0]
+    s = steps.linearize(measured).singular_values[0]
     rank = int((s > 1e-11 * s[0]).sum())
     ks = np.array([rank, rank - 2, rank - 5])
-    run = iterate(
+    run = steps.iterate(
         measured,
         np.concatenate([penalize_truncated(ks, p), penalize_ridge(np.array([1e-3, 1e-1]), p)]),
         limit=20,  # the first version ended ridge there; it now runs until its steps are small
         ahead=0.0,
     )
-    library = cases.run_library(measured)
+    library = steps.run_library(measured)
     errors = measured.compute_output_errors(run.values, run.machine)
     return {
         "rank": rank,
@@ -922,26 +900,17 @@ def report_tsvd_2016(name: str, five: bool) -> Report:
 
 def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: int) -> Report:
     """Plan points, draw machines, and calibrate them from planes and lines in the paper's form."""
-    from loopcal.papers.cmm_constraint_2011.calibrations import calibrate_cell
-    from loopcal.papers.cmm_constraint_2011.machines import (
-        AXES,
-        compute_spread,
-        load_machine,
-        plan_points,
-    )
+    from loopcal.papers.cmm_constraint_2011 import steps
 
-    study = plan_points(load_machine(), groups, points, AXES, 0, sweeps)
+    study = steps.plan_points(groups, points, seed=0, sweeps=sweeps)
     made = {
-        weights: calibrate_cell(study, 1e-3, 1e-5, 0, trials, weights=weights)
+        weights: steps.calibrate_cell(study, 1e-3, 1e-5, 0, trials, weights=weights)
         for weights in ("printed", "full")
     }
     return {
         "design": study.optimized.design,
         "value": study.optimized.value,
-        "spread": [
-            compute_spread(study.planned.linearize(study.first)),
-            compute_spread(study.optimized.rows),
-        ],
+        "spread": list(study.spreads),
         "failed": [one.failed for one in made.values()],
         "errors": {weights: dict(one.errors) for weights, one in made.items()},
     }
@@ -949,17 +918,11 @@ def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: in
 
 def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) -> Report:
     """Calibrate one machine from planes and lines with the surfaces as unknowns."""
-    from loopcal.papers.cmm_constraint_2011 import forms
-    from loopcal.papers.cmm_constraint_2011.machines import (
-        AXES,
-        draw_true_machines,
-        load_machine,
-        plan_points,
-    )
+    from loopcal.papers.cmm_constraint_2011 import steps
 
-    study = plan_points(load_machine(), groups, points, AXES, 0, 0)
-    q = study.layout.solve_readings(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
-    data = forms.build_measurements(study.layout, q[0], noise)
+    study = steps.plan_points(groups, points, seed=0, sweeps=0)
+    q = study.layout.solve_readings(steps.draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
+    data = steps.build_measurements(study.layout, q[0], noise)
     options = lc.FitOptions(rank_tolerance=1e-5, sigma_uncertainty=0.0)
     result = lc.identify(study.robot, data, lc.MAP(), options=options)
     return report_fit(result, parts=False)

@@ -28,7 +28,6 @@ USES_LIBRARY = {
     "studies/results/summary_view.py": "makes a table in memory",
     "cli/commands/regularize_command.py": "makes a table in memory",
     "io/runs/run_folder.py": "makes arrays.npz in memory",
-    "papers/drawing.py": "draws into memory",
     "report/pictures.py": "draws into memory",
 }
 """Modules that use them, and why they may."""

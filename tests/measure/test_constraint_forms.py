@@ -23,8 +23,11 @@ from loopcal.estimate.plane_line_products import (
     map_displacements,
 )
 from loopcal.findings import Finding
-from loopcal.papers.cmm_constraint_2011.forms import build_measurements, compare_covariances
-from loopcal.papers.cmm_constraint_2011.machines import draw_true_machines
+from loopcal.papers.cmm_constraint_2011.steps import (
+    build_measurements,
+    compare_covariances,
+    draw_true_machines,
+)
 from loopcal.planning.plane_line_planning import PlaneLineGroups, linearize_surfaces
 
 MM = 1e-3

@@ -1,4 +1,3 @@
-# SPDX-License-Identifier: Apache-2.0
 """The 42-parameter hexapod study: which published numbers and claims are confirmed.
 
 Statistics are over 20 drawings (seed 0). Their bounds are written beside them and hold for seeds 0
@@ -6,39 +5,32 @@ to 6 too. A root mean square over 20 drawings of few independent directions has 
 some 15 %.
 """
 
-import re
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from loopcal.estimate.penalties import LeastSquares
+import loopcal as lc
 from loopcal.estimate.published_steps import LegForm
-from loopcal.estimate.trial_identification import identify_trials
-from loopcal.mechanism.solutions import forward
-from loopcal.papers.hexapod_42.noise_study import (
-    PRESUMED,
-    STATED,
-    compute_published_sizes,
-    recover_noise,
-    simulate_stated_noise,
-    to_si,
-)
-from loopcal.papers.hexapod_42.published import MM, Published
+from loopcal.papers.hexapod_42.results import Results, compute, find_rule, judge_claims
 from loopcal.papers.hexapod_42.steps import (
-    compute_actual_poses,
+    MM,
+    PRESUMED,
+    PRINTED,
+    STATED,
+    TO_SI,
+    Setup,
+    compute_explained_share,
     draw_measured_poses,
     iterate,
     to_measurements,
+    to_si,
     to_twists,
 )
-from loopcal.papers.hexapod_42.study import Results, compute
-from loopcal.papers.hexapod_42.verdicts import judge_claims
 from tests.papers.random_results import collect_answers
 
 pytestmark = pytest.mark.slow
 TRIALS = 20
-DOC = Path(__file__).parents[2] / "docs" / "papers" / "hexapod-42.md"
 
 
 @pytest.fixture(scope="module")
@@ -46,17 +38,25 @@ def results() -> Results:
     return compute(0, TRIALS, lambda _: None)
 
 
+@pytest.fixture(scope="module")
+def setup(results) -> Setup:
+    return results.setup
+
+
+def simulate_stated_noise(setup: Setup, seed: int, trials: int) -> lc.Trials:
+    noise = lc.Uniform(np.roll(to_si(STATED), 3))
+    instrument = lc.Instrument((lc.Sensor(lc.Pose("euler-xyz"), noise),))
+    truth = np.repeat(setup.truth.values[None], trials, axis=0)
+    return lc.simulate_trials(setup.robot, truth, setup.commanded.T, instrument, seed)
+
+
 def test_table_4_follows_from_tables_2_and_3_to_one_unit_of_the_last_digit(results) -> None:
     fourth = results.comparisons["table_4"]
-    actual = np.array(
-        [
-            label.endswith((" PP", " E1")) and not label.startswith("A2 ")
-            for label in fourth.published.labels
-        ]
-    )
+    labels = fourth.published.labels
+    actual = np.array([x.endswith((" PP", " E1")) and not x.startswith("A2 ") for x in labels])
     assert actual.sum() == 18
     assert fourth.within[actual].all()
-    assert not fourth.within[fourth.published.labels.index("A2 PP")].all()
+    assert not fourth.within[labels.index("A2 PP")].all()
     assert results.comparisons["table_4_a2"].within.all()
 
 
@@ -81,27 +81,28 @@ def test_row_a2_is_the_only_outlier(results) -> None:
     assert all(o.p_value < 1e-9 for o in results.outliers.first if o.label != "A2")
 
 
-def test_noise_free_steps_agree_with_the_paper(results) -> None:
-    for run, second in (
-        (results.exact, 2e-8),
-        (results.frozen, 3e-6),
-    ):  # [mm] matrix made anew; one matrix
-        errors = np.abs(run.compute_parameter_errors(results.study.truth)).max(axis=1) / MM
+def test_noise_free_steps_agree_with_the_paper(results, setup) -> None:
+    threshold, iterations = find_rule()
+    assert (threshold, iterations) == (1e-6, 2)
+    # [mm] with a new matrix in each iteration, and with one throughout
+    for run, second in ((results.runs["exact"], 2e-8), (results.runs["frozen"], 3e-6)):
+        errors = np.abs(run.compute_parameter_errors(setup.truth)).max(axis=1) / MM
         assert run.integrated[0] == pytest.approx(0.058938, abs=5e-7)  # [mm + rad], last digit
         assert errors[1] == pytest.approx(1.6e-3, rel=0.1)
         assert errors[2] < second
-        assert run.count_needed(results.printed.threshold) == results.printed.iterations == 2
-    assert np.abs(results.exact.compute_parameter_errors(results.study.truth)[3]).max() / MM < 1e-8
-    np.testing.assert_array_equal(
-        np.round(results.exact.conditions), [5822, 3501, 4924, 4570, 3385, 4683]
-    )
+        assert run.count_needed(threshold) == iterations
+        assert run.count_needed(0.0) is None
+    exact = results.runs["exact"]
+    assert np.abs(exact.compute_parameter_errors(setup.truth)[3]).max() / MM < 1e-8
+    conditions = np.round(exact.conditions)
+    np.testing.assert_array_equal(conditions, [5822, 3501, 4924, 4570, 3385, 4683])
 
 
 def test_stated_noise_prevents_the_stopping_rule_and_worsens_parameters(results) -> None:
-    stated = next(level for level in results.levels if level.limits == STATED)
+    stated = results.levels[STATED]
     assert not np.isfinite(stated.needed).any()
     assert 6e-4 < stated.median[3] < 1.2e-3  # [mm + rad]; 7.6e-4 to 9.5e-4 over seeds 0 to 6
-    before, alone, together, prior = results.methods
+    before, alone, together, prior = results.methods.values()
     assert before.parameters == pytest.approx(0.0336, abs=1e-4)  # [mm] Table 3 itself
     assert 0.14 < alone.parameters < 0.26  # [mm]; 0.168 to 0.200 over seeds 0 to 6
     assert 1.5 < alone.parameters / together.parameters < 3.1  # 1.8 to 2.6 over seeds 0 to 6
@@ -110,77 +111,55 @@ def test_stated_noise_prevents_the_stopping_rule_and_worsens_parameters(results)
     assert 0.008 < alone.wide < 0.03  # [mm]
 
 
-def test_per_leg_fit_has_2_4_times_the_standard_deviation_of_the_joint_fit(results) -> None:
-    study, sd = results.study, to_si(STATED) / np.sqrt(3.0)
-    legs, actual = LegForm.at(study.robot, study.commanded), compute_actual_poses(study)
+def test_per_leg_fit_has_2_4_times_the_standard_deviation_of_the_joint_fit(setup) -> None:
+    sd, legs = to_si(STATED) / np.sqrt(3.0), LegForm.at(setup.robot, setup.commanded)
     unit = np.eye(60).reshape(60, 10, 6) * sd  # exact to first order: each of 60 noises on its own
-    alone = np.sqrt(
-        np.sum([legs.fit(to_twists(noise, actual, study.order)) ** 2 for noise in unit], axis=0)
-    )
-    together = identify_trials(
-        study.robot, simulate_stated_noise(study, 0, 2), LeastSquares()
-    ).standard_deviations()[0]
-    rms = [float(np.sqrt(np.mean(values**2)) / MM) for values in (alone, together)]
+    squares = [legs.fit(to_twists(noise, setup.actual)) ** 2 for noise in unit]
+    trials = simulate_stated_noise(setup, 0, 2)
+    fits = lc.identify_trials(setup.robot, trials, lc.LeastSquares())
+    together = fits.standard_deviations()[0]
+    rms = [np.sqrt(np.mean(x)) / MM for x in (np.sum(squares, axis=0), together**2)]
     np.testing.assert_allclose(rms, [0.199, 0.084], rtol=0.03)  # [mm]
     assert rms[0] / rms[1] == pytest.approx(2.4, abs=0.1)
 
 
 def test_tables_5_and_6_imply_noise_1000_times_smaller_than_stated(results) -> None:
-    sizes = compute_published_sizes(results.printed)
+    sizes, presumed = results.sizes, results.levels[PRESUMED]
     np.testing.assert_allclose(sizes, [3.04e-7, 9.1e-10, 2.39e-4, 7.2e-7], rtol=0.01)
-    presumed = next(level for level in results.levels if level.limits == PRESUMED)
-    assert np.all(sizes / presumed.median < 2.0)
-    assert np.all(sizes / presumed.median > 0.5)
-    for level in results.levels:
-        if level.limits[0] != 1e-6 or level.limits[1] == 1e-6:
+    assert np.all(np.abs(np.log2(sizes / presumed.median)) < 1.0)
+    for limits, level in results.levels.items():
+        if limits[0] != 1e-6 or limits[1] == 1e-6:
             assert not level.contains(sizes).all()
 
 
-def test_table_6_contains_residuals_and_a_common_shift_leaves_none(results) -> None:
-    study = results.study
-    legs = LegForm.at(study.truth, forward(study.truth, study.commanded.q, study.commanded))
-    actual = compute_actual_poses(study)
-
-    def compute_explained_share(errors: np.ndarray) -> np.ndarray:
-        return legs.explain(to_twists(errors, actual, study.order))
-
-    printed = results.printed.pose_errors_after.values * np.array([MM] * 3 + [1.0] * 3)
-    assert compute_explained_share(printed).max() < 0.1
-    assert (
-        compute_explained_share(
-            np.random.default_rng(0).normal(size=(10, 6)) * to_si(PRESUMED)
-        ).mean()
-        > 0.7
-    )
-    offset = recover_noise(study, results.printed).mean(axis=0)
+def test_table_6_contains_residuals_and_a_common_shift_leaves_none(results, setup) -> None:
+    printed = PRINTED.table("table_6", "after").values * TO_SI
+    assert compute_explained_share(setup, printed).max() < 0.1
+    noise = np.random.default_rng(0).normal(size=(10, 6)) * to_si(PRESUMED)
+    assert compute_explained_share(setup, noise).mean() > 0.7
+    offset = results.noise.mean(axis=0)
     np.testing.assert_allclose(offset[:3] / MM, [3.1e-5, -1.1e-5, -1.0e-5], atol=1e-6)  # [mm]
     # what is left, 3 % of 3e-5 mm at most in a leg, hides below the residuals
-    assert compute_explained_share(np.tile(offset, (10, 1))).min() > 1.0 - 1e-3
+    assert compute_explained_share(setup, np.tile(offset, (10, 1))).min() > 1.0 - 1e-3
 
 
 def test_method_of_the_paper_fails_for_the_rounded_poses_of_table_4(results) -> None:
-    rows = {row[0]: row[2] for row in results.rounding}
-    assert rows["Table 4 as printed"] == pytest.approx(2.6, rel=0.05)  # [mm]
-    assert rows["without row A2"] > rows["not calibrated"]
-    assert rows["row A2 computed, rounded as row A1"] > rows["not calibrated"]
-    assert rows["computed poses in full"] < 1e-8
+    errors = {name: error for name, (_, error) in results.rounding.items()}
+    assert errors["Table 4 as printed"] == pytest.approx(2.6, rel=0.05)  # [mm]
+    assert errors["without row A2"] > errors["not calibrated"]
+    assert errors["row A2 computed, rounded as row A1"] > errors["not calibrated"]
+    assert errors["computed poses in full"] < 1e-8
 
 
-def test_steps_and_simulated_trials_draw_the_same_noise(results) -> None:
-    made, study = simulate_stated_noise(results.study, 3, 2), results.study
+def test_noise_follows_from_the_seed_and_is_that_of_simulated_trials(setup) -> None:
+    made = simulate_stated_noise(setup, 3, 2)
     for trial in range(2):
-        ours = (
-            to_measurements(study, draw_measured_poses(study, to_si(STATED), 3, trial))
-            .observations[0]
-            .measured
-        )
-        np.testing.assert_allclose(
-            made.measured[0][trial], ours, rtol=0, atol=1e-13
-        )  # [rad, m] rounding
-
-
-def test_unreachable_threshold_gives_no_iteration_count(results) -> None:
-    assert iterate(results.study, compute_actual_poses(results.study), 2).count_needed(0.0) is None
+        drawn = draw_measured_poses(setup, to_si(STATED), 3, trial)
+        ours = to_measurements(setup, drawn).observations[0].measured
+        np.testing.assert_allclose(made.measured[0][trial], ours, rtol=0, atol=1e-13)  # rounding
+    first, again, other = (draw_measured_poses(setup, to_si(STATED), seed) for seed in (7, 7, 8))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).all()
 
 
 def test_40_wide_poses_reduce_the_error_tenfold_at_the_stated_noise(results) -> None:
@@ -191,47 +170,19 @@ def test_40_wide_poses_reduce_the_error_tenfold_at_the_stated_noise(results) -> 
     assert rows["drawn, wide", 40][5] < rows["the paper's ten", 10][5] / 10.0
 
 
-def test_claims_have_the_expected_verdicts(results) -> None:
+def test_claims_have_the_expected_verdicts_which_follow_from_the_numbers(results) -> None:
     judged = {v.name: v.agrees for v in judge_claims(results)}
     assert len(judged) == 17
     assert {name for name, agrees in judged.items() if agrees} == {
-        "converges",
-        "table_4",
-        "threshold",
-        "residuals",
-        "positions_improve",
-        "seven_poses",
-    }
-
-
-def test_verdict_changes_with_the_computed_results(results) -> None:
-    wrong = results.orders[1:]
-    changed = Results(
-        **{
-            **vars(results),
-            "orders": (*[o for o in wrong if o.formula == "Rz(alpha) Ry(beta) Rx(gamma)"], *wrong),
-        }
-    )
-    claim = next(v for v in judge_claims(changed) if v.name == "rotation")
-    assert claim.agrees
-
-
-def test_every_verdict_can_be_does_not_agree(results) -> None:
-    answers = collect_answers(judge_claims, results, keep=(Published,))
+        "converges", "table_4", "threshold", "residuals", "positions_improve", "seven_poses"
+    }  # fmt: skip
+    printed = next(o for o in results.orders if o.formula == "Rz(alpha) Ry(beta) Rx(gamma)")
+    changed = replace(results, orders=(printed, *results.orders[1:]))
+    assert next(v for v in judge_claims(changed) if v.name == "rotation").agrees
+    answers = collect_answers(judge_claims, results, keep=(Setup,))
     assert len(answers) == 17
     assert [claim for claim, given in answers.items() if False not in given] == []
 
 
-def test_noise_follows_from_the_seed_alone(results) -> None:
-    draws = (draw_measured_poses(results.study, to_si(STATED), seed) for seed in (7, 7, 8))
-    first, again, other = draws
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).all()
-
-
-def test_page_lists_exactly_the_modules_of_the_study() -> None:
-    folder = Path(__file__).parents[2] / "src" / "loopcal" / "papers" / "hexapod_42"
-    named = set(re.findall(r"`(\w+\.(?:py|yaml))`", DOC.read_text("utf-8")))
-    assert named == {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}} - {
-        "__init__.py"
-    }
+def test_iteration_ends_after_its_limit(setup) -> None:
+    assert len(iterate(setup, setup.actual, 2).integrated) == 3

@@ -14,23 +14,10 @@ from loopcal.cli.entry_point import main
 from loopcal.estimate.plane_line_products import Layout, PaperRows, identify_from_rows
 from loopcal.estimate.published_steps import penalize_ridge, penalize_truncated
 from loopcal.measure.instrument import make_random_stream
-from loopcal.papers import PAPERS, cmm_constraint_2011, hexapod_42, tsvd_2016
-from loopcal.papers.cmm_constraint_2011.calibrations import METHODS
-from loopcal.papers.cmm_constraint_2011.published import read_published as read_cmm
-from loopcal.papers.hexapod_42 import noise_study
-from loopcal.papers.hexapod_42.published import MM, load_nominal_machine, to_values
-from loopcal.papers.hexapod_42.published import read_published as read_hexapod
-from loopcal.papers.hexapod_42.study import round_to_degrees
-from loopcal.papers.paper_studies import load_paper_study
-from loopcal.papers.tsvd_2016.machines import (
-    LIMITS,
-    ROBOTS,
-    list_measured_poses,
-    load_machine,
-    measure_machines,
-)
-from loopcal.papers.tsvd_2016.situations import LAMBDAS, SHORT
-from loopcal.papers.tsvd_2016.steps import iterate
+from loopcal.papers.cmm_constraint_2011 import steps as cmm
+from loopcal.papers.hexapod_42 import steps as hexapod
+from loopcal.papers.paper import PAPERS
+from loopcal.papers.tsvd_2016 import steps as tsvd
 from loopcal.studies.files.study_file import load_study
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.simulation.block import (
@@ -43,14 +30,15 @@ from loopcal.studies.simulation.block import (
 from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.specification.levels import PosesLevel
 
+MM = 1e-3
+
 
 def test_the_grid_of_cmm_constraint_has_the_printed_sets_and_noises():
-    study, printed = load_paper_study(str(cmm_constraint_2011.__file__)), read_cmm()
-    assert [f"set {given}" for given in printed.sets] == list(study.errors)
-    assert [level.tolerance_factor for level in study.errors.values()] == [
-        float(given) for given in printed.sets
-    ]
-    for given in printed.noises:
+    study = PAPERS["cmm-constraint-2011"].load_study()
+    sets, noises = (cmm.PRINTED.find(key).split() for key in ("sets", "noises"))
+    assert [f"set {given}" for given in sets] == list(study.errors)
+    assert [level.tolerance_factor for level in study.errors.values()] == list(map(float, sets))
+    for given in noises:
         assert study.instruments[f"{given} mm"].sigma_position == pytest.approx(float(given) * MM)
     few = {"points": PosesLevel(10, "plane-line", groups=1, sweeps=0)}
     quick = replace(set_size(study, 0, 2), poses=few)
@@ -59,76 +47,62 @@ def test_the_grid_of_cmm_constraint_has_the_printed_sets_and_noises():
 
 
 def test_cells_of_cmm_constraint_are_the_equations_of_the_paper():
-    study = set_size(load_paper_study(str(cmm_constraint_2011.__file__)), 3, 2)
-    poses = {"points": replace(study.poses["100 points"], sweeps=0)}
-    study = replace(study, poses=poses)
+    study = set_size(PAPERS["cmm-constraint-2011"].load_study(), 3, 2)
+    study = replace(study, poses={"points": replace(study.poses["100 points"], sweeps=0)})
     numbers = find_cells(study, errors="set 1", instrument="0.01 mm")
+    points = np.array(json.loads(next(list_tasks(study, [0])).content)["measured"])
     stream = make_stream(3, 0)
     noise = np.stack([make_random_stream(stream, i).standard_normal((100, 3)) for i in range(2)])
     for cell in calibrate_cells(study, numbers):
-        coordinates = _find_coordinates(study)
-        layout = Layout(cell.robot, coordinates.reshape(10, 10, 6))
-        q = layout.hold_points(cell.truth, 1e-5 * noise)[1]
-        rows = PaperRows(layout, q, MM, 1e-5)
-        by_hand = identify_from_rows(rows, METHODS[cell.levels["method"]])
+        layout = Layout(cell.robot, points.reshape(10, 10, 6))
+        rows = PaperRows(layout, layout.hold_points(cell.truth, 1e-5 * noise)[1], MM, 1e-5)
+        by_hand = identify_from_rows(rows, cmm.METHODS[cell.levels["method"]])
         assert_allclose(cell.values, rows.values(by_hand.deviation), rtol=0, atol=1e-12)
 
 
-def _find_coordinates(study):
-    """Return the points (100, 6) of the only poses of a study."""
-    return np.array(json.loads(next(list_tasks(study, [0])).content)["measured"])
-
-
 def test_the_noise_study_has_the_errors_and_poses_of_the_tables():
-    study, printed = load_paper_study(str(hexapod_42.__file__)), read_hexapod()
+    study, setup = PAPERS["hexapod-42"].load_study(), hexapod.make_setup()
     (poses,) = study.poses.values()
-    assert_allclose(poses.coordinates, round_to_degrees(printed.nominal_poses), atol=1e-15)
-    numbers = find_cells(study, method="MAP")
-    (cell,) = calibrate_cells(set_size(study, 0, 2), numbers[:1])
-    robot = load_nominal_machine()
-    assert_allclose(
-        cell.truth - robot.values, np.tile(to_values(robot, printed.errors.values * MM), (2, 1)),
-        rtol=0, atol=1e-15,
-    )  # fmt: skip
-    for limits in noise_study.LEVELS:
+    assert_allclose(poses.coordinates, setup.poses, atol=1e-15)
+    (cell,) = calibrate_cells(set_size(study, 0, 2), find_cells(study, method="MAP")[:1])
+    assert_allclose(cell.truth, np.tile(setup.truth.values, (2, 1)), rtol=0, atol=1e-15)
+    for limits in hexapod.LEVELS:
         level = study.instruments[f"{limits[0]:g} mm and {limits[1]:g} rad"]
         assert level.distribution == "uniform"
         assert np.sqrt(3.0) * level.sigma_position == pytest.approx(limits[0] * MM, rel=1e-7)
         assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(limits[1], rel=1e-7)
-    assert {*noise_study.PER_LEG, noise_study.TOGETHER, noise_study.PRIOR} == set(study.methods)
+    assert {*hexapod.PER_LEG, hexapod.TOGETHER, hexapod.PRIOR} == set(study.methods)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", tsvd.ROBOTS)
 def test_the_sweeps_have_the_settings_and_poses_of_the_reproduction(name):
-    stem = ROBOTS[name].replace("-", "_")
-    study = load_paper_study(str(tsvd_2016.__file__), f"study_{stem}.yaml")
-    robot = load_machine(name)
+    study, robot = PAPERS["tsvd-2016"].load_study(tsvd.ROBOTS[name]), tsvd.load_machine(name)
     p = len(robot.parameters)
     (poses,) = study.poses.values()
-    assert_allclose(poses.coordinates, list_measured_poses(robot), rtol=0, atol=1e-8)
+    assert_allclose(poses.coordinates, tsvd.list_measured_poses(robot), rtol=0, atol=1e-8)
     keeps = [level.keep for level in study.methods.values() if level.keep is not None]
     assert keeps == list(range(p - 1, p // 3, -1))
     raw = [level for level in study.methods.values() if level.rows == "raw" and level.lam]
-    assert_allclose([level.lam or 0.0 for level in raw], [*LAMBDAS, *LAMBDAS])
-    assert {level.steps for level in raw} == {None, SHORT}
+    assert_allclose([level.lam or 0.0 for level in raw], [*tsvd.LAMBDAS, *tsvd.LAMBDAS])
+    assert {level.steps for level in raw} == {None, tsvd.SHORT}
     for level in study.instruments.values():
-        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(LIMITS[0])
-        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(LIMITS[3])
+        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(tsvd.LIMITS[0])
+        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(tsvd.LIMITS[3])
     assert study.instruments["5-DOF"].unused == ("psi",)
 
 
 def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
     """The reproduction runs all settings of a machine as one batch, which is faster."""
-    study = set_size(load_paper_study(str(tsvd_2016.__file__), "study_3_prs.yaml"), 1, 2)
+    study = set_size(PAPERS["tsvd-2016"].load_study("3-prs"), 1, 2)
     settings = {"TSVD 22": penalize_truncated(np.array([22]), 33),
                 "RE 1e-3": penalize_ridge(np.array([1e-3]), 33)}  # fmt: skip
     for instrument in study.instruments:
         for method, penalty in settings.items():
             numbers = find_cells(study, instrument=instrument, method=method)
             (cell,) = calibrate_cells(study, numbers)
-            measured = measure_machines("3-PRS", cell.truth)
+            measured = tsvd.measure_machines("3-PRS", cell.truth)
             trials = replace(measured.trials, measured=cell.measured)
-            run = iterate(replace(measured, trials=trials), penalty, np.arange(2))
+            run = tsvd.iterate(replace(measured, trials=trials), penalty, np.arange(2))
             step = np.abs(run.values - measured.robot.values).max()
             assert_allclose(cell.values, run.values, rtol=0, atol=1e-6 * step)
             assert abs(cell.iterations - run.count).max() <= 1

@@ -1,9 +1,9 @@
-# SPDX-License-Identifier: Apache-2.0
-"""What all repeated papers share: printed numbers, comparisons, pages, folders, the command."""
+"""What all repeated papers share: printed numbers, claims, pages, folders, the command."""
 
 import csv
 import json
-from dataclasses import replace
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,78 +11,77 @@ import pytest
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.json_text import to_json
-from loopcal.papers import PAPERS, Paper, paper
-from loopcal.papers.drawing import choose_styles, draw
-from loopcal.papers.reproduction import Figure, Series, Verdict
-from loopcal.papers.wording import Wording
-from loopcal.papers.writing import page, write_folder
+from loopcal.papers.claims import Claim, Verdict
+from loopcal.papers.paper import PAPERS, Paper, find_paper
+from loopcal.papers.published import Figure, Series
+from loopcal.papers.reproduction import choose_styles, draw, write_folder, write_page
 from tests.papers.small_reproduction import MADE_BY, build_reproduction
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_number_agrees_within_one_unit_of_its_last_printed_digit() -> None:
-    comparison = build_reproduction().comparisons[0]
+    comparison = build_reproduction().content.comparisons[0]
     np.testing.assert_array_equal(comparison.step, [[0.01, 1e-5], [1.0, 0.01]])
     np.testing.assert_array_equal(comparison.within, [[True, True], [False, True]])
     assert (comparison.agreeing, comparison.count, comparison.largest) == (3, 4, 2.0)
-
-
-def test_published_numbers_are_shown_as_printed() -> None:
-    rows = build_reproduction().comparisons[0].table().rows
-    assert [row[2] for row in rows] == ["0.12", "-3E-05", "7", "1.50"]
+    assert [row[2] for row in comparison.table().rows] == ["0.12", "-3E-05", "7", "1.50"]
 
 
 def test_page_shows_published_and_computed_numbers_and_marks_differences() -> None:
-    text = page(build_reproduction(), MADE_BY)
-    assert (
-        "| B | published | 7 | 1.50 |\n|  | computed | 9.0 | 1.500 |\n|  | difference | "
-        "**2.0e+00** | 0 |" in text
-    )
-    assert (
-        "## Our own checks\n\n1. **Not confirmed:** It holds.\n"
-        "   True in 0 of 2 draws. It does not." in text
-    )
-    assert "| q | - |" in text
-    assert "The first 2 of 3 rows" in text
-    assert "(figures/curve.png)" in text
-
-
-def build_wording(**claim: object) -> Wording:
-    text = {"claim": "x is small.", "where": "section 1", "evidence": "x is {x:g}.", **claim}
-    return Wording((), {"small": text}, {}, {})
-
-
-def test_claim_is_undecided_between_its_two_lists_of_comparisons() -> None:
-    words = build_wording(agrees=["x < 1"], disagrees=["x > 2"])
-    verdicts = [words.judge("small", x=x) for x in (0.5, 1.5, 2.5)]
-    assert [v.agrees for v in verdicts] == [True, None, False]
-    assert [v.word for v in verdicts] == ["Agrees", "Undecided", "Does not agree"]
-    two_valued = build_wording(agrees=["x < 1"])
-    assert [two_valued.judge("small", x=x).agrees for x in (0, 2)] == [True, False]
-
-
-def test_claim_whose_draws_differ_is_labelled_so() -> None:
-    words = build_wording(agrees=["x < 1"])
-    mixed = words.judge("small", x=0.5, draws=[{"x": x} for x in (0.5, 3.0, 0.1, 0.2, 0.9)])
-    assert (mixed.agrees, mixed.word) == (None, "Depends on the draw")
-    assert mixed.stability == "True in 4 of 5 draws."
-    same = words.judge("small", x=0.5, draws=[{"x": x} for x in (3.0, 2.0)])
-    assert (same.agrees, same.word, same.why) == (False, "Does not agree", "x is 0.5.")
-    assert words.judge("small", x=0.5).stability == ""
+    text = write_page(build_reproduction(), MADE_BY)
+    for part in (
+        (
+            "| B | published | 7 | 1.50 |\n|  | computed | 9.0 | 1.500 |\n|  | difference | "
+            "**2.0e+00** | 0 |"
+        ),
+        (
+            "## Our own checks\n\n1. **Not confirmed:** It holds.\n"
+            "   True in 0 of 2 draws. It does not."
+        ),
+        "| q | - |",
+        "The first 2 of 3 rows",
+        "(figures/curve.png)",
+    ):
+        assert part in text
 
 
 def test_statements_of_the_paper_and_own_checks_have_two_lists() -> None:
-    small = build_reproduction()
-    both = replace(
-        small, verdicts=(*small.verdicts, Verdict("It is said.", True, "It is.", "section 1"))
-    )
-    assert {title: len(v) for title, v in both.verdict_groups.items()} == {
-        "Statements of the paper": 1,
-        "Our own checks": 1,
-    }
-    text = page(both, MADE_BY)
-    assert text.index("1. **Agrees:** It is said. (section 1)") < text.index(
-        "2. **Not confirmed:**"
-    )
+    both = build_reproduction(Verdict("It is said.", True, "It is.", "section 1"))
+    counts = {title: len(verdicts) for title, verdicts in both.verdict_groups.items()}
+    assert list(counts.items()) == [("Statements of the paper", 1), ("Our own checks", 1)]
+    text = write_page(both, MADE_BY)
+    first = text.index("1. **Agrees:** It is said. (section 1)")
+    assert first < text.index("2. **Not confirmed:**")
+
+
+def make_claim(**more: object) -> Claim:
+    record = {"claim": "x is small.", "where": "section 1", "evidence": "x is {x:g}."}
+    return Claim("small", {**record, "agrees": [["x", "below", 1]], **more})
+
+
+@pytest.mark.parametrize(
+    ("more", "x", "draws", "agrees", "word", "reason"),
+    [
+        ({}, 0.5, (), True, "Agrees", "x is 0.5."),
+        ({}, 2.0, (), False, "Does not agree", "x is 2."),
+        ({"disagrees": [["x", "above", 2]]}, 1.5, (), None, "Undecided", "x is 1.5."),
+        ({"disagrees": [["x", "above", 2]]}, 2.5, (), False, "Does not agree", "x is 2.5."),
+        ({}, 0.5, (0.5, 3.0, 0.1, 0.2, 0.9), None, "Depends on the draw",
+         "True in 4 of 5 draws. x is 0.5."),
+        ({}, 0.5, (3.0, 2.0), False, "Does not agree", "True in 0 of 2 draws. x is 0.5."),
+    ],
+)  # fmt: skip
+def test_claim_is_judged_by_its_comparisons(more, x, draws, agrees, word, reason) -> None:
+    verdict = make_claim(**more).judge([{"x": drawn} for drawn in draws], x=x)
+    assert (verdict.agrees, verdict.word, verdict.reason) == (agrees, word, reason)
+
+
+def test_claim_holds_in_a_draw_where_it_holds_in_all_places() -> None:
+    claim = make_claim(evidence="{shares:each; |{name}: {count} of {of}}.")
+    places = {"a": {"x": np.array([0.5, 0.5, 2.0])}, "b": {"x": np.array([0.1, 3.0, 0.1])}}
+    verdict = claim.judge_everywhere(places)
+    assert (verdict.draws, verdict.why) == ((True, False, False), "a: 2 of 3; b: 2 of 3.")
 
 
 @pytest.mark.slow
@@ -94,12 +93,8 @@ def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> No
     }
     assert (folder / "figures" / "curve.png").read_bytes().startswith(b"\x89PNG")
     with (folder / "tables" / "extra.csv").open() as stream:
-        assert list(csv.reader(stream)) == [
-            ["case", "value"],
-            ["p", "1.0"],
-            ["q", ""],
-            ["r", "3.0"],
-        ]
+        rows = list(csv.reader(stream))
+    assert rows == [["case", "value"], ["p", "1.0"], ["q", ""], ["r", "3.0"]]
     with pytest.raises(FileError, match="not empty"):
         write_folder(folder, build_reproduction(), MADE_BY)
     (folder / "figures" / "curve.png").unlink()
@@ -112,51 +107,57 @@ def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 4, 9, 14])
-@pytest.mark.parametrize("log", ["", "y", "xy"])
+@pytest.mark.parametrize(("count", "log"), [(1, "xy"), (4, ""), (9, "y"), (14, "xy")])
 def test_legend_covers_no_curve_and_lies_within_the_picture(count, log) -> None:
     """Curves that fill the axes to their corners, with as many labels as the studies have."""
-    rng = np.random.default_rng(count)
-    x = tuple(map(float, np.geomspace(1e-5, 1.0, 30)))
-    series = [
-        Series(
-            f"MAP, errors of {i} mm, aligned", x, tuple(map(float, 10 ** rng.uniform(-4, 2, 30)))
-        )
-        for i in range(count)
-    ]
+    rng, x = np.random.default_rng(count), np.geomspace(1e-5, 1.0, 30)
+    names = [f"MAP, errors of {i} mm, aligned" for i in range(count)]
+    series = tuple(Series.of(name, x, 10 ** rng.uniform(-4, 2, 30)) for name in names)
     levels = {"before, errors of 0.01 mm": 1e-4, "MAP, phi and theta [deg]": 99.0}
-    small = Figure("f", "Title", "lambda [1]", "error [mm]", "Of 1.", tuple(series), levels, log)
+    small = Figure("f", "Title", "lambda [1]", "error [mm]", "Of 1.", series, levels, log)
     canvas = draw(small, choose_styles([small]))
-    canvas.canvas.draw()
-    legend = canvas.legends[0].get_window_extent()
-    axes = canvas.axes[0]
-    points = [axes.transData.transform(line.get_xydata()) for line in axes.lines[:count]]
+    canvas.draw_without_rendering()
+    legend, axes = canvas.legends[0].get_window_extent(), canvas.axes[0]
     x0, y0, x1, y1 = legend.extents
-    for xy in points:
+    for line in axes.lines[:count]:
+        xy = axes.transData.transform(line.get_xydata())
         inside = (xy[:, 0] >= x0) & (xy[:, 0] <= x1) & (xy[:, 1] >= y0) & (xy[:, 1] <= y1)
         assert not inside.any()
-    drawn = axes.get_tightbbox()
-    assert drawn is not None
-    assert not legend.overlaps(drawn)
+    assert not legend.overlaps(axes.get_tightbbox())
     assert canvas.bbox.x0 <= x0
     assert x1 <= canvas.bbox.x1
     assert canvas.bbox.y0 <= y0
-    assert axes.get_window_extent().height > 150  # [pixels] the curves keep room
+    assert axes.get_window_extent().height > 0.22 * canvas.bbox.height  # the curves keep room
+
+
+def test_labels_of_one_figure_differ_in_color_and_keep_it_in_others() -> None:
+    lines = [Series(label, (1.0,), (1.0,)) for label in ("a", "b", "c", "_unnamed")]
+    figures = [
+        Figure(name, "", "", "", "", series)
+        for name, series in (("f", tuple(lines[:2])), ("g", tuple(lines[1:])))
+    ]
+    styles = choose_styles(figures)
+    assert list(styles) == ["a", "b", "c"]
+    assert styles["b"]["color"] not in {styles["a"]["color"], styles["c"]["color"]}
 
 
 def test_unknown_paper_and_invalid_seed_or_trials_are_refused() -> None:
     with pytest.raises(DataError, match="hexapod-42"):
-        paper("hexapod")
+        find_paper("hexapod")
     for seed, trials in ((-1, 5), (0, 1)):
         with pytest.raises(DataError, match="give a seed of 0 or more"):
             PAPERS["hexapod-42"].run(seed, trials)
 
 
-def test_every_paper_has_its_registered_name_a_title_and_a_source() -> None:
-    assert all(
-        isinstance(one, Paper) and name == one.name and one.title and one.source
-        for name, one in PAPERS.items()
-    )
+@pytest.mark.parametrize("paper", PAPERS.values(), ids=PAPERS)
+def test_page_of_a_paper_lists_exactly_the_files_of_its_study(paper) -> None:
+    page = (ROOT / "docs" / "papers" / f"{paper.name}.md").read_text("utf-8")
+    folder = ROOT / "src" / "loopcal" / "papers" / paper.name.replace("-", "_")
+    named = set(re.findall(r"`(\w+\.(?:py|yaml))`", page))
+    files = {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}}
+    assert {name for name in named if not name.endswith("_draws.py")} == files - {"__init__.py"}
+    assert paper.title
+    assert paper.source
 
 
 def test_reproduce_lists_papers(capsys) -> None:
@@ -176,6 +177,15 @@ def test_reproduce_refuses_an_unknown_paper_and_a_used_folder(capsys, tmp_path) 
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
+def test_reproduce_prints_tables_and_statements(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(Paper, "run", lambda *_: build_reproduction())
+    assert main(["reproduce", "hexapod-42"]) == 0
+    printed = capsys.readouterr().out
+    for part in ("small: A title", "Extra", "Our own checks", "NOT CONFIRMED: It holds.",
+                 "True in 0 of 2 draws. It does not.", "Add -o FOLDER"):  # fmt: skip
+        assert part in printed
+
+
 @pytest.mark.slow
 def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
     folder = tmp_path / "out"
@@ -190,5 +200,3 @@ def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
     assert (folder / "figures" / "figure_4.png").is_file()
     again = PAPERS["hexapod-42"].run(0, 2)  # the same seed gives the same numbers
     assert json.loads(to_json(again.to_dict())) == document
-    assert main(["reproduce", "hexapod-42", "--trials", "2", "--seed", "8"]) == 0
-    assert "DOES NOT AGREE" in capsys.readouterr().out

@@ -1,109 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The result of repeating a paper: tables, verdicts and figures, all as data."""
+"""A repeated paper as data, and as a folder.
+
+page.md        what agrees, what does not and why, with all tables and figures
+result.json    the same for programs, and under `made_by` where it comes from
+tables/        NAME.csv and NAME.json, one row for each number
+figures/       NAME.png
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from loopcal.papers.printed import Comparison, Table
+from loopcal import serialization
+from loopcal.io.core.json_text import to_json
+from loopcal.io.core.result_folder import FolderKind, write_result_folder
+from loopcal.papers.claims import Verdict
+from loopcal.papers.published import Comparison, Figure, Table
+from loopcal.report.pictures import render_figure
 
-OWN_CHECK = "our own check, not a statement of the paper"
-"""Place of a claim that the paper does not make."""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+FOLDER = FolderKind(
+    "study",
+    "result.json",
+    ("made_by", "paper"),
+    ("page.md", "tables/*.csv", "tables/*.json", "figures/*.png"),
+)
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """The judgement of one claim.
-
-    Attributes
-    ----------
-    claim : the statement. agrees : whether the computed numbers support it; None where they cannot
-        decide, or where the draws of a random study differ.
-    why : the evidence in a sentence or two, with the numbers of this run.
-    where : place of the claim in the paper; OWN_CHECK for a check of ours.
-    name : of the claim in text.yaml.
-    draws : whether each repeated draw of a random study supports the claim (None: cannot decide);
-        empty where nothing was drawn again.
+class Content(NamedTuple):
+    """What a study shows: published beside computed numbers, one comparison for each table of the
+    paper; further tables; the judged claims; figures.
     """
 
-    claim: str
-    agrees: bool | None
-    why: str
-    where: str
-    name: str = ""
-    draws: tuple[bool | None, ...] = ()
-
-    @property
-    def is_own_check(self) -> bool:
-        """Whether the claim is a check of ours and not a statement of the paper."""
-        return self.where == OWN_CHECK
-
-    @property
-    def depends_on_draw(self) -> bool:
-        """Whether repeated draws lead to different answers."""
-        return len(set(self.draws)) > 1
-
-    @property
-    def word(self) -> str:
-        """The judgement as a word: a claim of the paper agrees, a check of ours is confirmed."""
-        if self.depends_on_draw:
-            return "Depends on the draw"
-        if self.agrees is None:
-            return "Undecided"
-        if self.is_own_check:
-            return "Confirmed" if self.agrees else "Not confirmed"
-        return "Agrees" if self.agrees else "Does not agree"
-
-    @property
-    def stability(self) -> str:
-        """How many of the repeated draws support the claim, as a sentence; else ""."""
-        if not self.draws:
-            return ""
-        return f"True in {sum(map(bool, self.draws))} of {len(self.draws)} draws."
-
-
-@dataclass(frozen=True)
-class Series:
-    """A line of a figure: points x, y. A label that begins with _ is not in the legend."""
-
-    label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-
-    @property
-    def is_named(self) -> bool:
-        """Whether the legend names the line."""
-        return not self.label.startswith("_")
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A figure as data.
-
-    Attributes
-    ----------
-    name : of its file. title, x_label, y_label, caption : texts, with units on the axes and the
-        number of cases in the caption.
-    series : the lines. levels : horizontal lines by label. log : logarithmic axes: "", "y" or "xy".
-    joined : whether lines join the points of a series. They do not where the order along x means
-        nothing.
-    """
-
-    name: str
-    title: str
-    x_label: str
-    y_label: str
-    caption: str
-    series: tuple[Series, ...]
-    levels: Mapping[str, float] = field(default_factory=dict)
-    log: str = "y"
-    joined: bool = True
-
-
-Content = tuple[tuple[Comparison, ...], tuple[Table, ...], tuple[Verdict, ...], tuple[Figure, ...]]
-"""What a study shows: comparisons, further tables, verdicts, figures."""
+    comparisons: tuple[Comparison, ...]
+    tables: tuple[Table, ...]
+    verdicts: tuple[Verdict, ...]
+    figures: tuple[Figure, ...]
 
 
 @dataclass(frozen=True)
@@ -113,10 +52,7 @@ class Reproduction:
     Attributes
     ----------
     paper, title, source : which one. about : paragraphs on what was done.
-    settings : seed and sizes of this run.
-    comparisons : published beside computed numbers, one for each table of the paper.
-    tables : further computed numbers. verdicts : the judged claims, those of the paper and our own
-        checks. figures : as data.
+    settings : seed and sizes of this run. content : its results.
     """
 
     paper: str
@@ -124,45 +60,139 @@ class Reproduction:
     source: str
     about: tuple[str, ...]
     settings: Mapping[str, Any]
-    comparisons: tuple[Comparison, ...]
-    tables: tuple[Table, ...]
-    verdicts: tuple[Verdict, ...]
-    figures: tuple[Figure, ...]
+    content: Content
 
     @property
     def verdict_groups(self) -> dict[str, tuple[tuple[int, Verdict], ...]]:
         """Verdicts with their numbers on a page, by title: statements of the paper, own checks."""
-        ordered = sorted(self.verdicts, key=lambda verdict: verdict.is_own_check)
-        groups: dict[str, tuple[tuple[int, Verdict], ...]] = {}
-        for number, verdict in enumerate(ordered, 1):
-            title = "Our own checks" if verdict.is_own_check else "Statements of the paper"
-            groups[title] = (*groups.get(title, ()), (number, verdict))
-        return groups
+        ordered = sorted(self.content.verdicts, key=lambda verdict: verdict.is_own_check)
+        numbered = list(enumerate(ordered, 1))
+        titles = {"Statements of the paper": False, "Our own checks": True}
+        groups = {
+            title: tuple(pair for pair in numbered if pair[1].is_own_check is own)
+            for title, own in titles.items()
+        }
+        return {title: group for title, group in groups.items() if group}
 
     def summary(self) -> Table:
         """Return how many numbers of each published table agree to one unit of their last digit."""
-        return Table(
-            "summary",
-            "Published beside computed",
-            (
-                "table",
-                "numbers",
-                "within one unit of the last digit",
-                "largest difference [units of the last digit]",
-            ),
-            tuple(
-                (c.title, c.count, c.agreeing, float((abs(c.difference) / c.step).max()))
-                for c in self.comparisons
-            ),
-            formats=("", "d", "d", ".2g"),
+        columns = ("table", "numbers", "within one unit of the last digit",
+                   "largest difference [units of the last digit]")  # fmt: skip
+        rows = tuple(
+            (c.title, c.count, c.agreeing, float((abs(c.difference) / c.step).max()))
+            for c in self.content.comparisons
         )
+        return Table("summary", "Published beside computed", columns, rows, ("", "d", "d", ".2g"))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all content by attribute name, for JSON."""
-        names = ("paper", "title", "source", "about", "settings", "verdicts", "figures")
+        """Return all content by name, for JSON."""
+        names = ("paper", "title", "source", "about", "settings")
         return {
             **{name: getattr(self, name) for name in names},
+            "verdicts": self.content.verdicts,
+            "figures": self.content.figures,
             "summary": self.summary().to_dict(),
-            "comparisons": [c.table().to_dict() for c in self.comparisons],
-            "tables": [table.to_dict() for table in self.tables],
+            "comparisons": [c.table().to_dict() for c in self.content.comparisons],
+            "tables": [table.to_dict() for table in self.content.tables],
         }
+
+
+def write_page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
+    """Return the page as Markdown; made_by : see `io.runs.run_folder.collect_provenance`."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    template = environment.get_template("page.md.j2")
+    return template.render(reproduction=reproduction, content=reproduction.content, made_by=made_by)
+
+
+def write_folder(
+    path: str | Path, reproduction: Reproduction, made_by: Mapping[str, Any], force: bool = False
+) -> Path:
+    """Write a reproduction whole or not at all; return the folder.
+
+    Parameters
+    ----------
+    path : folder to make. made_by : where the results come from. force : replace an earlier one.
+
+    Raises
+    ------
+    FileError : see `write_result_folder`.
+    """
+    content, path = reproduction.content, Path(path)
+    files = {"page.md": write_page(reproduction, made_by).encode("utf-8", "backslashreplace")}
+    compared = [c.table() for c in content.comparisons]
+    for table in (reproduction.summary(), *compared, *content.tables):
+        files[f"tables/{table.name}.csv"] = _write_csv(table).encode()
+        files[f"tables/{table.name}.json"] = to_json(table.to_dict()).encode()
+    styles = choose_styles(content.figures)
+    for figure in content.figures:
+        files[f"figures/{figure.name}.png"] = render_figure(draw(figure, styles), ".png")
+    document = {"made_by": made_by, **reproduction.to_dict()}
+    write_result_folder(path, FOLDER, document, files, force)
+    return path
+
+
+def choose_styles(figures: Sequence[Figure]) -> dict[str, dict[str, str]]:
+    """Return color and marker of each label of the legends: the same in all figures of a study;
+    labels of one figure differ in color as far as there are colors.
+    """
+    from loopcal.report.figures.style import COLORS, MARKERS
+
+    legends = [[s.label for s in f.series if not s.label.startswith("_")] for f in figures]
+    chosen: dict[str, int] = {}
+    for label in dict.fromkeys(label for legend in legends for label in legend):
+        taken = {chosen.get(other) for legend in legends if label in legend for other in legend}
+        free = (i for i in range(len(COLORS)) if i not in taken)
+        chosen[label] = next(free, len(chosen) % len(COLORS))
+    return {
+        label: {"color": COLORS[color], "marker": MARKERS[i % len(MARKERS)]}
+        for i, (label, color) in enumerate(chosen.items())
+    }
+
+
+def draw(figure: Figure, styles: Mapping[str, Mapping[str, str]]) -> Canvas:
+    """Draw a figure with its legend below the axes; styles : see `choose_styles`."""
+    from matplotlib.ticker import MaxNLocator
+
+    from loopcal.report.figures import style
+
+    canvas = style.start_figure(7.2, 4.6)
+    axes = canvas.add_subplot()
+    handles = []
+    for series in sorted(figure.series, key=lambda series: not series.label.startswith("_")):
+        if series.label.startswith("_"):
+            axes.plot(series.x, series.y, color=style.PALE, lw=style.THIN)
+            continue
+        handles += axes.plot(
+            series.x, series.y, label=series.label, ms=style.DOT, lw=style.LINE * figure.joined,
+            fillstyle="full" if figure.joined else "none",  # points on points stay visible
+            **styles[series.label],
+        )  # fmt: skip
+    for i, (label, value) in enumerate(figure.levels.items()):
+        own = (styles[s.label]["color"] for s in figure.series if s.label in label)
+        color, dashes = next(own, style.REFERENCE), ("--", ":", "-.")[i % 3]
+        handles.append(axes.axhline(value, color=color, ls=dashes, lw=style.LINE, label=label))
+    axes.set_xscale("log" if "x" in figure.log else "linear")
+    axes.set_yscale("log" if "y" in figure.log else "linear")
+    if "x" not in figure.log and all(x.is_integer() for s in figure.series for x in s.x):
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style.label_axes(axes, figure.x_label, figure.y_label)
+    style.add_legend(canvas, handles)
+    canvas.suptitle(figure.title, fontsize=style.TITLE)
+    return canvas
+
+
+def _write_csv(table: Table) -> str:
+    """Return a table as CSV with a header; numbers in full, and no cell where one is not finite."""
+    stream = StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(table.columns)
+    rows = serialization.to_json(table.rows)
+    writer.writerows(["" if cell is None else cell for cell in row] for row in rows)
+    return stream.getvalue()

@@ -28,7 +28,7 @@ from loopcal.cli.options import (
 
 if TYPE_CHECKING:
     from loopcal.estimate.published_steps import PerLegEstimate
-    from loopcal.papers.printed import Table as PrintedTable
+    from loopcal.papers.published import Table as PaperTable
     from loopcal.papers.reproduction import Reproduction
     from loopcal.report.tables import Block, Table
 
@@ -72,8 +72,7 @@ def reproduce(
       loopcal reproduce hexapod-42
       loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
     """  # noqa: D301
-    from loopcal.papers import PAPERS, TRIALS
-    from loopcal.papers import paper as find_paper
+    from loopcal.papers.paper import TRIALS, find_paper
 
     if paper is None:
         refuse_given(
@@ -81,15 +80,16 @@ def reproduce(
         )
         _list_papers(as_json)
         return
-    chosen = PAPERS[paper] if paper in PAPERS else find_paper(paper)
+    chosen = find_paper(paper)
     if output is not None:
-        from loopcal.papers.writing import refuse_study_folder
+        from loopcal.io.core.result_folder import refuse_folder
+        from loopcal.papers.reproduction import FOLDER
 
-        refuse_study_folder(output, force)
+        refuse_folder(output, FOLDER, force)
     result = chosen.run(seed, TRIALS if trials is None else trials, _print_step)
     if output is not None:
         from loopcal.io.runs.run_folder import collect_provenance
-        from loopcal.papers.writing import write_folder
+        from loopcal.papers.reproduction import write_folder
 
         command = ["loopcal", *sys.argv[1:]]
         write_folder(output, result, collect_provenance(command, {}, {"seed": seed}), force)
@@ -178,7 +178,7 @@ def _print_step(text: str) -> None:
 
 def _list_papers(as_json: bool) -> None:
     """Print the studies."""
-    from loopcal.papers import PAPERS
+    from loopcal.papers.paper import PAPERS
 
     if as_json:
         rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
@@ -191,18 +191,17 @@ def _list_papers(as_json: bool) -> None:
 def _view_reproduction(result: Reproduction) -> list[Block]:
     """Return the summary, the tables and the statements of the paper."""
     page: list[Block] = [f"{result.paper}: {result.title}"]
-    page += [_make_table(table) for table in (result.summary(), *result.tables)]
+    page += [_make_table(table) for table in (result.summary(), *result.content.tables)]
     for title, verdicts in result.verdict_groups.items():
         page += ["", title]
         for number, verdict in verdicts:
             word = verdict.word.upper() if verdict.agrees is False else verdict.word.lower()
             place = "" if verdict.is_own_check else f" ({verdict.where})"
-            why = f"{verdict.stability} {verdict.why}".strip()
-            page += [f"{number:2}. {word}: {verdict.claim}{place}", f"    {why}"]
+            page += [f"{number:2}. {word}: {verdict.claim}{place}", f"    {verdict.reason}"]
     return page
 
 
-def _make_table(printed: PrintedTable) -> Table:
+def _make_table(printed: PaperTable) -> Table:
     """Return a table of a study; long headings are broken."""
     from loopcal.report.tables import Column, Table, word_column
 

@@ -242,8 +242,7 @@ def _write_paper_study(
 ) -> None:
     """Write the study of a paper and report its files."""
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.papers import paper as find_paper
-    from loopcal.papers.paper_studies import make_paper_study
+    from loopcal.papers.paper import find_paper, make_paper_study
 
     made = make_paper_study(find_paper(paper), study_file, robot)
     refuse_outputs(made.outputs, (), force)

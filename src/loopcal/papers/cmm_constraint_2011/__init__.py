@@ -1,4 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A hexapod calibrated from points on planes and on perpendicular lines (doi:10.5772/45684),
-repeated.
-"""
+"""A hexapod calibrated from planes and perpendicular lines (doi:10.5772/45684), repeated."""

@@ -1,4 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 42-parameter hexapod: ten poses, errors assumed, poses simulated, parameters identified leg
-by leg.
-"""
+"""The 42-parameter hexapod: errors assumed, poses simulated, parameters identified leg by leg."""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ten steps of the paper's section 5, one library call for each of them.
+"""The ten steps of the paper's section 5, repeated with other noises, methods and poses, and the
+origin of its Table 4.
 
- 1 nominal poses, nominal parameters, errors          Study
- 2 actual poses: inverse kinematics of the nominal,   compute_actual_poses
+ 1 nominal poses, nominal parameters, errors          Setup
+ 2 actual poses: inverse kinematics of the nominal,   Setup.actual
    forward kinematics of the machine with errors
  3 measured poses: noise added                        draw_measured_poses
  4 pose errors: measured minus nominal                \
@@ -20,56 +21,181 @@ Derivation: docs/theory/hexapod.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import permutations
 
 import numpy as np
 
+import loopcal as lc
 from loopcal import geometry
 from loopcal.estimate.published_steps import LegForm, identify_per_leg
-from loopcal.geometry import OrientationForm, parse_orientation
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
+from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward, inverse
-from loopcal.papers.hexapod_42.published import MM
-from loopcal.typing import FloatArray
+from loopcal.numerics.statistics import compute_chi_square_quantile
+from loopcal.papers.paper import PAPERS
+from loopcal.papers.published import Cell, Printed, Published
+from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
+from loopcal.studies.specification.levels import PosesLevel
+from loopcal.studies.specification.study import Study
+from loopcal.typing import BoolArray, FloatArray
 
+MM = 1e-3
+TO_SI, TO_PRINTED = np.array([MM] * 3 + [1.0] * 3), np.array([1.0 / MM] * 3 + [1.0] * 3)
+"""From the units of Tables 4 and 6 to [m, rad], and from [m, rad] to them."""
+PARAMETERS = ("base.x", "base.y", "base.z", "length", "platform.x", "platform.y", "platform.z")
+"""Our names for the columns of Tables 2, 3 and 5."""
+ODD_POSE = "A2"
+"""The row of Table 4 that belongs to another machine; the outlier search finds it by itself."""
 ORDER = "xyz"
 """R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made. Equation (2) differs, see
-`rank_euler_orders` in table_4_study.py.
+`rank_euler_orders`.
 """
+ANGLES = geometry.parse_orientation(f"euler-{ORDER}")
+GREEK = ("alpha", "beta", "gamma")
+OUTLIER_LEVEL = 0.01
+"""Probability of calling any pose of good data an outlier."""
+
+STATED = (1e-3, 1e-6)
+"""Limits [mm, rad] of the stated noise. The paper gives none for angles: the same number in the
+unit that its Table 6 prints, 0.001 mrad.
+"""
+PRESUMED = (1e-6, 1e-9)
+"""Limits [mm, rad] of the noise with which Tables 5 and 6 agree, as the sweep shows."""
+LEVELS = (
+    STATED, (1e-4, 1e-7), (1e-5, 1e-8), (1e-6, 1e-12), PRESUMED, (1e-6, 5e-9), (1e-6, 1e-6),
+    (1e-7, 1e-10),
+)  # fmt: skip
+"""Limits [mm, rad] of the instruments of study.yaml."""
+PER_LEG = ("per leg, 1 step", "per leg, 2 steps", "per leg, 3 steps")
+TOGETHER, PRIOR = "least squares", "MAP"
+"""Methods of study.yaml."""
+NARROW, WIDE = "as in the paper", "wide"
+RANGES = {
+    NARROW: ((-10.0, -10.0, 200.0, -3.0, -3.0, -3.0), (10.0, 10.0, 210.0, 3.0, 3.0, 3.0)),
+    WIDE: ((-40.0, -40.0, 170.0, -14.0, -14.0, -14.0), (40.0, 40.0, 230.0, 14.0, 14.0, 14.0)),
+}
+"""Of drawn poses: low and high x, y, z [mm], alpha, beta, gamma [deg]."""
+PAPERS_TEN = "the paper's ten"
+UNMEASURED = 100
+"""Poses that are not measured, on which methods are compared."""
+DRAWN_POSES = 3  # purpose of a random stream
+
+PRINTED = Published(__file__)
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
-    """Step 1: the given machine, its errors and the poses.
+class Setup:
+    """Step 1.
 
     Attributes
     ----------
     robot : the machine as designed. truth : with its errors. poses : (n, 6) nominal [m, rad].
-    order : Euler order.
     """
 
     robot: Mechanism
     truth: Mechanism
     poses: FloatArray
-    order: str = ORDER
 
     @cached_property
     def commanded(self) -> Solution:
         """Nominal poses with the leg readings of the nominal machine."""
-        return inverse(self.robot, to_transforms(self.poses, self.order))
+        R = ANGLES.to_matrix(self.poses[:, 3:])
+        return inverse(self.robot, geometry.make_pose(R, self.poses[:, :3]))
 
-    def solve_truth(self) -> Solution:
-        """Return the poses of the true machine at the readings of the nominal one."""
-        return forward(self.truth, self.commanded.q, self.commanded)
+    @cached_property
+    def actual(self) -> FloatArray:
+        """(n, 6) true poses at the readings of the nominal machine: step 2."""
+        return self.compute_reached(self.truth)
 
     def compute_reached(self, machine: Mechanism) -> FloatArray:
         """Return the poses (n, 6) [m, rad] of a machine at the readings of the nominal one."""
-        return to_coordinates(forward(machine, self.commanded.q, self.commanded).T, self.order)
+        return to_coordinates(forward(machine, self.commanded.q, self.commanded).T)
+
+    def take(self, poses: FloatArray) -> Setup:
+        """Return the same machines at other poses."""
+        return replace(self, poses=poses)
+
+
+def make_setup(leg_lengths: bool = True) -> Setup:
+    """Return the hexapod of Tables 2 and 3 at the nominal poses of Table 4.
+
+    The printed radians are whole degrees to their last digit. Without `leg_lengths` the errors of
+    the leg lengths are zero.
+    """
+    robot = lc.load_robot("hexapod-42")
+    errors = PRINTED.table("table_3").values * MM
+    errors[:, PARAMETERS.index("length")] *= leg_lengths
+    poses = PRINTED.table("table_4", "PT").values / TO_PRINTED
+    poses[:, 3:] = np.deg2rad(np.round(np.rad2deg(poses[:, 3:])))
+    return Setup(
+        robot, robot.with_values(robot.parameters.nominal + to_values(robot, errors)), poses
+    )
+
+
+def to_values(robot: Mechanism, table: FloatArray) -> FloatArray:
+    """Return values (p,) in the robot's order of a table (6, 7) in the paper's layout."""
+    values = np.zeros(len(robot.parameters))
+    values[_find_places(robot)] = table
+    return values
+
+
+def to_table(robot: Mechanism, values: FloatArray) -> FloatArray:
+    """Return a table (6, 7) in the paper's layout of values (p,) in the robot's order."""
+    return values[_find_places(robot)]
+
+
+def _find_places(robot: Mechanism) -> np.ndarray:
+    index = robot.parameters.index
+    return np.array([[index(f"leg{leg}.{name}") for name in PARAMETERS] for leg in range(1, 7)])
+
+
+def to_coordinates(T: FloatArray) -> FloatArray:
+    """Return coordinates (n, 6) [m, rad] of transforms (n, 4, 4)."""
+    return np.concatenate([T[:, :3, 3], ANGLES.from_matrix(T[:, :3, :3])], axis=1)
+
+
+def subtract_poses(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return differences (n, 6) of coordinates, angles wrapped."""
+    change = first - second
+    return np.concatenate([change[:, :3], geometry.wrap_angle(change[:, 3:])], axis=1)
+
+
+def to_twists(errors: FloatArray, poses: FloatArray) -> FloatArray:
+    """Return twists (n, 6), rotation first, of coordinate errors (n, 6) [m, rad] near poses."""
+    omega = ANGLES.rates(poses[:, 3:]) @ errors[:, 3:, None]
+    return np.concatenate([omega[..., 0], errors[:, :3]], axis=1)
+
+
+def to_measurements(
+    setup: Setup, measured: FloatArray, sigma: FloatArray | float = 1.0
+) -> Measurements:
+    """Return measured poses (n, 6) [m, rad]; sigma : one for all values, or (n, 6) [m, rad]."""
+    kind = Pose(f"euler-{ORDER}").with_tool(setup.robot.tool)
+    sd = sigma if isinstance(sigma, float) else np.roll(sigma, 3, axis=1)
+    # a kind has its angles first
+    rows = Observations.from_sigma(kind, np.arange(len(measured)), np.roll(measured, 3, axis=1), sd)
+    labels = tuple(f"A{i + 1}" for i in range(len(measured)))
+    return Measurements(setup.robot.name, setup.commanded.q, (rows,), labels=labels)
+
+
+def to_si(limits: tuple[float, float]) -> FloatArray:
+    """Return limits (6,) [m, rad] of limits [mm, rad]."""
+    return np.array([limits[0] * MM] * 3 + [limits[1]] * 3)
+
+
+def compute_rms(values: FloatArray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+# --- the ten steps ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,34 +225,28 @@ class Iterations:
         return truth.values - np.stack([machine.values for machine in self.machines])
 
 
-def compute_actual_poses(study: Study) -> FloatArray:
-    """Return the true poses (n, 6) [m, rad] at the readings of the nominal machine: step 2."""
-    return study.compute_reached(study.truth)
-
-
 def draw_measured_poses(
-    study: Study, noise: FloatArray | None = None, seed: int = 0, trial: int = 0
+    setup: Setup, noise: FloatArray | None = None, seed: int = 0, trial: int = 0
 ) -> FloatArray:
     """Return the true poses (n, 6) with noise uniform in +-`noise` (6,) [m, rad]: step 3.
 
     Without noise they are exact. The drawn numbers are those of `simulate_trials` for the same
     seed and trial.
     """
-    actual = compute_actual_poses(study)
     if noise is None:
-        return actual
-    drawn = make_random_stream(seed, trial).uniform(-1.0, 1.0, actual.shape)
-    return actual + np.roll(drawn, 3, axis=1) * noise  # a kind has its angles first
+        return setup.actual
+    drawn = make_random_stream(seed, trial).uniform(-1.0, 1.0, setup.actual.shape)
+    return setup.actual + np.roll(drawn, 3, axis=1) * noise  # a kind has its angles first
 
 
 def iterate(
-    study: Study, measured: FloatArray, limit: int = 4, is_renewed: bool = True
+    setup: Setup, measured: FloatArray, limit: int = 4, is_renewed: bool = True
 ) -> Iterations:
     """Run steps 4 to 10 for a fixed number of iterations, beyond the paper's stopping rule too.
 
     Parameters
     ----------
-    study : the given machine. measured : (n, 6) [m, rad]. limit : number of iterations.
+    measured : (n, 6) [m, rad]. limit : number of iterations.
     is_renewed : whether the matrix is computed anew at every corrected machine. The paper does not
         say. False keeps the matrix of the nominal machine throughout.
 
@@ -135,9 +255,9 @@ def iterate(
     EstimationError
         A corrected machine cannot reach a pose.
     """
-    data = to_measurements(study, measured)
-    nominal = LegForm.at(study.robot, study.commanded)
-    machines, errors = [study.robot], [subtract_poses(measured, study.poses)]
+    data = to_measurements(setup, measured)
+    nominal = LegForm.at(setup.robot, setup.commanded)
+    machines, errors = [setup.robot], [subtract_poses(measured, setup.poses)]
     conditions = np.zeros(0)
     for k in range(limit):
         if is_renewed or k == 0:
@@ -145,28 +265,12 @@ def iterate(
             conditions = estimate.conditions if k == 0 else conditions
             corrected = estimate.robot
         else:
-            change = nominal.fit(to_twists(errors[-1], measured, study.order))
+            change = nominal.fit(to_twists(errors[-1], measured))
             corrected = machines[-1].with_values(machines[-1].values + change)
         machines.append(corrected)
-        errors.append(subtract_poses(measured, study.compute_reached(corrected)))
+        errors.append(subtract_poses(measured, setup.compute_reached(corrected)))
     stacked = np.stack(errors)
     return Iterations(tuple(machines), stacked, integrate_errors(stacked), conditions)
-
-
-def to_measurements(
-    study: Study, measured: FloatArray, sigma: FloatArray | float = 1.0
-) -> Measurements:
-    """Return measured poses (n, 6) [m, rad] as measurements.
-
-    Parameters
-    ----------
-    sigma : one for all values, or (n, 6) [m, rad].
-    """
-    kind = Pose(f"euler-{study.order}").with_tool(study.robot.tool)
-    sd = sigma if isinstance(sigma, float) else np.roll(sigma, 3, axis=1)
-    rows = Observations.from_sigma(kind, np.arange(len(measured)), np.roll(measured, 3, axis=1), sd)
-    labels = tuple(f"A{i + 1}" for i in range(len(measured)))
-    return Measurements(study.robot.name, study.commanded.q, (rows,), labels=labels)
 
 
 def integrate_errors(errors: FloatArray) -> FloatArray:
@@ -179,29 +283,301 @@ def integrate_errors(errors: FloatArray) -> FloatArray:
     return (lengths / MM + angles).max(axis=1)
 
 
-def to_transforms(poses: FloatArray, order: str) -> FloatArray:
-    """Return transforms (n, 4, 4) of poses (n, 6) [m, rad]."""
-    return geometry.make_pose(name_orientation(order).to_matrix(poses[:, 3:]), poses[:, :3])
+# --- noise, methods and poses, many draws -------------------------------------------------------
 
 
-def to_coordinates(T: FloatArray, order: str) -> FloatArray:
-    """Return coordinates (n, 6) [m, rad] of transforms (n, 4, 4)."""
-    angles = name_orientation(order).from_matrix(T[:, :3, :3])
-    return np.concatenate([T[:, :3, 3], angles], axis=1)
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Results with one level of noise.
+
+    Attributes
+    ----------
+    sizes : (t, 4) after calibration: pose residual rms [mm] and [rad], parameter error rms [mm],
+        max dQint [mm + rad]. needed : (t,) iterations, infinite for never.
+    """
+
+    sizes: FloatArray
+    needed: FloatArray
+
+    @property
+    def median(self) -> FloatArray:
+        """(4,) medians of the sizes."""
+        return np.median(self.sizes, axis=0)
+
+    def contains(self, sizes: FloatArray) -> BoolArray:
+        """Return which sizes (4,) lie between the smallest and the largest drawn ones."""
+        return (sizes >= self.sizes.min(axis=0)) & (sizes <= self.sizes.max(axis=0))
 
 
-def subtract_poses(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return differences (n, 6) of coordinates, angles wrapped."""
-    change = first - second
-    return np.concatenate([change[:, :3], geometry.wrap_angle(change[:, 3:])], axis=1)
+@dataclass(frozen=True)
+class MethodResult:
+    """Root mean squares [mm] over draws: parameters, and positions in the narrow and wide range."""
+
+    parameters: float
+    narrow: float
+    wide: float
 
 
-def name_orientation(order: str) -> OrientationForm:
-    """Return the Euler angles of this order."""
-    return parse_orientation(f"euler-{order}")
+def compute_published_sizes() -> FloatArray:
+    """Return the four sizes of `Level` of Tables 5 and 6 as printed."""
+    residual = PRINTED.table("table_6", "after").values * TO_SI
+    parameters = compute_rms(PRINTED.table("table_5", "after").values * 1e-3)
+    rms = (compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:]))
+    return np.array([*rms, parameters, integrate_errors(residual[None])[0]])
 
 
-def to_twists(errors: FloatArray, poses: FloatArray, order: str) -> FloatArray:
-    """Return twists (n, 6), rotation first, of coordinate errors (n, 6) [m, rad] near poses."""
-    omega = name_orientation(order).rates(poses[:, 3:]) @ errors[:, 3:, None]
-    return np.concatenate([omega[..., 0], errors[:, :3]], axis=1)
+def calibrate_methods(
+    study: Study, limits: tuple[float, float], methods: Sequence[str]
+) -> Iterator[CalibratedCell]:
+    """Yield the cells of a study with one level of noise, method by method."""
+    instrument = f"{limits[0]:g} mm and {limits[1]:g} rad"
+    for method in methods:
+        yield from calibrate_cells(study, find_cells(study, instrument=instrument, method=method))
+
+
+def load_study(seed: int, trials: int) -> Study:
+    """Return study.yaml with so many draws."""
+    return set_size(PAPERS["hexapod-42"].load_study(), seed, trials)
+
+
+def sweep_noise(
+    setup: Setup, iterations: int, threshold: float, seed: int, trials: int
+) -> dict[tuple[float, float], Level]:
+    """Repeat the ten steps at every level of noise; sizes are those after `iterations`."""
+    levels, study = {}, load_study(seed, trials)
+    for limits in LEVELS:
+        integrated, sizes = [], np.zeros((trials, 4))
+        for i, cell in enumerate(calibrate_methods(study, limits, PER_LEG)):
+            residual = compute_residuals(setup, cell)
+            integrated.append([integrate_errors(of_trial[None])[0] for of_trial in residual])
+            if i + 1 == iterations:
+                by_dimension = residual[..., :3] / MM, residual[..., 3:]
+                error = (setup.truth.values - cell.values)[:, None] / MM
+                rms = [np.sqrt(np.mean(x**2, axis=(1, 2))) for x in (*by_dimension, error)]
+                sizes = np.column_stack([*rms, integrated[-1]])
+        met = np.array(integrated) <= threshold
+        needed = np.where(met.any(axis=0), 1.0 + met.argmax(axis=0), np.inf)
+        levels[limits] = Level(sizes, needed)
+    return levels
+
+
+def compute_residuals(setup: Setup, cell: CalibratedCell) -> FloatArray:
+    """Return measured minus corrected poses (t, n, 6) [m, rad]; NaN without an estimate."""
+    commanded = setup.commanded
+    T = forward_trials(setup.robot, cell.values, commanded.q[None], commanded.state).T
+    measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
+    pairs = zip(measured, T, strict=True)
+    return np.stack([subtract_poses(poses, to_coordinates(reached)) for poses, reached in pairs])
+
+
+def compare_methods(setup: Setup, seed: int, trials: int) -> dict[str, MethodResult]:
+    """Compare the paper's method, all legs weighted together, and MAP on the same stated noise."""
+    cells = calibrate_methods(load_study(seed, trials), STATED, (PER_LEG[-1], TOGETHER, PRIOR))
+    names = ("leg by leg, unweighted (the paper)", "all legs, weighted by the noise",
+             "the same with tolerances as prior (MAP)")  # fmt: skip
+    values = {"not calibrated": setup.robot.values[None]}
+    values |= {name: cell.values for name, cell in zip(names, cells, strict=True)}
+    unmeasured = [setup.take(draw_poses(name, UNMEASURED, seed)) for name in RANGES]
+    return {
+        name: MethodResult(
+            compute_rms((v - setup.truth.values) / MM),
+            *(_compute_position_error(other, v) for other in unmeasured),
+        )
+        for name, v in values.items()
+    }
+
+
+def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> list[tuple[Cell, ...]]:
+    """Return table rows for other numbers and ranges of poses."""
+    sets = [("first of the paper", setup.poses[:n]) for n in (7, 8, 9)]
+    sets.append((PAPERS_TEN, setup.poses))
+    for name, counts in ((NARROW, (20, 40)), (WIDE, (10, 20, 40))):
+        sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
+    rows: list[tuple[Cell, ...]] = []
+    study, methods = load_study(seed, trials), (PER_LEG[-1], TOGETHER)
+    for name, poses in sets:
+        other = setup.take(poses)
+        exact = iterate(other, other.actual)
+        level = PosesLevel(len(poses), coordinates=tuple(map(tuple, poses.tolist())))
+        cells = calibrate_methods(replace(study, poses={name: level}), STATED, methods)
+        errors = [compute_rms((cell.values - setup.truth.values) / MM) for cell in cells]
+        left = compute_rms(exact.compute_parameter_errors(setup.truth)[-1] / MM)
+        needed = exact.count_needed(threshold)
+        rows.append((name, len(poses), needed, left, float(exact.conditions.max()), *errors))
+    return rows
+
+
+def draw_poses(name: str, n: int, seed: int) -> FloatArray:
+    """Return poses (n, 6) [m, rad] drawn uniformly in one of RANGES."""
+    low, high = (np.array(end) * np.array([MM] * 3 + [np.pi / 180.0] * 3) for end in RANGES[name])
+    return make_random_stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
+
+
+def recover_noise(setup: Setup) -> FloatArray:
+    """Return the noise (n, 6) [m, rad] that Tables 5 and 6 together imply.
+
+    residual = noise + D (true - corrected parameters), with D the change of the coordinates.
+    """
+    D = _linearize_truth(setup).D
+    rates = ANGLES.rates_inverse(setup.actual[:, 3:])
+    by_coordinates = np.concatenate([D[:, 3:], rates @ D[:, :3]], axis=1)
+    errors = to_values(setup.robot, PRINTED.table("table_5", "after").values * 1e-3 * MM)
+    return PRINTED.table("table_6", "after").values / TO_PRINTED - by_coordinates @ errors
+
+
+def compute_explained_share(setup: Setup, residuals: FloatArray) -> FloatArray:
+    """Return the share (6,) of each leg's residuals (n, 6) [m, rad] that parameters explain."""
+    return _linearize_truth(setup).explain(to_twists(residuals, setup.actual))
+
+
+def _linearize_truth(setup: Setup) -> LegForm:
+    return LegForm.at(setup.truth, forward(setup.truth, setup.commanded.q, setup.commanded))
+
+
+def _compute_position_error(setup: Setup, values: FloatArray) -> float:
+    """Return the rms distance [mm] of true and predicted positions at equal readings."""
+    commanded = setup.commanded
+    predicted, true = (
+        forward_trials(setup.robot, v, commanded.q[None], commanded.state).T[..., :3, 3]
+        for v in (values, setup.truth.values[None])
+    )
+    return float(np.sqrt(np.mean(np.sum(((predicted - true) / MM) ** 2, axis=-1))))
+
+
+# --- the origin of Table 4 ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Order:
+    """Agreement of one product of three rotations with Table 4: rms over the poses [mm], [rad]."""
+
+    formula: str
+    position: float
+    rotation: float
+
+
+@dataclass(frozen=True)
+class ReducedFit:
+    """A fit without one pose. drop : by which chi-square falls."""
+
+    label: str
+    chi_square: float
+    degrees: float
+    p_value: float
+    drop: float
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """The search for outliers.
+
+    Attributes
+    ----------
+    labels : of the outliers, in the order in which they were removed.
+    first, last : fits without each pose, before the first removal and after the last.
+    """
+
+    labels: tuple[str, ...]
+    first: tuple[ReducedFit, ...]
+    last: tuple[ReducedFit, ...]
+
+
+def write_rotation(order: str, angles: tuple[int, ...] = (0, 1, 2)) -> str:
+    """Return the product R of an Euler order whose angles are those of GREEK at these places.
+
+    Examples
+    --------
+    >>> write_rotation("ZYX")
+    'Rz(alpha) Ry(beta) Rx(gamma)'
+    >>> write_rotation("xyz")
+    'Rz(gamma) Ry(beta) Rx(alpha)'
+    """
+    turns = [f"R{axis.lower()}({GREEK[place]})" for axis, place in zip(order, angles, strict=True)]
+    return " ".join(reversed(turns) if order.islower() else turns)
+
+
+def rank_euler_orders(setup: Setup, nominal: FloatArray, measured: FloatArray) -> tuple[Order, ...]:
+    """Return all products, the best first: 12 sequences of axes, angles in any order.
+
+    Parameters
+    ----------
+    setup : machines of Tables 2 and 3. nominal, measured : (n, 6) poses of Table 4 [m, rad].
+    """
+    orders = []
+    for order in (name for name in geometry.EULER_ORDERS if name.islower()):
+        for angles in permutations(range(3)):
+            wanted, printed = (
+                geometry.make_pose(
+                    geometry.euler_to_matrix(poses[:, 3:][:, angles], order), poses[:, :3]
+                )
+                for poses in (nominal, measured)
+            )
+            commanded = inverse(setup.robot, wanted)
+            reached = forward(setup.truth, commanded.q, commanded).T
+            change = geometry.pose_difference(reached, printed)
+            sizes = (compute_rms(part) for part in (change[:, 3:] / MM, change[:, :3]))
+            orders.append(Order(write_rotation(order, angles), *sizes))
+    return tuple(sorted(orders, key=lambda o: o.position))
+
+
+def find_rounding(printed: Printed) -> FloatArray:
+    """Return the standard deviations (n, 6) [m, rad] of the rounding of printed poses."""
+    return printed.unit * TO_SI / np.sqrt(12.0)
+
+
+def search_outliers(setup: Setup, printed: Printed) -> Outliers:
+    """Name measured poses of Table 4 that the others contradict, without the errors of Table 3.
+
+    Removing a pose lowers the chi-square of a least-squares fit (all legs, weighted by the rounding
+    of each printed number) by a chi-square of its 6 equations if it belongs to the same machine.
+    The pose with the largest drop is removed while that drop is too large at OUTLIER_LEVEL.
+    """
+    data = to_measurements(setup, printed.values / TO_PRINTED, find_rounding(printed))
+    method = lc.LeastSquares()
+    keep, labels, rounds = np.arange(len(printed.rows)), [], []
+    while True:
+        whole = lc.identify(setup.robot, data.take(keep), method).chi_square
+        fits = []
+        for pose in keep:
+            fit = lc.identify(setup.robot, data.take(keep[keep != pose]), method)
+            test = fit.residual_test
+            numbers = (test.chi_square, test.degrees, test.p_value, whole - test.chi_square)
+            fits.append(ReducedFit(data.labels[pose], *numbers))
+        rounds.append(tuple(fits))
+        worst = int(np.argmax([fit.drop for fit in fits]))
+        largest = float(compute_chi_square_quantile(6, OUTLIER_LEVEL / len(keep)))
+        if fits[worst].drop <= largest or fits[worst].degrees < 6:
+            return Outliers(tuple(labels), rounds[0], rounds[-1])
+        labels.append(fits[worst].label)
+        keep = np.delete(keep, worst)
+
+
+def calibrate_from_print(setup: Setup, printed: Printed) -> Mapping[str, tuple[int | None, float]]:
+    """Return number of poses and rms parameter error [mm] of calibrations from Table 4 itself: as
+    printed, with row A2 corrected, without it, unrounded, and with all legs weighted.
+    """
+    actual, odd = setup.actual, printed.labels.index(ODD_POSE)
+    measured, unit = printed.values / TO_PRINTED, printed.unit[odd - 1] * TO_SI
+    repaired = measured.copy()
+    repaired[odd] = np.round(actual[odd] / unit) * unit
+    keep = np.arange(len(measured)) != odd
+    nine = setup.take(setup.poses[keep])
+    before = setup.robot.values - setup.truth.values
+    rows: dict[str, tuple[int | None, float]] = {"not calibrated": (None, compute_rms(before) / MM)}
+    for name, other, poses in (
+        ("Table 4 as printed", setup, measured),
+        ("row A2 computed, rounded as row A1", setup, repaired),
+        ("without row A2", nine, measured[keep]),
+        ("computed poses in full", setup, actual),
+    ):
+        error = iterate(other, poses).compute_parameter_errors(setup.truth)[-1]
+        rows[name] = len(poses), compute_rms(error) / MM
+    data = to_measurements(nine, measured[keep], find_rounding(printed)[keep])
+    for name, method in (
+        ("least squares", lc.LeastSquares()),
+        ("tolerances as prior (MAP)", lc.MAP()),
+    ):
+        error = lc.identify(setup.robot, data, method).robot.values - setup.truth.values
+        title = f"without row A2, all legs weighted by the rounding, {name}"
+        rows[title] = len(data.labels), compute_rms(error) / MM
+    return rows

@@ -1,4 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares, ridge and truncated SVD compared on two parallel manipulators
-(doi:10.1177/1687814016667908), repeated.
-"""
+"""Least squares, ridge and truncated SVD compared (doi:10.1177/1687814016667908), repeated."""

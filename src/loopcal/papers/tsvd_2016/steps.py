@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nine steps of the paper, for t machines or t settings of lambda and k at once.
+"""The nine steps of the paper, for t machines or t settings of lambda and k at once; one machine
+with the printed noise, and many drawn machines.
 
- 1 nominal parameters, e = 0                          `load_machine`                 \
- 2 forward kinematic model                            `forward_trials`                |
- 3 measured poses                                     `list_measured_poses`          | machines.py
- 4 measured data: true machine, with noise            `simulate_trials`               /
+ 1 nominal parameters, e = 0                          `load_machine`
+ 2 forward kinematic model                            `forward_trials`
+ 3 measured poses                                     `list_measured_poses`
+ 4 measured data: true machine, with noise            `simulate_trials`
  5 error transfer matrix T_j of pose j                `differentiate_pose`, x y z phi theta (psi)
  6 identification matrix H, all T_j in one column     `make_raw_problem`: one triangular factor
  7 de from H de = D, by LS, RE or TSVD                `take_steps`, with the filter factors below
@@ -14,27 +15,313 @@
 Raw numbers as in the paper: millimeters and radians, every equation and every parameter of weight
 one, and the filter acts on the step. With H = U S V' and s_i = S_ii the step is de = sum f_i (u_i'D
 / s_i) v_i, where f_i = 1 for LS, s_i^2 / (s_i^2 + lambda) for RE, and 1 for i <= k, else 0, for
-TSVD.
+TSVD. As in the paper the true machine decides which lambda and k are best: the bottom of the curve,
+the smallest product of the errors in position and angle.
+
+Dimensions, poses, true errors and output range are ours: the paper's Tables 1 to 4 are not in our
+text. The noise is the paper's (Appendix 1). Poses are x, y, z, phi, theta, psi with tilt and
+torsion, as in the paper.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+import loopcal as lc
+from loopcal import geometry
+from loopcal.diagnose.identifiable_parameters import Identifiability
+from loopcal.estimate.penalties import Method
 from loopcal.estimate.published_steps import (
     AHEAD,
     LIMIT,
+    RawProblem,
     RawSteps,
     StepRule,
     list_raw_units,
+    make_raw_problem,
+    penalize_none,
+    penalize_ridge,
+    penalize_truncated,
     take_steps,
 )
+from loopcal.measure.instrument import make_random_stream
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.simulation import Trials, simulate_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.decomposition import Decomposition
-from loopcal.papers.tsvd_2016.machines import Study
+from loopcal.mechanism.solutions import Solution, inverse
+from loopcal.numerics.decomposition import Decomposition, are_nonzero
+from loopcal.papers.published import Published
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
+
+MM = 1e-3
+PRINTED = Published(__file__)
+ROBOTS = {"RU-PUS-PRS": "ru-pus-prs", "3-PRS": "3-prs"}
+"""Names in the paper, and of our robot files."""
+COLUMNS = ("x", "y", "z", "phi", "theta", "psi")
+LENGTH_ERRORS, ANGLE_ERRORS = (0.05e-3, 0.1e-3), (2.5e-4, 5e-4)
+"""Least and largest size of true errors [m], [rad]; the sign is drawn."""
+TILTS, AZIMUTHS = (10.0, 20.0, 30.0), 12
+EVALUATED_TILTS, EVALUATED = (5.0, 15.0, 25.0, 35.0), 96
+HEIGHTS = (0.65, 0.7, 0.75)
+"""Of measured poses and output range [m], if z is free."""
+LIMITS = np.array([0.01e-3] * 3 + [np.deg2rad(0.01)] * 3)
+"""Limits of the noise [m, rad], as Appendix 1 shows."""
+MEASURES = (
+    "position [mm]",
+    "phi and theta [deg]",
+    "direction of the normal [deg]",
+    "parameters [tolerances]",
+    "parameters farther from the truth than nominal [share]",
+)
+"""Root mean squares over the output range and over the parameters, and a share."""
+ERRORS, RESAMPLING = 3, 4  # purposes of random streams
+
+LS, RANKED, RE, TSVD = "LS", "LS with rank detection", "RE", "TSVD"
+WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"
+LIBRARY: Mapping[str, Method] = {
+    WHITENED: lc.LeastSquares(), CROSS: lc.Ridge(lc.GCV()), PRIOR: lc.MAP(),
+}  # fmt: skip
+"""Methods of the library: rows whitened, columns scaled by tolerance."""
+EQUAL_INTERVALS, EQUAL_RATIOS = 11, 13
+"""Lambdas from the smallest singular value that is not zero to 1, the paper's range, in equal
+intervals as it says and in equal ratios as well.
+"""
+TRIED = np.array([1e-20, 1e-18, 1e-16, 1e-14, 1e-12, 1e3, 1e6])
+"""Lambdas among which the ends of convergence are looked for."""
+LAMBDAS = np.logspace(-6.0, 4.0, 11)
+"""Of RE on drawn machines, wider than the range from 1e-5 to 1 that the paper states."""
+TOGETHER = 10
+"""Machines at a time, for memory."""
+SHORT = 19
+"""Iterations of RE after which its curves are examined, too: one of the states in its history."""
+GAIN = 1.05
+"""A curve has an interior minimum if both of its ends are this many times higher."""
+
+BEFORE, TRUE = "before calibration", "true parameters known"
+RAW_LS, RAW_RE, RAW_TSVD = "raw LS", "raw RE at its best", "raw TSVD at its best"
+RAW_FIVE = "raw LS with rank detection, 5-DOF"
+RE_FIVE, TSVD_FIVE = "raw RE at its best, 5-DOF", "raw TSVD at its best, 5-DOF"
+HINDSIGHT = "whitened ridge, best lambda in hindsight"
+NARROW, WIDE = "MAP, tolerances a third of the spread", "MAP, tolerances three times the spread"
+WHITENED_FIVE, PRIOR_FIVE = "whitened LS, 5-DOF", "MAP, 5-DOF"
+METHODS = (
+    BEFORE, RAW_LS, RAW_RE, RAW_TSVD, RAW_FIVE, RE_FIVE, TSVD_FIVE, WHITENED, CROSS, PRIOR, NARROW,
+    WIDE, HINDSIGHT, WHITENED_FIVE, PRIOR_FIVE, TRUE,
+)  # fmt: skip
+FACTOR = 3.0
+"""Between the tolerances of NARROW and WIDE and the true spread."""
+GROUPS = 5
+"""Groups of machines for claims about medians: each is a smaller draw of the study."""
+HINDSIGHT_LAMBDAS = np.logspace(-2.5, 2.5, 11)
+"""Of ridge on whitened, scaled rows, where 1 is MAP."""
+RESAMPLES = 2000
+
+
+# --- machines and measurements ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """t machines of one structure, measured.
+
+    Attributes
+    ----------
+    name : of the structure in the paper. robot : as designed.
+    trials : true machines and their measurements.
+    """
+
+    name: str
+    robot: Mechanism
+    trials: Trials
+
+    @property
+    def kind(self) -> Component:
+        """The measurement kind."""
+        kind = self.trials.instrument.sensors[0].kind
+        assert isinstance(kind, Component)
+        return kind
+
+    @property
+    def freedoms(self) -> int:
+        """Measured coordinates of a pose, 6 or 5."""
+        return len(self.kind.components)
+
+    @property
+    def label(self) -> str:
+        """Structure and measurement."""
+        return f"{self.name}, {self.freedoms}-DOF"
+
+    @cached_property
+    def five(self) -> Study:
+        """The same measurements without psi."""
+        sensor, measured = self.trials.instrument.sensors[0], self.trials.measured[0][..., :5]
+        kind = replace(self.kind, components=self.kind.components[:5])
+        sensor = replace(sensor, kind=kind, noise=lc.Uniform(LIMITS[:5]))
+        instrument = lc.Instrument((sensor,))
+        return replace(
+            self, trials=replace(self.trials, instrument=instrument, measured=(measured,))
+        )
+
+    def with_noise(self, noise: FloatArray) -> Study:
+        """Return the same poses measured with a noise (36, c) [m, rad]."""
+        T = self.trials.T
+        measured = self.kind.measure(T, np.broadcast_to(noise, (*T.shape[:2], self.freedoms)))
+        return replace(self, trials=replace(self.trials, measured=(measured,)))
+
+    @cached_property
+    def raw(self) -> RawProblem:
+        """The measurements as the paper weights them."""
+        return make_raw_problem(self.robot, self.trials)
+
+    @cached_property
+    def grid(self) -> Solution:
+        """The output range: 96 poses, commanded with the machine as designed."""
+        return inverse(self.robot, list_output_range(self.robot))
+
+    @cached_property
+    def true_outputs(self) -> FloatArray:
+        """(t, 96, 4, 4) poses of the true machines, commanded to the output range."""
+        return self._compute_outputs(self.trials.truth)
+
+    def _compute_outputs(self, values: FloatArray) -> FloatArray:
+        return forward_trials(self.robot, values, self.grid.q[None], self.grid.state).T
+
+    def compute_output_errors(
+        self, values: FloatArray, machine: IntArray | None = None
+    ) -> FloatArray:
+        """Return errors of poses over the output range, at equal readings, and of parameters.
+
+        Parameters
+        ----------
+        values : (a, p) identified [SI]; NaN rows give NaN. machine : (a,) of which machine;
+            default: one row each.
+
+        Returns
+        -------
+        errors : (a, 5), see MEASURES. psi counts in none of them: the paper considers it
+            unnecessary.
+        """
+        is_finite = np.isfinite(values).all(axis=1, keepdims=True)
+        machine = np.arange(len(values)) if machine is None else machine
+        T = self._compute_outputs(np.where(is_finite, values, self.robot.values))
+        truth, nominal = self.trials.truth[machine], self.robot.parameters.nominal
+        parameters = ((values - truth) / self.robot.parameters.tolerance) ** 2
+        worse = np.abs(values - truth) > np.abs(nominal - truth)
+        sizes = np.sqrt(parameters.mean(axis=1)), worse.mean(axis=1)
+        errors = np.column_stack([_compare_poses(T, self.true_outputs[machine]), *sizes])
+        return np.where(is_finite, errors, np.nan)
+
+    def compute_commanded_errors(
+        self, values: FloatArray, machine: IntArray | None = None
+    ) -> FloatArray:
+        """Return the first two errors (a, 2) of the true machines, commanded to the output range
+        with identified values.
+
+        The readings come from the inverse kinematics of the identified machine; the true machine
+        takes its pose at them; the error is relative to the pose of the machine as designed.
+        Coordinates without an actuator keep their errors, even with the true values. Parameters as
+        for `compute_output_errors`.
+        """
+        is_finite = np.isfinite(values).all(axis=1, keepdims=True)
+        machine = np.arange(len(values)) if machine is None else machine
+        known = np.where(is_finite, values, self.robot.values)
+        target = list_output_range(self.robot)[None]
+        state = inverse_trials(self.robot, known, target, self.grid.state)
+        q = compute_readings(self.robot, known, state)
+        T = forward_trials(self.robot, self.trials.truth[machine], q, self.grid.state).T
+        return np.where(is_finite, _compare_poses(T, self.grid.T[None])[:, :2], np.nan)
+
+
+def _compare_poses(T: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return rms differences (a, 3) of poses (a, n, 4, 4): the first three MEASURES."""
+    position = np.sum((T[..., :3, 3] - reference[..., :3, 3]) ** 2, axis=-1) / MM**2
+    first, second = (geometry.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, reference))
+    angles = sum(
+        np.rad2deg(geometry.wrap_angle(a - b)) ** 2
+        for a, b in zip(first[:2], second[:2], strict=True)
+    )
+    normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - reference[..., :3, 2]) ** 2, axis=-1)
+    return np.sqrt(np.stack([np.mean(x, axis=1) for x in (position, angles, normal)], axis=1))
+
+
+def load_machine(name: str) -> Mechanism:
+    """Return the machine as designed, from the shipped robot file: step 1."""
+    return lc.load_robot(ROBOTS[name])
+
+
+def measure_machines(name: str, truth: FloatArray, seed: int = 0) -> Study:
+    """Measure 36 poses of true machines (t, p) [SI] in six coordinates with drawn noise: steps 3
+    and 4.
+    """
+    robot, kind = load_machine(name), Component(COLUMNS, "tilt-torsion")
+    instrument = lc.Instrument((lc.Sensor(kind, lc.Uniform(LIMITS)),))
+    poses = list_measured_poses(robot)
+    return Study(name, robot, simulate_trials(robot, truth, poses, instrument, seed))
+
+
+def measure_case(name: str, seed: int) -> Study:
+    """Measure one machine with drawn errors and the noise of Appendix 1."""
+    return measure_machines(name, draw_true_values(load_machine(name), 1, seed)).with_noise(
+        read_noise()
+    )
+
+
+def read_noise() -> FloatArray:
+    """Return the noise (36, 6) [m, rad] of Appendix 1."""
+    values = PRINTED.table("appendix_1").values
+    values[:, :3] *= MM
+    return values
+
+
+def list_measured_poses(robot: Mechanism) -> FloatArray:
+    """Return controlled coordinates (36, c) [m, rad]: 12 azimuths at each of TILTS.
+
+    Free z takes the three heights in turn.
+    """
+    phi, theta = (g.ravel() for g in np.meshgrid(np.arange(AZIMUTHS) * 360.0 / AZIMUTHS, TILTS))
+    i = np.arange(len(phi))
+    return _list_coordinates(robot, phi, theta, np.array(HEIGHTS)[(i // AZIMUTHS + i) % 3])
+
+
+def list_output_range(robot: Mechanism) -> FloatArray:
+    """Return controlled coordinates (96, c) [m, rad]: tilts of 5 to 35 degrees, more azimuths."""
+    heights = HEIGHTS if "z" in robot.controlled else (0.0,)
+    count = EVALUATED // (len(EVALUATED_TILTS) * len(heights))
+    grid = np.meshgrid(np.arange(count) * 360.0 / count, EVALUATED_TILTS, heights)
+    return _list_coordinates(robot, *(g.ravel() for g in grid))
+
+
+def _list_coordinates(
+    robot: Mechanism, phi: FloatArray, theta: FloatArray, z: FloatArray
+) -> FloatArray:
+    given = {"phi": geometry.wrap_angle(np.deg2rad(phi)), "theta": np.deg2rad(theta), "z": z}
+    return np.column_stack([given[name] for name in robot.controlled])
+
+
+def draw_true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
+    """Return nominal values (t, p) [SI] with errors of drawn size and sign.
+
+    Machine i is the same for any number of machines.
+    """
+    table = robot.parameters
+    low, high = np.array(
+        [LENGTH_ERRORS if d is Dimension.LENGTH else ANGLE_ERRORS for d in table.dimensions]
+    ).T
+    values = []
+    for trial in range(trials):
+        drawn = make_random_stream(seed, trial, ERRORS)
+        size, sign = drawn.uniform(low, high), drawn.choice([-1.0, 1.0], len(table))
+        values.append(table.nominal + sign * size)
+    return np.array(values)
+
+
+# --- the steps ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,17 +332,14 @@ class Iterations(RawSteps):
 
 
 def iterate(
-    study: Study,
-    penalty: FloatArray,
-    machine: IntArray | None = None,
-    limit: int = LIMIT,
+    study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT,
     ahead: float = AHEAD,
-) -> Iterations:
+) -> Iterations:  # fmt: skip
     """Run steps 5 to 9.
 
     Parameters
     ----------
-    study : the machines. penalty : (t | 1, p) of each setting, see above.
+    penalty : (t | 1, p) of each setting, see `take_steps`.
     machine : (t,) which machine was measured; default: the first. limit, ahead : see `StepRule`.
     """
     machine = np.zeros(len(penalty), dtype=np.int64) if machine is None else machine
@@ -63,18 +347,447 @@ def iterate(
     return Iterations(**vars(take_steps(study.raw.take(machine), penalty, rule)), machine=machine)
 
 
-def linearize(
-    study: Study, values: FloatArray, machine: IntArray
-) -> tuple[Decomposition, BoolArray]:
-    """Return the decomposition of H (steps 5 and 6), and which settings (a,) reach all poses.
-
-    Parameters
-    ----------
-    values : (a, p) corrected parameters [SI]. machine : (a,) which of the machines was measured.
-    """
-    return study.raw.take(machine).linearize(values)
+def linearize(study: Study) -> Decomposition:
+    """Return the decomposition of H of the first machine at nominal values: steps 5 and 6."""
+    first = study.raw.take(np.zeros(1, dtype=np.int64))
+    return first.linearize(study.robot.parameters.nominal[None])[0]
 
 
 def list_scales(robot: Mechanism) -> FloatArray:
     """Return the paper's units (p,) in SI: millimeters and radians."""
     return list_raw_units(robot.parameters.dimensions)
+
+
+def find_bottom(errors: FloatArray) -> int:
+    """Return the place of the smallest product of position and angle error in (s, 2 or more)."""
+    product = errors[:, 0] * errors[:, 1]
+    return int(np.argmin(np.where(np.isnan(product), np.inf, product)))
+
+
+# --- one machine with the printed noise ---------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Result of one method.
+
+    Attributes
+    ----------
+    setting : lambda or k. values : (p,) [SI], NaN if diverged. errors : (5,), see MEASURES.
+    commanded : (2,), see `Study.compute_commanded_errors`.
+    """
+
+    setting: str
+    values: FloatArray
+    errors: FloatArray
+    commanded: FloatArray
+    iterations: int
+    is_converged: bool
+
+    @property
+    def is_diverged(self) -> bool:
+        """Whether there is no answer."""
+        return not np.isfinite(self.values).all()
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """One algorithm over its setting.
+
+    Attributes
+    ----------
+    settings : (s,) lambda or k. runs : of all settings. errors : (s, 5), see MEASURES.
+    best : place of the bottom of the curve.
+    """
+
+    settings: FloatArray
+    runs: Iterations
+    errors: FloatArray
+    best: int
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One manipulator and one number of measured coordinates.
+
+    Attributes
+    ----------
+    study : one machine. singular_values : (p,) of the raw identification matrix at nominal
+        parameters. rank : of them. known : identifiability of the same measurements.
+    is_equal : (s,) which lambdas are at equal intervals. sweeps : by RE and TSVD, which begins with
+        all k: LS. answers : by method.
+    bracket : smallest and largest lambda of those tried that does not diverge.
+    normal_equations : largest component [mm, rad] of the first step if (H'H)^-1 H'D is computed as
+        printed.
+    """
+
+    study: Study
+    singular_values: FloatArray
+    rank: int
+    known: Identifiability
+    is_equal: BoolArray
+    sweeps: Mapping[str, Sweep]
+    answers: dict[str, Answer]
+    bracket: tuple[float, float]
+    normal_equations: float
+
+
+def solve_case(measured: Study, progress: Callable[[str], None]) -> Case:
+    """Run all methods on one machine's measurements."""
+    progress(f"{measured.label} measurement")
+    p, s = len(measured.robot.parameters), linearize(measured).singular_values[0]
+    rank = int(are_nonzero(s).sum())
+    lambdas, is_equal = space_lambdas(s[rank - 1])
+    ks = np.arange(p, p // 3, -1)
+
+    def run(penalty: FloatArray, settings: FloatArray, first: int = 0) -> Sweep:
+        runs = iterate(measured, penalty)
+        errors = measured.compute_output_errors(runs.values, runs.machine)
+        return Sweep(settings, runs, errors, first + find_bottom(errors[first:]))
+
+    def answer(sweep: Sweep, setting: str) -> Answer:
+        i, runs = sweep.best, sweep.runs
+        commanded = measured.compute_commanded_errors(runs.values[[i]], runs.machine[[i]])[0]
+        end = int(runs.count[i]), bool(runs.is_converged[i])
+        return Answer(setting, runs.values[i], sweep.errors[i], commanded, *end)
+
+    ridge = run(penalize_ridge(lambdas, p), lambdas)
+    truncated = run(penalize_truncated(ks, p), ks.astype(np.float64), first=1)
+    plain = run(penalize_none(p), np.zeros(1))
+    ranked = run(penalize_truncated(np.array([rank]), p), np.zeros(1))
+    return Case(
+        study=measured,
+        singular_values=s,
+        rank=rank,
+        known=lc.identifiability(measured.robot.nominal, measured.trials.trial(0)),
+        is_equal=is_equal,
+        sweeps={RE: ridge, TSVD: truncated},
+        answers={
+            LS: answer(plain, "-"),
+            RANKED: answer(ranked, f"rank {rank}"),
+            RE: answer(ridge, f"lambda = {lambdas[ridge.best]:.2g}"),
+            TSVD: answer(truncated, f"k = {ks[truncated.best]}"),
+            **run_library(measured),
+        },
+        bracket=find_bracket(measured),
+        normal_equations=solve_normal_equations(measured),
+    )
+
+
+def space_lambdas(smallest: float) -> tuple[FloatArray, BoolArray]:
+    """Return lambdas (s,) from the smallest singular value to 1, and which are equidistant."""
+    intervals = np.linspace(smallest, 1.0, EQUAL_INTERVALS)
+    ratios = np.geomspace(smallest, 1.0, EQUAL_RATIOS)
+    lambdas = np.unique(np.concatenate([intervals, ratios[1:-1]]))
+    return lambdas, np.isin(lambdas, intervals)
+
+
+def find_bracket(measured: Study) -> tuple[float, float]:
+    """Return the smallest and largest lambda of TRIED that does not diverge in three iterations."""
+    run = iterate(measured, penalize_ridge(TRIED, len(measured.robot.parameters)), limit=3)
+    safe = TRIED[~run.is_diverged]
+    return float(safe.min()), float(safe.max())
+
+
+def solve_normal_equations(measured: Study) -> float:
+    """Return the first step of LS as printed, with the inverse of H'H: only here it is formed.
+
+    With a null direction H'H is singular up to rounding, and so its inverse is rounding.
+    """
+    d = linearize(measured)
+    H = (d.singular_values[0][:, None] * d.directions[0].T) / d.scale
+    try:
+        step = np.linalg.inv(H.T @ H) @ (H.T @ d.projections[0])
+    except np.linalg.LinAlgError:
+        return float("inf")
+    return float(np.abs(step).max())
+
+
+def run_library(measured: Study) -> dict[str, Answer]:
+    """Return the results of LIBRARY."""
+    answers = {}
+    for name, method in LIBRARY.items():
+        fit = lc.identify_trials(measured.robot, measured.trials, method)
+        setting = {WHITENED: "-", PRIOR: "lambda = 1, by definition"}.get(name)
+        setting = setting or f"lambda = {float(fit.penalty[0, 0]):.2g}, chosen"
+        errors = measured.compute_output_errors(fit.values)[0]
+        commanded = measured.compute_commanded_errors(fit.values)[0]
+        end = int(fit.iterations[0]), bool(fit.converged[0])
+        answers[name] = Answer(setting, fit.values[0], errors, commanded, *end)
+    return answers
+
+
+def follow_ridge(
+    measured: Study, counts: tuple[int, ...]
+) -> list[tuple[int | str, float, FloatArray]]:
+    """Return the best lambda and its errors (5,) after each number of RE iterations, and at the end
+    of the iteration.
+    """
+    smallest = float(linearize(measured).singular_values[0, -1])
+    lambdas = np.geomspace(smallest, 1.0, EQUAL_RATIOS)
+    penalty = penalize_ridge(lambdas, len(measured.robot.parameters))
+    history = iterate(measured, penalty, limit=max(counts), ahead=0.0).history
+    ends: dict[int | str, FloatArray] = {n: history[min(n, len(history) - 1)] for n in counts}
+    ends["at convergence"] = iterate(measured, penalty).values
+    rows = []
+    for count, values in ends.items():
+        errors = measured.compute_output_errors(values, np.zeros(len(values), dtype=np.int64))
+        best = find_bottom(errors)
+        rows.append((count, float(lambdas[best]), errors[best]))
+    return rows
+
+
+# --- many drawn machines ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """One algorithm with one setting for each of t machines.
+
+    Attributes
+    ----------
+    settings : (t,) lambda or k. iterations : (t,). errors : (t, 5), see MEASURES, and commanded :
+        (t, 2), see `Study.compute_commanded_errors`; infinite if diverged.
+    """
+
+    settings: FloatArray
+    iterations: IntArray
+    errors: FloatArray
+    commanded: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """One structure, t drawn machines, and the paper's methods.
+
+    Attributes
+    ----------
+    name : of the structure. freedoms : measured coordinates, 6 or 5.
+    settings : (s,) of RE (lambda, rising) and TSVD (k, falling); the first one of both is LS:
+        lambda = 0, and k the number of parameters.
+    curves : (t, s, 5) errors at them, see MEASURES, infinite if diverged.
+    short : (t, s - 1, 5) errors of RE after `SHORT` iterations, infinite if diverged before.
+    chosen : by algorithm; RE and TSVD at the bottom of their curves, without LS.
+    exact : (t, 5) errors of LS with rank detection, measured without noise.
+    """
+
+    name: str
+    freedoms: int
+    settings: Mapping[str, FloatArray]
+    curves: Mapping[str, FloatArray]
+    short: FloatArray
+    chosen: Mapping[str, Chosen]
+    exact: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.exact)
+
+    @property
+    def label(self) -> str:
+        """Structure and measurement."""
+        return f"{self.name}, {self.freedoms}-DOF"
+
+    def compute_median(self, algorithm: str) -> FloatArray:
+        """Return the median curve (s, 5)."""
+        return np.median(self.curves[algorithm], axis=0)
+
+    def compute_rises(self, algorithm: str, measure: int) -> FloatArray:
+        """Return `compute_rise` of each machine's curve (t,)."""
+        return np.array([compute_rise(curve) for curve in self.curves[algorithm][:, :, measure]])
+
+    def compare_unseen(self, algorithm: str) -> FloatArray:
+        """Return errors (t, 2) relative to LS with a setting that was best on other machines.
+
+        Each half of the machines takes the setting at the bottom of the median curve of the other
+        half. Position and angle; infinite if the algorithm diverged, 0 if only LS did.
+        """
+        curves, ratios = self.curves[algorithm][:, 1:, :2], np.empty((len(self), 2))
+        for half in (0, 1):
+            best = find_bottom(np.median(curves[1 - half :: 2], axis=0))
+            errors, reference = curves[half::2, best], self.chosen[LS].errors[half::2, :2]
+            with np.errstate(invalid="ignore"):
+                ratios[half::2] = np.where(np.isfinite(errors), errors / reference, np.inf)
+        return ratios
+
+
+def compute_rise(curve: FloatArray) -> float:
+    """Return the lower end of a curve (s,), relative to its least inner value; 0 with no inside.
+
+    Settings that diverged are no part of the curve.
+    """
+    usable = curve[np.isfinite(curve)]
+    if len(usable) < 3:
+        return 0.0
+    return float(min(usable[0], usable[-1]) / usable[1:-1].min())
+
+
+def run_situation(measured: Study, progress: Callable[[str], None] = lambda _: None) -> Situation:
+    """Run the paper's methods on drawn machines."""
+    p, t = len(measured.robot.parameters), len(measured.trials)
+    ks = np.arange(p, p // 3, -1)
+    k = len(ks)
+    penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(LAMBDAS, p)])
+    settings = np.concatenate([ks, LAMBDAS])
+    parts = []
+    for first in range(0, t, TOGETHER):
+        progress(f"{measured.label}, machine {first + 1} of {t}")
+        machines = np.arange(first, min(first + TOGETHER, t))
+        run = iterate(
+            measured, np.tile(penalty, (len(machines), 1)), np.repeat(machines, len(penalty))
+        )
+        state = min(int(np.searchsorted(run.done.max(axis=1), SHORT)), len(run.done) - 1)
+        is_ridge = np.tile(np.arange(len(penalty)) >= k, len(machines))
+        short = measured.compute_output_errors(run.history[state, is_ridge], run.machine[is_ridge])
+        errors = measured.compute_output_errors(run.values, run.machine)
+        parts.append([x.reshape(len(machines), -1, *x.shape[1:])
+                      for x in (errors, run.count, run.values, short)])  # fmt: skip
+    errors, count, value, short = (np.concatenate(x) for x in zip(*parts, strict=True))
+    errors, machines, null = mark_diverged(errors), np.arange(t), 6 - measured.freedoms
+    places = {
+        LS: np.zeros(t, np.int64),
+        RANKED: np.full(t, null),
+        RE: k + np.array([find_bottom(curve) for curve in errors[:, k:]]),
+        TSVD: 1 + np.array([find_bottom(curve) for curve in errors[:, 1:k]]),
+    }
+    chosen = {
+        algorithm: Chosen(
+            settings[place],
+            count[machines, place],
+            errors[machines, place],
+            mark_diverged(measured.compute_commanded_errors(value[machines, place])),
+        )
+        for algorithm, place in places.items()
+    }
+    exact = measured.with_noise(np.zeros(measured.freedoms))
+    free = iterate(exact, penalize_truncated(np.array([p - null]), p), machines)
+    return Situation(
+        name=measured.name,
+        freedoms=measured.freedoms,
+        settings={RE: np.array([0.0, *LAMBDAS]), TSVD: ks.astype(np.float64)},
+        curves={RE: np.delete(errors, np.s_[1:k], axis=1), TSVD: errors[:, :k]},
+        short=mark_diverged(short),
+        chosen=chosen,
+        exact=mark_diverged(exact.compute_output_errors(free.values)),
+    )
+
+
+def mark_diverged(errors: FloatArray) -> FloatArray:
+    """Count diverged machines as infinitely wrong, so that medians stay honest."""
+    return np.where(np.isnan(errors), np.inf, errors)
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Results of t drawn machines.
+
+    The paper's methods take the setting that is best for the true machine. The library's methods
+    choose theirs from the data; MAP is given the true spread of the errors as its tolerances.
+
+    Attributes
+    ----------
+    name : of the structure. six, five : the paper's methods with 6- and 5-DOF measurement.
+    errors : method -> (t, 5), see MEASURES, infinite if diverged.
+    commanded : method -> (t, 2), see `Chosen`; without HINDSIGHT, which takes another lambda for
+        each measure.
+    """
+
+    name: str
+    six: Situation
+    five: Situation
+    errors: Mapping[str, FloatArray]
+    commanded: Mapping[str, FloatArray]
+
+    def __len__(self) -> int:
+        return len(self.six)
+
+    @property
+    def situations(self) -> tuple[Situation, Situation]:
+        """With 6- and 5-DOF measurement."""
+        return self.six, self.five
+
+    def list_groups(self) -> tuple[Draws, ...]:
+        """Return groups of machines of about equal size, `GROUPS` or as many as there are machines.
+
+        They hold the errors of the methods; the situations stay those of all machines.
+        """
+        places = np.array_split(np.arange(len(self)), min(GROUPS, len(self)))
+        return tuple(
+            replace(self, errors={m: errors[place] for m, errors in self.errors.items()})
+            for place in places
+        )
+
+    def compute_median(self, method: str) -> FloatArray:
+        """Return medians (5,) over the machines."""
+        return np.median(self.errors[method], axis=0)
+
+    def compute_interval(self, method: str) -> FloatArray:
+        """Return the bootstrap interval (2, 5) of the medians, 95 %."""
+        return _find_interval(_resample_medians(self.errors[method]))
+
+    def compute_ratio(self, method: str, other: str) -> FloatArray:
+        """Return the ratio (5,) of medians, method over other."""
+        return self.compute_median(method) / self.compute_median(other)
+
+    def compute_ratio_interval(self, method: str, other: str) -> FloatArray:
+        """Return the bootstrap interval (2, 2) of the ratio of medians in position and angle, the
+        machines drawn in pairs, 95 %.
+        """
+        first, second = (_resample_medians(self.errors[m][:, :2]) for m in (method, other))
+        return _find_interval(first / second)
+
+
+def _resample_medians(values: FloatArray) -> FloatArray:
+    """Return medians (RESAMPLES, ..) of machines drawn with replacement, always the same ones."""
+    t = len(values)
+    drawn = make_random_stream(0, 0, RESAMPLING).integers(0, t, (RESAMPLES, t))
+    return np.median(values[drawn], axis=1)
+
+
+def _find_interval(medians: FloatArray) -> FloatArray:
+    return np.quantile(medians, [0.025, 0.975], axis=0, method="nearest")  # some may be infinite
+
+
+def draw_machines(
+    name: str, seed: int, trials: int, progress: Callable[[str], None] = lambda _: None
+) -> Draws:
+    """Draw machines, measure and identify them by all methods."""
+    truth = draw_true_values(load_machine(name), trials, seed)
+    whole = measure_machines(name, truth, seed)
+    six, five = (run_situation(study, progress) for study in (whole, whole.five))
+    progress(f"{name}, methods of loopcal")
+    values = {BEFORE: np.repeat(whole.robot.parameters.nominal[None], trials, axis=0), TRUE: truth}
+    scaled = {NARROW: lc.Ridge(FACTOR**2), WIDE: lc.Ridge(FACTOR**-2)}
+    without = {WHITENED_FIVE: lc.LeastSquares(), PRIOR_FIVE: lc.MAP()}
+    for study, methods in ((whole, {**LIBRARY, **scaled}), (whole.five, without)):
+        for method, how in methods.items():
+            values[method] = lc.identify_trials(study.robot, study.trials, how).values
+    errors = {m: whole.compute_output_errors(v) for m, v in values.items()}
+    commanded = {m: whole.compute_commanded_errors(v) for m, v in values.items()}
+    errors[HINDSIGHT] = _run_in_hindsight(whole)
+    for method, algorithm, situation in (
+        (RAW_LS, LS, six),
+        (RAW_RE, RE, six),
+        (RAW_TSVD, TSVD, six),
+        (RAW_FIVE, RANKED, five),
+        (RE_FIVE, RE, five),
+        (TSVD_FIVE, TSVD, five),
+    ):
+        errors[method] = situation.chosen[algorithm].errors
+        commanded[method] = situation.chosen[algorithm].commanded
+    errors, commanded = (
+        {m: mark_diverged(of[m]) for m in METHODS if m in of} for of in (errors, commanded)
+    )
+    return Draws(name, six, five, errors, commanded)
+
+
+def _run_in_hindsight(measured: Study) -> FloatArray:
+    """Return the least error of each machine and measure over HINDSIGHT_LAMBDAS."""
+    start, tried = None, []
+    for lam in HINDSIGHT_LAMBDAS:
+        options = lc.FitOptions(start=start)
+        fit = lc.identify_trials(
+            measured.robot, measured.trials, lc.Ridge(float(lam)), options=options
+        )
+        start = fit.values
+        tried.append(measured.compute_output_errors(fit.values))
+    return np.min(tried, axis=0)

@@ -1,0 +1,810 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the paper does: points on planes and perpendicular lines, drawn machines, calibrations by LS
+and MAP, and errors at held-out poses; and the questions that it leaves open.
+
+Robot and workspace are ours, those of the robot file hexapod-nategh-agheli: the paper's Tables 1
+and 2 are not in our text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import hypot
+
+import numpy as np
+
+import loopcal as lc
+from loopcal import geometry
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.information import collect_information
+from loopcal.estimate.penalties import Method
+from loopcal.estimate.plane_line_products import (
+    WEIGHTS,
+    Layout,
+    PaperRows,
+    Weights,
+    identify_from_rows,
+)
+from loopcal.measure.instrument import Gaussian, make_random_stream
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import POSITION
+from loopcal.mechanism.solutions import Solution
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.papers.paper import PAPERS
+from loopcal.papers.published import Published, last_digit
+from loopcal.planning.exchange import MovedDesign
+from loopcal.planning.plane_line_planning import (
+    PlaneLineGroups,
+    improve_groups,
+    make_plane_line_instrument,
+)
+from loopcal.studies.simulation.block import calibrate_cells, find_cells, set_size
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+MM = 1e-3
+PRINTED = Published(__file__)
+ROBOT = "hexapod-nategh-agheli"
+GROUPS, POINTS, AXES, SWEEPS = 10, 10, ("z",), 3
+"""Planes with a line each, points of each (the paper's 100 positions), axes of the lines (planes of
+equal z), and sweeps of the coordinate exchange.
+"""
+HELD_OUT = 100
+"""Random poses over which errors are taken, as in the paper."""
+TRUTH = 1  # purpose of a random stream
+BEFORE, LS, PRIOR = "before", "LS", "MAP"
+METHODS: Mapping[str, Method] = {LS: lc.LeastSquares(), PRIOR: lc.MAP()}
+MEASURES = (
+    "position [mm]",
+    "orientation [deg]",
+    "position, aligned [mm]",
+    "orientation, aligned [deg]",
+    "parameters [mm]",
+    "parameters without gauge [mm]",
+    "position, gauge at nominal [mm]",
+)
+"""Root mean squares over the held-out poses, and the 2-norm of the errors of the 42 parameters."""
+ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "aligned")
+"""Placements of the base and the rotation of the platform, which plane and line do not determine:
+as the least deviation leaves them; with poses nearest to the nominal ones, which needs no truth;
+with poses nearest to the true ones.
+"""
+STATISTICS = ("position, mean [mm]", "position, standard deviation [mm]", "orientation, mean [deg]",
+              "orientation, standard deviation [deg]")  # fmt: skip
+LINES, FIFTY_SD = (1, 5), 1e-3
+"""Planes with a line each on which fifty points lie, and the standard deviation of the true errors
+of these machines [m]: that of set 3.
+"""
+SET, NOISE = 1.0, 0.01
+"""Of figure 5, as printed [mm]."""
+SD, VARIANCE = "standard deviation", "variance"
+READINGS: Mapping[str, Callable[[float], float]] = {
+    SD: lambda given: given * MM,
+    VARIANCE: lambda given: float(np.sqrt(given)) * MM,
+}
+"""From a printed number to a standard deviation [m]: "variance of 0.01mm" may mean either."""
+TEN, ONE, ANY = (
+    "ten planes, a line each",
+    "one plane, one line",
+    "ten planes of any axis, a line each",
+)
+RANKS = ((1, 100), (2, 50), (5, 20), (10, 10), (20, 10), (30, 10))
+"""Groups and points of each, drawn at random, whose rank is computed."""
+ERRORS, NOISES = 1e-3, (1e-6, 1e-5)
+"""Standard deviations [m] of parameters and of held coordinates where both forms are compared."""
+HARDEST, SHARE = (max(NOISES), LS), 5
+"""The noise and method with which fits converge worst, identified on all machines; with the others
+on one machine of so many: these fits take most of the time of the study.
+"""
+GAUGE_NAMES = tuple(
+    f"{what} {axis}"
+    for what in ("base shifted along", "base rotated about", "platform rotated about")
+    for axis in POSITION
+)
+"""The nine directions of the 42 parameters that plane and line cannot determine, k = x, y, z:
+
+    base shifted along k      db_i = k             the end point moves along k everywhere
+    base rotated about k      db_i = k x b_i       it rotates about the base's origin everywhere
+    platform rotated about k  dp_i = k x p_i       it does not move at all
+
+The first six move all points as one body, which changes no distance and no angle between them.
+"""
+
+
+# --- robot, points, true machines ---------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutPoses:
+    """Poses that were not measured, at which identified machines are compared with true ones.
+
+    Attributes
+    ----------
+    robot : as designed. solution : 100 random poses of its workspace, as it is commanded to them.
+    """
+
+    robot: Mechanism
+    solution: Solution
+
+    def solve(self, values: FloatArray) -> FloatArray:
+        """Return the poses (t, n, 4, 4) of machines (t, p) at the readings."""
+        return forward_trials(self.robot, values, self.solution.q[None], self.solution.state).T
+
+    def compute_twists(self, T: FloatArray, true: FloatArray, frame: str) -> FloatArray:
+        """Return differences (t, n, 6) [rad, m], rotation first, of poses (t | 1, n, 4, 4) from
+        true ones (t, n, 4, 4), in one of FRAMES.
+        """
+        T = np.broadcast_to(T, true.shape)
+        if frame != ABSOLUTE:
+            nominal = np.broadcast_to(self.solution.T, true.shape)
+            T = fit_motions(T, true if frame == ALIGNED else nominal)
+        return geometry.pose_difference(T, true)
+
+    def compute_errors(self, values: FloatArray, truth: FloatArray, true: FloatArray) -> FloatArray:
+        """Return errors (t, 7), see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n,
+        4, 4) the poses of the truth.
+        """
+        sizes, T = {}, self.solve(values)
+        for frame in FRAMES:
+            squares = np.mean(self.compute_twists(T, true, frame) ** 2, axis=1)
+            position, rotation = (np.sqrt(squares[:, p].sum(axis=1)) for p in np.s_[3:, :3])
+            sizes[frame] = [position / MM, np.rad2deg(rotation)]
+        wrong = values - truth
+        lengths = (np.linalg.norm(e, axis=1) / MM for e in (wrong, remove_gauge(self.robot, wrong)))
+        columns = (*sizes[ABSOLUTE], *sizes[ALIGNED], *lengths, sizes[AT_NOMINAL][0])
+        return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """The robot, the points it is sent to, and the poses at which it is judged.
+
+    Attributes
+    ----------
+    planned : how groups are written as designs. first, optimized : before and after coordinate
+        exchange. seed : of both.
+    """
+
+    robot: Mechanism
+    planned: PlaneLineGroups
+    first: FloatArray
+    optimized: MovedDesign
+    seed: int
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The measured points."""
+        return Layout(self.robot, self.planned.place_points(self.optimized.design))
+
+    @cached_property
+    def held_out(self) -> HeldOutPoses:
+        """Held-out poses, drawn with another seed than the points."""
+        return HeldOutPoses(
+            self.robot, sample_workspace(self.robot, HELD_OUT, self.seed + 1).solution
+        )
+
+    @cached_property
+    def spreads(self) -> tuple[float, float]:
+        """`compute_spread` of the points before and after coordinate exchange."""
+        drawn = self.planned.linearize(self.first)
+        return compute_spread(drawn), compute_spread(self.optimized.rows)
+
+
+def plan_points(
+    groups: int = GROUPS, points: int = POINTS, axes: tuple[str, ...] = AXES, *, seed: int,
+    sweeps: int,
+) -> Study:  # fmt: skip
+    """Draw groups at random and improve log det of their information by coordinate exchange.
+
+    With 0 sweeps they stay as drawn.
+    """
+    robot = lc.load_robot(ROBOT)
+    planned = PlaneLineGroups(robot, points, MM, axes)
+    first = planned.draw(groups, seed)
+    return Study(robot, planned, first, improve_groups(planned, first, sweeps), seed)
+
+
+def compute_spread(rows: FloatArray) -> float:
+    """Return the rms standard deviation of the identifiable directions [mm per mm of noise].
+
+    The rows are those for a noise of 1 mm.
+    """
+    s = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), compute_uv=False)
+    return float(np.sqrt(np.mean(1.0 / s[s > 1e-10 * s[0]] ** 2)))
+
+
+def draw_true_machines(
+    robot: Mechanism, sd: float, trials: int, seed: int, is_gauge_free: bool = False
+) -> FloatArray:
+    """Return nominal values (t, p) [m] with Gaussian errors.
+
+    Machine i has the same errors, scaled, for any sd and number of trials.
+    """
+    streams = (make_random_stream(seed, trial, TRUTH) for trial in range(trials))
+    drawn = np.stack([stream.standard_normal(len(robot.parameters)) for stream in streams])
+    return robot.parameters.nominal + sd * (remove_gauge(robot, drawn) if is_gauge_free else drawn)
+
+
+def fit_motions(T: FloatArray, others: FloatArray) -> FloatArray:
+    """Return poses (t, n, 4, 4) after the motion of the base and the turn of the platform that
+    bring them nearest to others.
+
+    Positions fix the base's motion (their least squares), then orientations the platform's turn
+    (nearest rotations): what plane and line leave open, and nothing else.
+    """
+    x, y = T[..., :3, 3], others[..., :3, 3]
+    middle, center = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
+    Q = geometry.project_to_rotations(np.swapaxes(y - center, 1, 2) @ (x - middle))
+    R = Q[:, None] @ T[..., :3, :3]
+    turn = geometry.project_to_rotations(np.sum(np.swapaxes(R, 2, 3) @ others[..., :3, :3], axis=1))
+    return geometry.make_pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + center)
+
+
+def list_gauge_directions(robot: Mechanism) -> FloatArray:
+    """Return changes (9, p) of the parameters, see GAUGE_NAMES, [m per m] and [m per rad]."""
+    changes = np.zeros((9, len(robot.parameters)))
+    for leg in robot.assembly.limbs:
+        base, platform = (
+            [robot.parameters.index(f"{leg.name}.{end}.{axis}") for axis in POSITION]
+            for end in ("base", "platform")
+        )
+        changes[0:3, base] = np.eye(3)
+        changes[3:6, base] = np.cross(np.eye(3), robot.values[base])
+        changes[6:9, platform] = np.cross(np.eye(3), robot.values[platform])
+    return changes
+
+
+def remove_gauge(robot: Mechanism, deviation: FloatArray) -> FloatArray:
+    """Return deviations (.., p) [m] without their part along the nine directions."""
+    basis = np.linalg.qr(list_gauge_directions(robot).T)[0]
+    return deviation - (deviation @ basis) @ basis.T
+
+
+# --- ranks --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class GroupRank:
+    """Rank of random groups. rows : their number. singular_values : (p,)."""
+
+    groups: int
+    points: int
+    rows: int
+    rank: int
+    singular_values: FloatArray
+
+    @property
+    def unused(self) -> float | None:
+        """Largest singular value that does not count; None without one."""
+        s = self.singular_values
+        return float(s[self.rank]) if self.rank < len(s) else None
+
+
+def compute_ranks(study: Study, seed: int) -> tuple[GroupRank, ...]:
+    """Return the ranks of random groups, with the tolerance 1e-10 of the largest singular value."""
+    ranks = []
+    for groups, points in RANKS:
+        planned = PlaneLineGroups(study.robot, points, MM, AXES)
+        rows = planned.linearize(planned.draw(groups, seed)).reshape(-1, len(planned.free))
+        s: FloatArray = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
+        ranks.append(GroupRank(groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
+    return tuple(ranks)
+
+
+def compute_gauge_effects(study: Study) -> FloatArray:
+    """Return the effects (9,) of the directions of GAUGE_NAMES on the rows, relative to the largest
+    singular value.
+    """
+    rows = study.optimized.rows.reshape(-1, len(study.robot.parameters))
+    g, largest = list_gauge_directions(study.robot), np.linalg.svd(rows, compute_uv=False)[0]
+    return np.linalg.norm(rows @ g.T, axis=0) / np.linalg.norm(g, axis=1) / largest
+
+
+def compute_pair_rank(study: Study) -> tuple[int, int]:
+    """Return the points of the first group and the rank of the equations (14) of all its pairs.
+
+    The points are those commanded.
+    """
+    nominal, layout = study.robot.parameters.nominal[None], study.layout
+    points, slopes, _ = layout.linearize_points(nominal, layout.solve_readings(nominal, 0.0, 0))
+    group, J = points[0, 0], slopes[0, 0]
+    plane = [0, *range(2, len(group))]
+    d_1, slope_1 = group[1] - group[0], J[1] - J[0]
+    rows = np.array([
+        (group[i] - group[j]) @ slope_1 + d_1 @ (J[i] - J[j])
+        for i in plane for j in plane if i < j
+    ])  # fmt: skip
+    return len(group), int(np.linalg.matrix_rank(rows, rtol=1e-9))
+
+
+# --- calibrations -------------------------------------------------------------------------------
+
+
+def compute_median(errors: FloatArray, converged: BoolArray | None = None) -> FloatArray:
+    """Return medians (k,) of errors (t, k) of the converged machines (t,); NaN without any."""
+    kept = errors if converged is None else errors[converged]
+    return np.median(kept, axis=0) if len(kept) else np.full(errors.shape[1], np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Machines:
+    """True values (t, p) [m] of t machines, and their estimates by method."""
+
+    truth: FloatArray
+    estimates: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """t machines with errors of one size, calibrated from points with noise of one size.
+
+    Attributes
+    ----------
+    sd, noise : standard deviations [m].
+    errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. converged : by LS,
+        MAP, (t,). machines : the true ones, and those that LS and MAP identified.
+    """
+
+    sd: float
+    noise: float
+    errors: Mapping[str, FloatArray]
+    iterations: IntArray
+    converged: Mapping[str, BoolArray]
+    machines: Machines
+
+    @classmethod
+    def judge(
+        cls, study: Study, sd: float, noise: float, machines: Machines, iterations: IntArray,
+        converged: Mapping[str, BoolArray],
+    ) -> Cell:  # fmt: skip
+        """Return calibrated machines with their errors at the held-out poses."""
+        truth, nominal = machines.truth, study.robot.parameters.nominal[None]
+        true = study.held_out.solve(truth)
+        errors = {
+            name: study.held_out.compute_errors(values, truth, true)
+            for name, values in {BEFORE: nominal, **machines.estimates}.items()
+        }
+        return cls(sd, noise, errors, iterations, converged, machines)
+
+    @property
+    def failed(self) -> int:
+        """Number of descents that did not converge."""
+        return sum(int((~converged).sum()) for converged in self.converged.values())
+
+    @property
+    def ratio(self) -> float:
+        """Noise over errors. To first order the reductions of cells depend on it only."""
+        return float(f"{self.noise / self.sd:.6g}")
+
+    def compute_median(self, method: str, measure: str) -> float:
+        """Return the median of a measure over the machines on which the method converged."""
+        place = MEASURES.index(measure)
+        return float(compute_median(self.errors[method], self.converged.get(method))[place])
+
+    def compute_reduction(self, method: str, measure: str) -> float:
+        """Return the percentage by which a median falls."""
+        after, before = (self.compute_median(m, measure) for m in (method, BEFORE))
+        return 100.0 * (1.0 - after / before)
+
+    def count_worse(self, method: str, measure: str) -> int:
+        """Return how many machines a method makes worse, of those on which it converged."""
+        place = MEASURES.index(measure)
+        is_worse = self.errors[method][:, place] > self.errors[BEFORE][:, place]
+        return int((is_worse & self.converged[method]).sum())
+
+
+def calibrate_cell(
+    study: Study, sd: float, noise: float, seed: int, trials: int, gauge_free: bool = False,
+    weights: Weights = "full",
+) -> Cell:  # fmt: skip
+    """Draw machines, hold their coordinates with noise, identify, compare at held-out poses.
+
+    Parameters
+    ----------
+    sd, noise : standard deviations [m], of a parameter and of a coordinate of a point. The prior of
+        MAP has this sd.
+    """
+    truth = draw_true_machines(study.robot, sd, trials, seed, gauge_free)
+    q = study.layout.solve_readings(truth, noise, seed)
+    problem = PaperRows(study.layout, q, sd, noise, weights)
+    descents = {name: identify_from_rows(problem, method) for name, method in METHODS.items()}
+    values = {name: problem.values(descent.deviation) for name, descent in descents.items()}
+    converged = {n: descent.status == DescentStatus.CONVERGED for n, descent in descents.items()}
+    iterations = descents[LS].iterations
+    return Cell.judge(study, sd, noise, Machines(truth, values), iterations, converged)
+
+
+def calibrate_grid(
+    study: Study, seed: int, trials: int, progress: Callable[[str], None]
+) -> dict[tuple[str, str], Cell]:
+    """Return the 3 x 4 cells by (set, noise) as printed, taken as standard deviations: those of
+    study.yaml at the points of this study.
+    """
+    grid = set_size(PAPERS["cmm-constraint-2011"].load_study(), seed, trials)
+    (level,) = grid.poses.values()
+    points = replace(level, coordinates=tuple(map(tuple, study.layout.flat.tolist())))
+    grid = replace(grid, poses={"points": points})
+    cells = {}
+    for given in PRINTED.find("sets").split():
+        progress(f"Table 3, set {given} mm")
+        for noise in PRINTED.find("noises").split():
+            numbers = find_cells(grid, errors=f"set {given}", instrument=f"{noise} mm")
+            made = {cell.levels["method"]: cell for cell in calibrate_cells(grid, numbers)}
+            machines = Machines(made[LS].truth, {name: cell.values for name, cell in made.items()})
+            cells[given, noise] = Cell.judge(
+                study, float(given) * MM, float(noise) * MM, machines, made[LS].iterations,
+                {name: cell.is_converged for name, cell in made.items()},
+            )  # fmt: skip
+    return cells
+
+
+def compute_rank_correlation(cells: Iterable[Cell], method: str) -> float:
+    """Return the rank correlation over cells of the reductions of parameters and positions."""
+    cells = tuple(cells)
+    first, second = (
+        np.argsort(np.argsort([c.compute_reduction(method, name) for c in cells])).astype(float)
+        for name in ("parameters [mm]", "position [mm]")
+    )
+    return float(np.corrcoef(first, second)[0, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class FiftyPoints:
+    """t machines calibrated from fifty points.
+
+    Attributes
+    ----------
+    groups : planes. iterations : (t,) of least squares. converged : by LS, MAP, (t,).
+    statistics : by method and frame (see FRAMES), (t, 4) see STATISTICS, over held-out poses.
+    """
+
+    groups: int
+    iterations: IntArray
+    converged: Mapping[str, BoolArray]
+    statistics: dict[tuple[str, str], FloatArray]
+
+    @property
+    def within_five(self) -> float:
+        """Percentage of the machines on which least squares converges within 5 iterations."""
+        return 100.0 * float(np.mean((self.iterations <= 5) & self.converged[LS]))
+
+    @property
+    def most_iterations(self) -> int:
+        """Largest number of iterations of least squares."""
+        return int(self.iterations.max())
+
+    def compute_median(self, method: str, frame: str) -> FloatArray:
+        """Return medians (4,) over the machines on which the method converged."""
+        return compute_median(self.statistics[method, frame], self.converged.get(method))
+
+    def compute_factors(self, method: str, frame: str) -> FloatArray:
+        """Return the factors (4,) by which calibration reduces the medians."""
+        return self.compute_median(BEFORE, frame) / self.compute_median(method, frame)
+
+
+def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyPoints:
+    """Calibrate machines from fifty random points with the noise of the paper's instrument."""
+    points = int(PRINTED.find("points", "measured")) // groups
+    noise = PRINTED.number("accuracy", "accuracy") * MM
+    layout = plan_points(groups, points, seed=seed + 2, sweeps=0).layout
+    truth = draw_true_machines(study.robot, FIFTY_SD, trials, seed)
+    problem = PaperRows(layout, layout.solve_readings(truth, noise, seed), FIFTY_SD, noise)
+    descents = {name: identify_from_rows(problem, method) for name, method in METHODS.items()}
+    machines = {BEFORE: study.robot.parameters.nominal[None]}
+    machines |= {name: problem.values(descent.deviation) for name, descent in descents.items()}
+    statistics, true = {}, study.held_out.solve(truth)
+    for name, values in machines.items():
+        T = study.held_out.solve(values)
+        for frame in FRAMES:
+            twists = study.held_out.compute_twists(T, true, frame)
+            position = np.linalg.norm(twists[:, :, 3:], axis=2) / MM
+            rotation = np.rad2deg(np.linalg.norm(twists[:, :, :3], axis=2))
+            statistics[name, frame] = np.stack(
+                [part(e, axis=1) for e in (position, rotation) for part in (np.mean, np.std)],
+                axis=1,
+            )
+    converged = {n: descent.status == DescentStatus.CONVERGED for n, descent in descents.items()}
+    return FiftyPoints(groups, descents[LS].iterations, converged, statistics)
+
+
+# --- open questions: number of planes, meaning of variances, gauge of errors, weights ------------
+
+
+@dataclass(frozen=True, eq=False)
+class Arrangement:
+    """A way to place 100 points.
+
+    Attributes
+    ----------
+    name : TEN, ONE or ANY. drawn, optimized : see `Study.spreads`. study : the points.
+    cell : set 3 with noise 0.01 mm, as standard deviations.
+    """
+
+    name: str
+    drawn: float
+    optimized: float
+    cell: Cell
+    study: Study
+
+    @property
+    def gain(self) -> float:
+        """Factor by which exchange reduces the standard deviation."""
+        return self.drawn / self.optimized
+
+
+def evaluate_arrangement(name: str, study: Study, seed: int, trials: int) -> Arrangement:
+    """Evaluate one way to place the points."""
+    cell = calibrate_cell(study, SET * MM, NOISE * MM, seed, trials)
+    return Arrangement(name, *study.spreads, cell, study)
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """One draw of points, machines and noise. A statement that holds in some draws only is labelled
+    so.
+
+    Attributes
+    ----------
+    ten : the ten planes. cells : Table 3, by (set, noise) as printed. weights : the cell of figure
+        5 by weights of the rows. fifties : fifty points on each number of planes in LINES.
+    """
+
+    ten: Arrangement
+    cells: Mapping[tuple[str, str], Cell]
+    weights: Mapping[str, Cell]
+    fifties: tuple[FiftyPoints, ...]
+
+
+def compute_draw(study: Study, seed: int, trials: int, progress: Callable[[str], None]) -> Draw:
+    """Calibrate the machines of one seed from the points of a study."""
+    cells = calibrate_grid(study, seed, trials, progress)
+    progress("weights of the rows, and fifty points")
+    ten = evaluate_arrangement(TEN, study, seed, trials)
+    fifties = tuple(calibrate_fifty(study, groups, seed, trials) for groups in LINES)
+    return Draw(ten, cells, compare_weights(ten, seed, trials), fifties)
+
+
+def compare_weights(ten: Arrangement, seed: int, trials: int) -> dict[str, Cell]:
+    """Return calibrations with the errors and the noise of figure 5 by every weighting of the rows,
+    of the same machines.
+    """
+    sizes = SET * MM, NOISE * MM, seed, trials
+    return {
+        weights: ten.cell if weights == "full"
+        else calibrate_cell(ten.study, *sizes, weights=weights)
+        for weights in WEIGHTS
+    }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One interpretation of the paper, and the figure 5 that follows from it.
+
+    Attributes
+    ----------
+    name, reading, truth, frame : how. reductions : (3,) of parameters, position, orientation by
+        least squares [%].
+    """
+
+    name: str
+    reading: str
+    truth: str
+    frame: str
+    reductions: FloatArray
+
+    @property
+    def distance(self) -> float:
+        """Largest difference from the printed percentages."""
+        return float(np.abs(self.reductions - list_printed()).max())
+
+
+def list_printed() -> FloatArray:
+    """Return the printed reductions (3,) of parameters, position and orientation [%]."""
+    position, orientation = (Stated(**PRINTED.find("figure_5", name)).reduction
+                             for name in ("position", "orientation"))  # fmt: skip
+    return np.array([PRINTED.number("figure_5", "estimation", "stated"), position, orientation])
+
+
+def rank_candidates(
+    arrangements: Iterable[Arrangement], seed: int, trials: int
+) -> tuple[Candidate, ...]:
+    """Return every interpretation of the paper, the nearest to its printed reductions first."""
+    absolute = ("parameters [mm]", "position [mm]", "orientation [deg]")
+    aligned = ("parameters without gauge [mm]", "position, aligned [mm]",
+               "orientation, aligned [deg]")  # fmt: skip
+    rows = []
+    for arrangement in arrangements:
+        for reading, size in READINGS.items():
+            for truth in ("all 42", "gauge-free"):
+                cell, is_free = arrangement.cell, truth == "gauge-free"
+                if reading != SD or is_free:
+                    sizes = size(SET), size(NOISE)
+                    cell = calibrate_cell(arrangement.study, *sizes, seed, trials, is_free)
+                for frame, names in ((ABSOLUTE, absolute), (ALIGNED, aligned)):
+                    reductions = np.array([cell.compute_reduction(LS, name) for name in names])
+                    rows.append(Candidate(arrangement.name, reading, truth, frame, reductions))
+    return tuple(sorted(rows, key=lambda row: row.distance))
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A number before and after, and its stated improvement.
+
+    Attributes
+    ----------
+    before, after : as printed, or "". stated : percentage or factor, as printed. unit : of
+        before and after.
+    """
+
+    stated: str
+    before: str = ""
+    after: str = ""
+    unit: str = ""
+
+    @property
+    def reduction(self) -> float:
+        """Percentage by which it falls."""
+        return 100.0 * (1.0 - float(self.after) / float(self.before))
+
+    @property
+    def factor(self) -> float:
+        """Before over after."""
+        return float(self.before) / float(self.after)
+
+    @property
+    def possible(self) -> tuple[float, float]:
+        """Least and largest factor of numbers that round to the printed ones."""
+        before, after = (bound_rms(text) for text in (self.before, self.after))
+        return before[0] / after[1], before[1] / after[0]
+
+    @property
+    def excess(self) -> float:
+        """By how much the stated factor is outside of the possible ones."""
+        return compute_excess(self.stated, self.possible)
+
+
+def bound_rms(*rounded: str) -> tuple[float, float]:
+    """Return the least and the largest root of the sum of squares of rounded numbers."""
+    low, high = (
+        hypot(*(float(text) + sign * 0.5 * last_digit(text) for text in rounded))
+        for sign in (-1, 1)
+    )
+    return low, high
+
+
+def compute_excess(stated: str, possible: tuple[float, float]) -> float:
+    """Return by how much a stated number, itself rounded, is outside of what is possible."""
+    half, (low, high) = 0.5 * last_digit(stated), possible
+    return max(low - half - float(stated), float(stated) - high - half, 0.0)
+
+
+# --- surfaces as unknowns of the measurement ----------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FormRow:
+    """How the two forms differ over many machines, with one noise and one method.
+
+    Attributes
+    ----------
+    noise : [m]. method : its name. machines : their number. converged : on how many both forms
+        converged; the differences are of these.
+    iterations : largest number with surfaces as unknowns. ranks : that occur there.
+    median, largest : over the machines, of the largest difference of the estimates along an
+        identifiable direction [sd].
+    """
+
+    noise: float
+    method: str
+    machines: int
+    converged: int
+    iterations: int
+    ranks: tuple[int, ...]
+    median: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class Forms:
+    """How the two forms differ.
+
+    Attributes
+    ----------
+    hardest : all machines, with HARDEST. others : a part of them, with other noises and methods.
+    covariance : largest relative difference of a variance.
+    """
+
+    hardest: FormRow
+    others: tuple[FormRow, ...]
+    covariance: float
+
+    @property
+    def rows(self) -> tuple[FormRow, ...]:
+        """All rows, the hardest first."""
+        return (self.hardest, *self.others)
+
+
+def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
+    """Return points on planes and lines as measurements.
+
+    Kinds `plane` and `line` that name the same surface share the unknowns of that name (direction,
+    height, shifts), so that the line is perpendicular to the plane by construction. Measured gaps
+    are zero: the coordinates were held.
+
+    Parameters
+    ----------
+    layout : lines along any axes of the base. q : (n, a) readings [SI]. sigma : of a held
+        coordinate [m].
+    """
+    number = np.arange(layout.points).reshape(layout.groups, -1)
+    axis = np.abs(layout.levers[0]).argmax(axis=1)
+    instrument = make_plane_line_instrument(
+        layout.robot, axis, number, lambda _, gaps: Gaussian(np.full(gaps, sigma))
+    )
+    observations = tuple(
+        Observations.from_sigma(
+            s.kind, s.assigned_rows, np.zeros((len(s.assigned_rows), len(s.noise.sigma))), sigma,
+            group=s.group,
+        )
+        for s in instrument.sensors
+    )  # fmt: skip
+    return Measurements(layout.robot.name, q, observations)
+
+
+def compare_forms(study: Study, seed: int, trials: int) -> Forms:
+    """Identify machines in both forms, at several noises and by both methods."""
+    truth = draw_true_machines(study.robot, ERRORS, trials, seed)
+    rows = {}
+    for noise in NOISES:
+        q = study.layout.solve_readings(truth, noise, seed)
+        for name in METHODS:
+            count = trials if (noise, name) == HARDEST else max(trials // SHARE, 2)
+            rows[noise, name] = compare_estimates(study.layout, q[:count], noise, name)
+    hardest = rows.pop(HARDEST)
+    return Forms(hardest, tuple(rows.values()), compare_covariances(study.layout, NOISES[0]))
+
+
+def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) -> FormRow:
+    """Identify machines with readings (t, n, a) in both forms by one method."""
+    sd = select_free_parameters(layout.robot).tolerance[0]
+    problem = PaperRows(layout, q, sd, noise)
+    paper = identify_from_rows(problem, METHODS[name], 1e-6)
+    values = problem.values(paper.deviation)
+    iterations, ranks, unlike = 0, set(), []
+    for i, readings in enumerate(q):
+        fit = lc.identify(layout.robot, build_measurements(layout, readings, noise), METHODS[name])
+        iterations, ranks = max(iterations, fit.history.iterations), ranks | {fit.rank}
+        if fit.history.status == paper.status[i] == DescentStatus.CONVERGED:
+            s, vt = _decompose_rows(PaperRows(layout, q[i : i + 1], sd, noise))
+            change = s * (vt @ (fit.robot.values - values[i])) / sd  # in standard deviations
+            unlike.append(float(np.abs(change).max()))
+    middle, largest = (float(np.median(unlike)), max(unlike)) if unlike else (np.nan, np.nan)
+    counts = len(q), len(unlike), iterations, tuple(sorted(ranks))
+    return FormRow(noise, name, *counts, middle, largest)
+
+
+def compare_covariances(layout: Layout, noise: float) -> float:
+    """Return the largest relative difference of the variances that both forms give any direction,
+    on surfaces reached exactly.
+    """
+    q = layout.solve_readings(layout.robot.parameters.nominal[None], 0.0, 0)
+    free = select_free_parameters(layout.robot)
+    factor = collect_information(free, build_measurements(layout, q[0], noise))[0]
+    s, vt = _decompose_rows(PaperRows(layout, q, free.tolerance[0], noise))
+    ratio = np.linalg.svd(factor[0, : len(free), : len(free)] @ (vt.T / s), compute_uv=False)
+    return float(np.abs(ratio**2 - 1.0).max())
+
+
+def _decompose_rows(problem: PaperRows) -> tuple[FloatArray, FloatArray]:
+    """Return singular values and directions of the paper's rows that count, of the first machine as
+    designed.
+    """
+    A = problem.whiten(np.zeros((1, problem.parameters)), np.zeros(1, dtype=np.int64))[0][0, :, :-1]
+    _, s, vt = np.linalg.svd(A, full_matrices=False)
+    kept = s > 1e-10 * s[0]
+    return s[kept], vt[kept]

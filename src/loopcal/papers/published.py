@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a paper prints and says, read from its data files, and what a run puts beside it.
+
+published.yaml holds the printed numbers as text, digit by digit. The last printed digit is the
+yardstick: a computed number agrees if it is within one unit of it ("0.0352" has the unit 1e-4,
+"-9E-05" the unit 1e-5). text.yaml holds the words:
+
+    about: paragraphs at the beginning of the page
+    claims: see `loopcal.papers.claims`
+    tables:
+      NAME: {title: ..., columns: [...], formats: [...], note: ..., shown: rows on a page}
+    figures:
+      NAME: {title: ..., x: label, y: label, caption: ..., log: y}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loopcal.findings.wording import fill_template
+from loopcal.papers.claims import Claim
+from loopcal.typing import BoolArray, FloatArray
+
+Cell = str | float | int | bool | None
+ROUNDING = 1e-9
+"""Of a unit, by which a difference may exceed it: decimal numbers are no binary ones."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text and numbers.
+
+    Attributes
+    ----------
+    name : of its file. title, note : what it shows. columns : their names, with units.
+    formats : of each column on a page ("" for text). shown : rows on a page, None for all.
+    """
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    formats: tuple[str, ...]
+    note: str = ""
+    shown: int | None = None
+
+    def text(self) -> list[tuple[str, ...]]:
+        """Rows as a page shows them; a dash for what does not exist."""
+
+        def show(cell: Cell, spec: str) -> str:
+            if cell is None or isinstance(cell, bool):
+                return {None: "-", True: "yes", False: "no"}[cell]
+            return cell if isinstance(cell, str) else format(cell, spec)
+
+        assert all(len(row) == len(self.formats) for row in self.rows), self.name
+        return [tuple(map(show, row, self.formats)) for row in self.rows[: self.shown]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return name, title, note, columns and all rows, for JSON."""
+        return {name: getattr(self, name) for name in ("name", "title", "note", "columns", "rows")}
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A block of printed numbers: a row of texts under each label."""
+
+    rows: Mapping[str, tuple[str, ...]]
+
+    @classmethod
+    def parse(cls, lines: Mapping[str, str]) -> Printed:
+        """Read lines of numbers separated by blanks."""
+        return cls({label: tuple(line.split()) for label, line in lines.items()})
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the rows."""
+        return tuple(self.rows)
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """(r, c) the numbers, in the units they are printed in."""
+        return np.array([[float(cell) for cell in row] for row in self.rows.values()])
+
+    @cached_property
+    def unit(self) -> FloatArray:
+        """(r, c) one unit of the last digit."""
+        return np.array([[last_digit(cell) for cell in row] for row in self.rows.values()])
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A published table beside computed numbers.
+
+    Attributes
+    ----------
+    name : of its file. title, note : what is compared. columns : of the printed block, with units.
+    published : as printed. computed : (r, c). yardstick : (r, c) difference within which numbers
+        agree; default: one unit of the last printed digit.
+    """
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    published: Printed
+    computed: FloatArray
+    note: str = ""
+    yardstick: FloatArray | None = None
+
+    @cached_property
+    def difference(self) -> FloatArray:
+        """(r, c) computed - published."""
+        return self.computed - self.published.values
+
+    @cached_property
+    def step(self) -> FloatArray:
+        """(r, c) within which they agree."""
+        return self.published.unit if self.yardstick is None else self.yardstick
+
+    @cached_property
+    def within(self) -> BoolArray:
+        """(r, c) which numbers agree."""
+        return self.agrees_with(self.computed)
+
+    def agrees_with(self, numbers: FloatArray) -> BoolArray:
+        """Return which of other computed numbers (r, c) agree with the published ones."""
+        return np.abs(numbers - self.published.values) <= self.step * (1.0 + ROUNDING)
+
+    @property
+    def count(self) -> int:
+        """Number of numbers."""
+        return self.within.size
+
+    @property
+    def agreeing(self) -> int:
+        """How many agree."""
+        return int(self.within.sum())
+
+    @property
+    def differing(self) -> int:
+        """How many differ."""
+        return self.count - self.agreeing
+
+    @property
+    def largest(self) -> float:
+        """Largest difference, in the units of the table (which must have one)."""
+        return float(np.abs(self.difference).max())
+
+    def table(self) -> Table:
+        """One row for each number."""
+        rows = [
+            (label, column, printed, *(a[i, j].item() for a in
+             (self.computed, self.difference, self.step, self.within)))
+            for i, (label, texts) in enumerate(self.published.rows.items())
+            for j, (column, printed) in enumerate(zip(self.columns, texts, strict=True))
+        ]  # fmt: skip
+        columns = ("row", "column", "published", "computed", "difference",
+                   "unit of the last digit", "within one unit")  # fmt: skip
+        formats = ("", "", "", ".9g", ".2g", ".0e", "")
+        return Table(self.name, self.title, columns, tuple(rows), formats, self.note)
+
+    def side_by_side(self) -> Table:
+        """The layout of the paper, three lines a row: published, computed, and the difference, in
+        bold if it is too large.
+        """
+        lines: list[tuple[Cell, ...]] = []
+        for i, (label, texts) in enumerate(self.published.rows.items()):
+            computed = (_like(*pair) for pair in zip(self.computed[i], texts, strict=True))
+            shown = [f"{d:.1e}" if d else "0" for d in self.difference[i]]
+            marked = (d if ok else f"**{d}**" for d, ok in zip(shown, self.within[i], strict=True))
+            lines += [(label, "published", *texts), ("", "computed", *computed)]
+            lines.append(("", "difference", *marked))
+        columns = ("", "", *self.columns)
+        return Table(self.name, self.title, columns, tuple(lines), ("",) * len(columns), self.note)
+
+
+@dataclass(frozen=True)
+class Series:
+    """A line of a figure: points x, y. A label that begins with _ is not in the legend."""
+
+    label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+
+    @classmethod
+    def of(cls, label: str, x: Sequence[Any] | FloatArray, y: Sequence[Any] | FloatArray) -> Series:
+        """Return a line of numbers."""
+        return cls(label, tuple(map(float, x)), tuple(map(float, y)))
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure as data.
+
+    Attributes
+    ----------
+    name : of its file. title, x_label, y_label, caption : texts, with units on the axes and the
+        number of cases in the caption.
+    series : the lines. levels : horizontal lines by label. log : logarithmic axes: "", "y" or "xy".
+    joined : whether lines join the points of a series; not if the order along x means nothing.
+    """
+
+    name: str
+    title: str
+    x_label: str
+    y_label: str
+    caption: str
+    series: tuple[Series, ...]
+    levels: Mapping[str, float] = field(default_factory=dict)
+    log: str = "y"
+    joined: bool = True
+
+
+@dataclass(frozen=True)
+class _File:
+    """A data file beside a module of a paper (its `__file__`), read when it is needed."""
+
+    module: str
+
+    @cached_property
+    def content(self) -> Mapping[str, Any]:
+        """What the file says."""
+        return _read_content(Path(self.module).with_name(self.file_name))
+
+    @property
+    def file_name(self) -> str:
+        """Name of the file."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Published(_File):
+    """The printed numbers of a paper, as text."""
+
+    file_name = "published.yaml"
+
+    def find(self, *keys: str) -> Any:
+        """Return the text or mapping at these keys."""
+        found = self.content
+        for key in keys:
+            found = found[key]
+        return found
+
+    def number(self, *keys: str) -> float:
+        """Return the number at these keys."""
+        return float(self.find(*keys))
+
+    def table(self, *keys: str) -> Printed:
+        """Return the block of numbers at these keys."""
+        return Printed.parse(self.find(*keys))
+
+
+@dataclass(frozen=True)
+class PaperText(_File):
+    """The words of a paper, filled with numbers."""
+
+    file_name = "text.yaml"
+
+    def about(self, **data: Any) -> tuple[str, ...]:
+        """Return the paragraphs at the beginning of the page."""
+        return tuple(fill_template(text, **data) for text in self.content["about"])
+
+    def claim(self, name: str) -> Claim:
+        """Return a claim."""
+        return Claim(name, self.content["claims"][name])
+
+    def table(
+        self, name: str, rows: Iterable[Sequence[Any]], file_name: str = "",
+        more: Sequence[tuple[str, str]] = (), /, **data: Any,
+    ) -> Table:  # fmt: skip
+        """Return a table of computed rows.
+
+        Parameters
+        ----------
+        name : in text.yaml. rows : of cells. file_name : of the written table; default `name`.
+        more : titles and formats of further columns. data : numbers in title, columns and note.
+        """
+        text = self.content["tables"][name]
+        titles = (*text["columns"], *(title for title, _ in more))
+        formats = (*text["formats"], *(spec for _, spec in more))
+        cells = tuple(
+            tuple(cell.item() if isinstance(cell, np.generic) else cell for cell in row)
+            for row in rows
+        )
+        title, note, *columns = (
+            fill_template(part, **data) for part in (text["title"], text.get("note", ""), *titles)
+        )
+        shown = text.get("shown")
+        return Table(file_name or name, title, tuple(columns), cells, formats, note, shown)
+
+    def compare(
+        self, name: str, published: Printed, computed: FloatArray,
+        yardstick: FloatArray | None = None, /, **data: Any,
+    ) -> Comparison:  # fmt: skip
+        """Return a published table beside computed numbers (r, c); see `Comparison`."""
+        text = self.content["tables"][name]
+        note, columns = fill_template(text.get("note", ""), **data), tuple(text["columns"])
+        return Comparison(name, text["title"], columns, published, computed, note, yardstick)
+
+    def figure(
+        self, name: str, series: Iterable[Series], levels: Mapping[str, float] | None = None,
+        file_name: str = "", log: str | None = None, /, *, joined: bool = True, **data: Any,
+    ) -> Figure:  # fmt: skip
+        """Return a figure.
+
+        Parameters
+        ----------
+        name : in text.yaml. series, levels, log, joined : see `Figure`; default of log: that of
+            text.yaml. file_name : of the written figure; default `name`. data : numbers in texts.
+        """
+        text = self.content["figures"][name]
+        words = (fill_template(text[key], **data) for key in ("title", "x", "y", "caption"))
+        log = text.get("log", "y") if log is None else log
+        return Figure(file_name or name, *words, tuple(series), levels or {}, log, joined)
+
+
+def last_digit(text: str) -> float:
+    """Return one unit of the last digit of a printed number.
+
+    Examples
+    --------
+    >>> last_digit("-0.0352"), last_digit("-9E-05"), last_digit("200"), last_digit("1.20E-09")
+    (0.0001, 1e-05, 1.0, 1e-11)
+    """
+    return float(Decimal(1).scaleb(int(Decimal(text).as_tuple().exponent)))
+
+
+def _like(value: float, printed: str) -> str:
+    """Write a number as the printed one is, with one digit more."""
+    if "E" in printed.upper():
+        return f"{value:.3e}"
+    return f"{value:.{max(1 - round(float(np.log10(last_digit(printed)))), 1)}f}"
+
+
+@cache
+def _read_content(path: Path) -> dict[str, Any]:
+    from loopcal.io.core.yaml_file import read_yaml
+
+    return read_yaml(path, "file of a paper", has_names=False).content
