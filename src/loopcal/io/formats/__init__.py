@@ -6,9 +6,7 @@ A format is a `Format` with `read`, `write` or both, in a module of its own, and
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import delta_gcode, hangprinter, klipper, parameter_table
-from loopcal.io.formats import linuxcnc as hal_file
-from loopcal.io.formats import linuxcnc as ini_file
+from loopcal.io.formats import delta_gcode, hangprinter, klipper, linuxcnc, parameter_table
 from loopcal.io.formats.program_format import Format
 from loopcal.io.formats.urdf import urdf_format
 
@@ -18,8 +16,8 @@ FORMATS: Mapping[str, Format] = {
         klipper.FORMAT,
         delta_gcode.MARLIN,
         delta_gcode.REPRAP,
-        hal_file.FORMAT,
-        ini_file.FORMAT,
+        linuxcnc.FORMAT,
+        linuxcnc.INI_FORMAT,
         urdf_format.FORMAT,
         hangprinter.FORMAT,
         parameter_table.JSON,
