@@ -39,8 +39,10 @@ def bench_import() -> Metric:
 
 def bench_help() -> Metric:
     """Time `loopcal --help`, which loads the commands but nothing heavy."""
-    command = "import sys; from loopcal.cli.entry_point import main; "
+    command = (
+        "import sys; from loopcal.cli.entry_point import main; "
         "sys.argv = ['loopcal', '--help']; main()"
+    )
     return measure_ratio(
         "start.help", functools.partial(run_python, "-c", command), import_numpy, limit=1.5
     )
