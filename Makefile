@@ -18,7 +18,7 @@ NATIVE := tools/native.sh $(shell find native -type f -not -path '*/build/*' -no
   -not -path '*/__pycache__/*' -not -name 'libloopcal.*')
 
 .NOTPARALLEL:
-.PHONY: help demo test quick native evidence docs site fuzz bench bench-update viewer check format constraints clean
+.PHONY: help demo test quick native evidence evidence-quick docs site fuzz bench bench-update viewer check format constraints clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -37,6 +37,9 @@ native: .venv/native.stamp  ## build the native engine into .venv; without a C++
 evidence: .venv/dev.stamp native  ## statistics at full size: docs/evidence/*.json, the tables made from them, their tests
 	$(BIN)/python -m tools.evidence
 	$(BIN)/pytest $(PARALLEL) -m evidence
+
+evidence-quick: .venv/dev.stamp native  ## the same scripts at a reduced size, with limits of its own; no file is written
+	$(BIN)/python -m tools.evidence --quick
 
 docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json and from the code
 	$(BIN)/python -m tools.evidence --tables

@@ -7,6 +7,7 @@ leg length).
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +58,16 @@ def add_outliers(truth: np.ndarray, data: Measurements, seed: int) -> Measuremen
     run = simulate(ROBOT.with_values(other), draw_poses(seed), make_instrument(), seed)
     values[OUTLIERS[2]] = run.observations[0].measured[OUTLIERS[2]]
     return replace(data, observations=(replace(rows, measured=values),))
+
+
+QUICK = {"DRAWS": 5, "CLEAN": 10}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    plain, huber, tukey = tables["robust"]["rows"]
+    assert huber[2] == tukey[2] == 100.0
+    assert max(huber[1], tukey[1]) < plain[1]
 
 
 def collect() -> dict:

@@ -145,6 +145,16 @@ def compare_fifty_points(study: Study) -> list[list[Any]]:
     ]
 
 
+QUICK = {"DRAWS": 8, "STARTS": 1, "FEW_DRAWS": 3, "DRAWS_PER_INTERPRETATION": 4, "MACHINES": 4}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    _, before, after, gain, *_ = tables["exchange"]["rows"][0]
+    assert after < before
+    assert gain > 1.0
+
+
 def collect() -> dict[str, Any]:
     """Collect the 3 x 4 cells, five starts, one plane and ten, weights, interpretations of
     figure 5, and fifty points.

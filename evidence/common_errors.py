@@ -8,6 +8,7 @@ displacement of all targets of a pose or of all poses of a session.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -76,6 +77,16 @@ def measure(case: Case, seed: int) -> Measurements:
     measured[:, first:] += np.tile(shift, (measured.shape[1] - first) // 3)
     labels = np.array([f"s{i}" for i in session]) if case.sessions else rows.session
     return replace(data, observations=(replace(rows, measured=measured, session=labels),))
+
+
+QUICK = {"CLEAN": 3, "COMMON": 3}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    reported = [row[-1] for row in tables["ratios"]["rows"]]
+    assert max(reported[:5]) == 0.0
+    assert reported[6] == 100.0, "eight targets that share an error"
 
 
 def collect() -> dict:

@@ -298,6 +298,19 @@ def count_verdicts_on_random_data() -> list[list]:
     return rows
 
 
+QUICK = {
+    "ERROR_FACTORS": (1.0,),
+    "ROBOTS_WITH_EVERY_KIND": ("3-prs",),
+    "ROBOTS_WITH_SLIPS": ("3-prs",),
+}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert all(row[5] == 0 for row in tables["false_alarms"]["rows"])
+    assert all(row[2] == row[1] for row in tables["random"]["rows"])
+
+
 def collect() -> dict:
     """Collect false alarms, detections and verdicts on random numbers."""
     alarms = {

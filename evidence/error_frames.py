@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -348,12 +349,24 @@ def report_medians(reports: list[Report]) -> dict[str, float]:
     return medians
 
 
+QUICK = {"MACHINES": 2, "STACKED": 20}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    for setup, _, *shares in tables["coverage"]["rows"]:
+        assert min(shares) > 80.0, setup
+
+
 def collect() -> dict:
     """Collect every set-up at full size."""
     figures, held_out, coverage = [], [], []
     for setup in list_setups():
         study = prepare_study(setup)
-        true, reported = measure_true_figures(study), report_medians(report_machines(study))
+        true, reported = (
+            measure_true_figures(study, STACKED),
+            report_medians(report_machines(study, MACHINES)),
+        )
         for name, words in FIGURES.items():
             numbers = (reported[name], true.rms[name], true.median[name])
             figures.append([setup.name, words, *(1e6 * x for x in numbers)])

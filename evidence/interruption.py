@@ -397,6 +397,14 @@ def list_failures(outcomes: dict[str, dict[str, int]]) -> list[str]:
     ]
 
 
+QUICK = {"MOMENTS": 2, "TIMES": 1, "CASES": {name: CASES[name] for name in ("calibrate", "new")}}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert all(row[-1] == 0 for row in tables["outcomes"]["rows"])
+
+
 def collect() -> dict[str, Any]:
     """Return the counts of all cases."""
     kinds = [KILL, INTERRUPT, f"{KILL}, slow", f"{INTERRUPT}, slow"]

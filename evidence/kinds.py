@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -373,7 +374,7 @@ def _recovery_rows() -> list[list[object]]:
     """Return a row for each setting: rank and largest error on each robot, none if refused."""
     rows: dict[int, list[object]] = {}
     each = len(list_cases(ROBOTS[:1]))
-    for i, case in enumerate(list_cases()):
+    for i, case in enumerate(list_cases(ROBOTS)):
         result = recover_machine(case)
         row = rows.setdefault(i % each, [case.setting])
         worst = (
@@ -388,12 +389,12 @@ def _recovery_rows() -> list[list[object]]:
 def _coverage_rows() -> list[list[object]]:
     """Return one row for each kind and robot, and one that must fail."""
     rows: list[list[object]] = []
-    loud = next(case for case in list_cases() if case.kind.name == "position")
+    loud = next(case for case in list_cases(ROBOTS) if case.kind.name == "position")
     for case, noise in [
-        *((case, Gaussian) for case in select_most_unknown()),
+        *((case, Gaussian) for case in select_most_unknown(ROBOTS)),
         (loud, DoubledNoise),
     ]:
-        result = compute_coverage(case, noise=noise)
+        result = compute_coverage(case, FITS, noise)
         shares = [
             part.mean() if part.size else None
             for part in (result.directions, result.parameters, result.setup)
@@ -408,6 +409,16 @@ def _coverage_rows() -> list[list[object]]:
             ]
         )
     return rows
+
+
+QUICK = {"ROBOTS": ("linear-delta",), "FITS": 8}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert all(row[2] is None or row[2] < 1e-6 for row in tables["recovery"]["rows"])
+    *true, loud = tables["coverage"]["rows"]
+    assert loud[3] < 90.0 < min(row[3] for row in true if row[3] is not None)
 
 
 def collect() -> dict:

@@ -5,6 +5,8 @@ robot, noise and method.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -95,12 +97,22 @@ def choose_values(robot: Mechanism, data: Measurements) -> Array:
     return identify(choice.robot, data).robot.values if choice.chosen.parameters else robot.values
 
 
+QUICK = {"MACHINES": 4, "MODEL_CHOICES": 1, "ROBOTS": ("3-prs", "linear-delta")}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    default = 3 + list(METHODS).index("default")
+    for row in tables["median_error_um"]["rows"]:
+        assert row[default] < 1.1 * row[2], row[:2]
+
+
 def collect() -> dict:
     """Collect every cell: medians, and the number of machines that the default made worse."""
     rows = []
     for name in ROBOTS:
         for title, noise in NOISE.items():
-            result = evaluate_cell(name, noise)
+            result = evaluate_cell(name, noise, MACHINES, MODEL_CHOICES)
             worse = int((result["default"] > result["before"]).sum())
             chosen = result.pop("chosen model")
             ratio = float(np.median(chosen / result["default"][: len(chosen)]))

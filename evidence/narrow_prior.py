@@ -6,6 +6,7 @@ often the conflict is reported, what the default fit loses by it, and what its i
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def _collect_deviations() -> dict:
         if name != "hexapod-42":
             cases += [(True, size) for size in TOGETHER]
         for is_shared, size in cases:
-            r = evaluate_deviation(name, size, is_shared)
+            r = evaluate_deviation(name, size, is_shared, MACHINES)
             what = "all lengths of the limbs" if is_shared else "one parameter"
             errors_um = [1e6 * r[key] for key in METHODS]
             covered = [100 * r[f"covered, {title}"] for title in ("MAP", "default")]
@@ -140,12 +141,22 @@ def _collect_deviations() -> dict:
     return {"columns": columns, "formats": formats, "rows": rows}
 
 
+QUICK = {"MACHINES": 4, "FACTORS": (1.0, 10.0), "FAR": ("five-bar",)}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    for robot, factor, *_, ratio, named in tables["narrow"]["rows"]:
+        assert ratio < 1.2, (robot, factor)
+        assert factor == 1.0 or named == 100.0, robot
+
+
 def collect() -> dict:
     """Collect every robot and factor."""
     rows = []
     for name in ("hexapod-42", "3-prs"):
         for factor in FACTORS:
-            r = evaluate_case(name, factor)
+            r = evaluate_case(name, factor, MACHINES)
             errors_um = [1e6 * r[key] for key in METHODS]
             rows.append(
                 [

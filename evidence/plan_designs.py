@@ -7,6 +7,8 @@ Robots and measurements are those of `evidence.planned`.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from evidence.planned import CASES, Case
@@ -68,6 +70,15 @@ def evaluate_design(case: Case, criterion_name: str) -> list[object]:
         certified.efficiency,
         1.0 - certified.efficiency,
     ]
+
+
+QUICK = {"DESIGNS": DESIGNS[2:3], "CANDIDATES": 200, "STARTS": 2, "DRAWS": 20}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    for row in tables["designs"]["rows"]:
+        assert row[7] >= row[6] - 1e-6 > row[4], row
 
 
 def collect() -> dict:

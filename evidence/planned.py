@@ -11,6 +11,7 @@ draws its own random poses; the first n of them are its set of n.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -295,7 +296,7 @@ def compare_noise(case: Case) -> list:
     """
     row: list[object] = [case.robot, case.measured, GLANCE]
     for noise_factor in NOISE_FACTORS:
-        study = prepare_study(case, machines=1, noise_factor=noise_factor)
+        study = prepare_study(case, SEEDS, 1, RANDOM[-1], CANDIDATES, noise_factor)
         plan = plan_poses(study.problem.with_options(n_poses=GLANCE)).errors.after
         curve = [float(np.median(predict_random(study, n))) for n in RANDOM]
         row.append(
@@ -316,9 +317,28 @@ def _rms(errors: Array) -> Array:
     return np.sqrt((errors**2).mean(axis=-1))
 
 
+QUICK = {
+    "SEEDS": 4,
+    "MACHINES": 2,
+    "CANDIDATES": 200,
+    "CASES": CASES[-1:],
+    "PLANNED": (16,),
+    "RANDOM": (16, 40, 110),
+    "NOISE_FACTORS": (1.0,),
+}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    for *_, position, other, _, _, better in tables["accuracy"]["rows"]:
+        assert position < other
+        assert better >= SEEDS / 2
+
+
 def collect() -> dict:
     """Compute every case at full size."""
-    tables = [compare_case(prepare_study(case)) for case in CASES]
+    studies = (prepare_study(c, SEEDS, MACHINES, RANDOM[-1], CANDIDATES) for c in CASES)
+    tables = [compare_case(study, PLANNED, RANDOM) for study in studies]
     accuracy, saving = ([row for table in tables for row in table[i]] for i in (0, 1))
     errors = [
         f"{what}: {how}"

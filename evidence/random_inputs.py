@@ -19,6 +19,14 @@ LONG_RUN = Path(__file__).with_name("random_inputs_longest.json")
 """Counts of the longest run of `make fuzz`, with the seeds."""
 
 
+QUICK = {"INPUTS": 60}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert all(row[1] == 0 for row in tables["counts"]["rows"][4:-1])
+
+
 def collect() -> dict[str, Any]:
     """Return the counts of this run, and the tables of these and of the longest one."""
     summary = Summary()

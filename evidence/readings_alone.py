@@ -9,6 +9,8 @@ be that of its degrees of freedom.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -51,6 +53,16 @@ def repeat_fits(repeats: int, poses: int = POSES) -> tuple[FloatArray, FloatArra
     assert all(fit.converged for fit in fits)
     errors = np.array([whiten_errors(fit, trials.truth[0]) for fit in fits])
     return errors, np.array([fit.chi_square for fit in fits]), int(fits[0].residual_test.dof)
+
+
+QUICK = {"REPEATS": 20}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    one, _, squares, band, _ = tables["spread"]["rows"]
+    assert 0.5 < one[1] < one[2] < 1.6
+    assert band[1] < squares[1] <= squares[2] < band[2]
 
 
 def collect() -> dict:

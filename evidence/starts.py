@@ -9,6 +9,7 @@ rows at least as well as the truth does at the poses of the nominal machine.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,6 +184,14 @@ def compute_start(name: str, seed: int) -> StartResult | None:
         turn, right = (geometry.exp_so3(values[first : first + 3]) for values in (result, truth))
         rotation_error = float(np.linalg.norm(geometry.log_so3(turn @ right.T)))
     return StartResult(left / best, rotation_error)
+
+
+QUICK = {"DRAWS": 15}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert all(row[2] == row[1] > 0 for row in tables["found"]["rows"])
 
 
 def collect() -> dict:

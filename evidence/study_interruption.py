@@ -196,6 +196,16 @@ def _wait_for_blocks(driver: subprocess.Popen[str], folder: Path, count: int) ->
     return driver.poll() is None
 
 
+QUICK = {"REPLICATES": 500, "KILLS": 2}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    row = dict(zip(tables["outcome"]["columns"], tables["outcome"]["rows"][0], strict=True))
+    assert row["lost"] == row["doubled"] == row["different"] == 0
+    assert row["driver kills"] + row["worker kills"] == KILLS
+
+
 def collect() -> dict[str, Any]:
     """Return the counts of the full-size study."""
     disturbance = Disturbance(REPLICATES, BLOCK, KILLS)

@@ -11,8 +11,17 @@ from typing import Any
 from evidence.questions.example_studies import Shown, collect_study
 
 SHOWN = Shown(("position", "covered_position"), ("position", "covered_position"), "method")
+IS_QUICK = False
+
+
+QUICK = {"IS_QUICK": True}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert tables["scores"]["rows"]
 
 
 def collect() -> dict[str, Any]:
     """Return answers, medians and figures of the study."""
-    return collect_study("methods", SHOWN)
+    return collect_study("methods", SHOWN, IS_QUICK)

@@ -134,6 +134,14 @@ def calculate_load(seconds: float, block: int, constants: Constants) -> dict[str
     }
 
 
+QUICK = {"NAMES": ("poses", "instruments"), "BLOCKS": (50,), "TIMED": 20, "REPEATS": 1, "CELLS": 1}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert all(min(row[2:]) > 0 for row in tables["trials"]["rows"])
+
+
 def collect() -> dict[str, Any]:
     """Measure the constants, and calculate the loads."""
     import distributed

@@ -13,6 +13,14 @@ from loopcal.papers.tsvd_2016.steps import draw_machines
 DRAWS, SEED = 100, 0
 
 
+QUICK = {"DRAWS": 3}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    assert len(tables["medians"]["rows"]) > 1
+
+
 def collect() -> dict[str, Any]:
     """Collect medians with bootstrap intervals, ratios, and curves over lambda and k."""
     return to_document(draw_machines("3-PRS", SEED, DRAWS), SEED)

@@ -2,7 +2,8 @@
 """Run evidence/*.py, write docs/evidence/*.json and figures, and make the tables of the
 documentation from those files.
 
-Run as `python -m tools.evidence`. `--tables` makes the tables only; names choose scripts.
+Run as `python -m tools.evidence`. `--tables` makes the tables only, `--quick` runs the scripts at
+their reduced size, checks what holds there and leaves no file; names choose scripts.
 evidence/README.md says what a script returns.
 """
 
@@ -16,6 +17,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from tools.machine import describe_machine
@@ -29,15 +31,22 @@ class EvidenceError(Exception):
     """A page that asks for evidence which is not there."""
 
 
-def collect(script: Path) -> dict[str, Any]:
-    """Run the `collect` function of one evidence script."""
+def collect(script: Path, is_quick: bool = False) -> dict[str, Any]:
+    """Run the `collect` function of one evidence script, or `collect` and `check` at its reduced
+    size.
+    """
     spec = importlib.util.spec_from_file_location(f"evidence_{script.stem}", script)
     if spec is None or spec.loader is None:
         raise ImportError(f"{script} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses look for the module that defines them
     spec.loader.exec_module(module)
-    return module.collect()
+    if not is_quick:
+        return module.collect()
+    vars(module).update(module.QUICK)
+    document = module.collect()
+    module.check(document["tables"])
+    return document
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
@@ -70,24 +79,41 @@ def find_figures(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix in (".png", ".svg"))
 
 
-def run_script(script: Path) -> None:
-    """Collect one script's evidence, and write its JSON file and its figures."""
+def run_script(script: Path, folder: Path, is_quick: bool) -> None:
+    """Collect one script's evidence, and write its JSON file and its figures into a folder."""
     begin = time.perf_counter()
-    document = collect(script)
+    document = collect(script, is_quick)
     seconds = round(time.perf_counter() - begin, 1)
     provenance = {
         "script": f"evidence/{script.name}",
         "seconds": seconds,
         "machine": describe_machine(),
     }
-    folder = ROOT / "docs" / "evidence"
     if figures := write_figures(folder, script.stem, document.pop("figures", {})):
         document["figures"] = figures
     write_json(folder / f"{script.stem}.json", {"made": provenance, **document})
     print(f"evidence: {script.stem} took {seconds} s", flush=True)
 
 
-def run_all(scripts: list[Path]) -> None:
+def run_quickly(scripts: list[Path]) -> None:
+    """Run scripts at their reduced size; their tables are those of the full size, with other rows.
+
+    EvidenceError where a table is missing or new. AssertionError where a script's `check` fails.
+    """
+    with TemporaryDirectory() as place:
+        run_all(scripts, Path(place), is_quick=True)
+        for script in scripts:
+            quick, full = (
+                json.loads((folder / f"{script.stem}.json").read_text(encoding="utf-8"))["tables"]
+                for folder in (Path(place), ROOT / "docs" / "evidence")
+            )
+            if quick.keys() != full.keys():
+                raise EvidenceError(f"{script.stem} makes the tables {', '.join(quick)}")
+            for table in quick.values():
+                render_table(table)
+
+
+def run_all(scripts: list[Path], folder: Path, is_quick: bool) -> None:
     """Run scripts side by side, one on each core; those that took longest the last time begin
     first.
 
@@ -98,7 +124,9 @@ def run_all(scripts: list[Path]) -> None:
         os.environ.setdefault(name, "1")
     ordered = sorted(scripts, key=read_seconds, reverse=True)
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
-        for done in as_completed([pool.submit(run_script, script) for script in ordered]):
+        for done in as_completed(
+            [pool.submit(run_script, script, folder, is_quick) for script in ordered]
+        ):
             done.result()
 
 
@@ -176,17 +204,21 @@ def main(arguments: list[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", help="evidence/NAME.py scripts to run; all without")
-    parser.add_argument("--tables", action="store_true", help="run no script")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--tables", action="store_true", help="run no script")
+    size.add_argument("--quick", action="store_true", help="run scripts at their reduced size")
     options = parser.parse_args(arguments)
 
     scripts = [ROOT / "evidence" / f"{name}.py" for name in options.names] or sorted(
         (ROOT / "evidence").glob("*.py")
     )
     start = time.perf_counter()
-    if not options.tables:
-        run_all(scripts)
+    if not options.tables and not options.quick:
+        run_all(scripts, ROOT / "docs" / "evidence", is_quick=False)
     try:
-        outdated = find_outdated(ROOT)
+        if options.quick:
+            run_quickly(scripts)
+        outdated = {} if options.quick else find_outdated(ROOT)
     except EvidenceError as error:
         print(f"evidence: {error}", file=sys.stderr)
         return 1

@@ -44,10 +44,12 @@ class Shown:
         return all(cell.levels[name] == level for name, level in (self.levels or {}).items())
 
 
-def collect_study(name: str, shown: Shown) -> dict[str, Any]:
-    """Run examples/studies/NAME.yaml in one process; return the content of its evidence file."""
+def collect_study(name: str, shown: Shown, is_quick: bool) -> dict[str, Any]:
+    """Run examples/studies/NAME.yaml or its quick tier in one process; return the content of its
+    evidence file.
+    """
     with TemporaryDirectory() as place:
-        result = loopcal.study(STUDIES / f"{name}.yaml", Path(place) / "study")
+        result = loopcal.study(STUDIES / f"{name}.yaml", Path(place) / "study", quick=is_quick)
         return describe_results(result, shown)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables in the documentation are generated from docs/evidence/*.json and agree with it."""
 
+import ast
 import json
 from pathlib import Path
 
@@ -78,6 +79,52 @@ def test_figures_of_a_script_are_written_under_its_name_and_old_ones_removed(tmp
         "poses-a.svg",
     ]
     assert (tmp_path / "poses-a.svg").read_bytes() == b"new"
+
+
+SCRIPT = """
+DRAWS, SIZES = 1000, (1, 2, 3)
+QUICK = {"DRAWS": 3}
+
+
+def collect():
+    table = {"columns": ["draws", "sizes"], "rows": [[DRAWS, len(SIZES)]]}
+    return {"tables": {"counts": table}}
+
+
+def check(tables):
+    assert tables["counts"]["rows"][0] == [DRAWS, 2], "sizes"
+"""
+
+
+def test_a_reduced_size_replaces_constants_and_is_checked(tmp_path: Path) -> None:
+    script = tmp_path / "counts.py"
+    script.write_text(SCRIPT)
+    assert evidence.collect(script)["tables"]["counts"]["rows"] == [[1000, 3]]
+    with pytest.raises(AssertionError, match="sizes"):
+        evidence.collect(script, is_quick=True)
+    script.write_text(SCRIPT.replace("2, 3)", "2)"))
+    assert evidence.collect(script, is_quick=True)["tables"]["counts"]["rows"] == [[3, 2]]
+
+
+def test_every_script_has_a_reduced_size_of_names_that_it_has(root: Path) -> None:
+    for script in sorted((root / "evidence").glob("*.py")):
+        body = ast.parse(script.read_text("utf-8")).body
+        assigned = {
+            name.id
+            for line in body
+            if isinstance(line, ast.Assign | ast.AnnAssign)
+            for name in ast.walk(line)
+            if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
+        }
+        functions = {line.name for line in body if isinstance(line, ast.FunctionDef)}
+        (quick,) = (
+            line.value
+            for line in body
+            if isinstance(line, ast.Assign) and ast.unparse(line.targets[0]) == "QUICK"
+        )
+        assert isinstance(quick, ast.Dict)
+        assert {"collect", "check"} <= functions, script.name
+        assert {ast.literal_eval(key) for key in quick.keys if key} <= assigned, script.name
 
 
 def test_every_figure_belongs_to_evidence_and_is_shown_on_a_page(root: Path) -> None:
