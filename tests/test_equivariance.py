@@ -5,7 +5,7 @@ instrument, the units of the file, and the order of poses, limbs and actuators. 
 A new file in src/loopcal/robots is included automatically.
 """
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from loopcal import geometry
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
-from loopcal.io.core.records import _to_si, read_units
-from loopcal.io.core.yaml_file import read_yaml
-from loopcal.io.robot.robot_file import HEADER, list_shipped_robots, load_robot
+from loopcal.io.core.records import get_field_types
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
@@ -91,14 +90,11 @@ def test_units_of_the_file_do_not_matter(name: str, tmp_path: Path) -> None:
     from ruamel.yaml import YAML
 
     robot, q = load_cached_robot(name), draw_readings(name)
-    file = read_yaml(list_shipped_robots()[name], "robot file")
-    content = {key: value for key, value in file.content.items() if key not in HEADER}
-    family = FAMILIES[file.content["family"]]
-    si = _to_si(family, content, file, read_units(file), ())
-    head = {"format": 1, "units": {"length": "m", "angle": "rad"}, "family": family.family}
+    record = robot.record.record  # type: ignore[union-attr]
+    head = {"format": 1, "units": {"length": "m", "angle": "rad"}, "family": record.family}
     path = tmp_path / "robot.yaml"
     with path.open("w") as stream:
-        YAML().dump(head | _restore_keys(si), stream)
+        YAML().dump(head | _to_content(record), stream)
     other = load_robot(path)
     assert other.parameters.names == robot.parameters.names
     assert_allclose(other.values, robot.values, rtol=1e-15, atol=0)
@@ -107,11 +103,15 @@ def test_units_of_the_file_do_not_matter(name: str, tmp_path: Path) -> None:
     assert_allclose(inverse(other, forward(robot, q).T).q, q, rtol=0, atol=1e-10)
 
 
-def _restore_keys(node: Any) -> Any:
-    """Return a record with the keys of a file: `from` for `from_`."""
-    if isinstance(node, dict):
-        return {key.removesuffix("_"): _restore_keys(value) for key, value in node.items()}
-    return [_restore_keys(value) for value in node] if isinstance(node, list) else node
+def _to_content(value: Any) -> Any:
+    """Return a record as the content of a file in SI units."""
+    if is_dataclass(value):
+        keys = get_field_types(FAMILIES.get(getattr(value, "family", ""), type(value)))
+        stated = {f.name.removesuffix("_"): getattr(value, f.name) for f in fields(value)}
+        return {key: _to_content(stated[key]) for key in keys if stated[key] is not None}
+    if isinstance(value, dict):
+        return {key: _to_content(item) for key, item in value.items()}
+    return [_to_content(item) for item in value] if isinstance(value, tuple) else value
 
 
 @cache

@@ -50,7 +50,7 @@ def test_python_m_loopcal_runs_the_command_line() -> None:
 
 
 def test_large_packages_are_not_imported_before_a_command_runs() -> None:
-    code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'pydantic', 'ruamel', 'rich'} & set(sys.modules))"  # noqa: E501
+    code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'msgspec', 'ruamel', 'rich'} & set(sys.modules))"  # noqa: E501
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
 
@@ -62,7 +62,7 @@ UNUSED = {
         "rich",
         "pandas",
         "xarray",
-        "pydantic",
+        "msgspec",
         "unittest",
         "numpy.f2py",
         "numpy.ma",

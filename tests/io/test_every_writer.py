@@ -16,7 +16,7 @@ LIBRARY |= {"mkstemp", "fdopen", "mkdir", "makedirs", "hardlink_to", "copy2", "N
 """Functions of Python and libraries that can write."""
 
 USES_LIBRARY = {
-    "cli/defect_report.py": "the report of a defect is for people, and must not fail",
+    "cli/entry_point.py": "the report of a defect is for people, and must not fail",
     "cli/terminal.py": "writes to the null device",
     "io/example_folders.py": "writes the files of a new folder",
     "io/core/outputs.py": "makes the folder for a folder",
@@ -25,8 +25,8 @@ USES_LIBRARY = {
     "io/core/text_file.py": "writes files",
     "studies/results/export.py": "writes a long table row by row",
     "studies/files/study_folder.py": "writes the files of a new folder",
-    "studies/results/summary_view.py": "makes a table in memory",
-    "cli/commands/regularize_command.py": "makes a table in memory",
+    "studies/results/questions.py": "makes a table in memory",
+    "cli/commands/calibration_commands.py": "makes a table in memory",
     "io/runs/run_folder.py": "makes arrays.npz in memory",
     "report/pictures.py": "draws into memory",
 }

@@ -1,17 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML files and records: values in SI units, and errors in one sentence with their line."""
 
+import copy
 import math
+import subprocess
+import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.core.records import read_record, read_units
 from loopcal.io.core.yaml_file import parse_yaml, read_yaml
+from loopcal.io.robot.robot_file import HEADER, list_shipped_robots
+from loopcal.mechanism.families import FAMILIES
 from loopcal.units import Angle, Length, Ratio
 
+SHIPPED = {n: read_yaml(path, "robot file") for n, path in list_shipped_robots().items()}
 Vector = tuple[Length, Length, Length]
 
 
@@ -154,3 +162,125 @@ def test_folder_and_missing_file_are_refused(tmp_path) -> None:
         read_yaml(tmp_path, "robot file")
     with pytest.raises(FileError, match="this robot file does not exist"):
         read_yaml(tmp_path / "absent.yaml", "robot file")
+
+
+WRONG = (
+    *(None, True, False, 0, -3, 1.5, 2.0, "", "1", "x", "2 mm", "ball"),
+    *([], [1.0], [[]], [1.0, 2.0, 3.0], {}, {"x": 1.0}, {"": []}),
+)
+"""Values that take the place of others, of every form that a file can have."""
+
+
+def list_places(node: Any) -> list[tuple[Any, Any]]:
+    """Return every container within a node, with each of its keys."""
+    keys = node if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
+    own = [(node, key) for key in keys]
+    return own + [place for key in keys for place in list_places(node[key])]
+
+
+def change(node: Any, rng: np.random.Generator) -> Any:
+    """Return a copy with one value replaced, removed, repeated or added."""
+    changed = copy.deepcopy(node)
+    places = list_places(changed)
+    container, key = places[rng.integers(len(places))]
+    match rng.integers(4):
+        case 0:
+            del container[key]
+        case 1 if isinstance(container, list):
+            container.insert(key, copy.deepcopy(container[key]))
+        case 1:
+            container["further"] = 1.0
+        case _:
+            container[key] = copy.deepcopy(WRONG[rng.integers(len(WRONG))])
+    return changed
+
+
+@pytest.mark.parametrize("name", [n for n, r in SHIPPED.items() if "family" in r.content])
+def test_changed_robot_is_read_or_refused_in_one_sentence(name: str) -> None:
+    file, rng, refused = SHIPPED[name], np.random.default_rng(0), 0
+    content = {key: value for key, value in file.content.items() if key not in HEADER}
+    family = FAMILIES[file.content["family"]]
+    for _ in range(60):
+        try:
+            record = read_record(file, change(content, rng), family, read_units(file))
+        except FileError as error:
+            refused += "\n" not in str(error)
+        else:
+            assert isinstance(record, family)
+    assert refused > 5
+
+
+@dataclass(frozen=True)
+class Part:
+    size: float
+    kind: Literal["part"] = "part"
+
+    def __post_init__(self) -> None:
+        if self.size < 0.0:
+            raise ValueError("size is negative; it must be above 0")
+
+
+@dataclass(frozen=True)
+class Box:
+    size: float
+    lid: bool
+    kind: Literal["box"] = "box"
+
+
+@dataclass(frozen=True)
+class Whole:
+    number: int
+    text: str | None
+    first: Part | Box | tuple[float, float]
+    others: dict[str, Part]
+    rest: Any = None
+    flag: bool = False
+    level: Literal[1, "high"] = 1
+
+
+FITS: dict[str, Any] = {"number": 1, "text": None, "first": {"size": 1}, "others": {}}
+ACCEPTED: dict[str, tuple[Any, ...]] = {
+    "number": (0, 1, -3),
+    "text": (None, "", "1", "x", "2 mm", "ball", "high"),
+    "first": ({"size": 1.0}, {"size": 1, "lid": True}, [1, 2.0]),
+    "others": ({}, {"a": {"size": 1.0}}),
+    "flag": (True, False),
+    "level": (1, "high"),
+}
+
+
+@pytest.mark.parametrize("key", ACCEPTED)
+def test_only_values_of_the_annotated_form_are_read(key: str) -> None:
+    file = parse_yaml("format: 1\n", "whole.yaml", "file")
+    values = [*WRONG, *(v for allowed in ACCEPTED.values() for v in allowed), {"size": -1.0}]
+    for value in values:
+        is_allowed = any(same(value, allowed) for allowed in ACCEPTED[key])
+        with nullcontext() if is_allowed else pytest.raises(FileError, match=repr(key)[:-1]):
+            read_record(file, FITS | {key: value}, Whole, None)
+
+
+def same(first: Any, second: Any) -> bool:
+    return type(first) is type(second) and first == second
+
+
+def test_records_of_a_union_are_told_apart_by_their_keys_and_constants() -> None:
+    file = parse_yaml("format: 1\n", "whole.yaml", "file")
+    for node, expected in (
+        ({"size": 1, "kind": "part"}, Part(1.0)),
+        ({"size": 1, "lid": False}, Box(1.0, lid=False)),
+        ([1, 2], (1.0, 2.0)),
+    ):
+        assert read_record(file, FITS | {"first": node}, Whole, None).first == expected
+    with pytest.raises(FileError, match=r"'first.kind' is 'bax' .did you mean 'box'"):
+        read_record(file, FITS | {"first": {"size": 1, "kind": "bax"}}, Whole, None)
+    with pytest.raises(FileError, match=r"'others.a.size' is negative; it must be above 0"):
+        read_record(file, FITS | {"others": {"a": {"size": -1}}}, Whole, None)
+
+
+def test_a_robot_is_read_without_importing_msgspec() -> None:
+    code = (
+        "import sys; from loopcal.io.robot.robot_file import load_robot; load_robot('hexapod-42'); "
+        "print('msgspec' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -35,7 +35,7 @@ from loopcal.studies.specification.levels import (
     PosesLevel,
     Robot,
 )
-from loopcal.studies.specification.study import Study, dump_json, list_conflicts
+from loopcal.studies.specification.study import Study, list_conflicts
 from tests.findings.expectations import expect_refusal
 
 HEADER = StoreHeader("{}", ("outcome", "position", "rank"), {"numerics": "1"})
@@ -369,7 +369,7 @@ STUDY = Study(
     ],
 )
 def test_more_replicates_and_further_levels_keep_finished_blocks(changed) -> None:
-    assert list_conflicts(dump_json(STUDY), dump_json(changed)) == ()
+    assert list_conflicts(STUDY.to_json(), changed.to_json()) == ()
 
 
 @pytest.mark.parametrize(
@@ -395,7 +395,7 @@ def test_more_replicates_and_further_levels_keep_finished_blocks(changed) -> Non
     ],
 )
 def test_other_changes_are_named(changed, sentence) -> None:
-    assert list_conflicts(dump_json(STUDY), dump_json(changed)) == (sentence,)
+    assert list_conflicts(STUDY.to_json(), changed.to_json()) == (sentence,)
 
 
 def test_other_names_of_files_with_the_same_content_keep_finished_blocks() -> None:
@@ -408,4 +408,4 @@ def test_other_names_of_files_with_the_same_content_keep_finished_blocks() -> No
         for name in ("old", "new")
     )
     assert old.compute_key(old.cells[0], 0) == new.compute_key(new.cells[0], 0)
-    assert list_conflicts(dump_json(old), dump_json(new)) == ()
+    assert list_conflicts(old.to_json(), new.to_json()) == ()

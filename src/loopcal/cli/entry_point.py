@@ -137,11 +137,6 @@ MODULES = {
 """Modules of `loopcal.cli.commands`, and the commands in each; imported when they run."""
 
 
-NO_PLUGINS = ("PYDANTIC_DISABLE_PLUGINS", "__all__")
-"""The records of loopcal need no plugins of pydantic, which are searched in all installed packages.
-"""
-
-
 class SectionedGroup(CommandGroup):
     """A group whose help lists its commands below headings, in the order of the work."""
 
@@ -232,7 +227,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments : words after `loopcal`; default: those of the process.
     """
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    os.environ.setdefault(*NO_PLUGINS)
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_streams()
     command = None
@@ -316,7 +310,7 @@ def _refuse(sentence: str, hint: str | None = None) -> int:
 
 # --- What the command line does with an exception that is no mistake of the user: a defect report.
 
-PACKAGES = ("loopcal", "numpy", "scipy", "ruamel.yaml", "pydantic", "click")
+PACKAGES = ("loopcal", "numpy", "scipy", "ruamel.yaml", "msgspec", "click")
 """Packages whose versions a report states."""
 
 PREFIX, SUFFIX = "loopcal-defect-", ".txt"

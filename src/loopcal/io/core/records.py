@@ -4,24 +4,24 @@
 The annotations of the fields say everything. Numbers annotated `Length`, `Angle` or `Ratio` are
 converted to SI: by the units of the file, or, where the file has none, from texts such as `5 um`.
 Keys that are not fields are refused, except in records whose class says `OTHER_KEYS = True`; a
-field `from_` has the key `from`. The rest is checked strictly (text is not a number). pydantic is
-imported only where something does not fit: its first complaint becomes one sentence with a line.
+field `from_` has the key `from`. The rest is checked strictly (text is not a number). The first
+value that does not fit is answered by one sentence with its line.
+
+The reader is our own, because general ones name neither the key of a mapping nor the line, do not
+choose between records by their keys, and take longer to import than to read a robot.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import types
 import typing
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from loopcal.errors import FileError, UnitError, suggest_names
-from loopcal.io.core.record_building import NoFitError, make_builder
 from loopcal.io.core.yaml_file import (
     Location,
     YamlFile,
@@ -60,18 +60,13 @@ def read_record(
     ------
     FileError : the first value that does not fit, at its line.
     """
-    scaled = _to_si(record, dict(content), file, units, location)
-    with suppress(NoFitError):
-        return make_builder(record)(scaled)
-    from pydantic import ValidationError
-
     try:
-        return _make_adapter(record).validate_json(json.dumps(scaled), strict=True)
-    except ValidationError as error:
-        (fact, act), place = _translate(error, file, content, location)
+        value: T = _RecordReader(file, units).read(record, dict(content), location)
+    except _MisfitError as error:
         if word is not None:
-            raise word(file.path, fact) from None
-        raise file.error(f"{fact}{act}", place) from None
+            raise word(file.path, error.fact) from None
+        raise file.error(f"{error.fact}{error.action}", error.location) from None
+    return value
 
 
 def read_units(file: YamlFile) -> dict[Dimension, Unit]:
@@ -110,71 +105,99 @@ def get_field_types(record: type) -> Mapping[str, Any]:
     return {_key(f.name): hints[f.name] for f in dataclasses.fields(record) if f.init}
 
 
-@cache
-def _make_adapter(record: type) -> Any:
-    """Return pydantic's reader of a record; cached, because making it takes as long as reading."""
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(record)
-
-
 def _key(name: str) -> str:
     """Return the key of a field: `from` for the field `from_`."""
     return name.removesuffix("_")
 
 
-def _to_si(
-    annotation: Any, node: Any, file: YamlFile, units: Units | None, location: Location
-) -> Any:
-    """Return `node` with numbers in SI and field names as keys; refuse unknown keys.
+class _MisfitError(Exception):
+    """A value does not fit its annotation: what is wrong, `; ` what to do, and where."""
 
-    Values that do not fit the annotation stay as they are; pydantic names them.
-    """
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        for mark in arguments[1:]:
-            if isinstance(mark, Dimension):
-                return _scale(node, mark, file, units, location)
-        return _to_si(arguments[0], node, file, units, location)
-    if origin in (Union, types.UnionType):
-        branch = max(arguments, key=lambda branch: _fit(branch, node))
-        return _to_si(branch, node, file, units, location)
-    if isinstance(node, dict) and _is_record(annotation):
-        hints = get_field_types(annotation)
-        if getattr(annotation, "OTHER_KEYS", False):
-            node = {key: value for key, value in node.items() if key in hints}
-        refuse_unknown_keys(file, list(node), list(hints), location)
-        names = {_key(field.name): field.name for field in dataclasses.fields(annotation)}
-        return {
-            names[key]: _to_si(hints[key], value, file, units, (*location, key))
-            for key, value in node.items()
-        }
-    if isinstance(node, dict) and _is_mapping(annotation):
-        return {
-            key: _to_si(arguments[1], value, file, units, (*location, key))
-            for key, value in node.items()
-        }
-    if isinstance(node, list) and origin in (tuple, list):
-        repeated = origin is list or (len(arguments) == 2 and arguments[1] is Ellipsis)
-        each = [arguments[0]] * len(node) if repeated else list(arguments) + [Any] * len(node)
-        return [_to_si(each[i], item, file, units, (*location, i)) for i, item in enumerate(node)]
-    return node
+    def __init__(self, fact: str, action: str, location: Location) -> None:
+        super().__init__(fact)
+        self.fact, self.action, self.location = fact, action, location
 
 
-def _scale(
-    node: Any, dimension: Dimension, file: YamlFile, units: Units | None, location: Location
-) -> Any:
-    """Return a number, or nested lists of numbers, in SI."""
-    if isinstance(node, list):
-        return [_scale(item, dimension, file, units, (*location, i)) for i, item in enumerate(node)]
-    if units is None and dimension is not Dimension.RATIO and node is not None:
-        return file.quantity(node, dimension, location)
-    if isinstance(node, int | float) and not isinstance(node, bool):
+@dataclasses.dataclass(frozen=True)
+class _RecordReader:
+    """The reader of one file, with the units of its numbers."""
+
+    file: YamlFile
+    units: Units | None
+
+    def read(self, annotation: Any, node: Any, at: Location, of: Dimension | None = None) -> Any:
+        """Return the value of an annotation from a node `at` a location; `of` is its dimension."""
+        origin, arguments = get_origin(annotation), get_args(annotation)
+        if origin is Annotated:
+            marks = [mark for mark in arguments[1:] if isinstance(mark, Dimension)]
+            return self.read(arguments[0], node, at, marks[0] if marks else of)
+        if origin in (Union, types.UnionType):
+            _refuse_tags(arguments, node, at)
+            branch = max(arguments, key=lambda branch: _fit(branch, node))
+            return self.read(branch, node, at, of)
+        if origin is Literal:
+            return _read_literal(arguments, node, at)
+        if origin is list:
+            arguments = (*arguments, ...)
+        if origin in (tuple, list):
+            return origin(self._read_items(arguments, node, at, of))
+        if _is_record(annotation):
+            return self._read_fields(annotation, _require(dict, node, at), at)
+        if _is_mapping(annotation):
+            items = _require(dict, node, at).items()
+            return {key: self.read(arguments[1], value, (*at, key), of) for key, value in items}
+        if annotation is Any and isinstance(node, list):
+            return [self.read(Any, item, (*at, i), of) for i, item in enumerate(node)]
+        if of is not None:
+            node = self._scale(node, of, at)
+        return node if annotation is Any else _require(annotation, node, at)
+
+    def _scale(self, node: Any, dimension: Dimension, at: Location) -> Any:
+        """Return a number in SI; what is none as it is."""
+        if self.units is None and dimension is not Dimension.RATIO and node is not None:
+            return self.file.quantity(node, dimension, at)
+        if not isinstance(node, int | float) or isinstance(node, bool):
+            return node
         try:
-            return to_si(node, find_unit("1") if units is None else units[dimension])
+            return to_si(node, find_unit("1") if self.units is None else self.units[dimension])
         except UnitError as error:
-            raise file.error(f"{name_location(location)!r}: {error}", location) from None
-    return node
+            raise self.file.error(f"{name_location(at)!r}: {error}", at) from None
+
+    def _read_items(
+        self, arguments: tuple[Any, ...], node: Any, at: Location, of: Dimension | None
+    ) -> list[Any]:
+        """Return the items of a list of any length, or of one with these members."""
+        items = _require(list, node, at)
+        members = arguments
+        if arguments[1:] == (Ellipsis,):
+            members = arguments[:1] * len(items)
+        elif len(items) != len(members):
+            fact = f"{_name(at)} has {len(items)} values, but {len(members)} are needed"
+            act = "remove the others" if len(items) > len(members) else "add the missing ones"
+            raise _MisfitError(fact, f"; {act}", at)
+        pairs = enumerate(zip(members, items, strict=True))
+        return [self.read(member, item, (*at, i), of) for i, (member, item) in pairs]
+
+    def _read_fields(self, record: Any, node: dict[str, Any], at: Location) -> Any:
+        """Return a record from a mapping of its keys."""
+        hints = get_field_types(record)
+        if getattr(record, "OTHER_KEYS", False):
+            node = {key: value for key, value in node.items() if key in hints}
+        refuse_unknown_keys(self.file, list(node), list(hints), at)
+        absent, values = dataclasses.MISSING, {}
+        for field in (field for field in dataclasses.fields(record) if field.init):
+            key = _key(field.name)
+            if key in node:
+                values[field.name] = self.read(hints[key], node[key], (*at, key))
+            elif field.default is absent and field.default_factory is absent:
+                raise _MisfitError(f"{_name(at)} has no key {key!r}", "; add it", at)
+        try:
+            return record(**values)
+        except ValueError as error:  # what the record itself says of its values
+            key, _, fact = str(error).partition(" ")
+            if has_child(node, key):  # its text begins with the key that is wrong
+                raise _MisfitError(f"{_name((*at, key))} {fact}", "", (*at, key)) from None
+            raise _MisfitError(f"{_name(at)}: {error}", "", at) from None
 
 
 def _is_record(annotation: Any) -> bool:
@@ -197,130 +220,84 @@ def _fit(annotation: Any, node: Any) -> float:
         return _fit(arguments[0], node)
     if origin in (Union, types.UnionType):
         return max(_fit(a, node) for a in arguments)
-    if annotation in (None, type(None)):
-        return 1.0 if node is None else -1.0
+    if node is None or annotation is types.NoneType:
+        return 1.0 if node is None and annotation is types.NoneType else -1.0
     if isinstance(node, dict):
         if not _is_record(annotation):
             return 0.05 if _is_mapping(annotation) else -1.0
         hints = get_field_types(annotation)
-        tags = {key: get_args(h) for key, h in hints.items() if get_origin(h) is Literal}
+        tags = _list_tags(annotation)
         score = sum(10.0 if node[key] in tags[key] else -10.0 for key in tags if key in node)
         return score + sum(1.0 if key in hints else -0.5 for key in node) + 0.1
     if isinstance(node, list):
         if origin not in (tuple, list):
             return -1.0
-        fixed = origin is tuple and arguments[-1:] != (Ellipsis,)
         inner = _fit(arguments[0], node[0]) if node and arguments else 0.0
-        length = 2.0 if not fixed or len(arguments) == len(node) else 0.5
-        return length + (0.5 if inner > 0 else -0.4)
+        has_length = origin is list or arguments[-1] is Ellipsis or len(arguments) == len(node)
+        return (2.0 if has_length else 0.5) + (0.5 if inner > 0 else -0.4)
     if isinstance(node, str):
         return 1.0 if annotation is str or (origin is Literal and node in arguments) else -1.0
     if isinstance(node, bool):
         return 1.0 if annotation is bool else -1.0
-    return 1.0 if annotation in (float, int) else -1.0
+    return 1.0 if annotation is type(node) else 0.9 if annotation is float else -1.0
 
 
-def _translate(
-    error: Any, file: YamlFile, content: Mapping[str, Any], location: Location
-) -> tuple[tuple[str, str], Location]:
-    """Return the first complaint of pydantic (by line) in our own words, and its location.
-
-    Where pydantic names branches of a union, the deepest complaint is the relevant one; a constant
-    that another branch has comes last.
-    """
-    complaints = error.errors(include_url=False, include_context=True)
-    places = [_resolve(c["loc"], content) for c in complaints]
-    if any(len(path) < len(c["loc"]) - 1 for (path, _), c in zip(places, complaints, strict=True)):
-        chosen = max(
-            range(len(places)),
-            key=lambda i: (len(places[i][0]), complaints[i]["type"] != "literal_error"),
-        )
-    else:
-        chosen = min(range(len(places)), key=lambda i: file.line((*location, *places[i][0])))
-    complaint, (path, node) = complaints[chosen], places[chosen]
-    if complaint["type"] == "literal_error":  # every branch names its own constants
-        expected = {
-            c["ctx"]["expected"]: None
-            for c, place in zip(complaints, places, strict=True)
-            if c["type"] == "literal_error" and place[0] == path
-        }
-        complaint = {**complaint, "ctx": {"expected": ", ".join(expected)}}
-    parent = complaint["loc"][:-1]
-    missing = [c["loc"][-1] for c in complaints if c["loc"] and c["loc"][:-1] == parent]
-    needed = max((step + 1 for step in missing if isinstance(step, int)), default=0)
-    path = (*location, *path)
-    if complaint["type"] == "value_error":  # its text begins with the key that is wrong
-        key, _, fact = str(complaint["ctx"]["error"]).partition(" ")
-        if has_child(node, key):
-            path = (*path, key)
-            return (f"{name_location(path)!r} {fact}", ""), path
-    return _word(complaint, path, node, needed), path
+def _list_tags(record: Any) -> dict[str, tuple[Any, ...]]:
+    """Return key -> constants of the fields that tell a record from others."""
+    hints = get_field_types(record)
+    return {key: get_args(h) for key, h in hints.items() if get_origin(h) is Literal}
 
 
-def _resolve(loc: tuple[str | int, ...], content: Any) -> tuple[Location, Any]:
-    """Return the part of pydantic's location that exists in the file, and the node there."""
-    location: list[str | int] = []
-    node = content
-    for part in loc:
-        step = part if has_child(node, part) else _key(part) if isinstance(part, str) else part
-        if has_child(node, step):
-            node = node[step]
-            location.append(step)
-    return tuple(location), node
+def _refuse_tags(branches: tuple[Any, ...], node: Any, at: Location) -> None:
+    """Refuse a mapping with a constant that no record of a union has; name those of all."""
+    if not isinstance(node, dict):
+        return
+    tags = [_list_tags(branch) for branch in branches if _is_record(branch)]
+    for key in node:
+        if tags and all(key in tag for tag in tags):
+            allowed = dict.fromkeys(constant for tag in tags for constant in tag[key])
+            _read_literal(tuple(allowed), node[key], (*at, key))
 
 
-NUMBERS: Mapping[str, str] = {
-    **dict.fromkeys(("float_type", "float_parsing"), "a number"),
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
+def _read_literal(allowed: tuple[Any, ...], node: Any, at: Location) -> Any:
+    """Return the allowed value that a node equals."""
+    for value in allowed:
+        if type(node) is type(value) and node == value:
+            return value
+    names = [str(value) for value in allowed]
+    hint = "" if str(node) in names else suggest_names(str(node), names)
+    shown = quote(node) if isinstance(node, str) else _describe(node)
+    constants = ", ".join(map(repr, allowed))
+    raise _MisfitError(f"{_name(at)} is {shown}{hint}; allowed: {constants}", "", at)
+
+
+NEEDED: Mapping[type, tuple[tuple[type, ...], str, str]] = {
+    float: ((int, float), "a number", "write a number"),
+    int: ((int,), "a whole number", "write a number"),
+    str: ((str,), "text", "put it in quotes"),
+    bool: ((bool,), "true or false", "write one of the two"),
+    list: ((list,), "a list", "write it as [.., ..]"),
+    dict: ((dict,), "a mapping", "write 'key: value' lines"),
+    types.NoneType: ((types.NoneType,), "nothing", "remove it"),
 }
-SHAPES: Mapping[str, tuple[str, str]] = {
-    **dict.fromkeys(("tuple_type", "list_type"), ("a list", "write it as [.., ..]")),
-    **dict.fromkeys(
-        ("dataclass_type", "dict_type", "mapping_type", "dataclass_exact_type"),
-        ("a mapping", "write 'key: value' lines"),
-    ),
-    "string_type": ("text", "put it in quotes"),
-    "bool_type": ("true or false", "write one of the two"),
-}
-"""Complaint of pydantic -> what is needed, and what to do."""
-ADD = "; add the missing ones"
+"""Type of a field -> types that a file may have there, in words, and what to do."""
 
 
-def _word(complaint: Any, location: Location, node: Any, needed: int) -> tuple[str, str]:
-    """Return what is wrong by a complaint of pydantic (found, allowed), and `; ` what to do.
+def _require(needed: type, node: Any, at: Location) -> Any:
+    """Return a node of the type that is needed; a whole number as a float where that is needed."""
+    allowed, words, act = NEEDED[needed]
+    if isinstance(node, allowed) and (needed is bool or not isinstance(node, bool)):
+        return float(node) if needed is float else node
+    if needed is int and isinstance(node, float):
+        act = "write it without a decimal point and without an exponent"
+    if needed in (float, int) and isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
+        act = "write the number without quotes and without a unit"
+        act = "write a decimal point, not a comma" if "," in node else act
+    raise _MisfitError(f"{_name(at)} is {_describe(node)}, but {words} is needed", f"; {act}", at)
 
-    `needed` is the number of values of a fixed list of which some are missing.
-    """
-    kind, context = complaint["type"], complaint.get("ctx", {})
-    name = repr(name_location(location)) if location else "this file"
-    if kind in ("missing", "missing_argument"):
-        if isinstance(node, list):
-            return f"{name} has {len(node)} values, but {needed} are needed", ADD
-        return f"{name} has no key {_key(str(complaint['loc'][-1]))!r}", "; add it"
-    if kind in ("too_long", "too_short"):
-        bound = context.get("max_length", context.get("min_length"))
-        act = "; remove the others" if kind == "too_long" else ADD
-        return f"{name} has {len(node)} values, but {bound} are needed", act
-    if kind in NUMBERS:
-        act = "; write a number"
-        if kind.startswith("int") and isinstance(node, float):
-            act = "; write it without a decimal point and without an exponent"
-        if isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
-            act = "; write the number without quotes and without a unit"
-            act = "; write a decimal point, not a comma" if "," in node else act
-        return f"{name} is {_describe(node)}, but {NUMBERS[kind]} is needed", act
-    if kind in SHAPES:
-        shape, act = SHAPES[kind]
-        return f"{name} is {_describe(node)}, but {shape} is needed", f"; {act}"
-    if kind == "literal_error":
-        expected = context["expected"].replace(" or ", ", ")
-        names = [part.strip("' ") for part in expected.split(",")]
-        hint = "" if str(node) in names else suggest_names(str(node), names)
-        return f"{name} is {quote(node)}{hint}; allowed: {expected}", ""
-    if kind == "value_error":
-        return f"{name}: {context.get('error', complaint['msg'])}", ""
-    reason = complaint["msg"][:1].lower() + complaint["msg"][1:]
-    return f"{name} is {_describe(node)}, which does not fit ({reason})", "; correct it"
+
+def _name(location: Location) -> str:
+    return repr(name_location(location)) if location else "this file"
 
 
 def _describe(node: Any) -> str:

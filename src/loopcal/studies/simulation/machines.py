@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import convert
 
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.estimate.losses import Huber, Loss, Tukey
@@ -53,7 +54,6 @@ from loopcal.studies.specification.levels import (
     PosesLevel,
     Scores,
 )
-from loopcal.studies.specification.study import read_record
 from loopcal.typing import FloatArray
 from loopcal.units import parse_quantity
 from loopcal.workflow.simulated_measurements import InstrumentDescription, build_instrument
@@ -297,9 +297,9 @@ def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
     Drawn poses depend on the machine only. Planned ones also depend on what is measured, and on the
     tolerances.
     """
-    level = read_record(PosesLevel, content["poses"])
+    level = convert(content["poses"], PosesLevel)
     description = {key: content[key] for key in ("robot", "poses", "seed")}
-    description["held_out"] = read_record(Scores, content["scores"]).held_out
+    description["held_out"] = convert(content["scores"], Scores).held_out
     if is_planned(level):
         errors = content["errors"]
         tolerances = {key: errors[key] for key in TOLERANCES if key in errors}
@@ -310,7 +310,7 @@ def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     """Return the poses of a description: given ones, drawn from the workspace, or planned."""
-    level, seed = read_record(PosesLevel, description["poses"]), description["seed"]
+    level, seed = convert(description["poses"], PosesLevel), description["seed"]
     robot = build_robot_of(description["robot"])
     held_out = sample_workspace(robot.nominal, description["held_out"], seed + 1).coordinates
     chosen_seed = seed if level.seed is None else level.seed
@@ -322,10 +322,10 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     elif not is_planned(level):
         measured = sample_workspace(robot.nominal, level.count, stream).coordinates
     else:
-        errors = read_record(ErrorsLevel, description["errors"])
+        errors = convert(description["errors"], ErrorsLevel)
         instrument = make_instrument(
-            read_record(InstrumentLevel, description["instrument"]),
-            read_record(NoiseLevel, description["noise"]),
+            convert(description["instrument"], InstrumentLevel),
+            convert(description["noise"], NoiseLevel),
         )
         options = PlanOptions(n_poses=level.count, hold_out=0, seed=chosen_seed)
         chosen = plan(change_tolerances(robot, errors).nominal, instrument, options=options)

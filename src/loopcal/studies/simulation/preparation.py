@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from msgspec import convert
 
 from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed_motions
 from loopcal.estimate.options import FitOptions
@@ -45,7 +46,7 @@ from loopcal.studies.specification.levels import (
     Scores,
     ThermalGrowth,
 )
-from loopcal.studies.specification.study import format_json, read_record
+from loopcal.studies.specification.study import format_json
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -218,16 +219,16 @@ def prepare_cell(content: Mapping[str, Any]) -> PreparedCell:
 def _prepare(text: str) -> PreparedCell:
     """Return the cell of the common content of its blocks, as JSON."""
     content = json.loads(text)
-    errors = read_record(ErrorsLevel, content["errors"])
+    errors = convert(content["errors"], ErrorsLevel)
     robot = change_tolerances(build_robot_of(content["robot"]), errors).nominal
-    noise = read_record(NoiseLevel, content["noise"])
-    level = read_record(InstrumentLevel, content["instrument"])
+    noise = convert(content["noise"], NoiseLevel)
+    level = convert(content["instrument"], InstrumentLevel)
     measured = np.array(content["measured"])
-    poses = read_record(PosesLevel, content["poses"])
+    poses = convert(content["poses"], PosesLevel)
     instrument = place_instrument(make_instrument(level, noise), robot, poses, measured)
-    method = read_record(MethodLevel, content["method"])
-    effects = read_record(EffectsLevel, content["effects"])
-    scores = read_record(Scores, content["scores"])
+    method = convert(content["method"], MethodLevel)
+    effects = convert(content["effects"], EffectsLevel)
+    scores = convert(content["scores"], Scores)
     layout = make_layout(robot, measured, poses.groups) if poses.is_on_surfaces else None
     motions = np.zeros((12, 0))
     if scores.error_frame != BASE:

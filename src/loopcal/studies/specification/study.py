@@ -11,9 +11,11 @@ import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
-from typing import Any, TypeVar
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import msgspec
 
 from loopcal.presentation import HtmlResult
 from loopcal.studies.specification.levels import (
@@ -76,8 +78,6 @@ def select_levels(study: Study, cell: Cell) -> dict[str, Any]:
 
 # --- Keys of blocks: a hash of everything that determines their numbers, and of nothing else.
 
-T = TypeVar("T")
-
 NUMERICS = 2
 """Version of the numbers of a block; another one makes all blocks anew.
 
@@ -114,35 +114,12 @@ def format_json(content: Mapping[str, Any]) -> str:
 
 def describe_record(record: Any) -> dict[str, Any]:
     """Return the fields of a record that differ from their defaults, as plain values."""
-    fields: dict[str, Any] = _make_adapter(type(record)).dump_python(
-        record, mode="json", exclude_defaults=True
-    )
-    return fields
-
-
-def read_record(record: type[T], fields: Mapping[str, Any]) -> T:
-    """Return the record of `describe_record`."""
-    return load_json(record, json.dumps(fields))
-
-
-def dump_json(record: Any) -> str:
-    """Return a record as JSON."""
-    text: bytes = _make_adapter(type(record)).dump_json(record)
-    return text.decode()
-
-
-def load_json(record: type[T], text: str) -> T:
-    """Return the record of a text of `dump_json`."""
-    value: T = _make_adapter(record).validate_json(text, strict=True)
-    return value
-
-
-@cache
-def _make_adapter(record: type) -> Any:
-    """Return pydantic's reader and writer of a record; made once, because that takes long."""
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(record)
+    default = type(record)()
+    return {
+        item.name: describe_record(value) if is_dataclass(value) else value
+        for item in fields(record)
+        if (value := getattr(record, item.name)) != getattr(default, item.name)
+    }
 
 
 BLOCK, REPLICATES = 50, 1000
@@ -212,12 +189,12 @@ class Study(HtmlResult):
 
     def to_json(self) -> str:
         """Return the study as JSON, which `from_json` reads."""
-        return dump_json(self)
+        return msgspec.json.encode(self).decode()
 
     @classmethod
     def from_json(cls, text: str) -> Study:
         """Return the study of a text of `to_json`."""
-        return load_json(cls, text)
+        return msgspec.json.decode(text, type=cls)
 
 
 # --- Which changes to a study keep its finished blocks valid, and which do not.
