@@ -61,17 +61,13 @@ from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
+# table G.2).
 COMPONENT_LEVEL = 0.954499736103642
-"""Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
-table G.2).
-"""
-
-LEVEL = 0.95
-"""Share of the errors below the expanded uncertainty of a length or an angle."""
+LEVEL = 0.95  # share of the errors below the expanded uncertainty of a length or an angle
 
 COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
-BLOCK = 1024
-"""Poses whose sensitivities are in memory at once."""
+BLOCK = 1024  # poses whose sensitivities are in memory at once
 
 Axes = Literal["base", "platform"]
 Point = Literal["tool", "platform"]
@@ -479,8 +475,7 @@ def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
 
 # --- Check the linear prediction of pose errors by many simulated calibrations.
 
-BATCH = 250
-"""Trials that are identified at once; progress is reported between them."""
+BATCH = 250  # trials that are identified at once; progress is reported between them
 
 
 @dataclass(frozen=True, eq=False)

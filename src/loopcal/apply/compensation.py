@@ -36,21 +36,14 @@ from loopcal.units import Dimension
 
 Mode = Literal["readings", "commands"]
 
-SHOWN = 5
-"""Targets out of reach that the text lists."""
-
-ROUNDING = 1e-9
-"""An error below this share of the robot's size (or this many radians) is rounding."""
-
+SHOWN = 5  # targets out of reach that the text lists
+ROUNDING = 1e-9  # an error below this share of the robot's size (or this many radians) is rounding
+# Passes over all targets (the controller's answer, the best poses, the errors before, and the
+# uncertainty), and what progress calls them.
 PASSES, TASK = 4, "computing compensation"
-"""Passes over all targets (the controller's answer, the best poses, the errors before, and the
-uncertainty), and what progress calls them.
-"""
-
+# Share of its first value below which the fixed-point iteration must bring the distance to the
+# best pose. It usually falls a hundredfold in each step.
 REDUCED = 0.1
-"""Share of its first value below which the fixed-point iteration must bring the distance to the
-best pose. It usually falls a hundredfold in each step.
-"""
 
 
 class Reach(Enum):
@@ -64,6 +57,7 @@ class Reach(Enum):
     NOT_CONVERGED = "not converged"
 
 
+# Code of the finding of a target -> its state.
 CODES = {
     "compensation.reached": Reach.REACHED,
     "compensation.reached-in-part": Reach.IN_PART,
@@ -72,7 +66,6 @@ CODES = {
     "compensation.unreachable": Reach.UNREACHABLE,
     "compensation.not-converged": Reach.NOT_CONVERGED,
 }
-"""Code of the finding of a target -> its state."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,26 +40,15 @@ from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
 
-LEVEL = 0.95
-"""Probability that conformity and nonconformity need: the default of ISO 14253-1:2017."""
-
+LEVEL = 0.95  # probability that conformity and nonconformity need: the default of ISO 14253-1:2017
+# Probabilities of the bounds of an interval, and of the estimate between them.
 INTERVAL = (0.025, 0.5, 0.975)
-"""Probabilities of the bounds of an interval, and of the estimate between them."""
-
+# Fields that findings state of an estimate with its interval.
 INTERVAL_NAMES = ("estimate", "expanded", "low", "high")
-"""Fields that findings state of an estimate with its interval."""
-
-NODES = 32
-"""Values of tau in each of the two searches."""
-
-MOST = 2000
-"""Errors that are compared one by one."""
-
-NEGLIGIBLE = 1e-6
-"""Density of tau, in terms of the largest one, that is left out."""
-
-BISECTIONS = 24
-"""Bisections of a quantile: each halves its interval."""
+NODES = 32  # values of tau in each of the two searches
+MOST = 2000  # errors that are compared one by one
+NEGLIGIBLE = 1e-6  # density of tau, in terms of the largest one, that is left out
+BISECTIONS = 24  # bisections of a quantile: each halves its interval
 
 
 class Decision(Enum):

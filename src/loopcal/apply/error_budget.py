@@ -53,8 +53,8 @@ if TYPE_CHECKING:
 # --- Split the covariance of a fit by the sources of its errors, and compute it for other sigmas.
 
 INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
+# Kinds of sources; others are the codes of the findings with which a covariance was added.
 EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
-"""Kinds of sources; others are the codes of the findings with which a covariance was added."""
 
 
 class Source(NamedTuple):
@@ -333,18 +333,15 @@ def _with_half_setup(fit: Identification, data: Measurements) -> Identification:
     return replace(fit, options=replace(fit.options, nuisance=setup))
 
 
+# Number of poses that are drawn from the workspace, and the seed of their draw.
 POSES, SEED = 200, 0
-"""Number of poses that are drawn from the workspace, and the seed of their draw."""
-
-NEGLIGIBLE = 0.01
-"""Share of an expected error below which the sentence leaves out a source."""
+NEGLIGIBLE = 0.01  # share of an expected error below which the sentence leaves out a source
 
 _LENGTHS = ("position", "orientation")
+# Kinds of sources whose errors the fit weighs against each other.
 _OF_ROWS = (INSTRUMENT, READINGS, SETUP, TOLERANCES, EARLIER)
-"""Kinds of sources whose errors the fit weighs against each other."""
-
+# Beginning of the codes of findings on the tolerances, whose errors count as theirs.
 PRIOR = "prior."
-"""Beginning of the codes of findings on the tolerances, whose errors count as theirs."""
 
 
 class ErrorSources(NamedTuple):

@@ -43,20 +43,12 @@ if TYPE_CHECKING:
 
     from loopcal.mechanism.model import Mechanism
 
-PREFIX = "heights_"
-"""Beginning of the names of the stored arrays."""
-
-FEWEST = 3
-"""Heights that show a plane; with fewer there is no map."""
-
-LEVEL = 0.2
-"""Largest ratio of the points' range in z to that in x, y of a level surface."""
-
+PREFIX = "heights_"  # beginning of the names of the stored arrays
+FEWEST = 3  # heights that show a plane; with fewer there is no map
+LEVEL = 0.2  # largest ratio of the points' range in z to that in x, y of a level surface
+# Freedoms of a platform over whose x and y heights are mapped.
 TRANSLATIONS = tuple(AXES.index(axis) for axis in "xyz")
-"""Freedoms of a platform over whose x and y heights are mapped."""
-
-UPRIGHT = 0.95
-"""Least cosine of the angle between the z axes of the measured frame and of the base."""
+UPRIGHT = 0.95  # least cosine of the angle between the z axes of the measured frame and of the base
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 
 # --- The result of `assess_repeatability`: what each visited pose shows.
 
+# Dimensions of the quantities.
 DIMENSIONS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
-"""Dimensions of the quantities."""
 
 
 class Estimate(NamedTuple):
@@ -177,32 +177,17 @@ def describe_largest(poses: tuple[VisitedPose, ...], quantity: str) -> str:
     return ", ".join(words)
 
 
-TAIL = 0.025
-"""Probability beyond each bound of an interval."""
-
-STANDARD_VISITS = 30
-"""Visits of each pose that ISO 9283 asks for."""
-
+TAIL = 0.025  # probability beyond each bound of an interval
+STANDARD_VISITS = 30  # visits of each pose that ISO 9283 asks for
+# Share of the scatter that the uncertainty of the instrument may be (ISO 9283, section 6.4).
 LARGEST_NOISE = 0.25
-"""Share of the scatter that the uncertainty of the instrument may be (ISO 9283, section 6.4)."""
-
-FEWEST_VISITS = 2
-"""Visits without which there is no scatter."""
-
-NORMAL = 1.959963984540054
-"""Quantile of the normal distribution for intervals of 95 %."""
-
-LARGE = 1e3
-"""Square of the mean over its variance beyond which its length is normal."""
-
-SMALLEST_SHARE = 0.05
-"""Share of the variance that the direction of the mean has at least."""
-
-DRAWS = 1000
-"""Drawn sets of visits for the interval of RP_l."""
-
+FEWEST_VISITS = 2  # visits without which there is no scatter
+NORMAL = 1.959963984540054  # quantile of the normal distribution for intervals of 95 %
+LARGE = 1e3  # square of the mean over its variance beyond which its length is normal
+SMALLEST_SHARE = 0.05  # share of the variance that the direction of the mean has at least
+DRAWS = 1000  # drawn sets of visits for the interval of RP_l
+# Sets of visits that together give the true RP_l of a scatter, in terms of `DRAWS` visits.
 MANY = 20
-"""Sets of visits that together give the true RP_l of a scatter, in terms of `DRAWS` visits."""
 
 POSITION, ORIENTATION = "position", "orientation"
 

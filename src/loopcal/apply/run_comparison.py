@@ -125,8 +125,8 @@ def list_data_digests(run: StoredRun) -> tuple[str, ...]:
 
 # --- Refuse calibrations whose numbers cannot be compared, and say why.
 
+# Attributes by which an argument is recognized as a run.
 NEEDED = ("path", "result", "robot", "arrays", "load_posterior")
-"""Attributes by which an argument is recognized as a run."""
 
 
 def check_runs(runs: Sequence[StoredRun]) -> None:
@@ -221,8 +221,7 @@ def _name_actuators(robot: Mechanism) -> str:
 
 # --- The errors of several calibrations at the same held-out poses.
 
-QUANTITIES = ("position", "orientation", "length")
-"""Quantities whose errors are compared."""
+QUANTITIES = ("position", "orientation", "length")  # quantities whose errors are compared
 
 
 @dataclass(frozen=True)
@@ -326,17 +325,12 @@ def _read_errors(run: StoredRun, poses: Sequence[str] | None) -> dict[str, Quant
 
 # --- Two calibrations: whether the machine has changed, and by what.
 
+# Probability that any of the compared machines is declared changed although none is.
 CHANGE_LEVEL = 0.05
-"""Probability that any of the compared machines is declared changed although none is."""
-
-CAUSE_LEVEL = 0.01
-"""Probability of rejecting the true cause of a change."""
-
+CAUSE_LEVEL = 0.01  # probability of rejecting the true cause of a change
+# Probability of a chi-square as small as that of runs which share rows in another form.
 TOO_WELL = 1e-3
-"""Probability of a chi-square as small as that of runs which share rows in another form."""
-
-COVERED = 1.96
-"""Standard deviations of the half-width of a 95 % interval of a change."""
+COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a change
 
 
 @dataclass(frozen=True, eq=False)

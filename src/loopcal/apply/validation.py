@@ -59,18 +59,11 @@ if TYPE_CHECKING:
 
 # --- Findings of a validation: limits, setup parameters that moved, and poses that were left out.
 
+# Number of rows below which an error cannot be judged. At 4 rows the rms of noise alone varies by
+# a third.
 FEW_ROWS = 5
-"""Number of rows below which an error cannot be judged.
-
-At 4 rows the rms of noise alone varies by a third.
-"""
-
-
-GREW = 1.1
-"""Factor by which an error must grow to be called larger."""
-
-NOISE_LEVEL = 1e-3
-"""Probability that noise alone exceeds what is called the noise."""
+GREW = 1.1  # factor by which an error must grow to be called larger
+NOISE_LEVEL = 1e-3  # probability that noise alone exceeds what is called the noise
 
 
 @dataclass(frozen=True)
@@ -256,8 +249,8 @@ def check_limits(
 
 # --- Held-out poses that do not fit: the search, and findings with their largest errors.
 
+# Factor by which an rms error must fall without the blunders to be called dominated by them.
 DOMINATES = 2.0
-"""Factor by which an rms error must fall without the blunders to be called dominated by them."""
 
 
 def find_blunders(
@@ -673,8 +666,7 @@ def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, 
 
 # --- Rows that a calibration was fitted to are no independent validation.
 
-REFUSED_SHARE = 0.5
-"""Share of reused rows from which data are refused for validation."""
+REFUSED_SHARE = 0.5  # share of reused rows from which data are refused for validation
 
 
 def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding | None:
@@ -704,11 +696,9 @@ def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding
 
 # --- A validation in a run folder: its numbers in result.json, and its differences as arrays.
 
-ERRORS = ("before", "after")
-"""Errors whose differences are stored."""
-
+ERRORS = ("before", "after")  # errors whose differences are stored
+# First word of the names of the stored arrays, `held_out_<before or after>_<quantity>`.
 PREFIX = "held_out"
-"""First word of the names of the stored arrays, `held_out_<before or after>_<quantity>`."""
 
 
 def store_differences(validation: Validation) -> dict[str, FloatArray]:

@@ -49,13 +49,11 @@ from loopcal.numerics.statistics import compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS
 
+# Factor of the uncertainty of the measured poses from which a correlation that no test shows is
+# allowed for.
 NOTICEABLE = 1.05
-"""Factor of the uncertainty of the measured poses from which a correlation that no test shows is
-allowed for.
-"""
-
+# Code of the finding that independent errors would mean that sigma is too large.
 TOO_SMALL = "noise.residuals-too-small"
-"""Code of the finding that independent errors would mean that sigma is too large."""
 
 
 def adjust_uncertainty(
@@ -247,28 +245,15 @@ def _without_doubt_of_sigma(fit: Identification) -> Identification:
 
 # --- Test whether large residuals are more frequent than normal noise makes them.
 
-LEVEL = 0.01
-"""Probability that normal noise is reported; below `SIGNIFICANCE` it is a warning."""
-
-
-DRAWS, BATCH = 10_000, 500
-"""Draws of normal errors at most, and at once."""
-
-DOUBT = 0.05
-"""Probability from which no more draws are needed."""
-
-FEWEST = 5.0
-"""Degrees of freedom of the residuals from which the test is made."""
-
-MOST_ROWS = 1000
-"""Residuals that are tested at most, evenly chosen."""
-
-TESTABLE = 1e-6
-"""Share of its variance that the fit must leave of a row to be tested."""
-
+LEVEL = 0.01  # probability that normal noise is reported; below `SIGNIFICANCE` it is a warning
+DRAWS, BATCH = 10_000, 500  # draws of normal errors at most, and at once
+DOUBT = 0.05  # probability from which no more draws are needed
+FEWEST = 5.0  # degrees of freedom of the residuals from which the test is made
+MOST_ROWS = 1000  # residuals that are tested at most, evenly chosen
+TESTABLE = 1e-6  # share of its variance that the fit must leave of a row to be tested
+# Beginning of the codes that say what the residuals of a fit depend on, and the one that does
+# not.
 PATTERNS, NO_PATTERN = "residuals.", "residuals.perhaps-correlated"
-"""Beginning of the codes that say what the residuals of a fit depend on, and the one that does not.
-"""
 
 
 @dataclass(frozen=True)

@@ -38,16 +38,12 @@ from loopcal.units import Dimension
 
 # --- Test held-out blocks against what a fit predicts: noise plus the uncertainty of the fit.
 
+# Probability of naming any block where none is wrong. It is small, because a named block changes
+# the verdict.
 LEVEL = 1e-3
-"""Probability of naming any block where none is wrong. It is small, because a named block changes
-the verdict.
-"""
-
-FOLDED = 10_000
-"""Rows that are factorized at once."""
-
+FOLDED = 10_000  # rows that are factorized at once
+# Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians.
 ANYWHERE = 1e3
-"""Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians."""
 
 
 class HeldOutBlocks(NamedTuple):
@@ -269,15 +265,11 @@ def _make_free(robot: Mechanism, uncertainty: FitUncertainty | None) -> FreePara
     return FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
 
 
-MOST_PERMUTED = 4
-"""Targets of which all orders are tried; of more only exchanges of two."""
-
-MOST_EXPLAINED = 10
-"""Poses for which explanations are tried, the farthest first."""
-
+MOST_PERMUTED = 4  # targets of which all orders are tried; of more only exchanges of two
+MOST_EXPLAINED = 10  # poses for which explanations are tried, the farthest first
+# Other poses that do not fit, the farthest first, with which the values of one are exchanged.
 MOST_EXCHANGED = 50
-"""Other poses that do not fit, the farthest first, with which the values of one are exchanged."""
-
+# Data of the finding that only some explanations have.
 UNUSED: dict[str, Any] = {
     "pairs": (),
     "other": "",
@@ -286,13 +278,11 @@ UNUSED: dict[str, Any] = {
     "column": "",
     "left_out": "",
 }
-"""Data of the finding that only some explanations have."""
-
+# Factors by which values in another unit differ.
 FACTORS: dict[Dimension, tuple[float, ...]] = {
     Dimension.LENGTH: (1e3, 1e-3, 10.0, 0.1, 25.4, 1.0 / 25.4),
     Dimension.ANGLE: (180.0 / np.pi, np.pi / 180.0, 1e3, 1e-3, 60.0, 1.0 / 60.0),
 }
-"""Factors by which values in another unit differ."""
 
 
 @dataclass(frozen=True)
@@ -382,8 +372,8 @@ def _explain(check: HeldOutCheck, data: Measurements, block: int) -> Explanation
     return Explanation("none", {}, tuple(dict.fromkeys(tried)))
 
 
+# Names and numbers for the sentence, and the measurements read in another way.
 Reading = tuple[dict[str, Any], Measurements]
-"""Names and numbers for the sentence, and the measurements read in another way."""
 
 
 def _worst_p_value(check: HeldOutCheck, data: Measurements) -> float:

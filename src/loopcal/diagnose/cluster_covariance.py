@@ -44,13 +44,10 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # --- Divide poses into the units that may share an error: days, sessions, blocks or single poses.
 
+# Clusters that a cluster-robust variance needs. The variance of a mean has one degree of freedom
+# less, and with fewer than 4 its distribution is not known well enough (Tipton, 2015).
 FEWEST_CLUSTERS = 5
-"""Clusters that a cluster-robust variance needs. The variance of a mean has one degree of freedom
-less, and with fewer than 4 its distribution is not known well enough (Tipton, 2015).
-"""
-
-NIGHT = 6 * 3600.0
-"""Time without a measurement [s] after which another day begins."""
+NIGHT = 6 * 3600.0  # time without a measurement [s] after which another day begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,31 +117,20 @@ def _pose_days(data: Measurements) -> IntArray:
     return np.column_stack([np.arange(len(time)), day])
 
 
-LIMIT = 1.5
-"""Ratio of standard uncertainties above which the stated ones are too small."""
-
+LIMIT = 1.5  # ratio of standard uncertainties above which the stated ones are too small
+# Probability, for independent errors, of a ratio as large as that of position or orientation,
+# below which the ratio is reported: 1 % of data sets for the two together.
 SIGNIFICANCE = 0.005
-"""Probability, for independent errors, of a ratio as large as that of position or orientation,
-below which the ratio is reported: 1 % of data sets for the two together.
-"""
-
+# Share of the variance of poses by noise that residuals must be able to judge. The rest lies in
+# directions that one cluster alone determines.
 JUDGED = 0.5
-"""Share of the variance of poses by noise that residuals must be able to judge. The rest lies in
-directions that one cluster alone determines.
-"""
-
+# Degrees of freedom below which the distribution of a ratio is not known well (Tipton, 2015), and
+# its own standard deviation exceeds 35 %.
 FEWEST_DEGREES = 4.0
-"""Degrees of freedom below which the distribution of a ratio is not known well (Tipton, 2015), and
-its own standard deviation exceeds 35 %.
-"""
-
+# Clusters, evenly chosen, whose scores are compared: the degrees of freedom of more of them
+# change no conclusion.
 MOST_CLUSTERS = 10_000
-"""Clusters, evenly chosen, whose scores are compared: the degrees of freedom of more of them change
-no conclusion.
-"""
-
-COMMON = 1e-9
-"""Share of its own size below which a variance of poses is zero."""
+COMMON = 1e-9  # share of its own size below which a variance of poses is zero
 
 
 class Ratio(NamedTuple):

@@ -46,8 +46,8 @@ from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
 
+# Determinant of 1 - leverage of a block below which the other blocks do not determine its rows.
 NOTHING_LEFT = 1e-12
-"""Determinant of 1 - leverage of a block below which the other blocks do not determine its rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,22 +309,14 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
 
 # --- Choose the simplest set of free parameters that predicts held-out poses as well as any.
 
+# Names of parameters that shift an actuator reading.
 OFFSETS = re.compile(r"(^|\.)(offset|stop|zero|home)$|^q\d+$")
-"""Names of parameters that shift an actuator reading."""
-
-LENGTHS = re.compile(r"(^|\.)(length|radius)$|^[lr]\d*$")
-"""Names of the main dimensions."""
-
-NOTHING = "nothing"
-"""Name of the set that frees no parameter."""
-
-CONTROLLER = "controller"
-"""Name of the set that the controller of the machine stores."""
-
+LENGTHS = re.compile(r"(^|\.)(length|radius)$|^[lr]\d*$")  # names of the main dimensions
+NOTHING = "nothing"  # name of the set that frees no parameter
+CONTROLLER = "controller"  # name of the set that the controller of the machine stores
+# Codes of the reasons why a set is not compared: the data have too few equations for it, or its
+# fit without a fold does not converge.
 NOT_COMPARED = ("fit.too-few-equations", "model.fold-not-converged")
-"""Codes of the reasons why a set is not compared: the data have too few equations for it, or its
-fit without a fold does not converge.
-"""
 
 
 class Conditioning(NamedTuple):

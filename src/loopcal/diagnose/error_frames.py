@@ -42,13 +42,11 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray, IntArray
 
 Over = Literal["measured", "home", "predicted"]
+# Frames that exist for every calibration; the others are the names of its instruments' frames.
 FITTED, BASE, RELATIVE = "fitted", "base", "relative"
-"""Frames that exist for every calibration; the others are the names of its instruments' frames."""
-
+# Singular values of the motions of frames, relative to the largest, up to which a motion does not
+# move the reference poses, or the errors do not contain it: the square root of double rounding.
 FIT_TOLERANCE = 1e-8
-"""Singular values of the motions of frames, relative to the largest, up to which a motion does not
-move the reference poses, or the errors do not contain it: the square root of double rounding.
-"""
 
 
 class ErrorFrame(NamedTuple):
@@ -373,10 +371,9 @@ def _as_base_motion(by_base: FloatArray, twists: FloatArray) -> FloatArray:
 # --- What the parameters, the frame and the readings of a calibrated robot do to its tool at
 # poses.
 
+# Measured poses, evenly chosen, by which two uncertainties are compared: ratios over more poses
+# hardly differ.
 MOST_POSES = 1000
-"""Measured poses, evenly chosen, by which two uncertainties are compared: ratios over more poses
-hardly differ.
-"""
 
 
 class ToolErrors(NamedTuple):

@@ -30,10 +30,9 @@ from loopcal.units import Dimension
 
 # --- Find parameters whose estimates are strongly correlated.
 
+# Correlation above which the error of one parameter is mostly that of another (81 % of its
+# variance).
 STRONG = 0.9
-"""Correlation above which the error of one parameter is mostly that of another (81 % of its
-variance).
-"""
 
 
 @dataclass(frozen=True)
@@ -86,14 +85,10 @@ def find_correlated_groups(
 # --- Predict the gain of a calibration: pose errors expected from the tolerances, and after the
 # fit.
 
-GAIN = 1.1
-"""Factor by which an expected error must become smaller to count as an improvement."""
-
+GAIN = 1.1  # factor by which an expected error must become smaller to count as an improvement
+# Expected errors below this share of the robot's size, or this angle [rad], are rounding.
 ROUNDING = 1e-12
-"""Expected errors below this share of the robot's size, or this angle [rad], are rounding."""
-
-MOST_POSES = 200
-"""Largest number of poses at which errors are predicted, evenly chosen."""
+MOST_POSES = 200  # largest number of poses at which errors are predicted, evenly chosen
 
 
 @dataclass(frozen=True)

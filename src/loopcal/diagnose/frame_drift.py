@@ -30,17 +30,13 @@ from loopcal.numerics.statistics import compute_any_probability, compute_chi_squ
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import find_unit
 
+# Probability, for each of the two tests, of a report although no frame and no target moved.
 LEVEL = 0.01
-"""Probability, for each of the two tests, of a report although no frame and no target moved."""
-
-TINY = 1e-99
-"""Smallest probability that is written; a smaller one is stated as below this."""
-
+TINY = 1e-99  # smallest probability that is written; a smaller one is stated as below this
+# Standard deviation of stated places [m], negligible beside the noise of any instrument.
 EXACT = 1e-9
-"""Standard deviation of stated places [m], negligible beside the noise of any instrument."""
-
+# Singular values of whitened rows with scaled columns, relative to the largest, that are zero.
 RANK = 1e-9
-"""Singular values of whitened rows with scaled columns, relative to the largest, that are zero."""
 
 
 @dataclass(frozen=True, eq=False)

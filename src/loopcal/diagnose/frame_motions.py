@@ -29,24 +29,17 @@ from loopcal.mechanism.states import Status
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
+# Poses at which motions are compared: 144 equations for the 12 numbers of two frames and the
+# directions in question.
 PROBES = 24
-"""Poses at which motions are compared: 144 equations for the 12 numbers of two frames and the
-directions in question.
-"""
-
+# Range of the readings of these poses to each side of home, in robot sizes and radians.
 SPREAD_LENGTH, SPREAD_ANGLE = 0.05, 0.1
-"""Range of the readings of these poses to each side of home, in robot sizes and radians."""
-
+# Shares of this range that are tried, until half of the poses are reached.
 SHARES = (1.0, 0.1, 0.01)
-"""Shares of this range that are tried, until half of the poses are reached."""
-
+# Share of the motion by all parameters below which a motion counts as none: the square root of
+# double rounding.
 NO_MOTION = 1e-8
-"""Share of the motion by all parameters below which a motion counts as none: the square root of
-double rounding.
-"""
-
-SAME_MOTION = 1e-6
-"""Relative difference below which two motions count as equal."""
+SAME_MOTION = 1e-6  # relative difference below which two motions count as equal
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
 # --- The observability indices O1 to O5. Formulas and sources: docs/theory/observability.md.
 
+# Units of the singular values; every index depends on them.
 SCALING = "rows divided by sigma, columns multiplied by tolerance"
-"""Units of the singular values; every index depends on them."""
 
 MEANING = {
     "o1": "(product of s)^(1/L) / sqrt(m): a small uncertainty ellipsoid",
@@ -116,20 +116,12 @@ def compute_observability(singular_values: FloatArray, rank: int, equations: int
     )
 
 
-MOST_WEAK = 5
-"""Number of weak directions that are listed, weakest first."""
-
-AROUND = 3
-"""Number of singular values listed before the cut."""
-
-MOST_ROWS = 12
-"""Number of parameters in the printed table; the others are counted."""
-
-CLEAR_GAP = 1e3
-"""Ratio of the singular values at the cut that makes the rank clear."""
-
+MOST_WEAK = 5  # number of weak directions that are listed, weakest first
+AROUND = 3  # number of singular values listed before the cut
+MOST_ROWS = 12  # number of parameters in the printed table; the others are counted
+CLEAR_GAP = 1e3  # ratio of the singular values at the cut that makes the rank clear
+# Multiples of the rank tolerance between which a clear rank does not change.
 NEARBY_TOLERANCES = (1e-2, 1e2)
-"""Multiples of the rank tolerance between which a clear rank does not change."""
 
 
 @dataclass(frozen=True)

@@ -27,18 +27,14 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
+# Remaining part 1 - w g of a direction below which only this block determines it, so that its
+# residual tests nothing.
 TESTABLE = 1e-6
-"""Remaining part 1 - w g of a direction below which only this block determines it, so that its
-residual tests nothing.
-"""
-
+# Variance of a predicted residual outside the fit, in units of the noise, above which the fit
+# does not predict it.
 UNPREDICTABLE = 1e10
-"""Variance of a predicted residual outside the fit, in units of the noise, above which the fit does
-not predict it.
-"""
-
+# Standard deviation in tolerances that stands in G for a direction that the fit does not use.
 UNDETERMINED = 1e6
-"""Standard deviation in tolerances that stands in G for a direction that the fit does not use."""
 
 
 class Influence(NamedTuple):

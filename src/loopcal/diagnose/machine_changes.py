@@ -32,15 +32,11 @@ from loopcal.numerics.statistics import (
 )
 from loopcal.typing import BoolArray, FloatArray
 
+# Sine of the angle up to which null directions of two linearizations are the same direction.
 PARALLEL = 1e-2
-"""Sine of the angle up to which null directions of two linearizations are the same direction."""
-
+# Share of the largest singular value above which a column of both data sets is independent.
 INDEPENDENT = 1e-9
-"""Share of the largest singular value above which a column of both data sets is independent."""
-
-
-OF_NOISE = 2
-"""Parts of the errors that are the noise of the two calibrations."""
+OF_NOISE = 2  # parts of the errors that are the noise of the two calibrations
 
 
 class ErrorPart(NamedTuple):
@@ -232,8 +228,7 @@ def _list_added_parts(posterior: Posterior) -> list[CovariancePart]:
 
 # --- Which parameter, limb or pair of limbs explains the change of a machine.
 
-DISTINGUISHED = 0.05
-"""Probability of distinguishing the true cause from a better one by chance."""
+DISTINGUISHED = 0.05  # probability of distinguishing the true cause from a better one by chance
 
 
 @dataclass(frozen=True)

@@ -42,27 +42,17 @@ from loopcal.numerics.statistics import (
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-FEWEST_POSES = 5
-"""Different poses below which nothing can be said of how errors vary with the pose."""
-
+FEWEST_POSES = 5  # different poses below which nothing can be said of how errors vary with the pose
+# Share of the effect of errors on the rows below which the parameters take up all of it.
 UNSEEN = 1e-8
-"""Share of the effect of errors on the rows below which the parameters take up all of it."""
-
-NEGLIGIBLE = 1e-12
-"""Share of the largest variance by slow errors below which one is rounding."""
-
+NEGLIGIBLE = 1e-12  # share of the largest variance by slow errors below which one is rounding
+# Lengths over which slow errors vary, in halves of the range of a coordinate, and whether they
+# vary with the rotation of the platform: a wave over the workspace, and slower ones.
 KERNELS = ((0.6, False), (1.7, True))
-"""Lengths over which slow errors vary, in halves of the range of a coordinate, and whether they
-vary with the rotation of the platform: a wave over the workspace, and slower ones.
-"""
-
+# Length, in halves of the range, over which errors vary that no two poses share, and most poses
+# for these.
 ROUGH, MOST_ROUGH = 1e-3, 150
-"""Length, in halves of the range, over which errors vary that no two poses share, and most poses
-for these.
-"""
-
-ROTATION, PLACE = 0, 1
-"""Number of the errors of rotation and of place."""
+ROTATION, PLACE = 0, 1  # number of the errors of rotation and of place
 
 
 class SlowErrorRows(NamedTuple):

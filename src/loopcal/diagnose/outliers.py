@@ -50,19 +50,13 @@ from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_
 
 # --- Search the observation blocks that a fit to all others does not explain.
 
-MOST_ROUNDS = 20
-"""Largest number of searches with other suspects."""
-
-MOST_EXCLUDED = 0.5
-"""Largest share of excluded blocks; beyond it nothing can be said of the others."""
-
+MOST_ROUNDS = 20  # largest number of searches with other suspects
+MOST_EXCLUDED = 0.5  # largest share of excluded blocks; beyond it nothing can be said of the others
+# Variance of the noise, in units of the stated one, below which residuals are rounding.
 SMALLEST_NOISE = 1e-12
-"""Variance of the noise, in units of the stated one, below which residuals are rounding."""
-
+# Suspects, farthest first, that are compared with others which would do as well; more suspects
+# are a matter of the model.
 MOST_COMPARED = 10
-"""Suspects, farthest first, that are compared with others which would do as well; more suspects are
-a matter of the model.
-"""
 
 
 class JudgingNoise(NamedTuple):
@@ -358,8 +352,8 @@ def _join_groups(groups: list[BoolArray]) -> list[BoolArray]:
     return joined
 
 
+# Blocks that a robust fit is made from: it is where the others are compared, not a result.
 MOST_ROBUST = 20_000
-"""Blocks that a robust fit is made from: it is where the others are compared, not a result."""
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,9 @@ from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
+# Weights of parameters that a controller can set (those of a transmission), and of dimensions
+# that are not zero: they are kept against others of as much as ten and three times their share.
 SETTABLE, NONZERO = 0.1, 0.3
-"""Weights of parameters that a controller can set (those of a transmission), and of dimensions that
-are not zero: they are kept against others of as much as ten and three times their share.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +183,9 @@ def _merge(
 # --- Separate the combinations of parameters that data determine to a useful accuracy from the
 # others.
 
+# Multiples of the accuracy for which the number of combinations is stated, too.
 NEIGHBORS = (0.1, 10.0)
-"""Multiples of the accuracy for which the number of combinations is stated, too."""
-
-NEGLIGIBLE_GAIN = 1e-6
-"""Part of a combination of length one that is rounding and left out."""
+NEGLIGIBLE_GAIN = 1e-6  # part of a combination of length one that is rounding and left out
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,33 +23,20 @@ from loopcal.units import Dimension, find_unit, list_symbols
 
 # --- Whether measured points have the names of the poses and targets at which they were measured.
 
+# Distance from its prediction, in medians, above which a point is not where its name says.
 FAR = 8.0
-"""Distance from its prediction, in medians, above which a point is not where its name says."""
-
-FITS = 6
-"""Repetitions of the fit without the points that are far."""
-
+FITS = 6  # repetitions of the fit without the points that are far
+# Ratio of the distances with one instrument frame to those with two, above which it has moved.
+# Also of those with names as they are to those with shifted names.
 MOVED = 8.0
-"""Ratio of the distances with one instrument frame to those with two, above which it has moved.
-Also of those with names as they are to those with shifted names.
-"""
-
+# Like `MOVED`, per degree of freedom: ratio above which it may have moved. Geometric errors alone
+# gave at most 1.2 with 30 poses of a hexapod.
 DOUBTED = 2.0
-"""Like `MOVED`, per degree of freedom: ratio above which it may have moved. Geometric errors alone
-gave at most 1.2 with 30 poses of a hexapod.
-"""
-
-GRID = 8
-"""Moments between which a move or a shift of names is sought at first."""
-
+GRID = 8  # moments between which a move or a shift of names is sought at first
+# Share of the extent of the poses by which points are away, above which units are doubted.
 SCALE_SHARE = 0.02
-"""Share of the extent of the poses by which points are away, above which units are doubted."""
-
-FEWEST_POSES = 4
-"""Poses on each side of a moment at which an instrument may have moved."""
-
-LEAST_SHARE = 1e-9
-"""Share of the extent of all points below which a distance is rounding."""
+FEWEST_POSES = 4  # poses on each side of a moment at which an instrument may have moved
+LEAST_SHARE = 1e-9  # share of the extent of all points below which a distance is rounding
 
 
 @dataclass(frozen=True)

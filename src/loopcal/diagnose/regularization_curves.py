@@ -43,17 +43,13 @@ from loopcal.typing import FloatArray, Progress, report_no_progress
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PER_DECADE = 4
-"""Values of lam per factor of ten where no fit is repeated."""
-
+PER_DECADE = 4  # values of lam per factor of ten where no fit is repeated
+# Values of lam, and of k, that are fitted again for each fold, beside those of rules.
 MOST_FITTED = 13
-"""Values of lam, and of k, that are fitted again for each fold, beside those of rules."""
-
+# Range of lam in units of the largest squared singular value; a rule may choose more.
 LOWEST, HIGHEST = 1e-12, 10.0
-"""Range of lam in units of the largest squared singular value; a rule may choose more."""
-
+# Decades below lam = 1 (the tolerances as a prior) that the grid contains, as far as allowed.
 FEWEST_DECADES = 4.0
-"""Decades below lam = 1 (the tolerances as a prior) that the grid contains, as far as allowed."""
 
 Scheme = Literal["leave-one-out", "folds"]
 

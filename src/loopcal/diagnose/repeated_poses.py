@@ -29,13 +29,10 @@ from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
 from loopcal.typing import IntArray
 
+# Singular values of the whiteners of repeats below this share of the largest belong to components
+# that no repeat measured, which have no mean. Stated sigmas differ by less than that.
 UNMEASURED = 1e-12
-"""Singular values of the whiteners of repeats below this share of the largest belong to components
-that no repeat measured, which have no mean. Stated sigmas differ by less than that.
-"""
-
-LEVEL = 0.01
-"""Probability below which the lack of fit exceeds the pure error."""
+LEVEL = 0.01  # probability below which the lack of fit exceeds the pure error
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ from loopcal.units import Dimension
 
 # --- The residuals of a fit that no parameter explains, in the order of measurement.
 
-EXPLAINED = 1e-6
-"""Share of its length below which a column counts as explained by other columns."""
+EXPLAINED = 1e-6  # share of its length below which a column counts as explained by other columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +192,8 @@ def _iterate_rows(
 # --- Effects that the residuals of a fit may depend on: time, temperature, session, actuator
 # reading.
 
+# What residuals may depend on.
 ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
-"""What residuals may depend on."""
 
 
 class EffectColumn(NamedTuple):
@@ -338,16 +337,13 @@ def list_components(rows: Observations) -> Iterator[tuple[EffectColumn, list[int
     yield from members.items()
 
 
+# Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the
+# same for slow errors of the poses (`model_discrepancy`).
 LEVEL = 0.05
-"""Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the
-same for slow errors of the poses (`model_discrepancy`).
-"""
-
+# Probability that independent errors change the uncertainty of a fit: patterns or slow errors.
 FALSE_ALARMS = compute_any_probability(LEVEL, 2)
-"""Probability that independent errors change the uncertainty of a fit: patterns or slow errors."""
-
+# Degrees of freedom of the residuals for each size of an effect that is tested, at least.
 FEWEST_LEFT = 3.0
-"""Degrees of freedom of the residuals for each size of an effect that is tested, at least."""
 
 
 class EffectSizes(NamedTuple):
@@ -528,17 +524,12 @@ def _list_testable(
 
 # --- The covariance of a fit whose errors are correlated in the order of measurement.
 
+# Correlations of neighbors between which the average is taken.
 RHO = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.92, 0.96, 0.98, 0.99)
-"""Correlations of neighbors between which the average is taken."""
-
-SHARE = (1.0, 0.75, 0.5, 0.3, 0.15)
-"""Shares a of the correlated noise."""
-
+SHARE = (1.0, 0.75, 0.5, 0.3, 0.15)  # shares a of the correlated noise
+# Relative variance of the size of the covariance below which it counts as known.
 LEAST_SCATTER = 1e-9
-"""Relative variance of the size of the covariance below which it counts as known."""
-
-LONGEST = 400
-"""Rows of a series whose correlation is considered at once; longer series are cut."""
+LONGEST = 400  # rows of a series whose correlation is considered at once; longer series are cut
 
 
 @dataclass(frozen=True, eq=False)

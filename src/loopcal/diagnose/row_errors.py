@@ -46,14 +46,10 @@ from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-MOST_COMPONENTS = 3
-"""Components of the largest error."""
-
-BISECTIONS = 60
-"""Bisections of the median of the largest error: each halves its interval."""
-
+MOST_COMPONENTS = 3  # components of the largest error
+BISECTIONS = 60  # bisections of the median of the largest error: each halves its interval
+# Kind of the readings of redundant actuators, which must agree on one pose.
 READINGS = "actuator readings"
-"""Kind of the readings of redundant actuators, which must agree on one pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,10 +111,10 @@ class QuantityErrors:
         )
 
 
+# Errors of a quantity that no row measures.
 NO_ERRORS = QuantityErrors(
     Dimension.LENGTH, np.zeros((0, MOST_COMPONENTS)), np.zeros(0, np.intp), (), ()
 )
-"""Errors of a quantity that no row measures."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,13 +33,12 @@ from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_tail
 
+# Share of the start's cost below which a gain is rounding: the last digits of a file.
 NO_GAIN = 1e-3
-"""Share of the start's cost below which a gain is rounding: the last digits of a file."""
 
 MM = 1e-3
 
-SMALL = 0.01
-"""Changes below this are not listed [mm, deg]."""
+SMALL = 0.01  # changes below this are not listed [mm, deg]
 
 
 class StartVerdict(Enum):

@@ -39,28 +39,20 @@ from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-POSES = 24
-"""Number of poses of a further measurement."""
-
+POSES = 24  # number of poses of a further measurement
+# Singular value above which an instrument observes a direction, relative to the largest of its
+# rows and of those that exist.
 OBSERVED = 1e-8
-"""Singular value above which an instrument observes a direction, relative to the largest of its
-rows and of those that exist.
-"""
-
+# A further measurement must reduce the remaining uncertainty of the leading parameter below this
+# share.
 IMPROVEMENT = 0.9
-"""A further measurement must reduce the remaining uncertainty of the leading parameter below this
-share.
-"""
-
-MOST_MISSING = 3
-"""Largest number of open combinations that a refusal lists."""
+MOST_MISSING = 3  # largest number of open combinations that a refusal lists
 
 TILT = "tilt-torsion"
+# Single coordinates, the simplest further measurements.
 SINGLE = (("x",), ("y",), ("z",), ("psi",), ("theta",), ("phi", "theta"))
-"""Single coordinates, the simplest further measurements."""
-
+# Standard deviations [SI] of a further instrument where none are stated.
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
-"""Standard deviations [SI] of a further instrument where none are stated."""
 
 
 @dataclass(frozen=True)

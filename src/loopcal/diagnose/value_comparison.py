@@ -48,14 +48,11 @@ from loopcal.units import Dimension
 
 # --- Measure by how much second-order effects of a change of parameters exceed the noise.
 
+# Poses at which machines are compared; without a stated workspace their distance from home: a
+# share of the robot's size, or radians.
 POSES, NEAR = 20, 0.05
-"""Poses at which machines are compared; without a stated workspace their distance from home: a
-share of the robot's size, or radians.
-"""
-STEP = 1e-3
-"""Step of the differences that make G [standard deviations]."""
-SMALLEST = 1e-8
-"""Singular values of G below this share of the largest count as zero."""
+STEP = 1e-3  # step of the differences that make G [standard deviations]
+SMALLEST = 1e-8  # singular values of G below this share of the largest count as zero
 DRAWN_POSES = 5  # purpose of a random stream
 
 
@@ -95,16 +92,13 @@ def measure_second_order(posterior: Posterior, change: FloatArray) -> float:
     return float(w @ w)
 
 
-TINY = 1e-99
-"""Probability below which a sentence states no number."""
-MOST_NAMED = 4
-"""Parameters that name the direction of the largest difference."""
+TINY = 1e-99  # probability below which a sentence states no number
+MOST_NAMED = 4  # parameters that name the direction of the largest difference
+# Smallest part of a parameter in that direction, relative to the largest, for it to be named.
 LEAST_PART = 0.3
-"""Smallest part of a parameter in that direction, relative to the largest, for it to be named."""
+# Relative difference up to which fixed values, and poses of two robot files, are equal: files
+# state some seven digits.
 EQUAL = 1e-6
-"""Relative difference up to which fixed values, and poses of two robot files, are equal: files
-state some seven digits.
-"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,16 +38,13 @@ from loopcal.planning.path import check_paths, interpolate_path, locate_home, me
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
 
-HALVINGS = 12
-"""Bisections of the line to the middle: the boundary is located to 1/4096 of it."""
+HALVINGS = 12  # bisections of the line to the middle: the boundary is located to 1/4096 of it
+# Decimal places of the robot's size, in its unit, to which coordinates are commanded; the same of
+# a radian.
 DIGITS = 5
-"""Decimal places of the robot's size, in its unit, to which coordinates are commanded; the same of
-a radian.
-"""
-ROUNDING = 1e-6
-"""Part of a step that is the rounding of a bound's own number."""
+ROUNDING = 1e-6  # part of a step that is the rounding of a bound's own number
+# Share of the coordinates of a boundary pose that are put to an end of their range.
 ON_BOUNDARY = 0.7
-"""Share of the coordinates of a boundary pose that are put to an end of their range."""
 
 
 @dataclass(frozen=True, eq=False)

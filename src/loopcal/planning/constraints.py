@@ -25,8 +25,7 @@ from loopcal.mechanism.workspace import evaluate_limits
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-ROUNDING = 1e-12
-"""Share of a bound by which it may be exceeded: the rounding of its own number."""
+ROUNDING = 1e-12  # share of a bound by which it may be exceeded: the rounding of its own number
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,11 +286,9 @@ def mark_on_path(counts: Mapping[Violation, int]) -> dict[Violation, int]:
 # --- Options of a plan: number of poses or accuracy goal, criterion, constraints, candidates,
 # seed.
 
+# Error that a plan makes small; that of a pose counts rotations times the robot's size.
 Target = Literal["pose", "position", "orientation"]
-"""Error that a plan makes small; that of a pose counts rotations times the robot's size."""
-
-N_POSES = 40
-"""Number of poses where neither a number nor a goal is given."""
+N_POSES = 40  # number of poses where neither a number nor a goal is given
 
 
 @dataclass(frozen=True, eq=False)

@@ -311,16 +311,12 @@ def compute_efficiency(criterion: Criterion, value: float, best: float, n_direct
 
 # --- Score of a design in scaled coordinates, and the change of score by every swap at once.
 
+# A design is singular where it determines a direction with less than this share of the mean
+# design's information, as a ratio of standard deviations.
 SINGULAR = 1e-6
-"""A design is singular where it determines a direction with less than this share of the mean
-design's information, as a ratio of standard deviations.
-"""
-
-GAIN = 1e-7
-"""An exchange or a move must multiply the efficiency by more than 1 + this."""
-
+GAIN = 1e-7  # an exchange or a move must multiply the efficiency by more than 1 + this
+# Ridge that is added to a singular start, as a ratio of standard deviations to the mean design.
 RIDGE = 1e-3
-"""Ridge that is added to a singular start, as a ratio of standard deviations to the mean design."""
 
 
 @dataclass(frozen=True, eq=False)

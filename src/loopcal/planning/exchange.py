@@ -42,19 +42,13 @@ from loopcal.planning.design_space import (
 from loopcal.planning.relaxation import RelaxedDesign, relax_design
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
+# (b,) indices of groups, (b, c) coordinates -> rows (b, r, o + p), NaN where not allowed.
 LinearizeGroups = Callable[[IntArray, FloatArray], FloatArray]
-"""(b,) indices of groups, (b, c) coordinates -> rows (b, r, o + p), NaN where not allowed."""
-
-SWEEP_GAIN = 1e-3
-"""Sweeps end when one has multiplied the efficiency by less than 1 + this."""
-
-EXCHANGES = 100
-"""Exchanges of each group of a design, on average and at most: a few are enough."""
-
+SWEEP_GAIN = 1e-3  # sweeps end when one has multiplied the efficiency by less than 1 + this
+EXCHANGES = 100  # exchanges of each group of a design, on average and at most: a few are enough
+# Copies of each group at random levels, which with the first design define the observable
+# directions.
 PROBES = 4
-"""Copies of each group at random levels, which with the first design define the observable
-directions.
-"""
 
 
 def fedorov_exchange(
@@ -373,25 +367,16 @@ def _choose_levels(scoring: Scoring, rows: FloatArray, trials: FloatArray) -> In
 
 # --- A good design with its certificate: relaxation, rounding, exchange and perturbation.
 
+# Default number of perturbations: the first over the number of groups, at least the second.
 PERTURBATIONS, LEAST_PERTURBATIONS = 1600, 20
-"""Default number of perturbations: the first over the number of groups, at least the second."""
-
+# Efficiency from which a design is not perturbed: the remaining gain is not worth the time.
 GOOD = 0.99
-"""Efficiency from which a design is not perturbed: the remaining gain is not worth the time."""
-
-PERTURBED = 0.15
-"""Share of the groups that a perturbation replaces; at least two groups."""
-
+PERTURBED = 0.15  # share of the groups that a perturbation replaces; at least two groups
+# Candidates of the exchange after a perturbation: the first times the size of the design, at
+# least the second.
 AMONG, FEWEST = 6, 100
-"""Candidates of the exchange after a perturbation: the first times the size of the design, at least
-the second.
-"""
-
-CURVE_PERTURBATIONS = 10
-"""Number of perturbations of each design of a curve."""
-
-BOUND_GAP = 3e-3
-"""Gap of the relaxation where only the size is needed."""
+CURVE_PERTURBATIONS = 10  # number of perturbations of each design of a curve
+BOUND_GAP = 3e-3  # gap of the relaxation where only the size is needed
 
 
 @dataclass(frozen=True, eq=False)

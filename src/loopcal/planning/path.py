@@ -35,24 +35,16 @@ from loopcal.planning.constraints import (
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-STEPS = 40
-"""Steps in which a path as long as the robot's size, or one radian, is checked."""
-AT_ONCE = 4096
-"""Paths that are checked at once."""
+STEPS = 40  # steps in which a path as long as the robot's size, or one radian, is checked
+AT_ONCE = 4096  # paths that are checked at once
+# Difference of readings, in the robot's size or in radians, above which a path ended on another
+# branch than its end.
 BRANCH = 1e-6
-"""Difference of readings, in the robot's size or in radians, above which a path ended on another
-branch than its end.
-"""
-FIRST_POSES = 8
-"""First poses that the order of visiting tries."""
+FIRST_POSES = 8  # first poses that the order of visiting tries
+# Share of the length by which a path must become shorter to count: rounding is no gain.
 LEAST_GAIN = 1e-12
-"""Share of the length by which a path must become shorter to count: rounding is no gain."""
-
-
-REVERSALS = 50
-"""Reversals of sections for each pose of an order, at most: about one is enough."""
-ORDERS = 100
-"""Orders that are computed anew because a path is not allowed, at most."""
+REVERSALS = 50  # reversals of sections for each pose of an order, at most: about one is enough
+ORDERS = 100  # orders that are computed anew because a path is not allowed, at most
 
 
 def locate_home(robot: Mechanism) -> FloatArray:

@@ -42,22 +42,15 @@ if TYPE_CHECKING:
 
 # --- Groups of poses whose points lie on a plane and on a line perpendicular to it, as candidates.
 
-AXIS = 3
-"""Column of the axis in a design."""
-
+AXIS = 3  # column of the axis in a design
+# Levels of every coordinate, in half ranges from the middle of the workspace.
 LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
-"""Levels of every coordinate, in half ranges from the middle of the workspace."""
-
+# Shortest allowed line, in half ranges of the workspace: a shorter one is hard to tell from a
+# point.
 SHORTEST = 0.25
-"""Shortest allowed line, in half ranges of the workspace: a shorter one is hard to tell from a
-point.
-"""
-
+# Groups out of reach are drawn anew in a workspace smaller by this factor, so many times.
 SHRINKAGE, ROUNDS = 0.85, 12
-"""Groups out of reach are drawn anew in a workspace smaller by this factor, so many times."""
-
-SURFACE = 5
-"""Nuisance parameters of a group: two rotations, a height, two shifts."""
+SURFACE = 5  # nuisance parameters of a group: two rotations, a height, two shifts
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,14 +346,11 @@ def find_line_axes(robot: Mechanism, coordinates: FloatArray, groups: int) -> In
     return np.asarray(np.abs(points[:, 1] - points[:, 0]).argmax(axis=1))
 
 
-SWEEPS = 3
-"""Sweeps over all coordinates: one more gains a few per cent."""
+SWEEPS = 3  # sweeps over all coordinates: one more gains a few per cent
+# Points of a group that give no information on the machine: k + 3 rows, less five nuisance
+# parameters of the surfaces.
 SPENT = 2
-"""Points of a group that give no information on the machine: k + 3 rows, less five nuisance
-parameters of the surfaces.
-"""
-DRAWN = 20
-"""Groups drawn for each that is needed before the constraints are said to exclude all."""
+DRAWN = 20  # groups drawn for each that is needed before the constraints are said to exclude all
 
 
 @dataclass(frozen=True, eq=False)

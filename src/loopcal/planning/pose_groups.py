@@ -127,14 +127,11 @@ def eliminate_freedoms(rows: FloatArray, count: int) -> FloatArray:
     return done.rest[:, first:, :-1]
 
 
-BLOCK = 256
-"""Groups whose rows are computed at once."""
-MOST = 5000
-"""Largest number of candidate combinations: as many rows are computed in some seconds."""
-ENOUGH = 100
-"""Groups from which the motions of frames are found that no group determines."""
+BLOCK = 256  # groups whose rows are computed at once
+MOST = 5000  # largest number of candidate combinations: as many rows are computed in some seconds
+ENOUGH = 100  # groups from which the motions of frames are found that no group determines
+# Up to this many times the requested number all combinations are enumerated before drawing.
 DENSE = 20
-"""Up to this many times the requested number all combinations are enumerated before drawing."""
 
 
 @dataclass(frozen=True, eq=False)

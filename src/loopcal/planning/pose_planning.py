@@ -40,20 +40,17 @@ from loopcal.planning.result import DesignQuality, ErrorForecast, Plan, PlannedP
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension, find_unit
 
+# Number of perturbations of a design: more of them gain some tenths of a per cent.
 PERTURBATIONS = 10
-"""Number of perturbations of a design: more of them gain some tenths of a per cent."""
-GAP = 5e-3
-"""Gap of the efficiency up to which the bound is computed."""
-DRAWS = 20
-"""Sets of evenly drawn poses that a plan is compared with."""
+GAP = 5e-3  # gap of the efficiency up to which the bound is computed
+DRAWS = 20  # sets of evenly drawn poses that a plan is compared with
+# Decimal places of the robot's size, in its unit, or of a radian, to which readings are stated.
 DIGITS = 8
-"""Decimal places of the robot's size, in its unit, or of a radian, to which readings are stated."""
+# Largest number of times that poses are added where a goal is missed because some are held out.
 EXTENSIONS = 12
-"""Largest number of times that poses are added where a goal is missed because some are held out."""
+# Poses of the fit for each validation pose, by default. At least FEW_ROWS poses are held out:
+# fewer leave the verdict of a calibration undecided.
 FITTED_PER_HELD_OUT = 4
-"""Poses of the fit for each validation pose, by default. At least FEW_ROWS poses are held out:
-fewer leave the verdict of a calibration undecided.
-"""
 
 
 def plan(

@@ -36,15 +36,13 @@ from loopcal.planning.constraints import Target
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-FRAMES = (FITTED, BASE, RELATIVE)
-"""Frames in which a plan can state errors."""
-
+FRAMES = (FITTED, BASE, RELATIVE)  # frames in which a plan can state errors
+# Dimension of the error of each target.
 DIMENSIONS: dict[Target, Dimension] = {
     "pose": Dimension.LENGTH,
     "position": Dimension.LENGTH,
     "orientation": Dimension.ANGLE,
 }
-"""Dimension of the error of each target."""
 
 
 @dataclass(frozen=True, eq=False)

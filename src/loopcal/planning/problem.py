@@ -50,16 +50,13 @@ from loopcal.planning.pose_groups import (
 from loopcal.planning.prediction import DIMENSIONS, ExpectedErrors, Prediction, linearize_prediction
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
-PREDICTED = 200
-"""Poses of the workspace whose errors are predicted."""
+PREDICTED = 200  # poses of the workspace whose errors are predicted
+# Largest singular value, in information per tolerance, up to which an instrument determines
+# nothing: the rest is rounding.
 NO_INFORMATION = 1e-6
-"""Largest singular value, in information per tolerance, up to which an instrument determines
-nothing: the rest is rounding.
-"""
+# Share of a pose's error up to which its position or orientation does not change at all: the rest
+# is rounding.
 NO_MOTION = 1e-9
-"""Share of a pose's error up to which its position or orientation does not change at all: the rest
-is rounding.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,14 +363,10 @@ def _select_predicted(candidates: Candidates, options: PlanOptions) -> Solution:
 
 # --- Number of poses: expected errors by number, and the smallest number that reaches a goal.
 
-SIZES = 6
-"""Numbers of poses on a curve."""
-RANGE = 4
-"""A curve goes from the smallest number to this many times the requested one."""
-MOST = 400
-"""Largest number of poses for a goal: more is over a day's work."""
-PERTURBATIONS = 4
-"""Number of perturbations of each design of a curve."""
+SIZES = 6  # numbers of poses on a curve
+RANGE = 4  # a curve goes from the smallest number to this many times the requested one
+MOST = 400  # largest number of poses for a goal: more is over a day's work
+PERTURBATIONS = 4  # number of perturbations of each design of a curve
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,17 +40,10 @@ from loopcal.planning.design_space import (
 )
 from loopcal.typing import FloatArray, IntArray
 
-ROUNDS = 40
-"""Largest number of times that candidates enter the barrier problem."""
-
-WARM_UP = 12
-"""Multiplicative steps over all candidates that select those to begin with."""
-
-NEWTON_STEPS = 40
-"""Largest number of Newton steps for one t."""
-
-GROWTH = 20.0
-"""Factor from one t to the next."""
+ROUNDS = 40  # largest number of times that candidates enter the barrier problem
+WARM_UP = 12  # multiplicative steps over all candidates that select those to begin with
+NEWTON_STEPS = 40  # largest number of Newton steps for one t
+GROWTH = 20.0  # factor from one t to the next
 
 
 @dataclass(frozen=True, eq=False)

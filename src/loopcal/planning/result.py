@@ -25,8 +25,7 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WEAK = 0.5
-"""Efficiency below which the certificate guarantees little."""
+WEAK = 0.5  # efficiency below which the certificate guarantees little
 
 
 def round_shortfall(efficiency: float) -> float:

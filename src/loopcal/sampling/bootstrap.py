@@ -292,8 +292,8 @@ def _find_range(columns: FloatArray) -> FloatArray:
 
 # --- The scatter of the errors of blocks against the stated uncertainty of each parameter.
 
+# Probability that any parameter is reported where errors are independent and as stated.
 FALSE_ALARMS = 0.01
-"""Probability that any parameter is reported where errors are independent and as stated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,14 +376,10 @@ def describe_scatter(
 
 # --- Choose which poses are resampled together.
 
+# Blocks of a unit with which it is resampled by default: with fewer, the scatter of the resamples
+# is itself known to 20 % at best.
 ENOUGH_BLOCKS = 12
-"""Blocks of a unit with which it is resampled by default: with fewer, the scatter of the resamples
-is itself known to 20 % at best.
-"""
-
-
-UNITS = ("pose", "block", "session", "day")
-"""Names of units."""
+UNITS = ("pose", "block", "session", "day")  # names of units
 
 
 def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters:
@@ -441,25 +437,15 @@ def _consecutive(data: Measurements, length: int) -> Clusters:
     return Clusters(name, member, len(names))
 
 
-Scheme = Literal["wild", "pairs", "normal"]
-"""How resamples are drawn."""
-
+Scheme = Literal["wild", "pairs", "normal"]  # how resamples are drawn
+# How intervals are read from the resamples, see `Bootstrap.intervals`.
 IntervalKind = Literal["widened", "percentile", "bias-corrected", "studentized"]
-"""How intervals are read from the resamples, see `Bootstrap.intervals`."""
-
-MOST_FAILED = 0.02
-"""Share of resamples that do not converge above which it is reported."""
-
-BATCH = 250
-"""Resamples that are fitted at once; progress is reported between them."""
-
+MOST_FAILED = 0.02  # share of resamples that do not converge above which it is reported
+BATCH = 250  # resamples that are fitted at once; progress is reported between them
+# Number of blocks below which the random factor of the wild bootstrap has six values instead of
+# two, so that there are enough different resamples (Webb, 2023).
 FEW_BLOCKS = 12
-"""Number of blocks below which the random factor of the wild bootstrap has six values instead of
-two, so that there are enough different resamples (Webb, 2023).
-"""
-
-WEBB = np.sqrt([0.5, 1.0, 1.5])
-"""Sizes of the six values +/-."""
+WEBB = np.sqrt([0.5, 1.0, 1.5])  # sizes of the six values +/-
 
 
 @dataclass(frozen=True, eq=False)

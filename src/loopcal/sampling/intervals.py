@@ -26,8 +26,7 @@ from loopcal.typing import BoolArray, FloatArray
 
 # --- Statistics of weighted draws, and how well the draws determine them.
 
-LARGEST_TAIL = 0.2
-"""Share of the draws whose weights are the tail, at most; see `fit_tail_shape`."""
+LARGEST_TAIL = 0.2  # share of the draws whose weights are the tail, at most; see `fit_tail_shape`
 
 
 def normalize_weights(log_weight: FloatArray) -> FloatArray:
@@ -87,14 +86,10 @@ def weighted_quantiles(draws: FloatArray, weight: FloatArray, level: FloatArray)
     return np.stack(columns, axis=1)
 
 
-OFF = 0.10
-"""Difference of an end of an interval, in linear half-widths, above which it is reported."""
-
-NAMED = 3
-"""Parameters that a finding names, at most."""
-
+OFF = 0.10  # difference of an end of an interval, in linear half-widths, above which it is reported
+NAMED = 3  # parameters that a finding names, at most
+# Probability that any end is reported by the random draws alone, where linear intervals hold.
 FALSE_ALARMS = 0.01
-"""Probability that any end is reported by the random draws alone, where linear intervals hold."""
 
 
 @dataclass(frozen=True, eq=False)

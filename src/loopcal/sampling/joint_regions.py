@@ -36,15 +36,11 @@ from loopcal.presentation import TableResult
 from loopcal.sampling.intervals import half_widths
 from loopcal.typing import FloatArray, IntArray
 
-Rule = Literal["maximum", "sidak", "bonferroni", "scheffe"]
-"""How simultaneous intervals are made."""
-
-DRAWS = 100_000
-"""Simulated maxima: the quantile has a standard error of about 0.3 %."""
+Rule = Literal["maximum", "sidak", "bonferroni", "scheffe"]  # how simultaneous intervals are made
+DRAWS = 100_000  # simulated maxima: the quantile has a standard error of about 0.3 %
 
 BATCH = 10_000
-SMALLEST = 1e-10
-"""Eigenvalue of a correlation matrix below which quantities depend on each other."""
+SMALLEST = 1e-10  # eigenvalue of a correlation matrix below which quantities depend on each other
 
 
 @dataclass(frozen=True, eq=False)

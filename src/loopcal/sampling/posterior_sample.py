@@ -160,25 +160,17 @@ def describe_density(fit: Identification, linear: FitLinearization) -> Posterior
     )
 
 
-BATCH = 250
-"""Draws that are evaluated at once; progress is reported between them."""
-
-ROUNDS = 4
-"""Proposals that are tried, at most."""
-
-GOOD_SHARE = 0.2
-"""Effective size, as a share of the draws, with which a proposal is kept."""
-
+BATCH = 250  # draws that are evaluated at once; progress is reported between them
+ROUNDS = 4  # proposals that are tried, at most
+GOOD_SHARE = 0.2  # effective size, as a share of the draws, with which a proposal is kept
+# Limits of the degrees of freedom of the proposal. As many as there are directions lose about a
+# third of the draws where the posterior is normal.
 SMALLEST_DEGREES, LARGEST_DEGREES = 8.0, 100.0
-"""Limits of the degrees of freedom of the proposal. As many as there are directions lose about a
-third of the draws where the posterior is normal."""
-
+# Effective size below which, and shape of the tail of the weights above which, the draws do not
+# represent the posterior (Vehtari et al., 2024).
 FEWEST_DRAWS, LARGEST_SHAPE = 400.0, 0.7
-"""Effective size below which, and shape of the tail of the weights above which, the draws do not
-represent the posterior (Vehtari et al., 2024)."""
-
+# Effective size, in directions, to which weights are flattened before a proposal is moved.
 FLATTENED = 50.0
-"""Effective size, in directions, to which weights are flattened before a proposal is moved."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,27 +49,21 @@ if TYPE_CHECKING:
     from loopcal.diagnose.value_comparison import ValueComparison
     from loopcal.estimate.recalibration import Change
 
+# Codes of data that a geometry cannot reach.
 OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
-"""Codes of data that a geometry cannot reach."""
-
+# Codes of data that leave nothing to compare: all values locate the poses, or the initial
+# geometry reaches none of these.
 NOTHING_TO_COMPARE = (
     "residuals.readings-missing",
     "residuals.no-rows-to-predict",
     "residuals.before-out-of-reach",
 )
-"""Codes of data that leave nothing to compare: all values locate the poses, or the initial geometry
-reaches none of these."""
-
+# Steps that the progress callback counts: conventions, model, fit, what the residuals add to the
+# uncertainty, validation, examination, uncertainty budget, suggestions.
 STEPS = 8
-"""Steps that the progress callback counts: conventions, model, fit, what the residuals add to the
-uncertainty, validation, examination, uncertainty budget, suggestions.
-"""
-
-
+# Standard deviations (rms) by which targets on the base contradict each other or their stated
+# places, above which their unit, order or places are wrong: one that was hit moves by less.
 GROSS = 1000.0
-"""Standard deviations (rms) by which targets on the base contradict each other or their stated
-places, above which their unit, order or places are wrong: one that was hit moves by less.
-"""
 
 
 def calibrate(

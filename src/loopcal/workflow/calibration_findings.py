@@ -21,14 +21,11 @@ from loopcal.units import Dimension
 from loopcal.workflow.calibration_options import DataSplit
 from loopcal.workflow.verdict import BASE_MOVED
 
+# Finding that a calibration is not expected to improve on the tolerances.
 NO_GAIN = "model.no-expected-gain"
-"""Finding that a calibration is not expected to improve on the tolerances."""
-
-ON_BASE = (*BASE_MOVED, "data.base-session-unused")
-"""Findings on targets on the base."""
-
+ON_BASE = (*BASE_MOVED, "data.base-session-unused")  # findings on targets on the base
+# Factor on sigma from which an estimated noise is no property of an instrument.
 UNUSUAL_NOISE = 10.0
-"""Factor on sigma from which an estimated noise is no property of an instrument."""
 
 
 def report_conventions(check: ConventionCheck) -> list[Finding]:

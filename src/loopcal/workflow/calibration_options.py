@@ -114,8 +114,7 @@ class CalibrationOptions:
 
 # --- Measurements divided into those to fit and those held out for validation.
 
-UNKNOWN = np.array(np.inf)
-"""Sigma of readings that may be missing."""
+UNKNOWN = np.array(np.inf)  # sigma of readings that may be missing
 
 
 @dataclass(frozen=True, eq=False)

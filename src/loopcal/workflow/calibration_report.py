@@ -35,11 +35,9 @@ if TYPE_CHECKING:
     from loopcal.diagnose.value_comparison import ValueComparison
     from loopcal.estimate.recalibration import Change
 
-TOP = 3
-"""Findings that a summary shows."""
-
+TOP = 3  # findings that a summary shows
+# Heading of the errors where no pose was held out.
 FITTED_ERRORS = "Errors at the fitted poses, which are optimistic:"
-"""Heading of the errors where no pose was held out."""
 
 
 @dataclass(frozen=True)

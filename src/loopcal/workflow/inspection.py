@@ -31,8 +31,7 @@ from loopcal.workflow.calibration_findings import (
     sort_open_freedoms,
 )
 
-FEW = 3
-"""Combinations that change poses and that a summary lists one by one."""
+FEW = 3  # combinations that change poses and that a summary lists one by one
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +148,7 @@ def analyze_identifiability(
 
 # --- Inspect a robot: its readings at home, and the limits that home exceeds.
 
-ROUNDING = 1e-9
-"""How far home may exceed a limit by rounding [m or rad]."""
+ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
 
 
 @dataclass(frozen=True, eq=False)

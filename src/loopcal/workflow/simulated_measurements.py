@@ -161,14 +161,13 @@ def predict_noise_free(
 
 # --- Build an instrument from a short description: kinds, noise, and which frames are unknown.
 
+# A frame that may be unknown -> the names that kinds have for it.
 FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
-"""A frame that may be unknown -> the names that kinds have for it."""
-
+# Name of a distribution -> noise with given standard deviations (m,) [SI].
 DISTRIBUTIONS: Mapping[str, Callable[[FloatArray], Noise]] = {
     "normal": Gaussian,
     "uniform": lambda sigma: Uniform(np.sqrt(3.0) * sigma),
 }
-"""Name of a distribution -> noise with given standard deviations (m,) [SI]."""
 
 
 @dataclass(frozen=True)

@@ -12,42 +12,32 @@ from loopcal.diagnose.start_values import StartCheck, StartVerdict
 from loopcal.estimate.residual_test import SIGNIFICANCE, ResidualTest, coverage_factor
 from loopcal.findings import Finding, Severity, report_finding
 
+# Findings that ask for more or other held-out poses.
 TOO_FEW_HELD_OUT = (
     "workflow.few-held-out-poses",
     "workflow.held-out-setup",
     "workflow.nothing-to-validate",
 )
-"""Findings that ask for more or other held-out poses."""
-
+# Findings on held-out poses that do not fit; the second leaves the verdict open.
 BLUNDERS = ("validation.blunder", "validation.blunders-dominate")
-"""Findings on held-out poses that do not fit; the second leaves the verdict open."""
-
+# Findings that leave the verdict open.
 TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDERS[1])
-"""Findings that leave the verdict open."""
-
-
-LIMIT_EXCEEDED = "gates.limit-exceeded"
-"""Finding that an error is above a stated limit."""
-
+LIMIT_EXCEEDED = "gates.limit-exceeded"  # finding that an error is above a stated limit
+# Finding that a limit was stated for something that no row measures.
 LIMIT_NOT_MEASURED = "gates.limit-not-measured"
-"""Finding that a limit was stated for something that no row measures."""
-
+# Finding that an error without the noise of its measurement keeps a limit.
 CONFORMS = "conformity.conforms"
-"""Finding that an error without the noise of its measurement keeps a limit."""
-
+# Finding that heights fit with either sign: the wrong one leads to the wrong geometry.
 SIGN_UNDECIDED = "conventions.height-sign-undecided"
-"""Finding that heights fit with either sign: the wrong one leads to the wrong geometry."""
-
+# Next step of a good calibration whose values are not recommended.
 NEXT_WITH_VALUES = {
     "values.keep-undecided": "workflow.next-state-noise",
     "values.keep-within-noise": "workflow.next-keep-values",
     "values.keep-not-confirmed": "workflow.next-keep-values",
 }
-"""Next step of a good calibration whose values are not recommended."""
-
+# Findings that an instrument or a target on the base moved.
 BASE_MOVED = ("residuals.frame-moved", "residuals.base-targets-moved")
-"""Findings that an instrument or a target on the base moved."""
-
+# Findings that residuals are not independent: a cause of large residuals other than sigma.
 DEPENDENT = (
     "residuals.drift",
     "residuals.trend",
@@ -58,7 +48,6 @@ DEPENDENT = (
     "residuals.common-errors",
     "residuals.model-discrepancy",
 )
-"""Findings that residuals are not independent: a cause of large residuals other than sigma."""
 
 
 class Verdict(Enum):

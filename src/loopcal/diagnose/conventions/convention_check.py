@@ -69,10 +69,9 @@ if TYPE_CHECKING:
 
 # --- The result of a convention check.
 
+# Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
+# three times too small, give about 3 each.
 IMPLAUSIBLE = 10.0
-"""Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
-three times too small, give about 3 each.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,19 +239,13 @@ def _has_uncertain_readings(data: Measurements) -> bool:
 # --- Check setup parameters (frames, targets, surfaces): stated values, and values kept from a
 # fit.
 
+# Number of stated parameters up to which each is estimated alone, to find the wrong one.
 MOST_SINGLE = 12
-"""Number of stated parameters up to which each is estimated alone, to find the wrong one."""
-
-SMALLER = 3.0
-"""Factor by which errors must decrease when a moved setup item is fitted again."""
-
+SMALLER = 3.0  # factor by which errors must decrease when a moved setup item is fitted again
+# Standard deviations of the noise (rms) that the errors with kept values must exceed; below,
+# noise may be the reason.
 ABOVE = 3.0
-"""Standard deviations of the noise (rms) that the errors with kept values must exceed; below, noise
-may be the reason.
-"""
-
-FEWEST = 8
-"""Smallest number of equations beyond the fitted parameters that supports a result."""
+FEWEST = 8  # smallest number of equations beyond the fitted parameters that supports a result
 
 
 class Contradiction(NamedTuple):
@@ -378,15 +371,12 @@ def _describe_value(robot: Mechanism, entry: Parameter, estimate: float) -> dict
 # --- Judge measurements that the robot does not explain in one step of a fit: a few rows far off,
 # a wrong statement about frames or targets, another interpretation, or none that is tested.
 
+# Smallest number of equations beyond those of unknown frames by which data are refused. With
+# fewer, frames and parameters alone explain nearly anything.
 FEWEST_TO_REFUSE = 8
-"""Smallest number of equations beyond those of unknown frames by which data are refused. With
-fewer, frames and parameters alone explain nearly anything.
-"""
-
+# Number of poses of large data sets by which interpretations are judged, and number of runs of
+# neighbors (rows may be shifted by one) that contain them.
 MOST_POSES, RUNS = 120, 4
-"""Number of poses of large data sets by which interpretations are judged, and number of runs of
-neighbors (rows may be shifted by one) that contain them.
-"""
 
 
 def compare_interpretations(

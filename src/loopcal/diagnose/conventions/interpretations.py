@@ -29,10 +29,9 @@ from loopcal.units import Dimension
 
 # --- Changes of tables of numbers: pure functions that scale or permute columns.
 
+# From written values (r, c), or readings (n, a), to those that the stated convention would write
+# [SI].
 Change = Callable[[FloatArray], FloatArray]
-"""From written values (r, c), or readings (n, a), to those that the stated convention would write
-[SI].
-"""
 
 
 def scale_columns(columns: Sequence[int], factor: float, zero: FloatArray | float = 0.0) -> Change:
@@ -64,8 +63,7 @@ def permute_columns(columns: Sequence[int], sources: Sequence[int]) -> Change:
     return change
 
 
-Slip = tuple[str, dict[str, Any], Change]
-"""Kind of a slip, what is read differently, and how."""
+Slip = tuple[str, dict[str, Any], Change]  # kind of a slip, what is read differently, and how
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +163,8 @@ def name_source(i: int, data: Measurements) -> str:
 
 DEGREES = 180.0 / np.pi
 
+# Factors by which the true values are larger than the written ones where a unit is wrong: m, mm,
+# um, cm, inch; rad, deg, mrad, arcmin, gon.
 FACTORS: Mapping[Dimension, tuple[float, ...]] = {
     Dimension.LENGTH: (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1),
     Dimension.ANGLE: (
@@ -172,12 +172,8 @@ FACTORS: Mapping[Dimension, tuple[float, ...]] = {
         *(60.0, 1.0 / 60.0, 0.9, 1.0 / 0.9),
     ),
 }
-"""Factors by which the true values are larger than the written ones where a unit is wrong: m, mm,
-um, cm, inch; rad, deg, mrad, arcmin, gon.
-"""
-
+# Those of them that are also tested for single columns.
 SINGLE_COLUMN_FACTORS = (1e3, 1e-3, 25.4, 1.0 / 25.4, DEGREES, 1.0 / DEGREES, 0.9, 1.0 / 0.9)
-"""Those of them that are also tested for single columns."""
 
 
 def list_interpretations(data: Measurements) -> Iterator[Interpretation]:
@@ -307,8 +303,8 @@ def _list_orders(groups: Mapping[str, Sequence[int]], noun: str) -> Iterator[Sli
             yield f"permuted-{noun}", {noun: names, "order": order}, change
 
 
+# From a kind to the slips of one family, the likelier families first.
 RULES = (_list_units, _list_rotations, _list_signs, _list_swaps)
-"""From a kind to the slips of one family, the likelier families first."""
 
 
 def _columns_by_name(kind: Kind) -> dict[str, list[int]]:
@@ -340,16 +336,11 @@ def _orientation_columns(kind: Kind) -> tuple[OrientationForm, list[int], list[i
 
 # --- Interpretations of actuator readings: other units, factors, signs, orders and rows.
 
+# Factors by which true readings are larger than the written ones where microsteps, a gear or a
+# pulley are stated wrongly.
 GEAR_FACTORS = (2.0, 0.5, 1.5, 1.0 / 1.5)
-"""Factors by which true readings are larger than the written ones where microsteps, a gear or a
-pulley are stated wrongly.
-"""
-
-NEGLIGIBLE = 1e-6
-"""Reading of the home pose [m or rad] that counts as 0."""
-
-MOST_PERMUTED = 4
-"""Number of actuators up to which all orders are tested."""
+NEGLIGIBLE = 1e-6  # reading of the home pose [m or rad] that counts as 0
+MOST_PERMUTED = 4  # number of actuators up to which all orders are tested
 
 
 def list_reading_interpretations(

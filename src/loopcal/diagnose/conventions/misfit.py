@@ -35,26 +35,17 @@ from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-FEWEST = 3
-"""Smallest number of equations beyond those of unknown frames that gives a misfit."""
-
-ALLOWED = 4.0
-"""Misfit up to which tolerances and noise explain a residual."""
-
+FEWEST = 3  # smallest number of equations beyond those of unknown frames that gives a misfit
+ALLOWED = 4.0  # misfit up to which tolerances and noise explain a residual
+# Ratio of misfits up to which two interpretations fit equally well; the first in the list is
+# reported, the others as alternatives.
 EQUALLY = 1.2
-"""Ratio of misfits up to which two interpretations fit equally well; the first in the list is
-reported, the others as alternatives.
-"""
-
+# Rows this many times the median row away are excluded, up to this share of the rows; the check
+# for outliers names them. The same share of the poses may be out of reach.
 FAR, MOST_EXCLUDED = 5.0, 0.25
-"""Rows this many times the median row away are excluded, up to this share of the rows; the check
-for outliers names them. The same share of the poses may be out of reach.
-"""
-
+# Number of poses that Newton's method does not reach from home at once, and that are tried along
+# a path before all others.
 FOLLOWED = 8
-"""Number of poses that Newton's method does not reach from home at once, and that are tried along a
-path before all others.
-"""
 
 
 class Effort(NamedTuple):
@@ -67,11 +58,8 @@ class Effort(NamedTuple):
     control: Halving
 
 
-QUICK = Effort(2, 8, Halving(3, 2))
-"""To compare many interpretations before a few are judged."""
-
-THOROUGH = Effort(None, 30, Halving(8, 6))
-"""To judge a few."""
+QUICK = Effort(2, 8, Halving(3, 2))  # to compare many interpretations before a few are judged
+THOROUGH = Effort(None, 30, Halving(8, 6))  # to judge a few
 
 
 class Reach(NamedTuple):
@@ -378,10 +366,9 @@ def _row_rms(whitened: FloatArray, sd: FloatArray) -> FloatArray:
 
 # --- Judge single interpretations: their frames, their misfit, and whether their fit is evidence.
 
+# Factor by which another interpretation must fit better before data are refused: true data of a
+# robot far beyond its tolerances fit twice as well in none of them.
 BETTER = 5.0
-"""Factor by which another interpretation must fit better before data are refused: true data of a
-robot far beyond its tolerances fit twice as well in none of them.
-"""
 
 
 def judge_data(
@@ -482,18 +469,13 @@ def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
 # --- Refine the misfit of one interpretation by Gauss-Newton steps within the tolerances, or far
 # beyond them.
 
+# Gauss-Newton steps by which the stated convention and the best other one are compared finally; a
+# step that does not lower the cost ends them.
 REFINEMENT = Halving(steps=3, attempts=1)
-"""Gauss-Newton steps by which the stated convention and the best other one are compared finally; a
-step that does not lower the cost ends them.
-"""
-
-LARGEST_STEP = 30.0
-"""Tolerances that a parameter may leave its value in these steps."""
-
+LARGEST_STEP = 30.0  # tolerances that a parameter may leave its value in these steps
+# Factor by which the deviations of a robot far from nominal may exceed its tolerances, and the
+# steps of its fit.
 FAR_AWAY, FIT = 30.0, Halving(steps=12, attempts=5)
-"""Factor by which the deviations of a robot far from nominal may exceed its tolerances, and the
-steps of its fit.
-"""
 
 
 def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:

@@ -55,14 +55,10 @@ from loopcal.units import Dimension
 
 # --- Interpretations of actuator readings that are counted from another zero, in either direction.
 
+# Number of constants in a scan, factor by which the next scan is narrower, and number of scans.
 SCANNED, NARROWER, SCANS = 25, 8.0, 4
-"""Number of constants in a scan, factor by which the next scan is narrower, and number of scans."""
-
-BEST = 3
-"""Number of hypotheses that are scanned again."""
-
-BESIDE = 0.02
-"""Share of the stroke by which readings may be outside: the stroke is nominal, too."""
+BEST = 3  # number of hypotheses that are scanned again
+BESIDE = 0.02  # share of the stroke by which readings may be outside: the stroke is nominal, too
 
 
 class _Zero(NamedTuple):
@@ -192,10 +188,9 @@ def _compute_sizes(
 
 # --- Interpretations of measurements with a frame, target or anchor that no file declares unknown.
 
+# Setup items that a user may forget to declare unknown. Surfaces with their frames and offsets
+# are none of them: the errors of the machine explain those, too.
 DECLARED = ("frame", "targets", "tool", "anchor")
-"""Setup items that a user may forget to declare unknown. Surfaces with their frames and offsets are
-none of them: the errors of the machine explain those, too.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,38 +237,26 @@ def _list_known(kind: Kind) -> tuple[str, ...]:
     return tuple(i for i in DECLARED if i in allowed and i not in kind.unknown)
 
 
+# Factor by which it must fit better if tolerances and noise do not explain the rest, as of a
+# robot far from nominal in data with a wrong unit.
 FAR_BETTER = 10.0
-"""Factor by which it must fit better if tolerances and noise do not explain the rest, as of a robot
-far from nominal in data with a wrong unit.
-"""
-
+# Misfit above which data that contradict stated setup parameters are refused. Below it, robots
+# far beyond their tolerances look the same, and it is a warning.
 GROSS = 100.0
-"""Misfit above which data that contradict stated setup parameters are refused. Below it, robots far
-beyond their tolerances look the same, and it is a warning.
-"""
-
+# Misfit up to which another interpretation is accepted if the robot reaches too few poses of the
+# data as written, which then have no misfit to compare.
 LARGEST = 10.0
-"""Misfit up to which another interpretation is accepted if the robot reaches too few poses of the
-data as written, which then have no misfit to compare.
-"""
-
+# Number of rows, and smallest number of poses, by which all interpretations are compared first.
 FEW_ROWS, FEWEST_POSES = 60, 20
-"""Number of rows, and smallest number of poses, by which all interpretations are compared first."""
-
+# Factor by which the misfit on these rows may exceed the limit of a far better fit, and largest
+# number of interpretations that are judged by all rows.
 PROMISING, MOST_JUDGED = 2.0, 8
-"""Factor by which the misfit on these rows may exceed the limit of a far better fit, and largest
-number of interpretations that are judged by all rows.
-"""
-
+# Number of interpretations of the readings that are judged: those of the smallest misfit before
+# parameters change.
 NEAREST, NEAREST_IN_PAIRS = 12, 4
-"""Number of interpretations of the readings that are judged: those of the smallest misfit before
-parameters change.
-"""
-
+# Share of the misfit below which an interpretation is a base of pairs, and largest number of
+# bases among the values, and among the readings.
 LOWERED, MOST_BASES = 0.7, 3
-"""Share of the misfit below which an interpretation is a base of pairs, and largest number of bases
-among the values, and among the readings.
-"""
 
 
 class Selection(NamedTuple):
@@ -579,13 +562,12 @@ def _select_promising(misfits: FloatArray, misfit: float) -> IntArray:
 # --- Find other orders of the actuators that explain data of a redundant robot as well as the
 # stated one, which explains them: the data cannot show which is true.
 
+# Number of measured residuals from which the order of a redundant robot's actuators is certain:
+# those of four positions, by which no machine of another order agrees with its redundant
+# readings.
 MEASURED = 12
-"""Number of measured residuals from which the order of a redundant robot's actuators is certain:
-those of four positions, by which no machine of another order agrees with its redundant readings.
-"""
-
+# Slips in the order of the actuators.
 ORDERS = ("swapped-readings", "reversed-readings", "permuted-readings")
-"""Slips in the order of the actuators."""
 
 
 def find_equal_orders(free: FreeParameters, data: Measurements) -> tuple[Interpretation, ...]:
@@ -619,8 +601,8 @@ def select_measured(data: Measurements) -> IntArray:
 # --- Report interpretations that explain data as well as the stated one, which explains them: the
 # data cannot show which is true.
 
+# Columns of a height, and standard deviations of the noise from which its sign matters.
 HEIGHT, SIGNIFICANT = (Column("z", Dimension.LENGTH),), 10.0
-"""Columns of a height, and standard deviations of the noise from which its sign matters."""
 
 
 def report_equals(free: FreeParameters, data: Measurements, misfit: float) -> Finding | None:
