@@ -271,8 +271,6 @@ def combine_errors(
     """Return the covariance (t, n, 6, 6) of the errors of n poses of t machines; infinite on the
     diagonal (and NaN beside it) where the data do not determine a component.
 
-    Parameters
-    ----------
     D : (t, n, 6, p) errors by the parameters in their units, of a point in a frame.
     directions, variance : (t, p, p), (t, p) as in `Posterior`.
     size : (t, n) of the effect of all parameters, rotations times the robot's size.
@@ -304,8 +302,6 @@ def _count_degrees(
 ) -> PoseDegrees:
     """Return the effective degrees of freedom of poses.
 
-    Parameters
-    ----------
     covariance : (n, 6, 6). D : (n, 6, p) errors by the parameters in their units.
     of_frame : (n, 6, k) errors by those of the frame itself, which count as noise.
     others : variances (n, 6) and degrees of freedom of other parts that were estimated.

@@ -271,8 +271,6 @@ def _check_settings(mode: str, steps: int) -> None:
 class _Iteration:
     """Outcome of the fixed-point iteration.
 
-    Attributes
-    ----------
     final : where the machine goes. commands : (n, c) [m, rad], or None.
     distances : (steps + 1, n, 6) twists from the best poses, before the first and after each step.
     """

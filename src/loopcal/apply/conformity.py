@@ -183,8 +183,6 @@ def judge_limits(
 
     Nothing is said of a quantity that no row measures, or whose noise nobody stated.
 
-    Parameters
-    ----------
     observations : the rows. after : their errors. limits : by quantity [m], [rad].
     share : of the noise that the errors contain. It is below 1 where setup parameters were fitted
         to the same rows and took up some of it.
@@ -283,8 +281,6 @@ def _rotate(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray,
 def _find_distribution(errors: FloatArray, noise: FloatArray) -> Callable[[float], float]:
     """Return the distribution function of the largest true error.
 
-    Parameters
-    ----------
     errors : (e, c). noise : (e, c) variances, NaN where not measured.
     """
     tau, weight = _weigh_scales(errors, noise)

@@ -60,8 +60,6 @@ EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
 class Source(NamedTuple):
     """A source of errors.
 
-    Attributes
-    ----------
     kind : one of the kinds above, "residuals.model-discrepancy", or the code of another finding.
     name : of the measurement with its session; "position" or "orientation" of a discrepancy; of
         other sources empty.
@@ -79,8 +77,6 @@ class Source(NamedTuple):
 class CovarianceSplit(NamedTuple):
     """The covariance of the parameters of a fit, by source.
 
-    Attributes
-    ----------
     sources : of errors. roots : (p, k) [SI] for each, whose squares add up to the covariance.
     undetermined : (p,) parameters of infinite variance, of which the roots contain what the
         tolerances allow.
@@ -110,8 +106,6 @@ def split_covariance(
 ) -> CovarianceSplit:
     """Return the covariance of a fit by source.
 
-    Parameters
-    ----------
     fit : with intervals. data : its measurements, with the sigma of their readings, without
         excluded poses. linear : of both, see `linearize_fit`.
     """
@@ -369,8 +363,6 @@ class ErrorSources(NamedTuple):
 class SourceBudget:
     """What one source does, and what half its sigma would leave.
 
-    Attributes
-    ----------
     source : kind, name, type of evaluation and degrees of freedom.
     position, orientation : variances [m^2, rad^2] of the length of the error of a pose.
     parameters : (p,) variances [SI]; NaN for undetermined parameters.
@@ -398,8 +390,6 @@ class HalvedErrors(NamedTuple):
 class ErrorBudget(TableResult):
     """The uncertainty of the parameters and of poses over the workspace, by source.
 
-    Attributes
-    ----------
     position, orientation : variances of the tool's place and of the rotation, by kind of source.
     lines : every source. sd : (p,) standard deviations of the parameters `names` [SI]; infinite for
         undetermined ones. worst : name of the determined parameter with the largest standard
@@ -483,19 +473,11 @@ def compute_error_budget(
 ) -> ErrorBudget | None:
     """Compute the uncertainty budget of a calibrated machine.
 
-    Parameters
-    ----------
     fit : an identification. data : the measurements it was made from.
     frame : in which the errors of poses are stated, see `choose_error_frame`;
         "relative" means relative to the home pose.
-
-    Returns
-    -------
-    ErrorBudget; None where the fit has no intervals, or where no pose is reached.
-
-    Raises
-    ------
-    EstimationError : no such frame.
+    Returns ErrorBudget; None where the fit has no intervals, or where no pose is reached.
+    Raises EstimationError: no such frame.
     """
     check_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals):

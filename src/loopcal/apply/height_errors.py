@@ -115,8 +115,6 @@ def map_height_errors(
     """Return the errors of all heights; None where the data measure no heights, the platform
     rotates or does not move in x, y and z, or a geometry does not reach the poses.
 
-    Parameters
-    ----------
     fit : that converged. fitted, held_out : the measurements of the calibration.
     """
     if not has_height_map(fit.robot):
@@ -162,8 +160,6 @@ def store_heights(heights: HeightErrors) -> dict[str, np.ndarray]:
 def restore_heights(arrays: Mapping[str, np.ndarray], robot: Mechanism) -> HeightErrors | None:
     """Return stored errors; None where a run has none, or its robot has no map of heights.
 
-    Parameters
-    ----------
     arrays : of the run. robot : for the unit.
     """
     if f"{PREFIX}poses" not in arrays or not has_height_map(robot):

@@ -67,8 +67,6 @@ class Estimate(NamedTuple):
 class VisitedPose:
     """Pose accuracy and repeatability of one target at one commanded pose.
 
-    Attributes
-    ----------
     pose : label of its first visit. target, direction : names of the target and of the direction of
         approach (the group of the rows); empty for the only one. visits : their number.
     components : names of the measured components, such as ("x", "y", "z").
@@ -297,8 +295,6 @@ def _describe_poses(
 def describe_visits(attained: FloatArray, is_position: bool) -> VisitedPose:
     """Return the characteristics of n visits of one pose.
 
-    Parameters
-    ----------
     attained : (n, c) attained minus commanded values of the measured components [m] or [rad].
     is_position : whether the components are those of one displacement.
     """

@@ -132,9 +132,7 @@ NEEDED = ("path", "result", "robot", "arrays", "load_posterior")
 def check_runs(runs: Sequence[StoredRun]) -> None:
     """Refuse too few runs, the same one twice, and what is no run.
 
-    Raises
-    ------
-    DataError : `runs.too-few`, `runs.given-twice` or `runs.no-calibration`.
+    Raises DataError: `runs.too-few`, `runs.given-twice` or `runs.no-calibration`.
     """
     is_list = isinstance(runs, Sequence) and not isinstance(runs, str)
     if not is_list or not all(hasattr(run, name) for run in runs for name in NEEDED):
@@ -156,14 +154,9 @@ def refuse_incomparable(
 ) -> None:
     """Refuse two runs whose parameters do not mean the same.
 
-    Parameters
-    ----------
     names : of both runs. is_same_data : whether both were fitted to the same rows; then they may
         identify different parameters, because only methods and models are compared.
-
-    Raises
-    ------
-    DataError : `runs.other-...`; EstimationError : `comparison.other-dimensions`.
+    Raises DataError: `runs.other-...`; EstimationError : `comparison.other-dimensions`.
     """
     words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
     mine, theirs = first.robot, second.robot
@@ -237,8 +230,6 @@ class QuantityErrors:
 class RunErrors:
     """Errors of a run by quantity.
 
-    Attributes
-    ----------
     run : name. own : at the held-out poses of the run itself, which other runs do not share.
     common : at the poses that are common to all runs; empty where there are none.
     """
@@ -253,8 +244,6 @@ def collect_errors(
 ) -> tuple[tuple[RunErrors, ...], int, tuple[Finding, ...]]:
     """Return the errors of each run, the number of common poses, and findings.
 
-    Parameters
-    ----------
     data : other measurements, at which all runs are validated; without it the common poses are
         those that all runs of one data set held out.
     """
@@ -337,8 +326,6 @@ COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a 
 class PairComparison:
     """A run against the first one.
 
-    Attributes
-    ----------
     first, second : names of the runs.
     data : "independent", "same", "shared" (some rows are common) or "unknown".
     shared : number of common fitted rows.
@@ -424,8 +411,6 @@ def compare_pair(
 ) -> PairComparison:
     """Compare a run with the first one.
 
-    Parameters
-    ----------
     names : of both runs. relation : of their data. tests : number of runs that are compared with
         the first one.
     """
@@ -556,8 +541,6 @@ def _leave_open(
 class RunSummary:
     """A run as one column of a comparison.
 
-    Attributes
-    ----------
     name : of its folder. robot, method, verdict : as result.json states them.
     estimates, plus_minus : parameter -> estimate and half-width of its 95 % interval [SI]; None
         where there is no interval. A parameter that this run kept fixed is absent.

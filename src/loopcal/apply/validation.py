@@ -70,8 +70,6 @@ NOISE_LEVEL = 1e-3  # probability that noise alone exceeds what is called the no
 class ErrorChange:
     """The rms error of one quantity before and after calibration.
 
-    Attributes
-    ----------
     before, after, noise_floor : [m], [rad] or [sigma]. values : number of measured components.
     """
 
@@ -123,8 +121,6 @@ def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
 def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
     """Return the frame of errors in words.
 
-    Parameters
-    ----------
     setup : frames, targets and surfaces that were estimated. Without any, positions and
         orientations are those in the stated frame of the instrument.
     """
@@ -258,8 +254,6 @@ def find_blunders(
 ) -> tuple[Blunder, ...]:
     """Return the compared poses that neither the calibration nor the other poses explain.
 
-    Parameters
-    ----------
     robot : the calibrated one. uncertainty : of the calibration; None where it is not known, then
         the noise and the other poses decide.
     """
@@ -278,8 +272,6 @@ def report_blunders(
 ) -> list[Finding]:
     """Return a finding for each blunder, and whether they dominate the errors.
 
-    Parameters
-    ----------
     errors : of all poses. rest : without the blunders.
     """
     largest = _find_largest(blunders, errors)
@@ -672,13 +664,8 @@ REFUSED_SHARE = 0.5  # share of reused rows from which data are refused for vali
 def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding | None:
     """Return the finding that some rows belong to a calibration; None where no row does.
 
-    Parameters
-    ----------
     fitted : the rows of the calibration; None where they are not known. data : for validation.
-
-    Raises
-    ------
-    DataError : half of the rows or more belong to it.
+    Raises DataError: half of the rows or more belong to it.
     """
     reused = (fitted or FittedRows()).find_in(data)
     if not reused.count:
@@ -718,8 +705,6 @@ def restore_validation(
     Findings stay sentences of `content`. Only the errors before and after have differences by
     component; of the others, the first component is the size.
 
-    Parameters
-    ----------
     content : `Validation.to_dict()` of the run. arrays : of the run. robot : for units.
     """
     if content.get("judged") is None:

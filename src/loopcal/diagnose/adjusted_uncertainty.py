@@ -64,14 +64,9 @@ def adjust_uncertainty(
     Estimates stay. No variance becomes smaller. A fit that did not converge, has no intervals, or
     has weights by a loss is returned as it is.
 
-    Parameters
-    ----------
     fit : an identification. data : the measurements it was made from.
     linear : of both, where the caller has it, see `linearize_fit`.
-
-    Raises
-    ------
-    DataError : another number of poses.
+    Raises DataError: another number of poses.
     """
     check_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
@@ -152,8 +147,6 @@ def _add_correlation(
 class ToolUncertainty(NamedTuple):
     """The uncertainty of the measured poses as a fit states it.
 
-    Attributes
-    ----------
     effects : orientation and position (3 n, p) by deviations of the parameters [per SI].
     stated : sum of the variances of each [SI].
     """
@@ -260,8 +253,6 @@ PATTERNS, NO_PATTERN = "residuals.", "residuals.perhaps-correlated"
 class HeavyTails:
     """The test of the residuals for heavy tails.
 
-    Attributes
-    ----------
     rows : number of residuals that are tested. p_value : probability of a smaller T for normal
         noise; NaN where there is no test.
     median, expected : of the absolute residuals in standard deviations, and that of normal noise.
@@ -302,8 +293,6 @@ def check_heavy_tails(
     A fit with a loss, without intervals, or with uncertain readings is not tested, nor one whose
     residuals depend on something: this makes some of them larger, and is reported already.
 
-    Parameters
-    ----------
     fit : an identification. data : the measurements it was made from.
     outliers : labels of poses that are known to be wrong, such as those of `find_outliers`.
     linear : of both, where the caller has it, see `linearize_fit`.

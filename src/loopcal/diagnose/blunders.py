@@ -49,8 +49,6 @@ ANYWHERE = 1e3
 class HeldOutBlocks(NamedTuple):
     """Rows of held-out blocks with what predicts them.
 
-    Attributes
-    ----------
     poses : labels of each of u blocks. member : (n,) block of each pose.
     groups : blocks of equal size: numbers (b,), H (b, m, k), residuals (b, m), present (b, m).
     """
@@ -104,8 +102,6 @@ class HeldOutBlocks(NamedTuple):
 class HeldOutCheck:
     """The search for held-out blocks that do not fit.
 
-    Attributes
-    ----------
     predictor : makes the rows of other measurements of the same poses. blocks : those of the data.
     search : its result; `suspects` (b,) are the numbers of the blocks that do not fit.
     """
@@ -141,8 +137,6 @@ class Predictor(NamedTuple):
     """What predicts held-out rows: a robot, the values of its nuisance parameters, and what is
     known of both.
 
-    Attributes
-    ----------
     robot : the calibrated one. values : name -> nuisance parameter [SI].
     kept : names of those that the fit knows; the others are unknown.
     uncertainty : of the fit; None where robot and nuisance parameters are taken as exact.
@@ -209,16 +203,11 @@ def check_held_out_rows(
 ) -> HeldOutCheck | None:
     """Search the held-out blocks that neither the fit nor the other blocks explain.
 
-    Parameters
-    ----------
     robot : the calibrated one. data : held-out rows whose poses are reached.
     values : name -> nuisance parameter [SI] with which they are compared. kept : names of those
         that the fit determined; the others were fitted to these rows.
     uncertainty : of the fit; None where it is not known.
-
-    Returns
-    -------
-    The result; None without any block that can be tested.
+    Returns the result; None without any block that can be tested.
     """
     table = data.nuisance_parameters.table
     unknown = tuple(p.name for p in table.entries if p.free and p.name not in kept)
@@ -289,8 +278,6 @@ FACTORS: dict[Dimension, tuple[float, ...]] = {
 class Explanation:
     """A way to read a pose in which it fits, or none.
 
-    Attributes
-    ----------
     what : "targets", "poses", "unit", "column", "target", or "none". data : its names and numbers.
     tried : what was tried.
     """
@@ -304,8 +291,6 @@ class Explanation:
 class Blunder:
     """A held-out block that neither the fit nor the other held-out blocks explain.
 
-    Attributes
-    ----------
     poses : its labels. times : its residuals in units of what noise and uncertainty explain.
     p_value : probability of a larger distance. explanation : what it may be.
     """
@@ -333,8 +318,6 @@ class Blunder:
 def name_blunders(check: HeldOutCheck, data: Measurements) -> tuple[Blunder, ...]:
     """Return the held-out blocks that do not fit, the farthest first, each with its explanation.
 
-    Parameters
-    ----------
     check : of these held-out data.
     """
     end, p_value = check.search.end, check.search.end.p_value()

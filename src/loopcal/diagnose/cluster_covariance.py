@@ -54,8 +54,6 @@ NIGHT = 6 * 3600.0  # time without a measurement [s] after which another day beg
 class Clusters:
     """Poses that may share an error, and are independent of the poses of other clusters.
 
-    Attributes
-    ----------
     unit : "day", "session", "block" or "pose". member : (n,) cluster 0..count-1 of each pose.
     """
 
@@ -136,8 +134,6 @@ COMMON = 1e-9  # share of its own size below which a variance of poses is zero
 class Ratio(NamedTuple):
     """Cluster-robust standard uncertainty of poses over the one that the fit states.
 
-    Attributes
-    ----------
     ratio : of the root mean square over the measured poses; NaN without uncertainty.
     degrees : degrees of freedom of its square for independent errors.
     share : of the variance by noise that residuals can judge.
@@ -157,8 +153,6 @@ NO_RATIO = Ratio(np.nan, np.nan, np.nan, np.nan)
 class ClusterCheck:
     """The cluster-robust covariance of a fit against the stated one.
 
-    Attributes
-    ----------
     unit : what is taken as independent: "day", "session", "block" or "pose"; empty where nothing
         could be compared. clusters : their number.
     position, orientation : ratios for the measured poses, from the directions that the data
@@ -198,8 +192,6 @@ def check_clusters(
     The clusters are the largest independent units of which there are enough, see
     `divide_into_clusters`.
 
-    Parameters
-    ----------
     fit : an identification. data : the measurements it was made from.
     frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means
         relative to the home pose.
@@ -224,8 +216,6 @@ class RobustSpread(NamedTuple):
     With the scores h_g of the G clusters, spread = sum_g (h_g h_g' - E_g), E_g the expectation for
     independent errors. Each cluster has h rows, turned into the eigenvectors of its leverage H_gg.
 
-    Attributes
-    ----------
     root : (p, k) L in tolerances, for the k directions that the fit estimates.
     scores : (G, k) h_g, the u_g in units of L.
     scaled_rows : (G, k, h) the rows in units of L; without a prior the sum of their squares is k.
@@ -309,8 +299,6 @@ def compute_robust_spread(
 ) -> RobustSpread:
     """Return the cluster-robust covariance of a fit, beside the stated one.
 
-    Parameters
-    ----------
     fit : with intervals. clusters : the cluster of each pose; of more than `MOST_CLUSTERS`, an
         even choice stands for all. linear : of the fit and its data, see `linearize_fit`.
     """

@@ -99,8 +99,6 @@ class CrossValidation(TableResult):
 class LeaveOneOut:
     """Scores of k methods.
 
-    Attributes
-    ----------
     methods : the methods. score : (k,) mean square of whitened leave-one-block-out residuals (1:
         noise alone), infinite where a block cannot be left out. standard_error : (k,) of the score,
         from the scatter over blocks. blocks : number of those with rows.
@@ -128,10 +126,7 @@ def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...
 
     Poses that a row compares, such as a distance, are in one block: otherwise no fold has the row.
 
-    Raises
-    ------
-    DataError
-        There are fewer than two folds, or more folds than blocks.
+    Raises DataError: there are fewer than two folds, or more folds than blocks.
     """
     names, member = np.unique(linked_blocks(data), return_inverse=True)
     if count < 2 or len(names) < count:
@@ -217,15 +212,9 @@ def score_leave_one_out(
 ) -> LeaveOneOut:
     """Score methods that keep the columns as they are: ridge, truncation, least squares, MAP.
 
-    Parameters
-    ----------
     robot : linearization point; best the robot of a fit. data : the measurements.
     methods : at least one.
-
-    Raises
-    ------
-    EstimationError
-        The measurements have nuisance parameters.
+    Raises EstimationError: the measurements have nuisance parameters.
     """
     free = select_free_parameters(robot)
     problem = problem_of(free, data)
@@ -332,8 +321,6 @@ class Conditioning(NamedTuple):
 class Candidate:
     """One set of free parameters.
 
-    Attributes
-    ----------
     name : of the set. parameters : their names.
     validation : cross-validation; None where without a fold too few equations remain, or the fit
         does not converge.

@@ -52,8 +52,6 @@ FIT_TOLERANCE = 1e-8
 class ErrorFrame(NamedTuple):
     """A frame in which errors of poses are stated.
 
-    Attributes
-    ----------
     name : "fitted", "base", "relative", or the name of the frame of an instrument.
     size : of the robot [m]. by_parameters : (12, p) G, also by the errors of a model discrepancy,
         see `list_error_twists`. own : (12, k) K.
@@ -106,8 +104,6 @@ class ReferencePoses(NamedTuple):
 class FrameFit(NamedTuple):
     """The best rigid fit of some motions of frames over m reference poses.
 
-    Attributes
-    ----------
     poses : (m, 4, 4). motions : (12, k) those that move these poses. size : of the robot [m].
     solution : (12, 6 m) motion that fits stacked twists of these poses best.
     """
@@ -163,17 +159,13 @@ def choose_error_frame(
 ) -> ErrorFrame:
     """Return a frame for the errors of poses of a calibrated robot.
 
-    Parameters
-    ----------
     frame : "fitted" fits the motions of the base and platform frames that the measurements do not
         determine, and is the base frame of the robot file where they determine all; "base" is that
         base frame in any case; "relative" is the first pose; the name of the frame of an
         instrument, such as "tracker", is that frame.
     origin : pose (1,) of the calibrated robot to which others are relative. origin_name : its name.
-
-    Raises
-    ------
-    EstimationError : no such frame (the text lists those that exist), or an unreachable origin.
+    Raises EstimationError: no such frame (the text lists those that exist), or an unreachable
+        origin.
     """
     robot = posterior.robot
     instruments = {} if posterior.frames is None else posterior.frames.instruments
@@ -204,8 +196,6 @@ def choose_error_frame(
 class FollowedMotion:
     """Motions of both frames that a pose or an instrument makes, to which errors are relative.
 
-    Attributes
-    ----------
     by_frames : (12, 12) by motions of the base and platform frames. by_parameters : (12, p).
     own : (12, k) by errors of its own, of variance 1. name : of the pose; else "".
     """
@@ -225,8 +215,6 @@ def refer_errors(
 ) -> ErrorFrame:
     """Return the frame in which errors are stated.
 
-    Parameters
-    ----------
     reference : poses over which frames are fitted.
     motions : (12, k) that the measurements do not determine; those that `followed` leaves are
         fitted, unless the frame is "base".
@@ -392,14 +380,9 @@ class ToolErrors(NamedTuple):
 def linearize_tool_errors(posterior: Posterior, solution: Solution, frame: str) -> ToolErrors:
     """Return the derivatives of the errors of the tool at poses, and the frame in words.
 
-    Parameters
-    ----------
     solution : poses that the calibrated robot reaches.
     frame : see `choose_error_frame`; "relative" means relative to the home pose.
-
-    Raises
-    ------
-    EstimationError : no such frame.
+    Raises EstimationError: no such frame.
     """
     robot = posterior.robot
     chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")

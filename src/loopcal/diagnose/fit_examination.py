@@ -39,8 +39,6 @@ STRONG = 0.9
 class CorrelatedGroup:
     """Parameters whose estimates are linked by correlations above STRONG, directly or in a chain.
 
-    Attributes
-    ----------
     names : in the order of the table. pair, correlation : the two most strongly correlated ones.
     """
 
@@ -95,8 +93,6 @@ MOST_POSES = 200  # largest number of poses at which errors are predicted, evenl
 class CalibrationGain:
     """Expected errors of the platform at the measured poses.
 
-    Attributes
-    ----------
     position_before, position_after : root mean square over poses of the expected position error
         [m].
     angle_before, angle_after : the same of the orientation [rad].
@@ -123,16 +119,11 @@ def estimate_calibration_gain(
 ) -> CalibrationGain:
     """Compare the errors expected after calibration with those that the tolerances allow.
 
-    Parameters
-    ----------
     fit : an identification; its tolerances must be stated. data : the measurements it was made
         from, or other readings.
     frame : in which the errors are stated, see `choose_error_frame`; "relative"
         means relative to the home pose.
-
-    Raises
-    ------
-    EstimationError : no such frame.
+    Raises EstimationError: no such frame.
     """
     free = fit.free_parameters
     if free.assumed.any():
@@ -277,8 +268,6 @@ def examine_fit(
 class ReadingError:
     """Recorded minus estimated readings of one actuator.
 
-    Attributes
-    ----------
     name : of the actuator. count : number of readings.
     reading, joint : root mean square of the reading and of the driven joint [SI], of these
         dimensions.
@@ -300,8 +289,6 @@ def compute_reading_errors(
 ) -> tuple[ReadingError, ...] | None:
     """Compare recorded readings with the estimated ones; None where the readings are exact.
 
-    Parameters
-    ----------
     fit : an identification. data : the measurements it was made from.
     """
     if fit.poses is None:

@@ -43,8 +43,6 @@ RANK = 1e-9
 class FrameDrift:
     """The largest motion of the frame of an instrument from the first measurement of a session.
 
-    Attributes
-    ----------
     frame, session : their names. targets : on the base.
     row : number of the measurement in its session at which the motion is most significant, from 1.
     rows : number of measurements of the session.
@@ -70,8 +68,6 @@ class FrameDrift:
 class ShapeTest(NamedTuple):
     """The test whether targets on the base kept their distances in all measurements.
 
-    Attributes
-    ----------
     frame : in which they were measured. targets : on the base.
     suspects : targets without each of which the noise explains the others. With three targets there
         is often more than one.
@@ -111,8 +107,6 @@ class _Solution(NamedTuple):
 def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Finding, ...]:
     """Return findings on frames that moved within a session, and on targets that moved.
 
-    Parameters
-    ----------
     angle : symbol of the unit in which angles are reported.
     """
     shapes = compare_shapes(data)

@@ -46,8 +46,6 @@ SAME_MOTION = 1e-6  # relative difference below which two motions count as equal
 class FrameMotions:
     """The d unobservable directions, and the frames that their combinations move.
 
-    Attributes
-    ----------
     kept : (p, d) the directions without the combinations that move frames; columns are zero where
         nothing else remains.
     frames : names of the moved frames: (), ("base",), ("platform",) or both. count : number of

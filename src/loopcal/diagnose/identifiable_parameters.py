@@ -60,8 +60,6 @@ MEANING = {
 class Observability:
     """The five indices over the L observable directions.
 
-    Attributes
-    ----------
     o1, o2, o3, o4, o5 : the larger the better. directions : L. left_out : number of null
         directions, which would make all five zero.
     equations : m. scaling : of rows and columns.
@@ -91,14 +89,9 @@ class Observability:
 def compute_observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
     """Return the indices of the singular values of whitened rows in units of tolerance.
 
-    Parameters
-    ----------
     singular_values : (p,), descending. rank : how many of them count. equations : m, number of
         rows.
-
-    Returns
-    -------
-    Observability; all indices are zero where the rank is zero.
+    Returns Observability; all indices are zero where the rank is zero.
     """
     s = singular_values[:rank]
     left_out = len(singular_values) - rank
@@ -128,8 +121,6 @@ NEARBY_TOLERANCES = (1e-2, 1e2)
 class ParameterIdentifiability:
     """What the data determine of one parameter.
 
-    Attributes
-    ----------
     name : of the parameter. partners : parameters with which only a combination is determined;
         only itself where it has no effect; empty where it is determined.
     left : standard deviation with the tolerances as a prior, over the tolerance: 1 where nothing is

@@ -40,8 +40,6 @@ UNDETERMINED = 1e6
 class Influence(NamedTuple):
     """One entry for each of u blocks.
 
-    Attributes
-    ----------
     leverage : (u,) trace of w G: number of parameters that the block determines.
     residuals : (u,) number of residuals. distance : (u,) d^2. degrees : (u,) its degrees of
         freedom.
@@ -67,8 +65,6 @@ def compute_influence(
 ) -> list[Influence]:
     """Return the influence of every block (one trial) on fits of the same rows, in one pass.
 
-    Parameters
-    ----------
     problem : unweighted. linearization : of the weighted problem.
     member : (n,) block 0..u-1 of each pose. decomposition : of the weighted fits.
     fits : the penalty of each fit, and the deviation (1, p) at which its residuals are evaluated,
@@ -116,8 +112,6 @@ def compute_block_influence(
 ) -> Influence:
     """Return the influence of b blocks of equal size.
 
-    Parameters
-    ----------
     half : (b, m, k) square root of G. residual : (b, m). present : (b, m) rows that exist; the
         others are zero. weight : (b,) of the blocks in the fit.
     """

@@ -50,8 +50,6 @@ class ErrorPart(NamedTuple):
 class ParameterChanges:
     """Rows `slope` d = `value` + noise of unit variance for the change d of p parameters.
 
-    Attributes
-    ----------
     names : (p,) of the parameters. unit : (p,) tolerances, which make columns comparable [SI].
     slope : (k, p) [1 / SI]. value : (k,) [1].
     errors : the independent parts of the noise; the sum of root root' is the unit matrix (k, k).
@@ -140,8 +138,6 @@ class ParameterChanges:
 def compare_information(first: Posterior, second: Posterior) -> ParameterChanges:
     """Return what two calibrations of independent data say of a change of the machine.
 
-    Parameters
-    ----------
     first, second : with `information`, of the same parameters.
     """
     before, after = first.information, second.information
@@ -235,8 +231,6 @@ DISTINGUISHED = 0.05  # probability of distinguishing the true cause from a bett
 class ChangeCause:
     """What explains a change.
 
-    Attributes
-    ----------
     kind : "parameter", "limb", "limbs" (two of them) or "none" where no such cause suffices.
     names : the best cause: a parameter, a limb or two limbs. parameters : those that may change.
     alternatives : other causes of this kind that the data cannot distinguish from it.
@@ -254,8 +248,6 @@ class ChangeCause:
 def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
     """Return the simplest cause of a change.
 
-    Parameters
-    ----------
     changes : of all parameters. level : probability with which the true cause is rejected.
     """
     limbs = group_by_limb(changes.names)

@@ -58,8 +58,6 @@ ROTATION, PLACE = 0, 1  # number of the errors of rotation and of place
 class SlowErrorRows(NamedTuple):
     """What the elimination of the parameters leaves of residuals and slow errors.
 
-    Attributes
-    ----------
     errors : of unit amplitude. slope : (p, m) change of the estimates [SI] with the coefficients.
     rows : (m, m) S. residuals : (m,) y.
     """
@@ -73,8 +71,6 @@ class SlowErrorRows(NamedTuple):
 class SlowErrors(NamedTuple):
     """Slow errors that residuals show.
 
-    Attributes
-    ----------
     rows : that show them. components : PLACE or ROTATION -> size and probability of these errors.
     is_slow : whether neighboring poses share them; otherwise each pose has its own.
     """
@@ -90,8 +86,6 @@ def find_slow_errors(
     """Return the slow errors that the residuals of a fit show; None without any, or where nothing
     can be tested.
 
-    Parameters
-    ----------
     fit : with intervals. data : its measurements, with the sigma of their readings, without
         excluded poses. linear : of both, see `linearize_fit`. T : (n, 4, 4) [m] measured poses.
     """

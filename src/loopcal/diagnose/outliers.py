@@ -62,8 +62,6 @@ MOST_COMPARED = 10
 class JudgingNoise(NamedTuple):
     """The noise by which each of u blocks is judged: that of the other fitted blocks.
 
-    Attributes
-    ----------
     variance : (u,) of the whitened rows, in units of the stated one.
     degrees : (u,) its degrees of freedom; infinite where the stated noise counts, 0 where nothing
         is known of it.
@@ -76,8 +74,6 @@ class JudgingNoise(NamedTuple):
 class PartialFit(NamedTuple):
     """A linear fit without some of u blocks, and its influence on every block.
 
-    Attributes
-    ----------
     excluded : (u,) blocks that are not fitted. influence : of all blocks.
     scale : factor on sigma; NaN where it is to be estimated and the fitted blocks do not show it.
     directions : number of directions that the fit determines.
@@ -136,8 +132,6 @@ class Refit(Protocol):
 class BlockSearch:
     """A search for blocks that do not fit.
 
-    Attributes
-    ----------
     refit : see `Refit`. whole : the fit to all blocks. limit : p-value below which a block is a
         suspect. fits : the fit without the suspects, or all fits of a cycle.
     """
@@ -163,8 +157,6 @@ def search_blocks(
 ) -> BlockSearch:
     """Search the blocks that the others do not explain.
 
-    Parameters
-    ----------
     low_weight : (u,) blocks with a small weight in a robust fit; the search begins without them.
     level : probability of any suspect where all blocks are right.
     """
@@ -188,8 +180,6 @@ def fit_without(
 ) -> PartialFit:
     """Fit linearly without the excluded blocks (u,), and compute the influence of every block.
 
-    Parameters
-    ----------
     fit : its method and rank tolerance are used. problem : of its data, unweighted.
     member : (n,) block of each pose. deviation, start : (1, p) to linearize at, and a warm start.
     noise : "given", or "estimated" from the fitted blocks.
@@ -223,8 +213,6 @@ def judge_noise(
     degrees of freedom by those of d_j^2 (least squares). Where fewer than five are left, stated
     noise counts as it is.
 
-    Parameters
-    ----------
     unexplained, degrees : sum of squares of all fitted blocks that no parameter explains.
     plain : influence (u,) on the fit by least squares. excluded : (u,) blocks that are not fitted.
     is_given : whether the noise is stated.
@@ -247,14 +235,9 @@ def search_suspects(
 ) -> tuple[PartialFit, ...]:
     """Exclude suspects until the same ones are suspected twice.
 
-    Parameters
-    ----------
     refit : see `Refit`. whole : the fit to all blocks. first : where the search begins.
     limit : p-value below which a block is a suspect. most : largest number of excluded blocks.
-
-    Returns
-    -------
-    The fit without the suspects, or all fits of a cycle.
+    Returns the fit without the suspects, or all fits of a cycle.
     """
     fits = [first]
     while len(fits) <= MOST_ROUNDS:
@@ -360,8 +343,6 @@ MOST_ROBUST = 20_000
 class Outlier:
     """A block that does not fit the others.
 
-    Attributes
-    ----------
     poses : its labels. distance : squared Mahalanobis norm of its residual against a fit of the
         others. degrees : degrees of freedom of the distance. p_value : probability of a larger one,
         for this block alone.
@@ -388,8 +369,6 @@ class Outlier:
 class Conflict:
     """Blocks that contradict each other, any one of which may be wrong.
 
-    Attributes
-    ----------
     poses : labels of each block. times : largest distance from a fit to all, in units of the
         expected noise.
     """

@@ -39,8 +39,6 @@ SETTABLE, NONZERO = 0.1, 0.3
 class MergedParameter:
     """A parameter that is fixed because others have the same effect.
 
-    Attributes
-    ----------
     name, unit : of the parameter. into : names of the kept parameters that replace it.
     changes : (k,) of each for one `unit` of it, to first order. units : (k,) symbols.
     """
@@ -73,8 +71,6 @@ class MergedParameter:
 class IdentifiableSubset(HtmlResult):
     """A set of free parameters that carries all information of the measurements.
 
-    Attributes
-    ----------
     kept : names of the parameters that stay free. dropped : those to fix, and their replacements.
     condition : of the kept columns alone. robot : with the dropped parameters fixed at their
         nominal values.
@@ -192,8 +188,6 @@ NEGLIGIBLE_GAIN = 1e-6  # part of a combination of length one that is rounding a
 class AccurateCombination:
     """A combination c'y of length one of the parameters, in units of the useful accuracy.
 
-    Attributes
-    ----------
     names : (k,) strongest first. coefficients : (k,) c of y = deviation / useful accuracy.
     sd : standard deviation by the data alone, in units of the useful accuracy; infinite where the
         data do not determine it.
@@ -212,8 +206,6 @@ class AccurateCombination:
 class UsefulAccuracy:
     """What data determine to a useful accuracy.
 
-    Attributes
-    ----------
     free_parameters : the free parameters.
     length, angle : the accuracy [m, rad].
     sd : (p,) [SI] standard deviation of each parameter by the data alone; infinite where they do
@@ -278,15 +270,10 @@ def judge_useful_accuracy(
 ) -> UsefulAccuracy:
     """Separate the combinations that the data of an analysis determine to an accuracy.
 
-    Parameters
-    ----------
     length : accuracy of lengths [m], a standard deviation.
     angle : accuracy of angles [rad]; default: the length over the robot's size, by which an angle
         moves a point at that distance as far as the length.
-
-    Raises
-    ------
-    EstimationError : an accuracy is not above 0 and finite.
+    Raises EstimationError: an accuracy is not above 0 and finite.
     """
     free = analysis.free_parameters
     angle = length / free.robot.size if angle is None else angle

@@ -43,8 +43,6 @@ LEAST_SHARE = 1e-9  # share of the extent of all points below which a distance i
 class PointCheck:
     """The points of a table against their predictions.
 
-    Attributes
-    ----------
     distance : median distance of a point from its prediction [m]. limit : of near points [m].
     renamed : (row, target) of points and the (row, target) whose prediction they fit.
     far : (row, target) of points that fit no prediction, and their distance [m].
@@ -70,14 +68,9 @@ class PointCheck:
 def check_point_names(kind: Position, T: FloatArray, measured: FloatArray) -> PointCheck | None:
     """Compare measured points with the predictions of the nominal robot.
 
-    Parameters
-    ----------
     kind : of the rows, mounted on the robot's tool. T : (r, 4, 4) platform pose of each row.
     measured : (r, 3 k) [m] points of k targets in the frame of the instrument, NaN where missing.
-
-    Returns
-    -------
-    None where there are too few points.
+    Returns None where there are too few points.
     """
     points = measured.reshape(len(T), len(kind.targets), 3)
     is_present: BoolArray = np.asarray(~np.isnan(points).any(axis=2))
@@ -283,13 +276,8 @@ def find_other_scale(
 ) -> tuple[str, float, float] | None:
     """Return which scale explains points that the nominal robot does not; None where it does.
 
-    Parameters
-    ----------
     kind, T, measured : see `check_point_names`. scales : name -> factor [1] that may be missing.
-
-    Returns
-    -------
-    Name, median distance with this factor, and median distance without it [m].
+    Returns Name, median distance with this factor, and median distance without it [m].
     """
     points = measured.reshape(len(T), len(kind.targets), 3)
     used: BoolArray = np.asarray(~np.isnan(points).any(axis=2))
@@ -315,15 +303,9 @@ def examine_points(robot: Mechanism, data: Measurements, unit: str) -> tuple[Fin
 
     Rows of other kinds than `position` are not examined.
 
-    Parameters
-    ----------
     unit : in which the points were read, for messages.
-
-    Raises
-    ------
-    DataError
-        Points have each other's names, all names are shifted by one pose, another unit explains the
-        points, or the instrument has moved.
+    Raises DataError: points have each other's names, all names are shifted by one pose, another
+        unit explains the points, or the instrument has moved.
     """
     findings: list[Finding] = []
     solution = forward(robot, data.readings)

@@ -66,8 +66,6 @@ class ChosenValue:
 class RegularizationCurve:
     """Held-out scores of one family of methods.
 
-    Attributes
-    ----------
     name : "lam" or "k". values : (n,) increasing. score : (n,) mean square of whitened held-out
         residuals; 1 is noise alone, infinite where poses cannot be left out.
     standard_error : (n,) of the score. chosen : what rules choose, among them the lowest score and

@@ -39,8 +39,6 @@ LEVEL = 0.01  # probability below which the lack of fit exceeds the pure error
 class LackOfFit:
     """Lack of fit against the pure error of repeated poses.
 
-    Attributes
-    ----------
     groups : number of poses that were repeated.
     pure, pure_degrees : sum of squares between repeats in units of the stated sigma, and its
         degrees of freedom.
@@ -71,8 +69,6 @@ class LackOfFit:
 def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     """Test a fit against the pure error of repeated poses.
 
-    Parameters
-    ----------
     fit : an identification without a loss. data : the measurements it was made from.
     """
     if fill_in_reading_sigma(fit.robot, data).reading_sigma is not None:

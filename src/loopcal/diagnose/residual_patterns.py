@@ -42,8 +42,6 @@ EXPLAINED = 1e-6  # share of its length below which a column counts as explained
 class ResidualRows:
     """R whitened rows of a fit, those of one series (a kind and its column) in order.
 
-    Attributes
-    ----------
     basis : (R, q) orthonormal, what is estimated. residual : (R,) of the least-squares fit.
     gain : (R, k) change of the k directions of the fit by an error of each row.
     root : (p, k) these directions [SI]: an error e of the rows changes the estimate by
@@ -127,8 +125,6 @@ def collect_residual_rows(
     """Return the residuals of a fit in the order of measurement; None where rows cannot be told
     apart, because their readings are uncertain, or where there are none.
 
-    Parameters
-    ----------
     fit : with intervals. data : its measurements, with the sigma of their readings, without
         excluded poses. linear : of both, see `linearize_fit`.
     """
@@ -199,8 +195,6 @@ ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "se
 class EffectColumn(NamedTuple):
     """One function of the quantity, for one measured component.
 
-    Attributes
-    ----------
     component : its name, such as "z". dimension : of its size.
     """
 
@@ -211,8 +205,6 @@ class EffectColumn(NamedTuple):
 class Effect(NamedTuple):
     """A dependence of the measured values on one quantity.
 
-    Attributes
-    ----------
     source : what it depends on, such as "time". name : of the temperature or actuator, else empty.
     columns : (R, c) whitened rows by the sizes. labels : what the c columns are.
     """
@@ -229,8 +221,6 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
     Linear in time, or in the order of measurement where the rows state no time, linear in each
     temperature, a difference between sessions, and quadratic in each actuator reading.
 
-    Parameters
-    ----------
     rows : of a fit. data : its measurements, without excluded poses. robot : names the actuators.
     """
     observations = [o for o in data.observations if len(o)]
@@ -349,8 +339,6 @@ FEWEST_LEFT = 3.0
 class EffectSizes(NamedTuple):
     """The sizes of a significant effect, and how they act on the residuals.
 
-    Attributes
-    ----------
     effect : what the residuals depend on. p_value : probability that independent errors show an
         effect as large, in any of the tests of a fit (Sidak).
     sizes, errors : (c,) [SI] estimates and standard deviations.
@@ -367,8 +355,6 @@ class EffectSizes(NamedTuple):
 class ResidualPatterns(NamedTuple):
     """What the residuals of a fit show.
 
-    Attributes
-    ----------
     tests : number of tests. effects : that are significant, the first found first.
     correlation : of neighboring residuals, less what a fit causes. p_value : probability of a
         larger one for independent errors, in any of the tests (Sidak).
@@ -536,8 +522,6 @@ LONGEST = 400  # rows of a series whose correlation is considered at once; longe
 class CorrelatedErrors:
     """The covariance of a fit by correlated errors.
 
-    Attributes
-    ----------
     covariance : (k, k) of the directions of the rows' gain. degrees : degrees of freedom of its
         size.
     correlation : of neighboring errors, mean. sigma : their size over the stated sigma, mean.
@@ -558,8 +542,6 @@ class _Segments(NamedTuple):
 def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> CorrelatedErrors:
     """Return the covariance by errors that are correlated within each series.
 
-    Parameters
-    ----------
     rows : of a fit. sigma_degrees : degrees of freedom nu0 that the stated sigmas count for,
         infinite where they are exact.
     """

@@ -70,8 +70,6 @@ class Statistics:
 class QuantityErrors:
     """Errors of one quantity: one entry for each measured row and target.
 
-    Attributes
-    ----------
     dimension : of the errors. components : (e, 3) differences [SI], NaN where not measured.
     rows : (e,) number of the row of each entry. targets : (e,) names; empty for the only one.
     measured : names of the components that are measured, such as ("z",).
@@ -121,8 +119,6 @@ NO_ERRORS = QuantityErrors(
 class PoseErrors:
     """Errors of r rows by quantity: "position", "orientation", "length" and others.
 
-    Attributes
-    ----------
     quantities : the errors of each quantity that some row measures.
     """
 
@@ -175,8 +171,6 @@ class NoiseFloor:
     chi-square with the same mean and variance, which is exact for components of equal sigma. The
     noise of uncertain joint readings is not part of it, so with such readings it is a lower bound.
 
-    Attributes
-    ----------
     rms, max : by quantity [m] or [rad].
     """
 
@@ -198,8 +192,6 @@ class NoiseFloor:
 class KindErrors:
     """Whitened errors of one kind of measurement, or of all kinds.
 
-    Attributes
-    ----------
     kind : its name; "all" for all kinds. count : measured components over all its rows.
     before, after : root mean square of the whitened residuals [sigma].
     noise_floor : the value for an exact geometry [sigma].
@@ -236,8 +228,6 @@ class KindErrors:
         degree of freedom less than b, so g over the root mean square of the rest has Student's t
         distribution: a common factor of all sigmas cancels.
 
-        Parameters
-        ----------
         values : measured values that are left to check the geometry.
         """
         from loopcal.numerics.special_functions import stdtr
@@ -271,8 +261,6 @@ def compute_row_errors(
 ) -> PoseErrors:
     """Return the errors of the rows of all kinds, one kind after the other.
 
-    Parameters
-    ----------
     observations : of every kind. residuals : (r, m) [SI] of each. first_row : number of the first.
     """
     errors_by_quantity: dict[str, list[QuantityErrors]] = {}
@@ -313,8 +301,6 @@ def compute_kind_errors(
 ) -> tuple[KindErrors, ...]:
     """Return the whitened errors of each kind and, last, of all kinds.
 
-    Parameters
-    ----------
     observations : of every kind. before, after : residuals (r, m) [SI] of each.
     """
     totals: dict[str, FloatArray] = {}
@@ -388,8 +374,6 @@ def _join(errors_by_kind: Sequence[QuantityErrors]) -> QuantityErrors:
 class PosePredictions:
     """Poses that a geometry predicts, and the setup parameters with which it is compared.
 
-    Attributes
-    ----------
     T : (1, n, 4, 4) [m]. joints : name -> (1, n) [SI].
     setup : the setup parameters (frames, targets, surfaces, offsets) of the measurements.
     values : (1, U) their values [SI]. kept : names of those that were given and not fitted.
@@ -446,8 +430,6 @@ class PosePredictions:
 class PredictionComparison:
     """Two geometries at the same recorded readings, at the poses that both reach.
 
-    Attributes
-    ----------
     data : the measurements with the compared rows only. rows : (r,) labels of those rows.
     usable : (n,) poses that are compared. predictable : (n,) poses that the data determine.
     estimated : (n,) poses of these that were estimated together with their rows.
@@ -522,16 +504,10 @@ def compare_predictions(
 ) -> PredictionComparison:
     """Predict measurements with two geometries of a robot.
 
-    Parameters
-    ----------
     before, after : the geometries. data : the measurements.
     setup_before, setup_after : values [SI] by name of setup parameters that are kept; the others
         are fitted to these rows.
-
-    Raises
-    ------
-    DataError
-        No row counts, or no pose is reached by both geometries.
+    Raises DataError: no row counts, or no pose is reached by both geometries.
     """
     counted = (o.take((o.weight > 0.0) & o.present.any(axis=1)) for o in data.observations)
     data = _take_rows(replace(data, observations=tuple(counted)), np.ones(data.n_poses, dtype=bool))
@@ -627,8 +603,6 @@ def predict_poses(
 ) -> PosePredictions:
     """Return the predicted poses with setup parameters that are kept or fit these rows best.
 
-    Parameters
-    ----------
     solution : poses of `data`. usable : (n,) which of them count.
     setup : values [SI] by name that are kept; None takes the nominal values of all and fits none.
     """

@@ -54,8 +54,6 @@ class StartVerdict(Enum):
 class StartCheck:
     """The geometry from which a fit started, compared with the fit.
 
-    Attributes
-    ----------
     verdict : see `StartVerdict`.
     before, after : root mean square of the residuals in units of the stated sigma, of the start and
         of the fit [1].
@@ -78,8 +76,6 @@ class StartCheck:
 class StoredAnswer:
     """A stored geometry and the optimum of the firmware's cost, from the same probes.
 
-    Attributes
-    ----------
     stored, best : the cost of each [mm^2]. moved : parameter, stored value, best value and unit, of
         those that differ.
     """
@@ -135,8 +131,6 @@ def compare_stored_geometry(robot: Mechanism, measured: Measurements) -> StoredA
 
     Return None where the probes do not determine an optimum.
 
-    Parameters
-    ----------
     robot : the printer with its stored geometry. measured : its heights and distances; their sigmas
         do not matter.
     """

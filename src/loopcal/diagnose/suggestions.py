@@ -59,8 +59,6 @@ SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
 class FurtherMeasurement:
     """A further measurement that determines a combination.
 
-    Attributes
-    ----------
     words : what is measured, such as `psi`. kind : its kind. left : standard deviation of the first
         parameter of the combination over its tolerance, from the data, the further measurement and
         the tolerances together.
@@ -156,8 +154,6 @@ def describe_missing_equations(robot: Mechanism, data: Measurements) -> Finding 
 
     Return None where more than a few combinations are open.
 
-    Parameters
-    ----------
     robot, data : as for `identifiability`.
     """
     if int(robot.parameters.free.sum()) - data.n_rows > MOST_MISSING:

@@ -297,13 +297,8 @@ def refuse_other_dimensions(
     """Refuse a machine that has other poses with the same values of all parameters: those of the
     robot or, where it reaches no pose with them, the stored ones.
 
-    Parameters
-    ----------
     names : of both in messages; default: those of the robots.
-
-    Raises
-    ------
-    EstimationError : other parameters, `comparison.other-dimensions` or
+    Raises EstimationError: other parameters, `comparison.other-dimensions` or
         `comparison.nothing-reached`.
     """
     called, given = names or (robot.name, stored.name)

@@ -51,8 +51,6 @@ ON_BOUNDARY = 0.7
 class Candidates:
     """Poses that may be measured.
 
-    Attributes
-    ----------
     coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses.
     is_uniform : (n,) True for those drawn evenly from the workspace, which represent it.
     excluded : violation -> number of poses that it excluded.
@@ -85,11 +83,8 @@ def draw_candidates(
 ) -> Candidates:
     """Draw about `count` allowed poses from the workspace of a robot, half of them at its boundary.
 
-    Raises
-    ------
-    MechanismError
-        The robot states no workspace, the constraints exclude all of it, or home itself violates
-        one.
+    Raises MechanismError: the robot states no workspace, the constraints exclude all of it, or
+        home itself violates one.
     """
     rng = np.random.default_rng(seed)
     checker, bounds = _build_home_checker(robot, constraints), workspace_ranges(robot)
@@ -107,10 +102,7 @@ def check_listed_poses(
     """Return those of the given poses (n, c) [m, rad] that are allowed; they represent the
     workspace themselves.
 
-    Raises
-    ------
-    MechanismError
-        None of them is allowed, or home itself violates a constraint.
+    Raises MechanismError: none of them is allowed, or home itself violates a constraint.
     """
     checker = _build_home_checker(robot, constraints)
     poses = np.unique(poses, axis=0)
@@ -135,8 +127,6 @@ def round_coordinates(
     """Round coordinates (n, c) to steps that a person can type: DIGITS of the robot's size and of a
     radian, in its units.
 
-    Parameters
-    ----------
     towards : (c,) place towards which everything is rounded; default: to the nearest.
     """
     steps = []

@@ -144,8 +144,6 @@ class Constraints:
 class Violation:
     """The first constraint that a pose or a path violates.
 
-    Attributes
-    ----------
     code : of the reason; worded in `loopcal.findings.catalog.phrases`.
     data : names and numbers of the reason.
     on_path : whether it occurs on the straight path from home, not at the pose itself.
@@ -164,8 +162,6 @@ class Violation:
 class ConstraintCheck:
     """Result of checking n poses or paths.
 
-    Attributes
-    ----------
     allowed : (n,). violations : (n,) the first `Violation` of each; None where allowed.
     """
 
@@ -181,8 +177,6 @@ class ConstraintCheck:
 class ConstraintChecker:
     """The constraints of one robot with their reference values.
 
-    Attributes
-    ----------
     medians : of margin and drive margin over the workspace.
     """
 

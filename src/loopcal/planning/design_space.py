@@ -26,8 +26,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 class PriorInformation:
     """Information that exists before the first new pose.
 
-    Attributes
-    ----------
     rows : (k, o + p) whitened and in tolerances: rows measured already, or identity rows for
         tolerances.
     n_nuisance : o, number of nuisance parameters; their columns come first.
@@ -58,8 +56,6 @@ class PriorInformation:
 class ObservableSpace:
     """The directions that a set of rows can determine; designs are compared in this space.
 
-    Attributes
-    ----------
     machine : (p, q) orthonormal directions of the machine's unknowns.
     nuisance : (o, o') directions of the nuisance parameters.
     singular_values : (p,) of the machine's columns after elimination, descending.
@@ -89,8 +85,6 @@ class ObservableSpace:
 class Design:
     """A chosen set of groups.
 
-    Attributes
-    ----------
     chosen : (n,) indices of the candidates, ascending.
     value : of the criterion.
     history : values of the best start: after it began, and after each exchange.
@@ -134,8 +128,6 @@ def find_observable_space(
     The nuisance parameters are eliminated by `loopcal.numerics.elimination`. The remainder
     of the machine's columns is cut at `tolerance` times its largest singular value.
 
-    Parameters
-    ----------
     rows : (N, r, o + p); NaN where a group is not allowed.
     """
     allowed = rows[is_allowed(rows)].reshape(-1, rows.shape[-1])
@@ -168,11 +160,9 @@ def require_enough(
 ) -> None:
     """Refuse a number of groups that cannot determine all directions.
 
-    Raises
-    ------
-    EstimationError
-        No candidate is allowed; nothing is observable; n groups have fewer rows than the prior
-        leaves unknowns; or, without repeats, fewer candidates are allowed than n.
+    Raises EstimationError: no candidate is allowed; nothing is observable; n groups have fewer
+        rows than the prior leaves unknowns; or, without repeats, fewer candidates are allowed than
+        n.
     """
     count = int(is_allowed(rows).sum())
     if count == 0:
@@ -233,8 +223,6 @@ class D:
 class I:  # noqa: E742
     """Mean variance of a prediction.
 
-    Attributes
-    ----------
     weights : (k, p) rows L: derivatives of all predicted quantities by the machine's unknowns [per
         tolerance].
     count : number of predictions (poses) in `weights`; the sum of the variances is divided by it.
@@ -275,14 +263,9 @@ def is_full_rank(singular_values: np.ndarray) -> bool:
 def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatArray) -> float:
     """Return the value of a criterion.
 
-    Parameters
-    ----------
     factor : (q, q) upper triangular R; R'R is the information on the observable directions.
     machine : (p, q) these directions, orthonormal in the machine's unknowns.
-
-    Returns
-    -------
-    value : -inf for D and inf for the others where R is singular.
+    Returns value : -inf for D and inf for the others where R is singular.
     """
     s = np.linalg.svd(factor, compute_uv=False)
     if not is_full_rank(s):
@@ -323,8 +306,6 @@ RIDGE = 1e-3
 class Scoring:
     """A criterion in the coordinates of the mean design.
 
-    Attributes
-    ----------
     space : the observable directions.
     transform : (o + p, Q) from given rows to scaled rows, Q = o' + q, nuisance directions first.
     prior_rows : (k, Q) scaled rows of the prior.
@@ -403,14 +384,9 @@ def build_scoring(
 ) -> Scoring:
     """Return the scoring whose mean design is the prior and every group with the same weight.
 
-    Parameters
-    ----------
     rows : (N, r, o + p), finite. weight : of each group.
-
-    Raises
-    ------
-    EstimationError
-        The criterion is E, or the weights of I depend on no observable direction.
+    Raises EstimationError: the criterion is E, or the weights of I depend on no observable
+        direction.
     """
     if isinstance(criterion, E):
         raise EstimationError("criterion E cannot be optimized; choose D, I or A")
@@ -439,8 +415,6 @@ def build_scoring(
 class ScaledCandidates:
     """The allowed groups of a problem in the coordinates of its scoring.
 
-    Attributes
-    ----------
     scoring : of designs. rows : (N, r, Q) scaled. indices : (N,) of the groups among all.
     repeats : whether a group may be chosen more than once.
     """
@@ -471,10 +445,7 @@ def scale_candidates(
 ) -> ScaledCandidates:
     """Return the allowed groups scaled by the mean design of n of them.
 
-    Raises
-    ------
-    EstimationError
-        See `require_enough` and `build_scoring`.
+    Raises EstimationError: see `require_enough` and `build_scoring`.
     """
     space = find_observable_space(rows, prior)
     require_enough(n, rows, prior, space, repeats)
@@ -487,8 +458,6 @@ def scale_candidates(
 class SwapTerms:
     """Terms of the swap formulas for all groups at the present design.
 
-    Attributes
-    ----------
     Y : (N, r, Q). W : (N, r, r).
     log_added : (N,) log det(I + G_kk).
     nuisance : the same terms in the nuisance columns; None without any, and for I and A.

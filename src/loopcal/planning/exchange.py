@@ -64,8 +64,6 @@ def fedorov_exchange(
 ) -> Design:
     """Choose n of N groups by exchange from several starts.
 
-    Parameters
-    ----------
     rows : (N, r, o + p) whitened and in tolerances; NaN where a group is not allowed.
     n : number of groups to choose. criterion : D, I or A. prior : information that exists before.
     seed : of the random starts; start i always has the same stream. starts : their number.
@@ -74,16 +72,9 @@ def fedorov_exchange(
         starts are drawn with its weights instead of evenly.
     first : more designs to start from; one of fewer than n groups is completed by the groups that
         gain most.
-
-    Returns
-    -------
-    Design; the best of all starts.
-
-    Raises
-    ------
-    EstimationError
-        n groups cannot determine the unknowns, fewer are allowed than requested, or there is no
-        start.
+    Returns Design; the best of all starts.
+    Raises EstimationError: n groups cannot determine the unknowns, fewer are allowed than
+        requested, or there is no start.
     """
     candidates, weights = (
         (scale_candidates(rows, n, criterion, prior, repeats), None)
@@ -112,8 +103,6 @@ def list_starts(
 ) -> list[IntArray]:
     """Return the rounding of weights (N,), where given, and the completed first designs.
 
-    Parameters
-    ----------
     first : designs by the indices of their groups among all.
     """
     rounded = [] if weights is None else [round_weights(weights, n, candidates.repeats)]
@@ -124,10 +113,7 @@ def list_starts(
 def require_determined(score: float, n: int, count: int, space: ObservableSpace) -> None:
     """Refuse the best of n of `count` groups where its score says that it is singular.
 
-    Raises
-    ------
-    EstimationError
-        The score is not finite.
+    Raises EstimationError: the score is not finite.
     """
     if not np.isfinite(score):
         raise EstimationError(
@@ -154,9 +140,8 @@ def exchange_groups(
 ) -> tuple[IntArray, list[float]]:
     """Exchange the chosen groups (n,) until no single swap gains; they must be nonsingular.
 
-    Returns
-    -------
-    chosen : (n,). history : scores at the beginning and after each exchange; see `is_exhausted`.
+    Returns chosen : (n,). history : scores at the beginning and after each exchange; see
+        `is_exhausted`.
     """
     scoring, rows = candidates.scoring, candidates.rows
     chosen, n = chosen.copy(), len(chosen)
@@ -222,8 +207,6 @@ def round_weights(weights: FloatArray, n: int, repeats: bool) -> IntArray:
 class MovedDesign:
     """A design of groups that were moved.
 
-    Attributes
-    ----------
     design : (u, c) coordinates. rows : (u, r, o + p) of it. value : of the criterion.
     history : value before the first sweep (-inf for D, inf for I and A where it is singular), and
         after each.
@@ -252,8 +235,6 @@ def coordinate_exchange(
 ) -> MovedDesign:
     """Improve a design by moving one coordinate of one group at a time.
 
-    Parameters
-    ----------
     linearize : (indices (b,), coordinates (b, c)) -> rows (b, r, o + p), NaN where not allowed. It
         is called for all groups and all levels of one coordinate at once. Rows of a group may
         depend on its index and its coordinates only, so that an accepted move leaves the rows of
@@ -263,15 +244,9 @@ def coordinate_exchange(
     criterion : D, I or A. prior : information that exists before.
     sweeps : largest number of passes over all coordinates. progress : receives the coordinates
         that are done.
-
-    Returns
-    -------
-    MovedDesign; the same for the same arguments.
-
-    Raises
-    ------
-    EstimationError
-        A group of the first design is not allowed, or the groups cannot determine the unknowns.
+    Returns MovedDesign; the same for the same arguments.
+    Raises EstimationError: a group of the first design is not allowed, or the groups cannot
+        determine the unknowns.
     """
     design = np.array(design0, dtype=np.float64)
     indices = np.arange(len(design))
@@ -337,8 +312,6 @@ def _score_design(scoring: Scoring, rows: FloatArray) -> float:
 def _choose_levels(scoring: Scoring, rows: FloatArray, trials: FloatArray) -> IntArray:
     """Return the best level (u,) of each group in turn, -1 where it stays.
 
-    Parameters
-    ----------
     rows : (u, r, c) at present. trials : (u, k, r, c) at the levels.
     """
     u, k = trials.shape[:2]
@@ -383,8 +356,6 @@ BOUND_GAP = 3e-3  # gap of the relaxation where only the size is needed
 class CertifiedDesign:
     """A design and its certificate.
 
-    Attributes
-    ----------
     design : the chosen groups. relaxed : weights and bound.
     efficiency : lower bound on the efficiency relative to the best possible design.
     """
@@ -408,16 +379,11 @@ def choose_design(
 ) -> CertifiedDesign:
     """Choose n of N groups, with a certificate.
 
-    Parameters
-    ----------
     rows, n, criterion, prior, seed, repeats, first : see `fedorov_exchange`.
     perturbations : their number; default PERTURBATIONS / n.
     gap : of the relaxation. progress : receives the perturbations that are done.
-
-    Raises
-    ------
-    EstimationError
-        n groups cannot determine the unknowns, or fewer are allowed than requested.
+    Raises EstimationError: n groups cannot determine the unknowns, or fewer are allowed than
+        requested.
     """
     relaxed = relax_design(rows, n, criterion, prior, gap, repeats)
     candidates, random = relaxed.candidates, np.random.default_rng(seed)
@@ -456,9 +422,7 @@ def _perturb(
 ) -> tuple[IntArray, list[float]]:
     """Perturb a design and exchange it among the candidates (N).
 
-    Returns
-    -------
-    best : (n,) the best groups. scores : those that were better than all before.
+    Returns best : (n,) the best groups. scores : those that were better than all before.
     """
     # a design found again has the same score up to rounding: in one order, it is the same design
     n, repeats, best = len(best), candidates.repeats, np.sort(best)
@@ -483,8 +447,6 @@ def _perturb(
 class DesignCurve:
     """Values of designs by their number of groups.
 
-    Attributes
-    ----------
     sizes : (k,) numbers of groups, ascending.
     values : (k,) of the criterion, never worse with more groups.
     bounds : (k,) values that no design of the same size exceeds.
@@ -501,8 +463,6 @@ class DesignCurve:
 class SmallestDesign:
     """The smallest design found that meets a target.
 
-    Attributes
-    ----------
     n : its number of groups. at_least : no smaller number of groups can meet the target.
     certified : the design. curve : all designs that the search made.
     """
@@ -527,11 +487,8 @@ def compute_design_curve(
 
     `progress` receives the sizes that are done.
 
-    Raises
-    ------
-    EstimationError
-        The smallest size cannot determine the unknowns, or fewer candidates are allowed than the
-        largest.
+    Raises EstimationError: the smallest size cannot determine the unknowns, or fewer candidates
+        are allowed than the largest.
     """
     designs: list[CertifiedDesign] = []
     for done, n in enumerate(sorted(set(sizes))):
@@ -555,16 +512,11 @@ def find_smallest_design(
 ) -> SmallestDesign:
     """Return the smallest design found whose criterion is at least as good as a target.
 
-    Parameters
-    ----------
     target : value of the criterion (for I a variance: the square of an rms standard deviation).
     most : largest number of groups; default: all that are allowed.
     others : see `choose_design`.
-
-    Raises
-    ------
-    EstimationError
-        No design of this many groups meets the target (so the bound says), or none was found.
+    Raises EstimationError: no design of this many groups meets the target (so the bound says), or
+        none was found.
     """
     count = int(is_allowed(rows).sum())
     most = count if most is None else most if repeats else min(most, count)
@@ -615,8 +567,6 @@ def search_size(
     the size; every second step halves the interval, or doubles the size while no size has met the
     target.
 
-    Parameters
-    ----------
     n : first size to try. q : number of observable directions.
     """
     low, limit, step = low - 1, high + 1, 0

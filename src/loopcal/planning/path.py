@@ -91,8 +91,6 @@ def check_paths(
 
     The line of sight is not required on a path.
 
-    Parameters
-    ----------
     steps : of a path as long as the robot's size; longer paths get more, every path at least 4.
     """
     robot, n = checker.robot, len(start)
@@ -144,8 +142,6 @@ def _tilt_vector(coordinates: FloatArray, places: list[int]) -> np.ndarray:
 class VisitingOrder:
     """An order of n poses.
 
-    Attributes
-    ----------
     order : (n,) indices of the poses.
     via_home : (n,) True where the path goes via home before the pose, because the straight path is
         not allowed.
@@ -253,13 +249,8 @@ def check_route(robot: Mechanism, labels: tuple[str, ...], coordinates: FloatArr
 
     Strokes, joint limits, cones and singularities count; other constraints are those of a plan.
 
-    Parameters
-    ----------
     labels : names of the stops. coordinates : (n, c) controlled coordinates [m, rad].
-
-    Raises
-    ------
-    MechanismError : a straight path is not allowed.
+    Raises MechanismError: a straight path is not allowed.
     """
     home = locate_home(robot)
     stops = np.vstack([home, coordinates, home])

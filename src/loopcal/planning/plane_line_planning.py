@@ -60,19 +60,12 @@ class PlaneLineGroups:
     A design of u groups is (u, c): fractions of the half ranges of the workspace, from -1 to 1,
     except for the axis, which is 0, 1 or 2.
 
-    Parameters
-    ----------
     robot : moves in x, y and z, and states a workspace.
     points : k, at least 4. sigma : of a held coordinate [m].
     axes : along which lines may run.
     shortest : least length of a line, in half ranges; a line of no length is none.
-
-    Raises
-    ------
-    EstimationError
-        Too few points for a plane, no axis, or a robot that cannot move in x, y and z.
-    MechanismError
-        The robot states no range for a coordinate.
+    Raises EstimationError: too few points for a plane, no axis, or a robot that cannot move in x,
+        y and z. Raises MechanismError: the robot states no range for a coordinate.
     """
 
     robot: Mechanism
@@ -137,10 +130,7 @@ class PlaneLineGroups:
         Lines are drawn long enough. Groups with a pose out of reach are drawn anew, nearer and
         nearer to the middle.
 
-        Raises
-        ------
-        EstimationError
-            No group near the middle of the workspace is allowed.
+        Raises EstimationError: no group near the middle of the workspace is allowed.
         """
         rng = np.random.default_rng(seed)
         design, left = np.zeros((groups, len(self.names))), np.arange(groups)
@@ -183,15 +173,10 @@ class PlaneLineGroups:
     def linearize(self, design: FloatArray, checker: ConstraintChecker | None = None) -> FloatArray:
         """Return the rows of groups for the machine, the surfaces eliminated.
 
-        Parameters
-        ----------
         design : (u, c). checker : further constraints on the poses.
-
-        Returns
-        -------
-        rows : (u, k - 2, p) divided by sigma, by deviations in tolerances; NaN for a group with a
-            pose that is out of reach or not allowed, too short a line, or points that do not
-            determine the surfaces.
+        Returns rows : (u, k - 2, p) divided by sigma, by deviations in tolerances; NaN for a group
+            with a pose that is out of reach or not allowed, too short a line, or points that do
+            not determine the surfaces.
         """
         x = self.place_points(design)
         different, back = np.unique(x.reshape(-1, x.shape[2]), axis=0, return_inverse=True)
@@ -268,14 +253,9 @@ def linearize_surfaces(
 
     The four rows of the line come first, then those of the plane.
 
-    Parameters
-    ----------
     points : (u, k, 3) [m]. J : (u, k, 3, p) their derivatives. axis : (u,) 0, 1 or 2, along which
         the lines run.
-
-    Returns
-    -------
-    F : (u, k + 3, 5) by two rotations, height and two shifts. A : (u, k + 3, p).
+    Returns F : (u, k + 3, 5) by two rotations, height and two shifts. A : (u, k + 3, p).
     """
     u, k = points.shape[:2]
     each = np.arange(u)
@@ -311,8 +291,6 @@ def make_plane_line_instrument(
 ) -> Instrument:
     """Return a plane and a line along each axis that is used, unknown in each group.
 
-    Parameters
-    ----------
     axis : (u,) 0, 1 or 2, along which the line of each group runs.
     points : (u, k) poses of each group: first the point on plane and line, then the other one on
         the line.
@@ -556,8 +534,6 @@ def improve_groups(
     """Improve the log determinant of the information of groups (u, c) by coordinate exchange; with
     0 sweeps they stay.
 
-    Parameters
-    ----------
     is_complete : whether so many groups determine all that such groups can determine; otherwise the
         tolerances take part. checker : further constraints on the poses.
     """
@@ -598,14 +574,8 @@ def _draw_allowed(
 ) -> tuple[FloatArray, FloatArray]:
     """Draw groups that satisfy the constraints: at least `count`, and enough to find the rank.
 
-    Returns
-    -------
-    design : (u, c). rows : (u, k - 2, p).
-
-    Raises
-    ------
-    EstimationError
-        Hardly any group satisfies the constraints.
+    Returns design : (u, c). rows : (u, k - 2, p).
+    Raises EstimationError: hardly any group satisfies the constraints.
     """
     enough = max(count, -(-len(groups.free) // (groups.points - SPENT)))
     designs: list[FloatArray] = []
@@ -636,10 +606,7 @@ def _draw_allowed(
 def _require_paths(checker: ConstraintChecker, x: FloatArray) -> BoolArray:
     """Return before which points (u * k,), in their order, the path goes via home.
 
-    Raises
-    ------
-    EstimationError
-        No straight path leads from home to a point.
+    Raises EstimationError: no straight path leads from home to a point.
     """
     flat = x.reshape(-1, x.shape[2])
     home = np.broadcast_to(locate_home(checker.robot), flat.shape)

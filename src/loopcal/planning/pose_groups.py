@@ -57,10 +57,7 @@ def add_redundant_readings(instrument: Instrument, robot: Mechanism) -> Instrume
 
     None where the robot has none, or states no sigma of its readings.
 
-    Raises
-    ------
-    DataError
-        Some readings of redundant actuators are stated to be exact.
+    Raises DataError: some readings of redundant actuators are stated to be exact.
     """
     if robot.program.sigma is None or resolve_reading_sigma(robot, None, 1) is None:
         return None
@@ -73,15 +70,10 @@ def observe_groups(
 ) -> ObservedPoses:
     """Return poses of groups of `size` poses each, with their freedoms as further parameters.
 
-    Parameters
-    ----------
     readings : (N size, a) of the groups, one after the other. joints : names of joints that kinds
         look at.
-
-    Returns
-    -------
-    Poses with p + size m columns: behind those of the machine are the m freedoms of the first pose
-    of the group, then of the second.
+    Returns Poses with p + size m columns: behind those of the machine are the m freedoms of the
+        first pose of the group, then of the second.
     """
     names = tuple(dict.fromkeys([*joints, *(a.name for a in free.robot.actuators)]))
     values = free.robot.values[None]
@@ -138,8 +130,6 @@ DENSE = 20
 class GroupRows:
     """Rows of N groups of poses.
 
-    Attributes
-    ----------
     rows : (N, r, o + p) whitened, machine columns in tolerances; NaN where a pose is not reached.
     members : (N, k) indices of the poses of each group.
     nuisance : names of the o nuisance parameters of the instrument.
@@ -161,14 +151,8 @@ def linearize_candidate_groups(
     Where the instrument compares poses and there are too many combinations, half of the groups are
     drawn and half are made of the most informative poses.
 
-    Parameters
-    ----------
     readings : (n, a) of the candidate poses [m, rad].
-
-    Raises
-    ------
-    DataError
-        See `list_groups`.
+    Raises DataError: see `list_groups`.
     """
     n, k = len(readings), count_poses_per_group(instrument)
     most = MOST if k == 1 or comb(n, k) <= MOST else MOST // 2
@@ -219,8 +203,6 @@ def combine_prior(
 
     Only stated tolerances of the robot and of the instrument count.
 
-    Parameters
-    ----------
     measured : (p, p) factor of earlier measurements, their nuisance parameters eliminated (the
         instrument was set up anew since).
     """
@@ -240,8 +222,6 @@ def decompose_information(
 
     The nuisance parameters are eliminated.
 
-    Parameters
-    ----------
     measured : as for `combine_prior`.
     """
     o, p = len(groups.nuisance), len(free)
@@ -260,8 +240,6 @@ def find_group_motions(
 ) -> FloatArray:
     """Return the motions (12, k) of frames that measurements of these groups do not determine.
 
-    Parameters
-    ----------
     readings : (n, a) of all poses. members : (N, k) of the groups; some of them are enough.
     """
     chosen = np.linspace(0, len(members) - 1, min(ENOUGH, len(members))).astype(int)
@@ -372,10 +350,7 @@ def _linearize_block(
 def count_poses_per_group(instrument: Instrument) -> int:
     """Return how many poses are measured together.
 
-    Raises
-    ------
-    DataError
-        The instrument has kinds that compare different numbers of poses.
+    Raises DataError: the instrument has kinds that compare different numbers of poses.
     """
     links = sorted({sensor.kind.poses_per_row for sensor in instrument.sensors} - {1})
     if len(links) > 1:
@@ -391,10 +366,7 @@ def list_groups(
 ) -> IntArray:
     """Return the members (N, k) of groups: each pose alone, or combinations, all or `most` drawn.
 
-    Raises
-    ------
-    DataError
-        The instrument compares more poses than there are.
+    Raises DataError: the instrument compares more poses than there are.
     """
     k = count_poses_per_group(instrument)
     if k == 1:
@@ -411,8 +383,6 @@ def add_informative_groups(
 ) -> IntArray:
     """Return members (M, k) of at most `most` further groups of the most informative poses.
 
-    Parameters
-    ----------
     rows : (N, r, c) of groups, whitened and in tolerances; NaN where not allowed. members : (N, k)
         their poses.
     poses : number of candidate poses.

@@ -105,10 +105,7 @@ def plan_poses(problem: PlanningProblem, progress: Progress = report_no_progress
 def _plan_for_goal(problem: PlanningProblem, progress: Progress) -> Plan:
     """Plan the smallest number of poses whose expected error reaches the goal.
 
-    Raises
-    ------
-    EstimationError
-        No number of poses reaches it.
+    Raises EstimationError: no number of poses reaches it.
     """
     options, k = problem.options, problem.poses_per_group
     curve = find_sample_size(problem, progress)

@@ -49,8 +49,6 @@ DIMENSIONS: dict[Target, Dimension] = {
 class Prediction:
     """Derivatives of the tool's pose at k poses of the workspace.
 
-    Attributes
-    ----------
     rotations, displacements : (k, 3, p) derivatives of its rotation [rad] and displacement [m] by
         the parameters in tolerances.
     size : makes rotations comparable with displacements [m].
@@ -86,16 +84,11 @@ def linearize_prediction(
 ) -> Prediction:
     """Return how the tool's pose depends on the parameters, in a frame.
 
-    Parameters
-    ----------
     solution : the poses to predict.
     unfixed : (12, k) motions of frames that the measurements will not determine.
     frame : "fitted": after the best rigid fit of these motions over the poses to predict; "base":
         in the base frame of the robot file; "relative": relative to the home pose.
-
-    Raises
-    ------
-    EstimationError : no such frame.
+    Raises EstimationError: no such frame.
     """
     check_frame(frame, FRAMES)
     poses = observe_poses(free, solution.q)
@@ -121,8 +114,6 @@ def linearize_prediction(
 class ExpectedErrors:
     """Predicted errors of the tool, root mean square over the workspace.
 
-    Attributes
-    ----------
     position [m], orientation [rad].
     """
 

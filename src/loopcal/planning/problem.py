@@ -63,8 +63,6 @@ NO_MOTION = 1e-9
 class PlanningProblem:
     """Everything that a choice of poses depends on.
 
-    Attributes
-    ----------
     free : the robot's free parameters. instrument : mounted on its tool.
     options : of the plan. candidates : poses that may be measured. groups : their rows.
     prior : information before the first new pose.
@@ -135,10 +133,8 @@ class PlanningProblem:
     def build_criterion(self, name: str | None = None, target: Target | None = None) -> Criterion:
         """Return criterion D, or I for a target; by default those of the options.
 
-        Raises
-        ------
-        EstimationError
-            The name is another one, or the target does not move or is not observable.
+        Raises EstimationError: the name is another one, or the target does not move or is not
+            observable.
         """
         name, target = name or self.options.criterion, target or self.options.target
         if name == "D":
@@ -187,10 +183,7 @@ class PlanningProblem:
     def require_equations(self, n: int) -> None:
         """Refuse n groups that give fewer equations than there are unknowns.
 
-        Raises
-        ------
-        EstimationError
-            With the smallest number of poses.
+        Raises EstimationError: with the smallest number of poses.
         """
         k = self.poses_per_group
         if n < self.min_groups:
@@ -217,18 +210,12 @@ def prepare_problem(
     own limits, wherever the constraints allow measuring. With allowed poses in the options, they
     are predicted for as many of these, drawn at random.
 
-    Parameters
-    ----------
     robot : at its present values, with its free parameters and tolerances.
     instrument : what will measure, with its noise. options : constraints, candidates, measurements
         made already (the instrument is taken to be set up anew after them), seed.
-
-    Raises
-    ------
-    EstimationError
-        The robot has no free parameter, or the instrument determines none of them.
-    MechanismError, DataError
-        See `draw_candidates`, `linearize_candidate_groups`, `check_closure`.
+    Raises EstimationError: the robot has no free parameter, or the instrument determines none of
+        them. Raises MechanismError, DataError: see `draw_candidates`,
+        `linearize_candidate_groups`, `check_closure`.
     """
     check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
     options = options or PlanOptions()
@@ -373,8 +360,6 @@ PERTURBATIONS = 4  # number of perturbations of each design of a curve
 class ErrorCurve:
     """Expected errors by the number of poses, or of pairs where poses are compared.
 
-    Attributes
-    ----------
     numbers : (k,) of poses or pairs, ascending.
     expected : errors after measuring a good design of each number.
     target : the error that the designs make small.
@@ -463,10 +448,8 @@ def find_sample_size(
 
     The curve covers the expected errors from the smallest number to twice that one.
 
-    Raises
-    ------
-    EstimationError
-        The goal is not a number above 0, or out of reach; then with the best possible error.
+    Raises EstimationError: the goal is not a number above 0, or out of reach; then with the best
+        possible error.
     """
     options, robot, rows = problem.options, problem.robot, problem.groups.rows
     target, goal, dimension = options.target, options.goal, DIMENSIONS[options.target]

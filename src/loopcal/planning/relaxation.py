@@ -50,8 +50,6 @@ GROWTH = 20.0  # factor from one t to the next
 class RelaxedDesign:
     """The best design with fractional weights, and its certificate.
 
-    Attributes
-    ----------
     weights : (N,) of sum n; at most 1 without repeats.
     slopes : (N,) derivatives of the score by the weights; 0 where a group is not allowed.
     value : of the criterion at these weights.
@@ -90,22 +88,14 @@ def relax_design(
 ) -> RelaxedDesign:
     """Return the best fractional weights and the bound.
 
-    Parameters
-    ----------
     rows : (N, r, o + p) whitened and in tolerances; NaN where a group is not allowed.
     n : number of groups of the design. criterion : D, I or A.
     prior : information that exists before. gap : of the efficiency at which to stop.
     repeats : whether a group may be measured more than once. Without, weights are at most 1 and
         the bound is tighter.
-
-    Returns
-    -------
-    RelaxedDesign; the bound holds whether or not the gap was reached.
-
-    Raises
-    ------
-    EstimationError
-        n groups cannot determine the unknowns, or fewer are allowed than requested.
+    Returns RelaxedDesign; the bound holds whether or not the gap was reached.
+    Raises EstimationError: n groups cannot determine the unknowns, or fewer are allowed than
+        requested.
     """
     candidates = scale_candidates(rows, n, criterion, prior, repeats)
     scoring, solution = candidates.scoring, _solve(candidates, n, gap)
@@ -225,8 +215,6 @@ def maximize_weights(
     """Return weights (s,) with the same sum whose score is within `gap` of the best, as a share of
     the efficiency.
 
-    Parameters
-    ----------
     scaled : (s, r, Q) of a nonsingular set of groups. w : (s,) inside all constraints.
     cap : c, the largest weight; infinite without.
     """

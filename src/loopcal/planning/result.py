@@ -37,8 +37,6 @@ def round_shortfall(efficiency: float) -> float:
 class PlannedPoses:
     """Poses in the order of visiting.
 
-    Attributes
-    ----------
     labels : (m,) names. coordinates : (m, c) controlled coordinates [m, rad].
     readings : (m, a) actuator readings to command [m, rad].
     held_out : (m,) True for validation poses.
@@ -81,8 +79,6 @@ class PlannedPoses:
 class Stop:
     """One stop of the machine: a pose of the plan, or home between two poses.
 
-    Attributes
-    ----------
     label : of the pose, or "home". is_via : only passed through. is_held_out : for validation.
     coordinates : (c,) controlled coordinates [m, rad]. readings : (a,) of these coordinates [SI].
     """
@@ -98,8 +94,6 @@ class Stop:
 class DesignQuality:
     """Quality of the poses for the fit.
 
-    Attributes
-    ----------
     figures : D, I, A and E, in tolerances.
     efficiency : lower bound on the efficiency relative to the best possible choice: (ratio of
         determinants)^(1/p) for D, ratio of variances for I.
@@ -115,8 +109,6 @@ class DesignQuality:
 class ErrorForecast:
     """Expected errors of the tool over the workspace.
 
-    Attributes
-    ----------
     before : with the prior information only; None where nothing bounds them.
     random : with as many poses drawn evenly, median of several draws; None where there are too few
         candidates.

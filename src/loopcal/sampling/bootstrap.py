@@ -66,8 +66,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_
 class ObservedColumns:
     """The whitened rows of one kind (one trial).
 
-    Attributes
-    ----------
     residual : (r, m).
     by_nuisance : (r, m, U) by the nuisance parameters, in units of their standard deviations.
     by_parameters : (r, m, p) by the machine's deviations, as the nuisance parameters follow it.
@@ -125,8 +123,6 @@ def _make_empty(problem: Problem, rows: ObservationRows, width: int) -> Observed
 class BlockErrors:
     """Errors of the M present measured values, block by block.
 
-    Attributes
-    ----------
     residual : (M,) whitened residuals at the truth of the resamples.
     error : (M,) those at the estimate, corrected for leverage.
     block : (M,) number of the block of each, ascending. count : of blocks.
@@ -146,8 +142,6 @@ class BlockErrors:
     ) -> tuple[FloatArray, ...]:
         """Return offsets (t, r, m) of every kind that replace the residuals by errors.
 
-        Parameters
-        ----------
         factor : (t, count) by which the error of each block is multiplied.
         sigma : standard deviation of errors in untested directions.
         """
@@ -178,8 +172,6 @@ def compute_block_errors(
 ) -> BlockErrors:
     """Return the errors of the rows of a fit, by independent blocks of poses.
 
-    Parameters
-    ----------
     shift : (p,) in tolerances, from the estimate to the truth of the resamples, at which the rows
         have the residuals that the errors replace.
     """
@@ -266,8 +258,6 @@ def _correct(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the corrected errors (M,) of a block, and a basis (M, d) of its untested directions.
 
-    Parameters
-    ----------
     half : (M, w) with half half' the leverage of the block by setup and machine. poses : (M, K)
         columns of the coordinates of its poses, whose range has leverage 1.
     """
@@ -300,8 +290,6 @@ FALSE_ALARMS = 0.01
 class BlockScatter:
     """The scatter of blocks, parameter by parameter (p,).
 
-    Attributes
-    ----------
     ratio : cluster-robust standard deviation over the one of independent errors; NaN where the data
         determine none.
     noise_degrees : degrees of freedom of the part of the variance that the blocks show.
@@ -385,15 +373,10 @@ UNITS = ("pose", "block", "session", "day")  # names of units
 def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters:
     """Return the blocks of poses that are resampled together.
 
-    Parameters
-    ----------
     unit : "pose", "block", "session" or "day", or the number of consecutive poses of a block, in
         the order of the column `time`, or else of the file. None takes the largest unit with at
         least `ENOUGH_BLOCKS` blocks, or else the smallest.
-
-    Raises
-    ------
-    EstimationError : the data do not contain enough units of this name.
+    Raises EstimationError: the data do not contain enough units of this name.
     """
     if isinstance(unit, int):
         return _consecutive(data, unit)

@@ -47,8 +47,6 @@ from loopcal.typing import FloatArray, Progress, report_no_progress
 class PosteriorDensity:
     """The posterior of a fit in the coordinates v = (y, w) of its linear approximation.
 
-    Attributes
-    ----------
     fit, linear : the fit and its rows. prior : rows of an earlier calibration with them, or None.
     decomposition, penalty : of rows divided by s; the penalty is that of a prior, or 0.
     mean : (p,) of the linear posterior, in tolerances. root : (p, k) E.

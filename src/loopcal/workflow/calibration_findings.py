@@ -142,8 +142,6 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
 class OpenFreedoms:
     """The combinations that data do not determine.
 
-    Attributes
-    ----------
     motions : of frames by these combinations. count : of all. changing : combinations that may
         change poses. names : of the parameters in these.
     """

@@ -121,8 +121,6 @@ UNKNOWN = np.array(np.inf)  # sigma of readings that may be missing
 class DataSplit:
     """The two sets of a calibration.
 
-    Attributes
-    ----------
     fitted : measurements to fit. held_out : measurements for validation; None where there are none.
     share : the share that was asked for; 0 where poses were named, or none were held out.
     seed : of the random choice.
@@ -159,15 +157,11 @@ def split_data(
 
     Measurements that state their held-out poses are divided so, and no other choice is allowed.
 
-    Parameters
-    ----------
     hold_out : share of the poses to hold out, drawn by whole blocks, and with all repeats of a
         pose, as `data.split` does. 0 holds nothing out.
     held_out : labels of the poses to hold out, instead of a share.
-
-    Raises
-    ------
-    DataError : a label that the data do not have, two choices of poses, or no pose is left to fit.
+    Raises DataError: a label that the data do not have, two choices of poses, or no pose is left
+        to fit.
     """
     stated = tuple(label for label, out in zip(data.labels, data.is_held_out, strict=True) if out)
     if stated and (hold_out or (held_out and set(held_out) != set(stated))):

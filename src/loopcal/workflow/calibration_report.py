@@ -44,8 +44,6 @@ FITTED_ERRORS = "Errors at the fitted poses, which are optimistic:"
 class Provenance:
     """Where a result comes from, as far as it is known without files.
 
-    Attributes
-    ----------
     versions : of loopcal, numpy, scipy and python, and the engine that computed. seeds : by name.
     options : the options in words.
     """

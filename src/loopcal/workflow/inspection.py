@@ -38,8 +38,6 @@ FEW = 3  # combinations that change poses and that a summary lists one by one
 class IdentifiabilityReport:
     """What measurements determine.
 
-    Attributes
-    ----------
     analysis : rank, singular values and a statement on each parameter.
     suggestions : further measurements for open combinations.
     subset : a smallest set of parameters; None where it was not asked for.
@@ -131,8 +129,6 @@ def analyze_identifiability(
 ) -> IdentifiabilityReport:
     """Return what measurements determine of a robot's free parameters.
 
-    Parameters
-    ----------
     data : measurements, or simulated ones without noise for an instrument that is considered.
     choose_subset : also choose a smallest set of parameters that says the same.
     rank_tolerance : share of the largest singular value below which one counts as zero.
@@ -155,8 +151,6 @@ ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
 class RobotInspection:
     """A robot and what it does at home.
 
-    Attributes
-    ----------
     robot : the robot. home_readings : (a,) readings of the actuators at home [SI].
     findings : notes of the robot file, and limits that home exceeds.
     """

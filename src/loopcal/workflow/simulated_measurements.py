@@ -53,8 +53,6 @@ def simulate_measurements(
 ) -> SimulatedMeasurements:
     """Command a robot to poses by its nominal geometry, and measure where the true machine goes.
 
-    Parameters
-    ----------
     robot : its values are those of the true machine, its nominal values those of the controller.
     poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
     draw_errors : draw the true machine from the tolerances instead.
@@ -64,11 +62,8 @@ def simulate_measurements(
     seed : of poses, errors and noise.
     skip_unreachable : leave out poses outside the reach or the strokes of the nominal or the true
         machine, and name them in the result. Poses without names keep their numbers.
-
-    Raises
-    ------
-    MechanismError, DataError : the robot states no workspace, or a pose is outside its reach or
-        strokes, with `skip_unreachable` every pose.
+    Raises MechanismError, DataError: the robot states no workspace, or a pose is outside its reach
+        or strokes, with `skip_unreachable` every pose.
     """
     truth = draw_true_machine(robot, seed) if draw_errors else robot
     targets = resolve_poses(truth.nominal, poses, seed)
@@ -148,8 +143,6 @@ def predict_noise_free(
 ) -> Measurements:
     """Return what an instrument would measure of the robot as it is, to analyze its data.
 
-    Parameters
-    ----------
     poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
     labels, places : (n,) names of the poses, and their places, for messages. seed : of the poses.
     """
@@ -174,8 +167,6 @@ DISTRIBUTIONS: Mapping[str, Callable[[FloatArray], Noise]] = {
 class InstrumentDescription:
     """What is known of an instrument before anything is measured.
 
-    Parameters
-    ----------
     kinds : names of kinds of measurement. components : coordinates that the kind `component`
         measures. orientation : form of measured angles; None for the default of the kind.
     sigma_position, sigma_angle : standard deviations of each length [m] and angle [rad].
@@ -198,9 +189,8 @@ class InstrumentDescription:
 def build_instrument(description: InstrumentDescription) -> Instrument:
     """Return the instrument of a description.
 
-    Raises
-    ------
-    DataError : an unknown kind, frame or component, or a setting that belongs to none of the kinds.
+    Raises DataError: an unknown kind, frame or component, or a setting that belongs to none of the
+        kinds.
     """
     possible = {"components": tuple(description.components), "orientation": description.orientation}
     settings = {name: value for name, value in possible.items() if value}

@@ -99,8 +99,6 @@ def choose_next_step(
 ) -> Finding:
     """Return the step that helps most now, as a suggestion.
 
-    Parameters
-    ----------
     findings : of the calibration. outliers : labels of poses that do not fit the others.
     recommendation : code of the finding that recommends the identified or the current values.
     repeatability : its share of the variance of the expected error, by quantity.
@@ -142,8 +140,6 @@ def _choose_limit_step(
 ) -> Finding | None:
     """Return the next step where only limits fail; None without a better one than to measure more.
 
-    Parameters
-    ----------
     failed : codes of the failures. repeatability : see `choose_next_step`.
     """
     of_limits = [f for f in findings if f.code in (LIMIT_NOT_MEASURED, LIMIT_EXCEEDED)]
@@ -183,8 +179,6 @@ def recommend_values(
 ) -> Finding:
     """Return the recommendation to apply the identified values or to keep the current ones.
 
-    Parameters
-    ----------
     start : the current values against the fit. residual_test : of the fit, for the scale of the
         noise. errors : at held-out poses; None without any. findings : of the calibration.
     """

@@ -251,8 +251,6 @@ FEWEST = 8  # smallest number of equations beyond the fitted parameters that sup
 class Contradiction(NamedTuple):
     """Stated setup parameters that the data contradict.
 
-    Attributes
-    ----------
     comparison : of the measurements with these parameters estimated. misfit : the remaining misfit.
     names : of the parameters. values : for each its name, estimate, stated value and certainty.
     """
@@ -266,8 +264,6 @@ class Contradiction(NamedTuple):
 class MovedSetups(NamedTuple):
     """Frames, targets and surfaces that are no longer where a fit located them.
 
-    Attributes
-    ----------
     names : of those that moved, or of all that may have moved. times : factor by which the errors
         decrease when they are fitted again.
     """
@@ -279,15 +275,10 @@ class MovedSetups(NamedTuple):
 def find_contradiction(stated: Comparison, misfit: float, better: float) -> Contradiction | None:
     """Find stated setup parameters without which measurements fit far better.
 
-    Parameters
-    ----------
     stated : the measurements as written. misfit : of these. better : factor by which it must
         decrease.
-
-    Returns
-    -------
-    Contradiction or None
-        Of the parameter that alone explains the misfit, or else of all stated ones.
+    Returns Contradiction or None Of the parameter that alone explains the misfit, or else of all
+        stated ones.
     """
     present = set(stated.data.nuisance_parameters.table.names)
     names = tuple(value.name for value in stated.data.stated_values if value.name in present)
@@ -308,8 +299,6 @@ def find_moved_setups(
 ) -> MovedSetups | None:
     """Find frames, targets and surfaces that were moved since a fit.
 
-    Parameters
-    ----------
     names : of those whose values are kept.
     sizes : from the names that are fitted again to the root mean square [1] of whitened errors,
         with the lost degrees of freedom taken into account, and the number of equations left; NaN
@@ -519,16 +508,10 @@ def explain_outside_strokes(
 ) -> Finding | None:
     """Find the interpretation that puts all readings inside their strokes and fits the data.
 
-    Parameters
-    ----------
     robot : as given. data : with readings outside their strokes. described : these readings, as of
         `loopcal.measure.data_checks.describe_outside_strokes`; default: described without places.
-
-    Returns
-    -------
-    Finding or None
-        `conventions.strokes-explained`, or `conventions.strokes-contradicted` if the data fit as
-        they are written; None if nothing explains them.
+    Returns Finding or None `conventions.strokes-explained`, or `conventions.strokes-contradicted`
+        if the data fit as they are written; None if nothing explains them.
     """
     described = describe_outside_strokes(data, robot) if described is None else described
     if described is None:

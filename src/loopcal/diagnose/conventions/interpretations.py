@@ -70,8 +70,6 @@ Slip = tuple[str, dict[str, Any], Change]  # kind of a slip, what is read differ
 class Interpretation:
     """One other way to read measurements.
 
-    Attributes
-    ----------
     slip : kind of the slip, such as `unit`; its code in the catalog is `conventions.<slip>`.
     details : what is read differently, such as quantity and factor.
     source : file or kind that it concerns; empty where it concerns all data.
@@ -348,8 +346,6 @@ def list_reading_interpretations(
 ) -> Iterator[Interpretation]:
     """Yield all other interpretations of the readings of actuators, the likelier slips first.
 
-    Parameters
-    ----------
     data : the measurements. actuators : of the robot.
     home : (a,), optional [SI]. Readings of the home pose; wrong gear factors are also counted from
         there, as for a machine that is homed to a reading other than 0.

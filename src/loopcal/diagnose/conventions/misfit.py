@@ -82,8 +82,6 @@ class Reach(NamedTuple):
 class Comparison:
     """Measurements in t interpretations of their values, compared with a robot at its values.
 
-    Attributes
-    ----------
     data : the measurements, at poses that the robot reaches. problem : of all interpretations.
     linearization : at the robot's values; None where the rows do not locate a target.
     effort : for unknown frames. excluded : labels of the rows of the first interpretation that are
@@ -157,8 +155,6 @@ def compare_with_robot(
 ) -> Comparison:
     """Compare measurements with a robot, all rows included.
 
-    Parameters
-    ----------
     data : at poses that the robot reaches. interpretations : of their values; default: as written.
     start : (t, U), optional. Nuisance parameters to start from; default: guessed from the data.
     """

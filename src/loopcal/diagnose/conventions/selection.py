@@ -64,8 +64,6 @@ BESIDE = 0.02  # share of the stroke by which readings may be outside: the strok
 class _Zero(NamedTuple):
     """Readings `sign q + base + c` of some actuators, with c between two limits.
 
-    Attributes
-    ----------
     columns : of the actuators. sign : 1 or -1. base : (k,) of each of them [m or rad].
     low, high : of c [m or rad].
     """
@@ -89,8 +87,6 @@ def find_zero_interpretations(
 ) -> list[Interpretation]:
     """Find the zeros with which the given robot fits best, the best first.
 
-    Parameters
-    ----------
     data : as written. poses : by which they are compared. reversed_only : only readings that are
         counted in the opposite direction.
     """
@@ -197,8 +193,6 @@ DECLARED = ("frame", "targets", "tool", "anchor")
 class SetupInterpretation(Interpretation):
     """Measurements some setup items of which are estimated; their values stay as written.
 
-    Attributes
-    ----------
     items : of `DECLARED`, unknown in all kinds that allow them.
     """
 
@@ -273,8 +267,6 @@ class Selection(NamedTuple):
 class Search(NamedTuple):
     """A finished search.
 
-    Attributes
-    ----------
     selection : the interpretation that explains the data; None without one.
     tried : slip -> number of single interpretations that were tested. pairs : number of pairs.
     """
@@ -303,8 +295,6 @@ def search_interpretations(
 ) -> Search:
     """Search for the interpretation that fits far better than the stated one.
 
-    Parameters
-    ----------
     data : as written. stated : their comparison at the poses that the robot reaches; None where it
         reaches too few. misfit : of the data as written. pairs : test pairs if no single
         interpretation explains the data.
