@@ -191,14 +191,18 @@ def compensate(
     DataError : unknown mode, no step, targets of another shape.
     EstimationError : no such frame.
     """
-    _check_settings(mode, steps)
+    if mode not in get_args(Mode):
+        raise DataError(f"mode is {mode!r}; it must be 'readings' or 'commands'")
+    if steps < 1:
+        raise DataError(f"steps is {steps}; it must be 1 or more, and 3 are usually enough")
     source = fit.posterior if isinstance(fit, Identification) else fit
     robot, posterior = (source, None) if isinstance(source, Mechanism) else (source.robot, source)
     old = controller or robot.nominal
     count = StepCounter(progress, PASSES + (steps if mode == "commands" else 0))
     count.begin(TASK)
     uncorrected = inverse(old, targets)
-    wanted = _state_poses(targets, uncorrected)
+    is_pose = np.shape(targets)[-2:] == (4, 4)
+    wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
     count.begin(TASK)
     best = inverse(robot, targets)
     count.begin(TASK)
@@ -236,12 +240,6 @@ def compensate(
     )
 
 
-def _state_poses(targets: ArrayLike, uncorrected: Solution) -> FloatArray:
-    """Return the wanted poses (n, 4, 4): the targets, or what the controller makes of them."""
-    is_pose = np.shape(targets)[-2:] == (4, 4)
-    return np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
-
-
 def _remove_unfixed_frames(
     posterior: Posterior, controller: Mechanism, T: FloatArray, errors: FloatArray, frame: str
 ) -> FloatArray:
@@ -257,14 +255,6 @@ def _remove_unfixed_frames(
         return errors
     reference = geometry.pose_difference(reached.T, frames.poses)
     return frames.remove(errors[None], T, reference[None])[0]
-
-
-def _check_settings(mode: str, steps: int) -> None:
-    """Raise DataError for an unknown mode or no step."""
-    if mode not in get_args(Mode):
-        raise DataError(f"mode is {mode!r}; it must be 'readings' or 'commands'")
-    if steps < 1:
-        raise DataError(f"steps is {steps}; it must be 1 or more, and 3 are usually enough")
 
 
 @dataclass(frozen=True, eq=False)

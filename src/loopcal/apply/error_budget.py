@@ -159,8 +159,14 @@ def halve_sigma(
             for observations in (data.observations, data.base_observations)
         )
         changed = replace(data, observations=of_poses, base_observations=of_base)
-    elif source.kind == SETUP and _has_stated_setup(fit):
-        other = _with_half_setup(fit, data)
+    elif source.kind == SETUP and any(
+        p.free and p.tolerance is not None for p in fit.nuisance.table.entries
+    ):
+        setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
+        for entry in setup.table.entries:
+            if entry.free and entry.tolerance is not None:
+                setup = setup.with_prior(entry.name, 0.5 * entry.tolerance)
+        other = replace(fit, options=replace(fit.options, nuisance=setup))
     else:
         return None
     problem, linearization = linearize_rows_of(other, changed)
@@ -311,20 +317,6 @@ def _halve_interval(rows: Observations, name: str, data: Measurements) -> Observ
     chosen = np.array([_name(rows, session, data) == name for session in rows.session.tolist()])
     factor = np.where(chosen, 0.25, 1.0)[:, None, None]
     return replace(rows, covariance=rows.covariance * factor)
-
-
-def _has_stated_setup(fit: Identification) -> bool:
-    """Return whether the standard deviation of some free setup parameter is stated."""
-    return any(p.free and p.tolerance is not None for p in fit.nuisance.table.entries)
-
-
-def _with_half_setup(fit: Identification, data: Measurements) -> Identification:
-    """Return a fit whose stated setup parameters have half their standard deviations."""
-    setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
-    for entry in setup.table.entries:
-        if entry.free and entry.tolerance is not None:
-            setup = setup.with_prior(entry.name, 0.5 * entry.tolerance)
-    return replace(fit, options=replace(fit.options, nuisance=setup))
 
 
 # Number of poses that are drawn from the workspace, and the seed of their draw.
@@ -528,7 +520,11 @@ def _list_sources(
     for source, root in zip(split.sources, split.roots, strict=True):
         twists = D @ root
         if source.kind == DISCREPANCY:
-            twists = _select_discrepancy(effects.by_discrepancy, source.name)
+            # columns are those of rotations and of places, then of what each pose has of its own
+            twists, part = effects.by_discrepancy, 1 if source.name == "position" else 0
+            shared_and_own = np.split(twists, [twists.shape[2] - 6], axis=2)
+            halves = [np.split(each, 2, axis=2)[part] for each in shared_and_own]
+            twists = np.concatenate(halves, axis=2)
         if source.kind == SETUP and not is_relative:
             twists = np.concatenate([twists, effects.by_frame], axis=2)
         variances = np.where(split.undetermined, np.nan, (root**2).sum(axis=1))
@@ -551,15 +547,6 @@ class _Places(NamedTuple):
     solution: Solution
     frame: str
     effects: ToolErrors
-
-
-def _select_discrepancy(twists: FloatArray, name: str) -> FloatArray:
-    """Return the twists (n, 6, k) of a model discrepancy that its position or orientation causes:
-    columns are those of rotations and of places, then what is independent at each pose, likewise.
-    """
-    part = 1 if name == "position" else 0
-    common, own = np.split(twists, [twists.shape[2] - 6], axis=2)
-    return np.concatenate([np.split(each, 2, axis=2)[part] for each in (common, own)], axis=2)
 
 
 def _halve(

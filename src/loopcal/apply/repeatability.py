@@ -213,7 +213,9 @@ def assess_repeatability(
     rows = compared.data.observations
     errors = compute_row_errors(rows, compared.after.residuals(rows))
     noise = compute_noise_floor(rows)
-    places = _place_rows(compared.data)
+    visit = np.concatenate([o.rows for o in compared.data.observations])
+    direction = np.concatenate([o.group for o in compared.data.observations])
+    places = _RowPlaces(compared.data.repeats[visit], visit, direction)
     poses = {
         quantity: entries
         for quantity in (POSITION, ORIENTATION)
@@ -249,13 +251,6 @@ def _keep_poses(data: Measurements) -> Measurements:
     if not kept:
         raise DataError(report_finding("repeatability.nothing-measured"))
     return replace(data, observations=kept)
-
-
-def _place_rows(data: Measurements) -> _RowPlaces:
-    """Return which commanded pose and visit each row of the observations belongs to."""
-    visit = np.concatenate([o.rows for o in data.observations])
-    direction = np.concatenate([o.group for o in data.observations])
-    return _RowPlaces(data.repeats[visit], visit, direction)
 
 
 def _describe_poses(

@@ -550,7 +550,14 @@ def validate(
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
     values_before, values = _choose_setup(fit, before, nuisance_values_before, nuisance_values)
-    _check_refit(refit, data)
+    owners = {owner_of(name) for name in data.nuisance_parameters.table.names}
+    for pattern in refit:
+        if not any(fnmatchcase(owner, pattern) for owner in owners):
+            listed = ", ".join(sorted(owners)) or "none"
+            raise DataError(
+                f"no frame, target or surface of these data is called {pattern!r}"
+                f"{suggest_names(pattern, owners)}; the data have: {listed}"
+            )
     kept_before, kept = _keep_setup(values_before, refit), _keep_setup(values, refit)
     compared = compare_predictions(old, robot, data, kept_before, kept)
     limits = {"position": limit_position, "orientation": limit_angle}
@@ -633,18 +640,6 @@ def _choose_setup(
     if values is None:
         values = {} if nuisance is None else nuisance.values
     return values_before, values
-
-
-def _check_refit(refit: Sequence[str], data: Measurements) -> None:
-    """Raise DataError for a name in `refit` that belongs to nothing in the data."""
-    owners = {owner_of(name) for name in data.nuisance_parameters.table.names}
-    for pattern in refit:
-        if not any(fnmatchcase(owner, pattern) for owner in owners):
-            listed = ", ".join(sorted(owners)) or "none"
-            raise DataError(
-                f"no frame, target or surface of these data is called {pattern!r}"
-                f"{suggest_names(pattern, owners)}; the data have: {listed}"
-            )
 
 
 def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, float]:

@@ -25,6 +25,7 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import add_slow_errors, find_slow_errors
 from loopcal.diagnose.residual_patterns import (
+    ORDER,
     READING,
     SESSION,
     TEMPERATURE,
@@ -33,6 +34,7 @@ from loopcal.diagnose.residual_patterns import (
     ResidualPatterns,
     ResidualRows,
     collect_residual_rows,
+    estimate_correlated_errors,
     find_patterns,
 )
 from loopcal.estimate.added_covariance import add_covariance
@@ -54,19 +56,23 @@ from loopcal.units import DISPLAY_UNITS
 NOTICEABLE = 1.05
 # Code of the finding that independent errors would mean that sigma is too large.
 TOO_SMALL = "noise.residuals-too-small"
+# Codes of the findings on what residuals depend on.
+CODES = {
+    ORDER: "residuals.trend",
+    TIME: "residuals.drift",
+    SESSION: "residuals.sessions-differ",
+    TEMPERATURE: "residuals.depend-on-temperature",
+    READING: "residuals.depend-on-reading",
+}
 
 
 def adjust_uncertainty(
     fit: Identification, data: Measurements, linear: FitLinearization | None = None
 ) -> Identification:
-    """Return a fit whose covariance allows for what the residuals show, and says why.
+    """Return a fit whose covariance allows for what the residuals of its data show, and says why.
 
     Estimates stay. No variance becomes smaller. A fit that did not converge, has no intervals, or
-    has weights by a loss is returned as it is.
-
-    fit : an identification. data : the measurements it was made from.
-    linear : of both, where the caller has it, see `linearize_fit`.
-    Raises DataError: another number of poses.
+    has weights by a loss is returned as it is. `linear` : see `linearize_fit`.
     """
     check_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
@@ -74,22 +80,15 @@ def adjust_uncertainty(
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     linear = linearize_fit(fit, data) if linear is None else linear
     rows = collect_residual_rows(fit, data, linear)
-    slow = find_slow_errors(fit, data, linear, _place_measured_poses(fit, data, linear))
+    if linear.solution.linearized is None or fit.poses is not None:
+        T = locate_measured_poses(fit, data).T
+    else:  # readings are exact, and the linearization has kept the poses
+        poses = linear.solution.linearized
+        T = poses.T[0, poses.is_reached[0]]
+    slow = find_slow_errors(fit, data, linear, T)
     if rows is not None:
         fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
     return fit if slow is None else add_slow_errors(fit, slow)
-
-
-def _place_measured_poses(
-    fit: Identification, data: Measurements, linear: FitLinearization
-) -> FloatArray:
-    """Return the measured poses (n, 4, 4) [m] that the calibrated robot reaches: those of the
-    linearization, where readings are exact and it has kept them.
-    """
-    poses = linear.solution.linearized
-    if poses is None or fit.poses is not None:
-        return locate_measured_poses(fit, data).T
-    return poses.T[0, poses.is_reached[0]]
 
 
 def _add_patterns(
@@ -121,8 +120,6 @@ def _add_correlation(
     Where residuals are too small and no test shows a correlation, it is added if it matters: the
     parameters may have taken up errors that are too slow for the tests.
     """
-    from loopcal.diagnose.residual_patterns import estimate_correlated_errors
-
     rows = patterns.rows
     errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
     independent = np.zeros_like(errors.covariance)
@@ -200,32 +197,28 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
     most = int(np.argmax(np.abs(effect.sizes) / effect.errors))
     label = effect.effect.labels[most]
     unit = DISPLAY_UNITS[label.dimension]
-    shown = {
-        "component": label.component,
-        "size": Quantity(float(effect.sizes[most]) / unit.factor_to_si, unit.symbol),
-        "error": Quantity(float(effect.errors[most]) / unit.factor_to_si, unit.symbol),
-        "ratio": ratio,
-        "severity": choose_severity(effect.p_value),
-    }
-    source, name = effect.effect.source, effect.effect.name
-    if source == TIME:
-        return report_finding("residuals.drift", **shown)
-    if source == SESSION:
-        return report_finding("residuals.sessions-differ", **shown)
-    if source == TEMPERATURE:
-        return report_finding("residuals.depend-on-temperature", name=name, **shown)
-    if source == READING:
-        return report_finding("residuals.depend-on-reading", name=name, **shown)
-    return report_finding("residuals.trend", **shown)
+    size, error = (
+        Quantity(float(values[most]) / unit.factor_to_si, unit.symbol)
+        for values in (effect.sizes, effect.errors)
+    )
+    name = effect.effect.name
+    return report_finding(
+        CODES[effect.effect.source],
+        **({"name": name} if name else {}),
+        component=label.component,
+        size=size,
+        error=error,
+        ratio=ratio,
+        severity=choose_severity(effect.p_value),
+    )
 
 
 def _without_doubt_of_sigma(fit: Identification) -> Identification:
     """Return a fit that does not call sigma alone too large: correlated errors make residuals
     small. Where the dependence is no warning, the small residuals still are.
     """
-    warned = any(
-        f.code.startswith("residuals.") and f.severity is Severity.WARNING for f in fit.findings
-    )
+    warnings = (f.code for f in fit.findings if f.severity is Severity.WARNING)
+    warned = any(code.startswith("residuals.") for code in warnings)
     severity = Severity.INFO if warned else Severity.WARNING
     findings = tuple(
         report_finding("noise.not-independent", ratio=f.data["ratio"], severity=severity)
@@ -292,10 +285,7 @@ def check_heavy_tails(
 
     A fit with a loss, without intervals, or with uncertain readings is not tested, nor one whose
     residuals depend on something: this makes some of them larger, and is reported already.
-
-    fit : an identification. data : the measurements it was made from.
-    outliers : labels of poses that are known to be wrong, such as those of `find_outliers`.
-    linear : of both, where the caller has it, see `linearize_fit`.
+    `outliers` : labels of poses that are known to be wrong. `linear` : see `linearize_fit`.
     """
     nothing = _untested(0)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
@@ -308,7 +298,13 @@ def check_heavy_tails(
     rows = collect_residual_rows(fit, data, linear)
     if rows is None:
         return nothing
-    wrong = np.flatnonzero(_belong_to(rows, data, outliers))
+    is_named = np.isin(np.array(data.labels), list(outliers))
+    is_wrong = np.zeros(len(rows.residual), dtype=bool)
+    for number, o in enumerate(o for o in data.observations if len(o)):
+        own = rows.kind == number
+        is_held = np.asarray(is_named[o.rows].reshape(len(o), -1).any(axis=1))
+        is_wrong[own] = is_held[rows.row[own]]
+    wrong = np.flatnonzero(is_wrong)
     return assess_tails(rows.without(wrong) if wrong.size else rows)
 
 
@@ -324,7 +320,9 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
         return _untested(len(kept))
     member = rows.series[kept][:, None] == find_distinct(rows.series[kept])
     u = _standardize(rows.residual[kept, None], left, member)
-    others = _take_root(np.eye(basis.shape[1]) - basis.T @ basis)
+    square, vectors = np.linalg.eigh(np.eye(basis.shape[1]) - basis.T @ basis)
+    known = square > TESTABLE
+    others = np.asarray(vectors[:, known] * np.sqrt(square[known]))
     rng, done, smaller = np.random.default_rng(0), 0, 0
     median, observed = 0.0, _compute_statistic(u)[0]
     while done < DRAWS:
@@ -352,17 +350,6 @@ def _untested(rows: int) -> HeavyTails:
     return HeavyTails(rows, np.nan, np.nan, np.nan, np.nan)
 
 
-def _belong_to(rows: ResidualRows, data: Measurements, labels: Sequence[str]) -> BoolArray:
-    """Return which residuals (R,) belong to poses with these labels."""
-    is_named = np.isin(np.array(data.labels), list(labels))
-    result = np.zeros(len(rows.residual), dtype=bool)
-    for number, o in enumerate(o for o in data.observations if len(o)):
-        own = rows.kind == number
-        is_held = np.asarray(is_named[o.rows].reshape(len(o), -1).any(axis=1))
-        result[own] = is_held[rows.row[own]]
-    return result
-
-
 def _standardize(residual: FloatArray, left: FloatArray, member: BoolArray) -> FloatArray:
     """Return residuals (k, d) in units of their standard deviation, by the series (k, s)."""
     expected = member.T @ left
@@ -374,10 +361,3 @@ def _standardize(residual: FloatArray, left: FloatArray, member: BoolArray) -> F
 def _compute_statistic(u: FloatArray) -> FloatArray:
     """Return T (d,) of residuals (k, d)."""
     return np.asarray(np.log1p(u**2 / 3.0).mean(axis=0))
-
-
-def _take_root(covariance: FloatArray) -> FloatArray:
-    """Return a root (q, k) of the part of the estimate that other rows determine."""
-    square, vectors = np.linalg.eigh(covariance)
-    known = square > TESTABLE
-    return np.asarray(vectors[:, known] * np.sqrt(square[known]))

@@ -17,7 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.influence import Influence, compute_block_influence, iterate_blocks
+from loopcal.diagnose.influence import (
+    Influence,
+    compute_block_influence,
+    iterate_blocks,
+    make_empty_influence,
+)
 from loopcal.diagnose.outliers import BlockSearch, PartialFit, search_blocks
 from loopcal.errors import LoopcalError
 from loopcal.estimate.fit_linearization import FitUncertainty
@@ -26,7 +31,6 @@ from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.robust_descent import estimate_scale_of
 from loopcal.findings import Finding, report_finding
-from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.readings import fill_in_reading_sigma
@@ -61,15 +65,11 @@ class HeldOutBlocks(NamedTuple):
         """Return the prediction by all blocks that are not excluded (u,)."""
         triangle, y = self.combine(excluded)
         u = len(excluded)
-        values = {
-            name: np.zeros(u)
-            for name in ("leverage", "residuals", "distance", "degrees", "deleted")
-        }
+        influence = make_empty_influence(u)
         for numbers, H, residual, present in self.groups:
             tested = compare_blocks(H, residual, present, triangle, y, ~excluded[numbers])
-            for name, array in values.items():
-                array[numbers] = getattr(tested, name)
-        influence = Influence(**values)  # type: ignore[arg-type]
+            for array, values in zip(influence, tested, strict=True):
+                array[numbers] = values
         inside, scale = (influence.degrees > 0) & ~excluded, 1.0
         if inside.any():
             distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
@@ -151,7 +151,10 @@ class Predictor(NamedTuple):
     def make_blocks(self, data: Measurements) -> HeldOutBlocks:
         """Return the rows of measurements with what predicts them."""
         data = fill_in_reading_sigma(self.robot, data)
-        free = _make_free(self.robot, self.uncertainty)
+        nothing = np.zeros(0)
+        free = FreeParameters(self.robot, nothing.astype(int), nothing, nothing, nothing > 0.0)
+        if self.uncertainty is not None:
+            free = self.uncertainty.free
         problem = problem_of(free, data)
         table = data.nuisance_parameters.table
         z = free.deviation(self.robot.values[None])
@@ -246,14 +249,6 @@ def compare_blocks(
     return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 
-def _make_free(robot: Mechanism, uncertainty: FitUncertainty | None) -> FreeParameters:
-    """Return the free parameters of a fit at its estimate; none where it is not known."""
-    if uncertainty is not None:
-        return uncertainty.free
-    nothing = np.zeros(0)
-    return FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
-
-
 MOST_PERMUTED = 4  # targets of which all orders are tried; of more only exchanges of two
 MOST_EXPLAINED = 10  # poses for which explanations are tried, the farthest first
 # Other poses that do not fit, the farthest first, with which the values of one are exchanged.
@@ -316,16 +311,11 @@ class Blunder:
 
 
 def name_blunders(check: HeldOutCheck, data: Measurements) -> tuple[Blunder, ...]:
-    """Return the held-out blocks that do not fit, the farthest first, each with its explanation.
-
-    check : of these held-out data.
-    """
+    """Return the held-out blocks that do not fit, the farthest first, each with its explanation."""
     end, p_value = check.search.end, check.search.end.p_value()
     blunders = []
     for count, i in enumerate(check.suspects.tolist()):
-        explanation = Explanation("none")
-        if count < MOST_EXPLAINED:
-            explanation = _explain(check, data, i)
+        explanation = _explain(check, data, i) if count < MOST_EXPLAINED else Explanation("none")
         times, p = float(np.sqrt(end.ratio[i])), float(p_value[i])
         blunders.append(Blunder(check.blocks.poses[i], times, p, explanation))
     return tuple(blunders)
@@ -341,8 +331,8 @@ def _explain(check: HeldOutCheck, data: Measurements, block: int) -> Explanation
         ("targets", _permute_targets(alone)),
         ("poses", _exchange_poses(check, data, poses, others)),
         ("unit", _convert_units(check, alone)),
-        ("column", _leave_out_columns(alone)),
-        ("target", _leave_out_targets(alone)),
+        ("column", _leave_out(alone, "column")),
+        ("target", _leave_out(alone, "left_out")),
     ):
         best, fitting = 0.0, None
         for words, read in readings:
@@ -441,41 +431,22 @@ def _convert_units(check: HeldOutCheck, data: Measurements) -> Iterator[Reading]
                 yield {"dimension": dimension.value, "factor": factor}, read
 
 
-def _leave_out_columns(data: Measurements) -> Iterator[Reading]:
-    """Give the data without one column of one row."""
-    for i, row, place in _list_rows(data):
-        for j, column in enumerate(data.observations[i].kind.columns):
-            yield {"column": f"{column.name}{place}"}, _without(data, i, row, (j,))
-
-
-def _leave_out_targets(data: Measurements) -> Iterator[Reading]:
-    """Give the data without one target of one row."""
-    for i, row, place in _list_rows(data):
-        for name, columns in _list_targets(data.observations[i].kind).items():
-            yield {"left_out": f"{name}{place}"}, _without(data, i, row, columns)
-
-
-def _list_rows(data: Measurements) -> Iterator[tuple[int, int, str]]:
-    """Give number of the kind and number of the row of all rows, and words for the row where the
-    kind has several.
-    """
+def _leave_out(data: Measurements, what: str) -> Iterator[Reading]:
+    """Give the data without one "column" of one row, or without one target ("left_out") of it."""
     for i, rows in enumerate(data.observations):
+        kind = rows.kind
+        groups: list[tuple[str, Sequence[int]]] = list(kind.target_columns.items())
+        if what == "column":
+            groups = [(column.name, (j,)) for j, column in enumerate(kind.columns)]
+        elif len(groups) < 2:
+            groups = [(kind.name, range(len(kind.columns)))]
         for row in range(len(rows)):
             label = "/".join(data.labels[pose] for pose in np.ravel(rows.rows[row]))
-            yield i, row, f" of the row {label}" if len(rows) > 1 else ""
-
-
-def _without(data: Measurements, i: int, row: int, columns: Sequence[int]) -> Measurements:
-    """Return measurements without some values of one row of one kind."""
-    measured = np.array(data.observations[i].measured)
-    measured[row, list(columns)] = np.nan
-    return _with_measured(data, i, measured)
-
-
-def _list_targets(kind: Kind) -> dict[str, tuple[int, ...]]:
-    """Return the targets of a kind with several, or the kind as a whole, with their columns."""
-    targets = dict(kind.target_columns)
-    return targets if len(targets) > 1 else {kind.name: tuple(range(len(kind.columns)))}
+            place = f" of the row {label}" if len(rows) > 1 else ""
+            for name, columns in groups:
+                measured = np.array(rows.measured)
+                measured[row, list(columns)] = np.nan
+                yield {what: f"{name}{place}"}, _with_measured(data, i, measured)
 
 
 def _with_measured(data: Measurements, i: int, measured: FloatArray) -> Measurements:

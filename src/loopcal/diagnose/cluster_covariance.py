@@ -367,7 +367,7 @@ def _compare(
     """Return the comparison for clusters; None where residuals cannot judge the poses."""
     spread = compute_robust_spread(fit, clusters, linear)
     effects = _list_pose_effects(fit, data, frame)
-    angle, position = (spread.compare(each.by_parameters, each.added) for each in effects)
+    angle, position = (spread.compare(*effect) for effect in effects)
     sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
     sizes = [r for r in sizes if r.share >= JUDGED and r.degrees >= FEWEST_DEGREES]
     if not sizes:
@@ -388,19 +388,12 @@ def _compare(
     return ClusterCheck(clusters.unit, clusters.count, position, angle, parameter, finding)
 
 
-class _PoseEffects(NamedTuple):
-    """Changes (3 n, p) of the measured poses by deviations in tolerances, and the sum of the
-    variances that they have beyond those by C.
-    """
-
-    by_parameters: FloatArray
-    added: float
-
-
 def _list_pose_effects(
     fit: Identification, data: Measurements, frame: str
-) -> tuple[_PoseEffects, _PoseEffects]:
-    """Return the effects on orientation and on the tool's position, in a frame."""
+) -> list[tuple[FloatArray, float]]:
+    """Return for the orientation and the tool's position of the measured poses their changes
+    (3 n, p) by deviations in tolerances, and the sum of the variances that they have beyond C.
+    """
     posterior = fit.posterior
     errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data, MOST_POSES), frame)
     p = len(posterior.unit)
@@ -409,11 +402,8 @@ def _list_pose_effects(
     )
     added = np.concatenate([by_part, errors.by_discrepancy], axis=2) ** 2
     D = errors.by_parameters * (fit.tolerance / posterior.unit)
-    angle, position = (
-        _PoseEffects(D[:, rows].reshape(-1, p), float(added[:, rows].sum()))
-        for rows in (slice(0, 3), slice(3, 6))
-    )
-    return angle, position
+    parts = (slice(0, 3), slice(3, 6))
+    return [(D[:, rows].reshape(-1, p), float(added[:, rows].sum())) for rows in parts]
 
 
 def _find_added_root(posterior: Posterior) -> FloatArray:

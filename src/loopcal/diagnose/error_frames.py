@@ -172,7 +172,11 @@ def choose_error_frame(
     check_frame(frame, (FITTED, BASE, RELATIVE, *instruments))
     motions = list_unfixed_motions(posterior)
     if frame in (FITTED, BASE) and not motions.shape[1]:
-        return _keep_base(posterior, frame)
+        own = posterior.discrepancy
+        p = len(posterior.unit) + (0 if own is None else own.errors.count)
+        by_parameters, by_itself = np.zeros((MOTIONS, p)), np.zeros((MOTIONS, 0))
+        over: Over = "measured" if _names_readings(posterior) else "home"
+        return ErrorFrame(frame, posterior.robot.size, by_parameters, by_itself, over=over)
     reference = reference_poses(posterior)
     if frame in (FITTED, BASE):
         return refer_errors(robot, frame, reference, motions)
@@ -316,15 +320,6 @@ def list_error_twists(posterior: Posterior, T: FloatArray, D: FloatArray) -> Flo
     if own is None:
         return by_parameters
     return np.concatenate([by_parameters, own.twists(T, D)], axis=2)
-
-
-def _keep_base(posterior: Posterior, frame: str) -> ErrorFrame:
-    """Return the base frame of a calibration that determines all frames: nothing is fitted."""
-    own = posterior.discrepancy
-    p = len(posterior.unit) + (0 if own is None else own.errors.count)
-    by_parameters, by_itself = np.zeros((MOTIONS, p)), np.zeros((MOTIONS, 0))
-    over: Over = "measured" if _names_readings(posterior) else "home"
-    return ErrorFrame(frame, posterior.robot.size, by_parameters, by_itself, over=over)
 
 
 def _names_readings(posterior: Posterior) -> bool:

@@ -347,7 +347,9 @@ def _estimate_drift(repeats: _Repeats) -> FrameDrift:
     best, largest = 1, -1.0
     for i in range(1, E):
         chosen = slice(m + 6 * (i - 1), m + 6 * i)
-        size = _compute_significance(free.values[chosen], free.root[chosen])
+        # the squared length of the motion in units of its uncertainty
+        u, s, _ = np.linalg.svd(free.root[chosen], full_matrices=False)
+        size = float((((u.T @ free.values[chosen]) / s) ** 2).sum())
         best, largest = (i, size) if size > largest else (best, largest)
     chosen = slice(m + 6 * (best - 1), m + 6 * best)
     motion, root = free.values[chosen], free.root[chosen]
@@ -357,12 +359,6 @@ def _estimate_drift(repeats: _Repeats) -> FrameDrift:
     kind = repeats.kind
     where = (kind.frame, repeats.session[0], kind.targets, best + 1, E)
     return FrameDrift(*where, shift, shift_sd, angle, angle_sd, chi_square, degrees, tail)
-
-
-def _compute_significance(motion: FloatArray, root: FloatArray) -> float:
-    """Return the squared length of a motion (6,) in units of its uncertainty, of root (6, r)."""
-    u, s, _ = np.linalg.svd(root, full_matrices=False)
-    return float((((u.T @ motion) / s) ** 2).sum())
 
 
 def _measure_length(vector: FloatArray, root: FloatArray) -> tuple[float, float]:

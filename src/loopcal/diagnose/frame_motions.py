@@ -95,7 +95,10 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
             frames = (name,)  # only one where it suffices
     infinite = np.isinf(posterior.variance[~posterior.determined])
     kept = null @ _gauge_projector(gauge, infinite)
-    explained = _explain_motions(moving, base, platform, robot.size)
+    unit = np.array([1.0 / robot.size] * 3 + [1.0] * 3)
+    both = np.concatenate([base * unit, platform * unit], axis=1)
+    motion = np.linalg.lstsq(both, moving, rcond=NO_MOTION)[0]
+    explained = motion / np.linalg.norm(motion, axis=0)
     growth = np.zeros((int(usable.sum()), 6, 1))
     growth[:, 3:, 0] = state.T[0, usable, :3, 3]
     rest = _without_span([base, platform, growth.reshape(-1, 1)], moved)
@@ -223,16 +226,6 @@ def _weigh_motions(
         (weight * D).reshape(-1, D.shape[-1]) for D in (twists, M[:, :, :6], M[:, :, 6:])
     )
     return motions, base, platform
-
-
-def _explain_motions(
-    moving: FloatArray, base: FloatArray, platform: FloatArray, size: float
-) -> FloatArray:
-    """Return the motions (12, g) of both frames that explain weighted motions (6 n, g) of poses."""
-    unit = np.array([1.0 / size] * 3 + [1.0] * 3)
-    both = np.concatenate([base * unit, platform * unit], axis=1)
-    motion = np.linalg.lstsq(both, moving, rcond=NO_MOTION)[0]
-    return motion / np.linalg.norm(motion, axis=0)
 
 
 def _without_span(frames: Sequence[FloatArray], moved: FloatArray) -> FloatArray:

@@ -79,7 +79,7 @@ def compute_influence(
         sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
         roots.append(d.scale[:, None] * d.directions[0] * sd)
         changes.append((solved - linearization.deviation)[0])
-    results = [_make_empty(u) for _ in fits]
+    results = [make_empty_influence(u) for _ in fits]
     total = problem.count_leverage_rows(member, u)
     rows = problem.leverage_rows(linearization, solution)
     for blocks, columns, r in iterate_blocks(rows, member, total):
@@ -89,22 +89,16 @@ def compute_influence(
         for result, root, change in zip(results, roots, changes, strict=True):
             half = np.concatenate([nuisance, A @ root], axis=2)
             tested = compute_block_influence(half, r + A @ change, present, weight[blocks])
-            for array, values in zip(_list_arrays(result), _list_arrays(tested), strict=True):
+            for array, values in zip(result, tested, strict=True):
                 array[blocks] = values
     return results
 
 
-def _make_empty(blocks: int) -> Influence:
+def make_empty_influence(blocks: int) -> Influence:
     """Return an influence of zeros, to be filled."""
-    counts = (np.zeros(blocks, np.int64) for _ in range(2))
-    zeros = (np.zeros(blocks) for _ in range(3))
-    return Influence(next(zeros), next(counts), next(zeros), next(counts), next(zeros))
-
-
-def _list_arrays(influence: Influence) -> tuple[np.ndarray, ...]:
-    """Return the arrays of an influence."""
-    i = influence
-    return (i.leverage, i.residuals, i.distance, i.degrees, i.deleted)
+    leverage, distance, deleted = np.zeros((3, blocks))
+    residuals, degrees = np.zeros((2, blocks), np.int64)
+    return Influence(leverage, residuals, distance, degrees, deleted)
 
 
 def compute_block_influence(

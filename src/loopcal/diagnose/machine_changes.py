@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.estimate.posterior import CovariancePart, DataInformation, Posterior, combine_degrees
+from loopcal.estimate.posterior import DataInformation, Posterior, combine_degrees
 from loopcal.numerics.decomposition import NULL_COMPONENT, are_nonzero
 from loopcal.numerics.statistics import (
     compute_averaged_tail,
@@ -200,7 +200,9 @@ def _whiten(
     for posterior, part, own in zip((first, second), combinations, information, strict=True):
         rows = part @ own.rows / np.sqrt(own.variance)
         errors += [
-            ErrorPart(rows @ added.root, added.degrees) for added in _list_added_parts(posterior)
+            ErrorPart(rows @ added.root, added.degrees)
+            for added in posterior.parts
+            if added.is_added and np.isfinite(added.root).all()
         ]
     covariance = np.sum([error.root @ error.root.T for error in errors], axis=0)
     root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
@@ -215,11 +217,6 @@ def _whiten(
         divide(value[:, None])[:, 0],
         tuple(ErrorPart(divide(error.root), error.degrees) for error in errors),
     )
-
-
-def _list_added_parts(posterior: Posterior) -> list[CovariancePart]:
-    """Return the parts of a covariance beside noise and tolerances."""
-    return [part for part in posterior.parts if part.is_added and np.isfinite(part.root).all()]
 
 
 # --- Which parameter, limb or pair of limbs explains the change of a machine.

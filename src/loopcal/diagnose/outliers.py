@@ -490,7 +490,12 @@ def find_outliers(
     fits, end, tested = search.fits, search.end, search.whole.tested
     always = np.all([each.excluded for each in fits], axis=0)
     ambiguous = np.any(groups, axis=0) if groups else np.zeros_like(always)
-    outliers = _list_outliers(end, labels, always & ~ambiguous)
+    p_value, degrees = end.p_value(), end.influence.degrees
+    outliers = tuple(
+        Outlier(labels[i], float(end.ratio[i] * degrees[i]), int(degrees[i]), float(p_value[i]))
+        for i in np.argsort(p_value, kind="stable")
+        if always[i] and not ambiguous[i]
+    )
     ratio = np.sqrt(search.whole.ratio)
     conflicts = tuple(
         Conflict(tuple(labels[i] for i in np.flatnonzero(group)), float(ratio[group].max()))
@@ -533,18 +538,6 @@ def _refit_robustly(
     except LoopcalError:
         return fit
     return robust if robust.converged else fit
-
-
-def _list_outliers(
-    end: PartialFit, labels: tuple[tuple[str, ...], ...], is_outlier: BoolArray
-) -> tuple[Outlier, ...]:
-    """Return the outliers among the blocks (u,) of a fit without them, the least probable first."""
-    p_value, degrees = end.p_value(), end.influence.degrees
-    return tuple(
-        Outlier(labels[i], float(end.ratio[i] * degrees[i]), int(degrees[i]), float(p_value[i]))
-        for i in np.argsort(p_value, kind="stable")
-        if is_outlier[i]
-    )
 
 
 def _weigh_blocks(problem: Problem, z: FloatArray, start: Start, member: IntArray) -> FloatArray:

@@ -132,7 +132,8 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
         identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
     )
     free, null = identifiability.free_parameters, identifiability.null_space()
-    places = _choose_fixed(free, null)
+    # of equal parameters the last one in the file is fixed
+    places = choose_pivots((null * _weights(free)[:, None]).T, first=False)
     kept = np.setdiff1d(np.arange(len(free)), places)
     B = null @ np.linalg.inv(null[places]) if len(places) else null
     dropped = tuple(_merge(free, int(place), B[:, i], kept) for i, place in enumerate(places))
@@ -140,12 +141,6 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
     names = tuple(free.names[i] for i in kept)
     condition = float(s[0] / s[-1]) if len(s) else 1.0
     return IdentifiableSubset(names, dropped, condition, free_only(free.robot, names))
-
-
-def _choose_fixed(free: FreeParameters, null: FloatArray) -> IntArray:
-    """Return the places (d,) of the parameters to fix, in the order of the robot's file."""
-    # of equal parameters the last one in the file is fixed
-    return choose_pivots((null * _weights(free)[:, None]).T, first=False)
 
 
 def _weights(free: FreeParameters) -> FloatArray:
@@ -280,7 +275,9 @@ def judge_useful_accuracy(
     for name, value in (("length", length), ("angle", angle)):
         if not 0.0 < value < np.inf:
             raise EstimationError(f"useful {name} is {value}; give a finite number above 0")
-    unit = _accuracy_units(free, length, angle)
+    units = {Dimension.LENGTH: length, Dimension.ANGLE: angle}
+    ratio = length / free.robot.size
+    unit = np.array([units.get(parameter.dimension, ratio) for parameter in free.parameters])
     _, s, vt = np.linalg.svd(analysis.factor * (unit / free.tolerance))
     s = np.where(s > np.finfo(np.float64).eps * len(s) * s[0], s, 0.0)
     count = int((s >= 1.0).sum())
@@ -296,13 +293,6 @@ def judge_useful_accuracy(
         undetermined=_name_combinations(free, vt[count:], s[count:]),
         nearby=tuple(int((s * factor >= 1.0).sum()) for factor in NEIGHBORS),
     )
-
-
-def _accuracy_units(free: FreeParameters, length: float, angle: float) -> FloatArray:
-    """Return the accuracy (p,) [SI] of each parameter; of ratios it is the length over the size."""
-    units = {Dimension.LENGTH: length, Dimension.ANGLE: angle}
-    ratio = length / free.robot.size
-    return np.array([units.get(parameter.dimension, ratio) for parameter in free.parameters])
 
 
 def _name_combinations(

@@ -91,10 +91,16 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
 
     ratio = max(lack, 0.0) / lack_degrees / (pure / degrees)
     p_value = float(fdtrc(lack_degrees, degrees, ratio))
-    findings = _lack_findings(ratio, p_value, scale, degrees)
-    return LackOfFit(
-        groups, pure, degrees, lack, lack_degrees, scale, p_value, p_value >= LEVEL, findings
-    )
+    findings = [report_finding("residuals.explained")]
+    if p_value < LEVEL:
+        findings = [report_finding("residuals.lack-of-fit", ratio=float(np.sqrt(ratio)))]
+    tail = float(compute_chi_square_tail(degrees, scale**2 * degrees))
+    if tail < SIGNIFICANCE:
+        findings.append(report_finding("residuals.repeatability-larger", scale=scale))
+    if tail > 1.0 - SIGNIFICANCE:
+        findings.append(report_finding("residuals.repeatability-smaller", scale=scale))
+    numbers = (groups, pure, degrees, lack, lack_degrees, scale, p_value)
+    return LackOfFit(*numbers, p_value >= LEVEL, tuple(findings))
 
 
 def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tuple[float, int]:
@@ -135,16 +141,3 @@ def _untested(
     """Return the reason why there is no test."""
     finding = report_finding(code)
     return LackOfFit(groups, pure, degrees, np.nan, np.nan, scale, np.nan, None, (finding,))
-
-
-def _lack_findings(ratio: float, p_value: float, scale: float, degrees: int) -> tuple[Finding, ...]:
-    """Return the result of the test, and a repeatability that contradicts the stated sigma."""
-    findings = [report_finding("residuals.explained")]
-    if p_value < LEVEL:
-        findings = [report_finding("residuals.lack-of-fit", ratio=float(np.sqrt(ratio)))]
-    tail = float(compute_chi_square_tail(degrees, scale**2 * degrees))
-    if tail < SIGNIFICANCE:
-        findings.append(report_finding("residuals.repeatability-larger", scale=scale))
-    if tail > 1.0 - SIGNIFICANCE:
-        findings.append(report_finding("residuals.repeatability-smaller", scale=scale))
-    return tuple(findings)

@@ -461,7 +461,10 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
         return np.nan, np.nan
     r, U = rows.residual, rows.basis
     observed = float(r[pairs] @ r[pairs + 1]) / rows.square
-    LU = _shift(U, pairs)
+    # L columns, L the symmetric matrix with 1/2 for each pair of neighbors
+    LU = np.zeros_like(U)
+    LU[pairs] += 0.5 * U[pairs + 1]
+    LU[pairs + 1] += 0.5 * U[pairs]
     inner = U.T @ LU
     # traces of B = M L M, from tr L = 0 and tr L^2 = pairs / 2
     first = -float(np.trace(inner))
@@ -471,14 +474,6 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
     if not variance > 0.0:
         return np.nan, np.nan
     return observed - mean, _compute_beta_tail(observed, mean, variance)
-
-
-def _shift(columns: FloatArray, pairs: np.ndarray) -> FloatArray:
-    """Return L columns, L the symmetric matrix with 1/2 for each pair of neighbors."""
-    moved = np.zeros_like(columns)
-    moved[pairs] += 0.5 * columns[pairs + 1]
-    moved[pairs + 1] += 0.5 * columns[pairs]
-    return moved
 
 
 def _compute_beta_tail(observed: float, mean: float, variance: float) -> float:

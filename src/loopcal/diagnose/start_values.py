@@ -140,7 +140,20 @@ def compare_stored_geometry(robot: Mechanism, measured: Measurements) -> StoredA
         return None  # fewer probes than parameters, or a geometry that cannot reach them
     if not fit.converged or fit.rank < len(fit.names):
         return None
-    return StoredAnswer(float(fit.history.cost[0]), float(fit.history.cost[-1]), tuple(_moved(fit)))
+    is_angle = np.array([name.endswith(".angle") for name in fit.names])
+    unit = np.where(is_angle, np.pi / 180.0, MM)
+    stored = fit.initial.values[fit.free_parameters.places] / unit
+    best = fit.estimate / unit
+    symbols = ["deg" if angle else "mm" for angle in is_angle]
+    return StoredAnswer(
+        float(fit.history.cost[0]),
+        float(fit.history.cost[-1]),
+        tuple(
+            (name, float(first), float(last), symbol)
+            for name, first, last, symbol in zip(fit.names, stored, best, symbols, strict=True)
+            if abs(last - first) > SMALL
+        ),
+    )
 
 
 def _is_noise_consistent(fit: Identification) -> bool:
@@ -173,17 +186,3 @@ def _with_firmware_weights(measured: Measurements) -> Measurements:
         for o in measured.observations
     ]
     return replace(measured, observations=tuple(weighted))
-
-
-def _moved(fit: Identification) -> list[tuple[str, float, float, str]]:
-    """Parameters that differ at the optimum, by name."""
-    is_angle = np.array([name.endswith(".angle") for name in fit.names])
-    unit = np.where(is_angle, np.pi / 180.0, MM)
-    stored = fit.initial.values[fit.free_parameters.places] / unit
-    best = fit.estimate / unit
-    symbols = ["deg" if angle else "mm" for angle in is_angle]
-    return [
-        (name, float(first), float(last), symbol)
-        for name, first, last, symbol in zip(fit.names, stored, best, symbols, strict=True)
-        if abs(last - first) > SMALL
-    ]

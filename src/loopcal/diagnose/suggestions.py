@@ -129,7 +129,10 @@ def suggest_measurements(
     # an observed direction must exceed the rounding of the existing rows, too
     root, floor = free.correlation_root(), float(np.linalg.norm(factor, ord=2))
     present = compute_remaining_sd(factor, root)
-    joints = _passive_joints(free.robot)
+    joints = [
+        (f"{limb.name}.{joint.name}", "length" if joint.kind == "P" else "angle")
+        for limb, joint in free.robot.assembly.passive_joints
+    ]
     scene = _draw_scene(free, [name for name, _ in joints])
     for words, kind in _list_candidates(free.robot, joints):
         try:
@@ -180,14 +183,6 @@ def _draw_scene(free: FreeParameters, joints: list[str]) -> ObservedPoses:
     except MechanismError:
         return probe_workspace(free, joints)
     return observe_poses(free, q, joints)
-
-
-def _passive_joints(robot: Mechanism) -> list[tuple[str, str]]:
-    """Return passive joints to which a sensor could be attached, with what it would measure."""
-    return [
-        (f"{limb.name}.{joint.name}", "length" if joint.kind == "P" else "angle")
-        for limb, joint in robot.assembly.passive_joints
-    ]
 
 
 def _list_candidates(robot: Mechanism, joints: list[tuple[str, str]]) -> Iterator[tuple[str, Kind]]:

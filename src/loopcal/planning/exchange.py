@@ -251,7 +251,11 @@ def coordinate_exchange(
     design = np.array(design0, dtype=np.float64)
     indices = np.arange(len(design))
     rows = np.array(linearize(indices, design))
-    _require_allowed(rows)
+    excluded = np.flatnonzero(~is_allowed(rows))
+    if len(excluded):
+        raise EstimationError(
+            f"group {excluded[0]} of the first design is not allowed; start from groups that are"
+        )
     probes = _probe_levels(linearize, design, rows, levels)
     space = find_observable_space(probes, prior)
     require_enough(len(design), rows, prior, space)
@@ -280,15 +284,6 @@ def coordinate_exchange(
     require_determined(history[-1], len(design), len(design), space)
     values = tuple(scoring.value(score) for score in history)
     return MovedDesign(design, rows, values[-1], values, evaluated, space, is_converged)
-
-
-def _require_allowed(rows: FloatArray) -> None:
-    """Refuse a first design (u, r, c) with a group that is not allowed."""
-    excluded = np.flatnonzero(~is_allowed(rows))
-    if len(excluded):
-        raise EstimationError(
-            f"group {excluded[0]} of the first design is not allowed; start from groups that are"
-        )
 
 
 def _probe_levels(
@@ -574,18 +569,17 @@ def search_size(
     while high - low > 1:
         n = min(max(n, low + 1), high - 1)
         value, step = value_of(n), step + 1
-        low, high = (low, n) if _meets_target(criterion, value, target) else (n, high)
+        low, high = (
+            (low, n)
+            if (value >= target if isinstance(criterion, D) else value <= target)
+            else (n, high)
+        )
         if step % 2:
             growth = np.exp((target - value) / q) if isinstance(criterion, D) else value / target
             n = int(np.ceil(n * min(growth, 4.0)))
         else:
             n = 2 * n if high == limit else (low + high) // 2
     return high
-
-
-def _meets_target(criterion: Criterion, value: float, target: float) -> bool:
-    """Return whether a value is at least as good as the target."""
-    return value >= target if isinstance(criterion, D) else value <= target
 
 
 def _collect_curve(designs: list[CertifiedDesign]) -> DesignCurve:

@@ -168,7 +168,12 @@ class PlaneLineGroups:
         fractions = np.concatenate([place, turn], axis=2)
         coordinates = 0.5 * (high + low) + 0.5 * (high - low) * fractions
         order = [names.index(name) for name in self.robot.controlled]
-        return self._shift_to_platform(coordinates[:, :, order])
+        x = coordinates[:, :, order]
+        controlled, tool = self.robot.controlled, self.robot.tool[:3, 3]
+        if tool.any():  # the origin of the tool is to be at the points, not that of the platform
+            offset = pose_from_coordinates(x, controlled, self.robot.home)[..., :3, :3] @ tool
+            x[..., [controlled.index(name) for name in POSITION]] -= offset
+        return x
 
     def linearize(self, design: FloatArray, checker: ConstraintChecker | None = None) -> FloatArray:
         """Return the rows of groups for the machine, the surfaces eliminated.
@@ -213,16 +218,6 @@ class PlaneLineGroups:
         """Return the length (u,) of the lines in half ranges."""
         end = design[:, 4 + len(self.orientation_names)]
         return np.abs(end - design[np.arange(len(design)), self._axis(design)])
-
-    def _shift_to_platform(self, x: FloatArray) -> FloatArray:
-        """Return coordinates (.., c) of the platform that put the origin of the tool at x."""
-        names, tool = self.robot.controlled, self.robot.tool[:3, 3]
-        if not tool.any():
-            return x
-        moved = x.copy()
-        offset = pose_from_coordinates(x, names, self.robot.home)[..., :3, :3] @ tool
-        moved[..., [names.index(name) for name in POSITION]] -= offset
-        return moved
 
     def _linearize_points(
         self, x: FloatArray, checker: ConstraintChecker | None = None
@@ -498,7 +493,7 @@ def plan_surfaces(
     designs, rows = _draw_allowed(
         groups, checker, options.groups, np.random.default_rng(options.seed)
     )
-    possible = count_observable(groups, rows)
+    possible = len(find_observable_space(rows, PriorInformation.none(len(groups.free))))
     rank = min(possible, options.groups * (options.points - SPENT))
     best = improve_groups(
         groups, designs[: options.groups], SWEEPS, rank == possible, checker, progress
@@ -516,11 +511,6 @@ def plan_surfaces(
         _rms_sd(best.rows, rank),
         best.is_converged,
     )
-
-
-def count_observable(groups: PlaneLineGroups, rows: FloatArray) -> int:
-    """Return how many combinations of parameters groups with these rows (u, k - 2, p) determine."""
-    return len(find_observable_space(rows, PriorInformation.none(len(groups.free))))
 
 
 def improve_groups(

@@ -46,7 +46,7 @@ from loopcal.planning.design_space import (
     factor_rows,
     is_allowed,
 )
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray
 
 # --- Rows of pose groups of a machine with redundant actuators, whose readings are measurements,
 # too.
@@ -400,7 +400,9 @@ def add_informative_groups(
     # in the order of their numbers, so that a combination is written in one way only
     informative = np.sort(np.argsort(-best, kind="stable")[:count])
     further = draw_combinations(informative, k, most, rng)
-    return further[~_is_member(further, members, poses)]
+    # one number for each combination tells which of them are listed already
+    places = float(poses) ** np.arange(further.shape[1])
+    return further[~np.isin(further @ places, members @ places)]
 
 
 def draw_combinations(poses: IntArray, k: int, most: int, rng: np.random.Generator) -> IntArray:
@@ -414,9 +416,3 @@ def draw_combinations(poses: IntArray, k: int, most: int, rng: np.random.Generat
     draws = np.sort(rng.integers(0, n, (2 * most, k)), axis=1)
     draws = np.unique(draws[(np.diff(draws, axis=1) > 0).all(axis=1)], axis=0)
     return poses[draws[np.sort(rng.permutation(len(draws))[:most])]]
-
-
-def _is_member(members: IntArray, others: IntArray, poses: int) -> BoolArray:
-    """Return which of members (M, k) occur among others (N, k)."""
-    places = float(poses) ** np.arange(members.shape[1])
-    return np.isin(members @ places, others @ places)

@@ -141,7 +141,13 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
     held_out = _draw_held_out(problem, n_held_out // k, rng)
     rows, members = np.array(problem.groups.rows), problem.groups.members
     rows[np.isin(members, members[held_out]).any(axis=1)] = np.nan
-    _require_candidates(problem, rows, n)
+    left = int(is_allowed(rows).sum())
+    if left < n:
+        raise EstimationError(
+            report_finding(
+                "plan.too-few-candidates", requested=n, what=problem.group_name, available=left
+            )
+        )
     best = choose_design(
         rows, n, criterion, problem.prior, options.seed, PERTURBATIONS, gap=GAP, progress=progress
     )
@@ -154,8 +160,15 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
         after=after,
         frame=problem.prediction.frame.describe(axes=""),
     )
+    factor = factor_design(rows[chosen], problem.prior, problem.space)
+    criteria: tuple[Criterion, ...] = (
+        problem.build_criterion("D"),
+        problem.build_criterion("I"),
+        A(),
+        E(),
+    )
     quality = DesignQuality(
-        _compute_figures(problem, rows[chosen]),
+        {c.name: evaluate_criterion(c, factor, problem.space.machine) for c in criteria},
         min(best.efficiency, 1.0),
         int(is_allowed(rows).sum()),
     )
@@ -214,17 +227,6 @@ def _draw_held_out(problem: PlanningProblem, count: int, rng: np.random.Generato
     return np.array(chosen, dtype=np.int64)
 
 
-def _require_candidates(problem: PlanningProblem, rows: FloatArray, n: int) -> None:
-    """Refuse more groups than remain to choose from."""
-    left = int(is_allowed(rows).sum())
-    if left < n:
-        raise EstimationError(
-            report_finding(
-                "plan.too-few-candidates", requested=n, what=problem.group_name, available=left
-            )
-        )
-
-
 def _arrange_poses(
     problem: PlanningProblem, chosen: IntArray, held_out: IntArray
 ) -> tuple[PlannedPoses, bool]:
@@ -239,8 +241,9 @@ def _arrange_poses(
     ordered = poses[visit.order]
     place = np.empty(len(candidates), dtype=np.int64)
     place[ordered] = np.arange(len(ordered))
+    numbers = [int(name) for name in problem.used_names if name.isdecimal()]
     planned = PlannedPoses(
-        _name_poses(problem, len(ordered)),
+        tuple(str(max(numbers, default=0) + i) for i in range(1, len(ordered) + 1)),
         candidates.coordinates[ordered],
         _round_readings(problem.robot, candidates.solution.q[ordered]),
         np.isin(ordered, members[held_out]),
@@ -267,24 +270,6 @@ def _round_readings(robot: Mechanism, readings: FloatArray) -> FloatArray:
     steps = 10.0 ** (np.floor(np.log10(scale / factors)) - DIGITS)
     # + 0: no reading is -0
     return np.round(readings / factors / steps) * steps * factors + 0.0
-
-
-def _name_poses(problem: PlanningProblem, count: int) -> tuple[str, ...]:
-    """Return numbers as names of poses, beginning after the largest one measured already."""
-    numbers = [int(name) for name in problem.used_names if name.isdecimal()]
-    return tuple(str(max(numbers, default=0) + i) for i in range(1, count + 1))
-
-
-def _compute_figures(problem: PlanningProblem, rows: FloatArray) -> dict[str, float]:
-    """Return D, I, A and E of a design."""
-    factor = factor_design(rows, problem.prior, problem.space)
-    criteria: tuple[Criterion, ...] = (
-        problem.build_criterion("D"),
-        problem.build_criterion("I"),
-        A(),
-        E(),
-    )
-    return {c.name: evaluate_criterion(c, factor, problem.space.machine) for c in criteria}
 
 
 def _predict_random(

@@ -38,7 +38,7 @@ from loopcal.planning.design_space import (
     divide_by_factor,
     scale_candidates,
 )
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray
 
 ROUNDS = 40  # largest number of times that candidates enter the barrier problem
 WARM_UP = 12  # multiplicative steps over all candidates that select those to begin with
@@ -135,7 +135,10 @@ def _solve(candidates: ScaledCandidates, n: int, gap: float) -> _Solution:
         if not w.sum() > 0.0:  # no group adds information to the prior: all designs are equal
             return _Solution(np.full(N, n / N), d, score, score, 0)
         w *= n / w.sum()
-    chosen = _select_first(candidates, w, n)
+    order, count = np.argsort(-w, kind="stable"), max(2 * n, 40)
+    while count < len(w) and not candidates.is_determined(order[:count]):
+        count *= 2
+    chosen = order[:count]
     inside = np.full(len(chosen), n / len(chosen))
     target, rounds = 0.2 * gap, 0
     while True:
@@ -188,16 +191,6 @@ def _bound(
     """Return the score that no design of n groups exceeds."""
     most = n * d.max() if repeats else np.partition(d, len(d) - n)[len(d) - n :].sum()
     return score + scoring.height * float(np.log((d0 + most) / scoring.height))
-
-
-def _select_first(candidates: ScaledCandidates, w: FloatArray, n: int) -> IntArray:
-    """Return the candidates of the largest weights: more than n, and enough to determine all
-    directions.
-    """
-    order, count = np.argsort(-w, kind="stable"), max(2 * n, 40)
-    while count < len(w) and not candidates.is_determined(order[:count]):
-        count *= 2
-    return order[:count]
 
 
 def _price(d: FloatArray, w: FloatArray, cap: float) -> float:

@@ -159,9 +159,11 @@ class Plan(TableResult):
     def findings(self) -> tuple[Finding, ...]:
         """Everything that the plan reports: content, certificate, errors, curve and notes."""
         curve = () if self.curve is None else (self.curve.report(self.robot),)
+        assert self.poses.path_length is not None, "a plan has a path"
+        length = Quantity(self.poses.path_length, "m")
         return (
             self._report_poses(),
-            self._report_path(),
+            report_finding("plan.path", length=length, via_home=int(self.poses.via_home.sum())),
             self._report_certificate(),
             self._report_errors(),
             *curve,
@@ -194,12 +196,6 @@ class Plan(TableResult):
             held_out=groups - self.n_groups,
             kinds=tuple(_name_kind(sensor.kind) for sensor in self.instrument.sensors),
         )
-
-    def _report_path(self) -> Finding:
-        """Return the length of the path."""
-        assert self.poses.path_length is not None, "a plan has a path"
-        length = Quantity(self.poses.path_length, "m")
-        return report_finding("plan.path", length=length, via_home=int(self.poses.via_home.sum()))
 
     def _report_certificate(self) -> Finding:
         """Return how far the choice can be from the best possible one."""

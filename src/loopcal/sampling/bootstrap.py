@@ -176,7 +176,13 @@ def compute_block_errors(
         have the residuals that the errors replace.
     """
     problem, kinds = linear.problem, list_observed_columns(linear.problem, linear.linearization)
-    cells = _list_cells(problem.rows, clusters)
+    columns = []
+    for number, of_kind in enumerate(problem.rows):
+        row, component = np.nonzero(of_kind.is_present[0])
+        block = clusters.member[of_kind.first_poses[row]]
+        columns.append(np.stack([block, np.full(len(row), number), row, component]))
+    cells = np.concatenate(columns, axis=1)
+    cells = _Cells(*cells[:, np.lexsort((cells[1], cells[0]))])
     V = linear.decomposition.scale[:, None] * linear.decomposition.directions[0]
     total = linear.decomposition.singular_values[0] ** 2 + linear.penalty[0]
     V = V[:, linear.is_estimated] / np.sqrt(total[linear.is_estimated])
@@ -218,17 +224,6 @@ class _Cells:
         mine = np.flatnonzero(self.kind == kind)
         places[self.row[mine], self.component[mine]] = mine
         return places
-
-
-def _list_cells(rows: Sequence[ObservationRows], clusters: Clusters) -> _Cells:
-    """Return the present components of rows (one trial)."""
-    columns = []
-    for i, of_kind in enumerate(rows):
-        row, component = np.nonzero(of_kind.is_present[0])
-        block = clusters.member[of_kind.first_poses[row]]
-        columns.append(np.stack([block, np.full(len(row), i), row, component]))
-    cells = np.concatenate(columns, axis=1)
-    return _Cells(*cells[:, np.lexsort((cells[1], cells[0]))])
 
 
 def _pose_columns(
@@ -665,7 +660,12 @@ class _Draw:
         if self.errors is None:
             drawn = self.rng.multinomial(G, np.full(G, 1.0 / G), count)
             weight = drawn[:, self.blocks.member].astype(np.float64)
-            equations = equations + (drawn - 1) @ self._count_rows()
+            total = np.zeros(self.blocks.count, dtype=np.int64)
+            for rows in self.linear.problem.rows:
+                present = rows.is_present[0].sum(axis=1)
+                owner = self.blocks.member[rows.first_poses]
+                total += np.bincount(owner, present, self.blocks.count).astype(np.int64)
+            equations = equations + (drawn - 1) @ total
         elif self.scheme == "normal":
             offset = self.errors.draw_normal(count, sigma, self.rng)
         else:
@@ -716,12 +716,3 @@ class _Draw:
         sd = np.where(has_prior, np.nan_to_num(table.tolerance), 0.0)
         mean = fit.nuisance.estimate if is_recentered else table.nominal
         return center, prior, mean + sd * rng.standard_normal((count, len(sd)))
-
-    def _count_rows(self) -> IntArray:
-        """Return the number (G,) of present residuals of each block."""
-        total = np.zeros(self.blocks.count, dtype=np.int64)
-        for rows in self.linear.problem.rows:
-            present = rows.is_present[0].sum(axis=1)
-            owner = self.blocks.member[rows.first_poses]
-            total += np.bincount(owner, present, self.blocks.count).astype(np.int64)
-        return total

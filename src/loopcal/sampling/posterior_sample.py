@@ -87,7 +87,9 @@ class PosteriorDensity:
         """Return log p (T,) at coordinates (T, k + u); -inf where a pose is not reached."""
         z, x = self.parameters(coordinates), self.setup(coordinates)
         count = len(z)
-        problem = resample_rows(self.linear.problem, None, None, self._prior_mean(count))
+        nuisance = self.linear.problem.nuisance
+        mean = np.zeros((count, 0)) if nuisance is None else nuisance.prior_mean.repeat(count, 0)
+        problem = resample_rows(self.linear.problem, None, None, mean)
         start = repeat_trial(self.linear.linearization.next_start, count)
         has_setup = x.shape[1] > 0
         if has_setup:
@@ -123,11 +125,6 @@ class PosteriorDensity:
     def _penalize(self, z: FloatArray) -> FloatArray:
         """Return the penalty (T,) of the tolerances."""
         return (self.penalty * self.decomposition.coordinates(z) ** 2).sum(axis=1)
-
-    def _prior_mean(self, count: int) -> FloatArray:
-        """Return the means of the priors of setup parameters, for each draw."""
-        nuisance = self.linear.problem.nuisance
-        return np.zeros((count, 0)) if nuisance is None else nuisance.prior_mean.repeat(count, 0)
 
 
 def describe_density(fit: Identification, linear: FitLinearization) -> PosteriorDensity:
@@ -215,12 +212,13 @@ class PosteriorSample(TableResult):
         change = ends.quantile - ends.linear
         known = np.where(np.isfinite(self.linear_sd), 1.0, np.nan)
         mean = self.linear_mean + (self.weight - self.linear_weight) @ self.draws
+        center = self.weight @ self.draws
         return Intervals(
             names=self.fit.names,
             level=level,
             source="posterior",
             center=mean * known,
-            sd=self._standard_deviations() * known,
+            sd=np.asarray(np.sqrt(self.weight @ (self.draws - center) ** 2)) * known,
             lower=(linear[0] + change[0]) * known,
             upper=(linear[1] + change[1]) * known,
             linear_lower=linear[0] * known,
@@ -265,11 +263,6 @@ class PosteriorSample(TableResult):
             "findings": self.findings,
         }
 
-    def _standard_deviations(self) -> FloatArray:
-        """Return standard deviations (p,) of the weighted draws."""
-        mean = self.weight @ self.draws
-        return np.asarray(np.sqrt(self.weight @ (self.draws - mean) ** 2))
-
 
 def sample_posterior(
     fit: Identification,
@@ -313,7 +306,12 @@ def sample_posterior(
     while rounds < ROUNDS:
         rounds += 1
         v, log_q = proposal.draw(count, rng)
-        log_p = _evaluate(density, v, progress)
+        log_densities = []
+        for first in range(0, len(v), BATCH):
+            progress(first, len(v), "evaluating draws")
+            log_densities.append(density.exact(v[first : first + BATCH]))
+        progress(len(v), len(v), "evaluating draws")
+        log_p = np.concatenate(log_densities)
         weight = normalize_weights(log_p - log_q)
         size = effective_size(weight)
         if best is None or size > effective_size(best[1]):
@@ -340,16 +338,6 @@ def sample_posterior(
         degrees=density.degrees,
         tail_shape=fit_tail_shape(weight),
     )
-
-
-def _evaluate(density: PosteriorDensity, v: FloatArray, progress: Progress) -> FloatArray:
-    """Return log p (T,) of draws v (T, k + u)."""
-    log_densities = []
-    for first in range(0, len(v), BATCH):
-        progress(first, len(v), "evaluating draws")
-        log_densities.append(density.exact(v[first : first + BATCH]))
-    progress(len(v), len(v), "evaluating draws")
-    return np.concatenate(log_densities)
 
 
 @dataclass(frozen=True, eq=False)

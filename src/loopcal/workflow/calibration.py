@@ -111,7 +111,10 @@ def calibrate(
     if options.has_limit and split.held_out is None:
         raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
     if options.check_conventions:
-        _refuse_wrong_base_targets(data)
+        # no pose can be reached from a frame that does not fit, and a fit would blame the robot
+        for shape in compare_shapes(data):
+            if shape.chi_square > GROSS**2 * shape.degrees:
+                raise DataError(report_moved_targets(shape))
     count = StepCounter(progress, STEPS)
     count.begin("checking conventions")
     conventions = check_conventions(
@@ -120,7 +123,11 @@ def calibrate(
         allow_still=options.allow_still,
         allow_implausible=not options.check_conventions,
     )
-    _refuse_far_rows(conventions, options)
+    # every fold without the far rows would be fitted well and predict them badly, and every fit
+    # with them takes all of its iterations
+    finding = conventions.finding
+    if options.choose_model and finding is not None and finding.code == "conventions.rows-far-off":
+        raise DataError(report_finding("model.rows-far-off", poses=finding.data["poses"]))
     redundant = robot.program.sigma is not None  # then readings are measurements, too
     if not split.fitted.n_rows and not redundant:
         raise DataError(report_finding("data.no-measured-value"))
@@ -131,27 +138,6 @@ def calibrate(
     count.begin("testing the residuals for patterns and slow errors")
     result = replace(result, fit=adjust_uncertainty(result.fit, split.fitted))
     return _report(result, split, conventions, options, count)
-
-
-def _refuse_wrong_base_targets(data: Measurements) -> None:
-    """Refuse targets on the base in another unit or order, which no frame of an instrument fits.
-
-    No pose can be reached from such a frame, and a fit would blame the robot.
-    """
-    for shape in compare_shapes(data):
-        if shape.chi_square > GROSS**2 * shape.degrees:
-            raise DataError(report_moved_targets(shape))
-
-
-def _refuse_far_rows(conventions: ConventionCheck, options: CalibrationOptions) -> None:
-    """Refuse to choose parameters by held-out poses of which a few are far off all others.
-
-    Every fold without them would be fitted well and predict them badly, and every fit with them
-    takes all of its iterations.
-    """
-    finding = conventions.finding
-    if options.choose_model and finding is not None and finding.code == "conventions.rows-far-off":
-        raise DataError(report_finding("model.rows-far-off", poses=finding.data["poses"]))
 
 
 @dataclass(frozen=True, eq=False)

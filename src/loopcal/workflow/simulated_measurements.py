@@ -26,7 +26,7 @@ from loopcal.measure.simulation import (
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import resolve_poses
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
 
@@ -69,7 +69,10 @@ def simulate_measurements(
     targets = resolve_poses(truth.nominal, poses, seed)
     skipped: tuple[str, ...] = ()
     if skip_unreachable:
-        is_kept = find_reachable_poses(truth, targets)
+        commanded = inverse(truth.nominal, targets)
+        reached = forward(truth, commanded.q, commanded).converged
+        inside = ~find_outside_strokes(commanded.q, truth).any(axis=1)
+        is_kept = commanded.converged & reached & inside
         numbers = labels or tuple(str(i + 1) for i in range(len(targets)))
         skipped = tuple(name for name, keep in zip(numbers, is_kept, strict=True) if not keep)
         if len(skipped) == len(targets):
@@ -86,14 +89,6 @@ def simulate_measurements(
         data = replace(data, labels=tuple(labels))
     check_strokes(data, truth, places=dict(enumerate(places)))
     return SimulatedMeasurements(data, truth, skipped)
-
-
-def find_reachable_poses(truth: Mechanism, targets: FloatArray) -> BoolArray:
-    """Return which coordinates (n, c) nominal and true machine reach, inside the strokes (n,)."""
-    commanded = inverse(truth.nominal, targets)
-    reached = forward(truth, commanded.q, commanded).converged
-    inside = ~find_outside_strokes(commanded.q, truth).any(axis=1)
-    return commanded.converged & reached & inside
 
 
 def fill_in_measurements(

@@ -155,29 +155,22 @@ def check_conventions(
     """
     check_types(robot, data)
     try:
-        return _check_conventions(robot, data, allow_still, allow_implausible)
+        if not allow_still and has_static_targets(data):
+            solution = forward(robot, data.readings)
+            if solution.converged.any():
+                T = solution.T[solution.converged]
+                check_targets_move(data.take(solution.converged), T, robot.size)
+        if allow_implausible:
+            return ConventionCheck(float("nan"))
+        check = compare_conventions(robot, data)
+        if check.is_refused:
+            raise DataError(check.finding)
+        return check
     except DataError as error:
         files = " and ".join(dict.fromkeys(o.source for o in data.observations if o.source))
         if not files:
             raise
         raise DataError(f"{files}: {error}") from error
-
-
-def _check_conventions(
-    robot: Mechanism, data: Measurements, allow_still: bool, allow_implausible: bool
-) -> ConventionCheck:
-    """Check as `check_conventions`; its errors name no files."""
-    if not allow_still and has_static_targets(data):
-        solution = forward(robot, data.readings)
-        if solution.converged.any():
-            T = solution.T[solution.converged]
-            check_targets_move(data.take(solution.converged), T, robot.size)
-    if allow_implausible:
-        return ConventionCheck(float("nan"))
-    check = compare_conventions(robot, data)
-    if check.is_refused:
-        raise DataError(check.finding)
-    return check
 
 
 def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck:
@@ -388,7 +381,13 @@ def compare_interpretations(
         if not misfit > ALLOWED:
             has_far_rows = whole.misfit > IMPLAUSIBLE and bool(stated.excluded)
             if has_far_rows:
-                return ConventionCheck(misfit, finding=_report_far_rows(stated))
+                finding = report_finding(
+                    "conventions.rows-far-off",
+                    count=len(stated.excluded),
+                    rows=sum(len(o) for o in stated.data.observations),
+                    poses=tuple(dict.fromkeys(stated.excluded)),
+                )
+                return ConventionCheck(misfit, finding=finding)
             return ConventionCheck(misfit, finding=report_equals(free, reach.data, misfit))
         if misfit > IMPLAUSIBLE:
             against = find_contradiction(stated, misfit, BETTER)
@@ -488,16 +487,6 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
         is_consistent=against.misfit <= ALLOWED,
     )
     return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
-
-
-def _report_far_rows(stated: Comparison) -> Finding:
-    """Report the rows that do not fit the others, which fit; they stay in the data."""
-    return report_finding(
-        "conventions.rows-far-off",
-        count=len(stated.excluded),
-        rows=sum(len(o) for o in stated.data.observations),
-        poses=tuple(dict.fromkeys(stated.excluded)),
-    )
 
 
 # --- Explain readings outside their strokes by another unit, order, sign or zero.
