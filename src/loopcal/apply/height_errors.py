@@ -103,7 +103,7 @@ class HeightErrors(TableResult):
             **{name: getattr(self, name) for name in ("poses", "points", "before", "after")},
             "held_out": self.is_held_out,
             "statistics": {
-                name: {e: vars(self.statistics(e, is_held_out)) for e in ("before", "after")}
+                name: {e: self.statistics(e, is_held_out) for e in ("before", "after")}
                 for name, is_held_out in self.list_sets()
             },
         }

@@ -18,6 +18,7 @@ from loopcal.diagnose.machine_changes import (
     estimate_cause,
     explain_change,
 )
+from loopcal.diagnose.row_errors import Statistics, compute_statistics
 from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
 from loopcal.errors import DataError
 from loopcal.estimate.fit_linearization import FitUncertainty
@@ -218,25 +219,16 @@ QUANTITIES = ("position", "orientation", "length")  # quantities whose errors ar
 
 
 @dataclass(frozen=True)
-class QuantityErrors:
-    """Errors of a quantity after calibration [SI]: root mean square and largest of `count`."""
-
-    rms: float
-    largest: float
-    count: int
-
-
-@dataclass(frozen=True)
 class RunErrors:
-    """Errors of a run by quantity.
+    """Statistics of the errors of a run after calibration [SI], by quantity.
 
     run : name. own : at the held-out poses of the run itself, which other runs do not share.
     common : at the poses that are common to all runs; empty where there are none.
     """
 
     run: str
-    own: Mapping[str, QuantityErrors]
-    common: Mapping[str, QuantityErrors]
+    own: Mapping[str, Statistics]
+    common: Mapping[str, Statistics]
 
 
 def collect_errors(
@@ -260,9 +252,7 @@ def collect_errors(
     return tuple(RunErrors(*fields) for fields in errors), len(poses), ()
 
 
-def _validate(
-    run: StoredRun, data: Measurements
-) -> tuple[dict[str, QuantityErrors], list[Finding]]:
+def _validate(run: StoredRun, data: Measurements) -> tuple[dict[str, Statistics], list[Finding]]:
     """Return the errors of a run at other measurements."""
     reused = report_reused_rows(run.fitted_rows, data)
     validation = validate(
@@ -273,10 +263,7 @@ def _validate(
         nuisance_values_before=run.initial_nuisance_values,
         uncertainty=run.load_uncertainty(),
     )
-    errors = {
-        name: QuantityErrors(e.statistics.rms, e.statistics.max, e.statistics.count)
-        for name, e in validation.after.quantities.items()
-    }
+    errors = {name: e.statistics for name, e in validation.after.quantities.items()}
     return errors, [] if reused is None else [reused]
 
 
@@ -291,7 +278,7 @@ def _find_common_poses(runs: Sequence[StoredRun]) -> tuple[str, ...]:
     return tuple(label for label in held_out[0] if all(label in others for others in held_out))
 
 
-def _read_errors(run: StoredRun, poses: Sequence[str] | None) -> dict[str, QuantityErrors]:
+def _read_errors(run: StoredRun, poses: Sequence[str] | None) -> dict[str, Statistics]:
     """Return the stored errors at some of the held-out poses; at all of them where None."""
     validation = run.result.get("validation") or {}
     labels = validation.get("poses", ())
@@ -306,9 +293,7 @@ def _read_errors(run: StoredRun, poses: Sequence[str] | None) -> dict[str, Quant
             if error is not None and (poses is None or label in poses)
         ]
         if chosen:
-            sizes = np.abs(np.array(chosen, dtype=float))
-            rms = float(np.sqrt((sizes**2).mean()))
-            result[name] = QuantityErrors(rms, float(sizes.max()), len(sizes))
+            result[name] = compute_statistics(np.abs(np.array(chosen, dtype=float)))
     return result
 
 

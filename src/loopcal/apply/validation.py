@@ -764,11 +764,12 @@ def _restore_errors(
 
 def _restore_floor(content: Mapping[str, Any]) -> NoiseFloor:
     """Return the noise floor."""
-    rms, largest = (
-        {quantity: _number(value) for quantity, value in content[key].items()}
-        for key in ("rms", "max")
+    return NoiseFloor(
+        {
+            metric: {quantity: _number(value) for quantity, value in values.items()}
+            for metric, values in content.items()
+        }
     )
-    return NoiseFloor(rms, largest)
 
 
 def _restore_kinds(content: list[Mapping[str, Any]]) -> tuple[KindErrors, ...]:

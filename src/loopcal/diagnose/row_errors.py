@@ -22,7 +22,7 @@ section 4.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -52,18 +52,65 @@ BISECTIONS = 60  # bisections of the median of the largest error: each halves it
 READINGS = "actuator readings"
 
 
-@dataclass(frozen=True, eq=False)
-class Statistics:
-    """Maximum, root mean square, mean and standard deviation of `count` errors (rows x targets).
+class Metric(NamedTuple):
+    """A number that sums up the sizes (e,) of errors, one or more.
 
-    All are NaN where there is no error.
+    words : its name in tables. compute : it from the sizes.
+    find_noise_floor : its value for an exact geometry, from the variances (e, c) of the noise of
+        components, NaN where absent; None where tables do not compare it with the noise.
     """
 
-    max: float
-    rms: float
-    mean: float
-    sd: float
-    count: int
+    words: str
+    compute: Callable[[FloatArray], float]
+    find_noise_floor: Callable[[FloatArray], float] | None = None
+
+
+def _median_of_largest(variances: FloatArray) -> float:
+    """Return the median of the largest of e errors with variances (e, c), NaN where absent."""
+    mean, square = np.nansum(variances, axis=1), np.nansum(variances**2, axis=1)
+    mean, square = mean[mean > 0.0], square[mean > 0.0]
+    if not len(mean):
+        return float("nan")
+    degrees, unit = mean**2 / square, square / mean
+    low, high = 0.0, 1e3 * float(mean.max())
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        tail = compute_chi_square_tail(degrees, middle / unit)
+        is_below = np.log1p(-np.minimum(tail, 1.0 - 1e-300)).sum() < np.log(0.5)
+        low, high = (middle, high) if is_below else (low, middle)
+    return float(np.sqrt(high))
+
+
+def _root_mean_square(sizes: FloatArray) -> float:
+    return float(np.sqrt(np.mean(sizes**2)))
+
+
+# All numbers that results, JSON and tables state of errors, by their names there.
+METRICS: Mapping[str, Metric] = {
+    "max": Metric("largest", lambda sizes: float(sizes.max()), _median_of_largest),
+    "rms": Metric(
+        "rms",
+        _root_mean_square,
+        # errors whose components are the sigmas have the sums of the variances as squares
+        lambda variances: _root_mean_square(np.sqrt(np.nansum(variances, axis=1))),
+    ),
+    "mean": Metric("mean", lambda sizes: float(sizes.mean())),
+    "sd": Metric("sd", lambda sizes: float(sizes.std(ddof=1)) if len(sizes) > 1 else np.nan),
+}
+# Those that tables compare with the noise floor, the rms first.
+SUMMARY = sorted((k for k, m in METRICS.items() if m.find_noise_floor), key=lambda k: k != "rms")
+
+
+class Statistics(dict[str, float]):
+    """The `METRICS` of errors (rows x targets) and their `count`, also as attributes such as `rms`.
+
+    All metrics are NaN where there is no error.
+    """
+
+    def __getattr__(self, name: str) -> float:
+        if name in self:
+            return self[name]
+        raise AttributeError(f"no metric is called {name!r}; there are {', '.join(self)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +197,7 @@ class PoseErrors:
         """Return statistics, sizes, balances, rows and targets of every quantity, SI."""
         return {
             name: {
-                **vars(errors.statistics),
+                **errors.statistics,
                 "errors": errors.size,
                 "balance": errors.balance,
                 "rows": errors.rows,
@@ -171,11 +218,24 @@ class NoiseFloor:
     chi-square with the same mean and variance, which is exact for components of equal sigma. The
     noise of uncertain joint readings is not part of it, so with such readings it is a lower bound.
 
-    rms, max : by quantity [m] or [rad].
+    metrics : metric of `SUMMARY` -> quantity -> its value [m] or [rad].
     """
 
-    rms: Mapping[str, float]
-    max: Mapping[str, float]
+    metrics: Mapping[str, Mapping[str, float]]
+
+    def to_dict(self) -> Mapping[str, Mapping[str, float]]:
+        """Return the values by metric and quantity for JSON, SI."""
+        return self.metrics
+
+    @property
+    def rms(self) -> Mapping[str, float]:
+        """Root mean square of the errors of each quantity [m] or [rad]."""
+        return self.metrics["rms"]
+
+    @property
+    def max(self) -> Mapping[str, float]:
+        """Median of the largest error of each quantity [m] or [rad]."""
+        return self.metrics["max"]
 
     @property
     def position(self) -> float:
@@ -249,11 +309,8 @@ class KindErrors:
 def compute_statistics(values: FloatArray) -> Statistics:
     """Return the statistics of errors (e,); NaN are not counted."""
     values = values[np.isfinite(values)]
-    if len(values) == 0:
-        return Statistics(np.nan, np.nan, np.nan, np.nan, 0)
-    sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
-    rms = float(np.sqrt(np.mean(values**2)))
-    return Statistics(float(values.max()), rms, float(values.mean()), sd, len(values))
+    metrics = {name: m.compute(values) if len(values) else np.nan for name, m in METRICS.items()}
+    return Statistics({**metrics, "count": len(values)})
 
 
 def compute_row_errors(
@@ -330,29 +387,16 @@ def summarize_kinds(totals: Mapping[str, FloatArray]) -> tuple[KindErrors, ...]:
 def compute_noise_floor(observations: Sequence[Observations]) -> NoiseFloor:
     """Return the noise floor of rows with their stated covariances."""
     variances = [np.diagonal(o.covariance, axis1=1, axis2=2) for o in observations]
-    # errors whose components are the sigmas have the sums of the variances as squares
     sigma = [np.sqrt(np.where(o.present, v, 0.0)) for o, v in zip(observations, variances)]  # noqa: B905
-    errors = compute_row_errors(observations, sigma)
+    errors = compute_row_errors(observations, sigma).quantities
+    floors = {name: METRICS[name].find_noise_floor for name in SUMMARY}
     return NoiseFloor(
-        {name: e.statistics.rms for name, e in errors.quantities.items()},
-        {name: _median_of_largest(e.components**2) for name, e in errors.quantities.items()},
+        {
+            name: {quantity: find(e.components**2) for quantity, e in errors.items()}
+            for name, find in floors.items()
+            if find is not None
+        }
     )
-
-
-def _median_of_largest(variances: FloatArray) -> float:
-    """Return the median of the largest of e errors with variances (e, c), NaN where absent."""
-    mean, square = np.nansum(variances, axis=1), np.nansum(variances**2, axis=1)
-    mean, square = mean[mean > 0.0], square[mean > 0.0]
-    if not len(mean):
-        return float("nan")
-    degrees, unit = mean**2 / square, square / mean
-    low, high = 0.0, 1e3 * float(mean.max())
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        tail = compute_chi_square_tail(degrees, middle / unit)
-        is_below = np.log1p(-np.minimum(tail, 1.0 - 1e-300)).sum() < np.log(0.5)
-        low, high = (middle, high) if is_below else (low, middle)
-    return float(np.sqrt(high))
 
 
 def _join(errors_by_kind: Sequence[QuantityErrors]) -> QuantityErrors:

@@ -12,6 +12,7 @@ import numpy as np
 from loopcal.apply.compensation import ROUNDING, Compensation
 from loopcal.apply.height_errors import HeightErrors
 from loopcal.diagnose.parameter_subset import UsefulAccuracy
+from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import count_decimals, list_names
@@ -60,9 +61,9 @@ def build_height_summary(heights: HeightErrors) -> Table:
     rows = []
     for name, is_held_out in heights.list_sets():
         before, after = (heights.statistics(e, is_held_out) for e in ("before", "after"))
-        for metric, key in (("rms", "rms"), ("largest", "max")):
-            shown = (format_in(unit, getattr(s, key), 3) for s in (before, after))
-            rows.append((name, metric, str(after.count), *shown, unit.symbol))
+        for key in SUMMARY:
+            shown = (format_in(unit, s[key], 3) for s in (before, after))
+            rows.append((name, METRICS[key].words, str(after.count), *shown, unit.symbol))
     columns = (word_column("points"), word_column("metric"))
     numbers = (Column("count"), Column("before"), Column("after"))
     caption = "Height errors (predicted - measured)"

@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
-from loopcal.apply.run_comparison import PairComparison, QuantityErrors, RunComparison, RunSummary
+from loopcal.apply.run_comparison import PairComparison, RunComparison, RunSummary
 from loopcal.apply.validation import FEW_ROWS, ErrorChange, Validation
 from loopcal.diagnose.regularization_curves import RegularizationCurve, RegularizationCurves
+from loopcal.diagnose.row_errors import METRICS, SUMMARY, Statistics
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
 from loopcal.findings.importance import sort_by_importance
@@ -64,10 +65,10 @@ def build_error_summary(validation: Validation, caption: str, with_before: bool 
     for quantity in validation.quantities:
         before, after = (e.statistics(quantity) for e in (validation.before, validation.after))
         name, unit = name_quantity(validation, quantity), validation.units[quantity]
-        for metric, key, noise in (("rms", "rms", floor.rms), ("largest", "max", floor.max)):
-            values = (getattr(before, key), getattr(after, key), noise[quantity])
+        for key in SUMMARY:
+            values = (before[key], after[key], floor.metrics[key][quantity])
             shown = (format_number(x / unit.factor_to_si, 3) for x in values)
-            rows.append((name, metric, str(after.count), *shown, unit.symbol))
+            rows.append((name, METRICS[key].words, str(after.count), *shown, unit.symbol))
     return _drop_before(_build(caption, "quantity", tuple(rows)), with_before)
 
 
@@ -117,7 +118,7 @@ def _drop_before(table: Table, with_before: bool) -> Table:
 
 
 def _build_error_statistics(validation: Validation, with_before: bool) -> Table:
-    """Return maximum, rms, mean and standard deviation of every error.
+    """Return all metrics of every error.
 
     Errors after commanding are left out where they equal the prediction errors, because the
     actuators can correct everything.
@@ -131,10 +132,9 @@ def _build_error_statistics(validation: Validation, with_before: bool) -> Table:
     for name, error in errors.items():
         for quantity in validation.quantities:
             statistics, unit = error.statistics(quantity), validation.units[quantity]
-            numbers = (statistics.max, statistics.rms, statistics.mean, statistics.sd)
-            cells = (format_number(x / unit.factor_to_si, 3) for x in numbers)
+            cells = (format_number(statistics[key] / unit.factor_to_si, 3) for key in METRICS)
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
-    numeric = (Column(title) for title in ("count", "largest", "rms", "mean", "sd"))
+    numeric = (Column(title) for title in ("count", *(m.words for m in METRICS.values())))
     columns = (word_column("error"), word_column("of"), *numeric, word_column("unit"))
     caption = f"Error statistics (rows x targets), {validation.frame}"
     return Table(caption, columns, tuple(rows))
@@ -395,13 +395,13 @@ def build_errors(comparison: RunComparison, show_unit: Callable[[str], Unit]) ->
         for quantity, error in errors.items():
             rows.append((run_errors.run, quantity, *_format_errors(error, show_unit(quantity))))
         if not errors:
-            rows.append((run_errors.run, ABSENT, ABSENT, ABSENT, ABSENT, ""))
+            rows.append((run_errors.run, *[ABSENT] * (2 + len(SUMMARY)), ""))
     caption = (
         f"Errors after calibration at {comparison.common_poses} poses that are common to all runs"
         if has_common
         else "Errors after calibration at the held-out poses of each run, which are different poses"
     )
-    numbers = (Column("count"), Column("rms"), Column("largest"))
+    numbers = (Column("count"), *(Column(METRICS[key].words) for key in SUMMARY))
     words = (word_column("run"), word_column("quantity"))
     return Table(caption, (*words, *numbers, word_column("unit")), tuple(rows))
 
@@ -456,10 +456,10 @@ def _format_estimate(value: float | None, half: float | None, unit: Unit) -> tup
     return format_with_uncertainty(shown, half), format_uncertainty(half)
 
 
-def _format_errors(error: QuantityErrors, unit: Unit) -> tuple[str, str, str, str]:
+def _format_errors(error: Statistics, unit: Unit) -> tuple[str, ...]:
     """Return the cells of errors."""
-    rms, largest = (format_number(x / unit.factor_to_si, 3) for x in (error.rms, error.largest))
-    return str(error.count), rms, largest, unit.symbol
+    cells = (format_number(error[key] / unit.factor_to_si, 3) for key in SUMMARY)
+    return str(error.count), *cells, unit.symbol
 
 
 def _write(value: float | None, unit: Unit) -> str:
