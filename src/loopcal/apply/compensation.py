@@ -259,14 +259,11 @@ def _remove_unfixed_frames(
 
 @dataclass(frozen=True, eq=False)
 class _Iteration:
-    """Outcome of the fixed-point iteration.
+    """Outcome of the fixed-point iteration."""
 
-    final : where the machine goes. commands : (n, c) [m, rad], or None.
-    distances : (steps + 1, n, 6) twists from the best poses, before the first and after each step.
-    """
-
-    final: Solution
-    commands: FloatArray | None
+    final: Solution  # where the machine goes
+    commands: FloatArray | None  # (n, c) [m, rad], or None
+    # (steps + 1, n, 6) twists from the best poses, before the first and after each step
     distances: FloatArray
 
 

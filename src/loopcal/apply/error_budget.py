@@ -58,32 +58,25 @@ EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
 
 
 class Source(NamedTuple):
-    """A source of errors.
+    """A source of errors."""
 
-    kind : one of the kinds above, "residuals.model-discrepancy", or the code of another finding.
-    name : of the measurement with its session; "position" or "orientation" of a discrepancy; of
-        other sources empty.
-    evaluation : "A" by statistics, "B" by other means (JCGM 100, 3.3), "A and B" where a stated
-        value was corrected by statistics.
-    degrees : degrees of freedom; infinite where the size counts as known.
-    """
-
+    # one of the kinds above, "residuals.model-discrepancy", or the code of another finding
     kind: str
+    # of the measurement with its session; "position" or "orientation" of a discrepancy; of other
+    # sources empty
     name: str
+    # "A" by statistics, "B" by other means (JCGM 100, 3.3), "A and B" where a stated value was
+    # corrected by statistics
     evaluation: str
-    degrees: float
+    degrees: float  # degrees of freedom; infinite where the size counts as known
 
 
 class CovarianceSplit(NamedTuple):
-    """The covariance of the parameters of a fit, by source.
+    """The covariance of the parameters of a fit, by source."""
 
-    sources : of errors. roots : (p, k) [SI] for each, whose squares add up to the covariance.
-    undetermined : (p,) parameters of infinite variance, of which the roots contain what the
-        tolerances allow.
-    """
-
-    sources: tuple[Source, ...]
-    roots: tuple[FloatArray, ...]
+    sources: tuple[Source, ...]  # of errors
+    roots: tuple[FloatArray, ...]  # (p, k) [SI] for each, whose squares add up to the covariance
+    # (p,) parameters of infinite variance, of which the roots contain what the tolerances allow
     undetermined: BoolArray
 
 
@@ -353,18 +346,14 @@ class ErrorSources(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SourceBudget:
-    """What one source does, and what half its sigma would leave.
+    """What one source does, and what half its sigma would leave."""
 
-    source : kind, name, type of evaluation and degrees of freedom.
-    position, orientation : variances [m^2, rad^2] of the length of the error of a pose.
-    parameters : (p,) variances [SI]; NaN for undetermined parameters.
-    halved : root mean squares with half the sigma of this source; None where it has no sigma.
-    """
-
-    source: Source
+    source: Source  # kind, name, type of evaluation and degrees of freedom
+    # position, orientation: variances [m^2, rad^2] of the length of the error of a pose
     position: float
     orientation: float
-    parameters: FloatArray
+    parameters: FloatArray  # (p,) variances [SI]; NaN for undetermined parameters
+    # root mean squares with half the sigma of this source; None where it has no sigma
     halved: HalvedErrors | None
 
 

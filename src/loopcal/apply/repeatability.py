@@ -65,28 +65,23 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VisitedPose:
-    """Pose accuracy and repeatability of one target at one commanded pose.
+    """Pose accuracy and repeatability of one target at one commanded pose."""
 
-    pose : label of its first visit. target, direction : names of the target and of the direction of
-        approach (the group of the rows); empty for the only one. visits : their number.
-    components : names of the measured components, such as ("x", "y", "z").
-    mean : (c,) attained minus commanded values.
-    accuracy, repeatability : AP_p and RP_l of a position; None for an orientation.
-    accuracies, repeatabilities : AP and RP of each component.
-    commanded : number of the commanded pose.
-    """
-
-    pose: str
+    pose: str  # label of its first visit
+    # target, direction: names of the target and of the direction of approach (the group of the
+    # rows); empty for the only one
     target: str
     direction: str
-    visits: int
-    components: tuple[str, ...]
-    mean: FloatArray
+    visits: int  # their number
+    components: tuple[str, ...]  # names of the measured components, such as ("x", "y", "z")
+    mean: FloatArray  # (c,) attained minus commanded values
+    # accuracy, repeatability: AP_p and RP_l of a position; None for an orientation
     accuracy: Estimate | None
     repeatability: Estimate | None
+    # accuracies, repeatabilities: AP and RP of each component
     accuracies: tuple[Estimate, ...]
     repeatabilities: tuple[Estimate, ...]
-    commanded: int = 0
+    commanded: int = 0  # number of the commanded pose
 
     def list_accuracies(self) -> tuple[Estimate, ...]:
         """Return AP_p of a position, and the AP of each component of an orientation."""

@@ -220,14 +220,12 @@ QUANTITIES = ("position", "orientation", "length")  # quantities whose errors ar
 
 @dataclass(frozen=True)
 class RunErrors:
-    """Statistics of the errors of a run after calibration [SI], by quantity.
+    """Statistics of the errors of a run after calibration [SI], by quantity."""
 
-    run : name. own : at the held-out poses of the run itself, which other runs do not share.
-    common : at the poses that are common to all runs; empty where there are none.
-    """
-
-    run: str
+    run: str  # name
+    # at the held-out poses of the run itself, which other runs do not share
     own: Mapping[str, Statistics]
+    # at the poses that are common to all runs; empty where there are none
     common: Mapping[str, Statistics]
 
 
@@ -309,22 +307,7 @@ COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a 
 
 @dataclass(frozen=True, eq=False)
 class PairComparison:
-    """A run against the first one.
-
-    first, second : names of the runs.
-    data : "independent", "same", "shared" (some rows are common) or "unknown".
-    shared : number of common fitted rows.
-    shift, shift_sd : (p,) change of each parameter of `names` and its standard deviation, while all
-        others may have changed as well [SI]; NaN where the data do not determine it, or where
-        nothing is tested.
-    significant : (p,) which shifts are larger than the noise explains, at the level for all
-        parameters of all runs together.
-    chi_square, degrees, p_value : of the change in all directions that both data sets determine;
-        NaN and 0 where it is not tested.
-    moved : whether the machine has changed; None where it is not tested.
-    cause : what explains the change. cause_shift, cause_sd : change of its parameters [SI].
-    finding : the result with its code.
-    """
+    """A run against the first one."""
 
     JSON_FIELDS: ClassVar[tuple[str, ...]] = (
         "first",
@@ -345,22 +328,31 @@ class PairComparison:
         "finding",
     )
 
+    # first, second: names of the runs
     first: str
     second: str
-    data: str
-    shared: int
+    data: str  # "independent", "same", "shared" (some rows are common) or "unknown"
+    shared: int  # number of common fitted rows
     names: tuple[str, ...]
+    # shift, shift_sd: (p,) change of each parameter of `names` and its standard deviation, while
+    # all others may have changed as well [SI]; NaN where the data do not determine it, or where
+    # nothing is tested
     shift: FloatArray
     shift_sd: FloatArray
+    # (p,) which shifts are larger than the noise explains, at the level for all parameters of all
+    # runs together
     significant: BoolArray
+    # chi_square, degrees, p_value: of the change in all directions that both data sets determine;
+    # NaN and 0 where it is not tested
     chi_square: float
     degrees: int
     p_value: float
-    moved: bool | None
-    cause: ChangeCause
+    moved: bool | None  # whether the machine has changed; None where it is not tested
+    cause: ChangeCause  # what explains the change
+    # cause_shift, cause_sd: change of its parameters [SI]
     cause_shift: FloatArray
     cause_sd: FloatArray
-    finding: Finding
+    finding: Finding  # the result with its code
 
     def __repr__(self) -> str:
         return f"<PairComparison: {self.finding}>"
@@ -524,17 +516,15 @@ def _leave_open(
 
 @dataclass(frozen=True)
 class RunSummary:
-    """A run as one column of a comparison.
+    """A run as one column of a comparison."""
 
-    name : of its folder. robot, method, verdict : as result.json states them.
-    estimates, plus_minus : parameter -> estimate and half-width of its 95 % interval [SI]; None
-        where there is no interval. A parameter that this run kept fixed is absent.
-    """
-
-    name: str
+    name: str  # of its folder
+    # robot, method, verdict: as result.json states them
     robot: str
     method: str
     verdict: str
+    # estimates, plus_minus: parameter -> estimate and half-width of its 95 % interval [SI]; None
+    # where there is no interval. A parameter that this run kept fixed is absent
     estimates: dict[str, float]
     plus_minus: dict[str, float | None]
 

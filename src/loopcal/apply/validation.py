@@ -68,15 +68,13 @@ NOISE_LEVEL = 1e-3  # probability that noise alone exceeds what is called the no
 
 @dataclass(frozen=True)
 class ErrorChange:
-    """The rms error of one quantity before and after calibration.
+    """The rms error of one quantity before and after calibration."""
 
-    before, after, noise_floor : [m], [rad] or [sigma]. values : number of measured components.
-    """
-
+    # before, after, noise_floor: [m], [rad] or [sigma]
     before: float
     after: float
     noise_floor: float
-    values: int
+    values: int  # number of measured components
 
     @property
     def times(self) -> float:

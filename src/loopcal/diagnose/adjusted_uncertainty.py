@@ -142,14 +142,11 @@ def _add_correlation(
 
 
 class ToolUncertainty(NamedTuple):
-    """The uncertainty of the measured poses as a fit states it.
+    """The uncertainty of the measured poses as a fit states it."""
 
-    effects : orientation and position (3 n, p) by deviations of the parameters [per SI].
-    stated : sum of the variances of each [SI].
-    """
-
+    # orientation and position (3 n, p) by deviations of the parameters [per SI]
     effects: tuple[FloatArray, FloatArray]
-    stated: tuple[float, float]
+    stated: tuple[float, float]  # sum of the variances of each [SI]
 
     def measure_growth(self, root: FloatArray) -> float:
         """Return the factor by which a covariance of root (p, k) [SI] increases the standard
@@ -244,19 +241,14 @@ PATTERNS, NO_PATTERN = "residuals.", "residuals.perhaps-correlated"
 
 @dataclass(frozen=True)
 class HeavyTails:
-    """The test of the residuals for heavy tails.
+    """The test of the residuals for heavy tails."""
 
-    rows : number of residuals that are tested. p_value : probability of a smaller T for normal
-        noise; NaN where there is no test.
-    median, expected : of the absolute residuals in standard deviations, and that of normal noise.
-    largest : the largest of them.
-    """
-
-    rows: int
-    p_value: float
+    rows: int  # number of residuals that are tested
+    p_value: float  # probability of a smaller T for normal noise; NaN where there is no test
+    # median, expected: of the absolute residuals in standard deviations, and that of normal noise
     median: float
     expected: float
-    largest: float
+    largest: float  # the largest of them
 
     @property
     def findings(self) -> tuple[Finding, ...]:

@@ -51,14 +51,11 @@ ANYWHERE = 1e3
 
 
 class HeldOutBlocks(NamedTuple):
-    """Rows of held-out blocks with what predicts them.
+    """Rows of held-out blocks with what predicts them."""
 
-    poses : labels of each of u blocks. member : (n,) block of each pose.
-    groups : blocks of equal size: numbers (b,), H (b, m, k), residuals (b, m), present (b, m).
-    """
-
-    poses: tuple[tuple[str, ...], ...]
-    member: IntArray
+    poses: tuple[tuple[str, ...], ...]  # labels of each of u blocks
+    member: IntArray  # (n,) block of each pose
+    # blocks of equal size: numbers (b,), H (b, m, k), residuals (b, m), present (b, m)
     groups: tuple[tuple[IntArray, FloatArray, FloatArray, BoolArray], ...]
 
     def fit_without(self, excluded: BoolArray) -> PartialFit:
@@ -100,15 +97,11 @@ class HeldOutBlocks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HeldOutCheck:
-    """The search for held-out blocks that do not fit.
+    """The search for held-out blocks that do not fit."""
 
-    predictor : makes the rows of other measurements of the same poses. blocks : those of the data.
-    search : its result; `suspects` (b,) are the numbers of the blocks that do not fit.
-    """
-
-    predictor: Predictor
-    blocks: HeldOutBlocks
-    search: BlockSearch
+    predictor: Predictor  # makes the rows of other measurements of the same poses
+    blocks: HeldOutBlocks  # those of the data
+    search: BlockSearch  # its result; `suspects` (b,) are the numbers of the blocks that do not fit
     suspects: IntArray
 
     @cached_property
@@ -136,15 +129,12 @@ class HeldOutCheck:
 class Predictor(NamedTuple):
     """What predicts held-out rows: a robot, the values of its nuisance parameters, and what is
     known of both.
-
-    robot : the calibrated one. values : name -> nuisance parameter [SI].
-    kept : names of those that the fit knows; the others are unknown.
-    uncertainty : of the fit; None where robot and nuisance parameters are taken as exact.
     """
 
-    robot: Mechanism
-    values: Mapping[str, float]
-    kept: tuple[str, ...]
+    robot: Mechanism  # the calibrated one
+    values: Mapping[str, float]  # name -> nuisance parameter [SI]
+    kept: tuple[str, ...]  # names of those that the fit knows; the others are unknown
+    # of the fit; None where robot and nuisance parameters are taken as exact
     uncertainty: FitUncertainty | None
     unknown: tuple[str, ...]
 
@@ -271,29 +261,21 @@ FACTORS: dict[Dimension, tuple[float, ...]] = {
 
 @dataclass(frozen=True)
 class Explanation:
-    """A way to read a pose in which it fits, or none.
+    """A way to read a pose in which it fits, or none."""
 
-    what : "targets", "poses", "unit", "column", "target", or "none". data : its names and numbers.
-    tried : what was tried.
-    """
-
-    what: str
-    data: dict[str, Any] = field(default_factory=dict)
-    tried: tuple[str, ...] = ()
+    what: str  # "targets", "poses", "unit", "column", "target", or "none"
+    data: dict[str, Any] = field(default_factory=dict)  # its names and numbers
+    tried: tuple[str, ...] = ()  # what was tried
 
 
 @dataclass(frozen=True)
 class Blunder:
-    """A held-out block that neither the fit nor the other held-out blocks explain.
+    """A held-out block that neither the fit nor the other held-out blocks explain."""
 
-    poses : its labels. times : its residuals in units of what noise and uncertainty explain.
-    p_value : probability of a larger distance. explanation : what it may be.
-    """
-
-    poses: tuple[str, ...]
-    times: float
-    p_value: float
-    explanation: Explanation
+    poses: tuple[str, ...]  # its labels
+    times: float  # its residuals in units of what noise and uncertainty explain
+    p_value: float  # probability of a larger distance
+    explanation: Explanation  # what it may be
 
     def report(self, **error: Any) -> Finding:
         """Return the finding, with `quantity`, `target` and `error` of its largest error."""

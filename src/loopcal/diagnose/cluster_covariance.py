@@ -52,13 +52,10 @@ NIGHT = 6 * 3600.0  # time without a measurement [s] after which another day beg
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Poses that may share an error, and are independent of the poses of other clusters.
+    """Poses that may share an error, and are independent of the poses of other clusters."""
 
-    unit : "day", "session", "block" or "pose". member : (n,) cluster 0..count-1 of each pose.
-    """
-
-    unit: str
-    member: IntArray
+    unit: str  # "day", "session", "block" or "pose"
+    member: IntArray  # (n,) cluster 0..count-1 of each pose
     count: int
 
 
@@ -132,18 +129,12 @@ COMMON = 1e-9  # share of its own size below which a variance of poses is zero
 
 
 class Ratio(NamedTuple):
-    """Cluster-robust standard uncertainty of poses over the one that the fit states.
+    """Cluster-robust standard uncertainty of poses over the one that the fit states."""
 
-    ratio : of the root mean square over the measured poses; NaN without uncertainty.
-    degrees : degrees of freedom of its square for independent errors.
-    share : of the variance by noise that residuals can judge.
-    p_value : probability of a larger ratio for independent errors.
-    """
-
-    ratio: float
-    degrees: float
-    share: float
-    p_value: float
+    ratio: float  # of the root mean square over the measured poses; NaN without uncertainty
+    degrees: float  # degrees of freedom of its square for independent errors
+    share: float  # of the variance by noise that residuals can judge
+    p_value: float  # probability of a larger ratio for independent errors
 
 
 NO_RATIO = Ratio(np.nan, np.nan, np.nan, np.nan)
@@ -151,22 +142,19 @@ NO_RATIO = Ratio(np.nan, np.nan, np.nan, np.nan)
 
 @dataclass(frozen=True, eq=False)
 class ClusterCheck:
-    """The cluster-robust covariance of a fit against the stated one.
+    """The cluster-robust covariance of a fit against the stated one."""
 
-    unit : what is taken as independent: "day", "session", "block" or "pose"; empty where nothing
-        could be compared. clusters : their number.
-    position, orientation : ratios for the measured poses, from the directions that the data
-        determine.
-    parameter : the parameter with the largest ratio, and that ratio; empty and NaN without any.
-    finding : the result.
-    """
-
+    # what is taken as independent: "day", "session", "block" or "pose"; empty where nothing could
+    # be compared
     unit: str
-    clusters: int
+    clusters: int  # their number
+    # position, orientation: ratios for the measured poses, from the directions that the data
+    # determine
     position: Ratio
     orientation: Ratio
+    # the parameter with the largest ratio, and that ratio; empty and NaN without any
     parameter: tuple[str, float]
-    finding: Finding
+    finding: Finding  # the result
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result by name for JSON."""
@@ -215,24 +203,20 @@ class RobustSpread(NamedTuple):
 
     With the scores h_g of the G clusters, spread = sum_g (h_g h_g' - E_g), E_g the expectation for
     independent errors. Each cluster has h rows, turned into the eigenvectors of its leverage H_gg.
-
-    root : (p, k) L in tolerances, for the k directions that the fit estimates.
-    scores : (G, k) h_g, the u_g in units of L.
-    scaled_rows : (G, k, h) the rows in units of L; without a prior the sum of their squares is k.
-    correction : (G, h) (1 - g)^(-1/2) for the leverages `leverage` (G, h); 0 where g is 1, so that
-        no residual can judge the row.
-    columns : (G, h, w) rows by everything that is estimated, in standard deviations: their products
-        are the leverages.
-    times : number of all clusters for each of the G.
     """
 
-    root: FloatArray
-    scores: FloatArray
+    root: FloatArray  # (p, k) L in tolerances, for the k directions that the fit estimates
+    scores: FloatArray  # (G, k) h_g, the u_g in units of L
+    # (G, k, h) the rows in units of L; without a prior the sum of their squares is k
     scaled_rows: FloatArray
+    # (G, h) (1 - g)^(-1/2) for the leverages `leverage` (G, h); 0 where g is 1, so that no
+    # residual can judge the row
     correction: FloatArray
     leverage: FloatArray
+    # (G, h, w) rows by everything that is estimated, in standard deviations: their products are
+    # the leverages
     columns: FloatArray
-    times: float = 1.0
+    times: float = 1.0  # number of all clusters for each of the G
 
     @property
     def is_tested(self) -> BoolArray:

@@ -97,20 +97,16 @@ class CrossValidation(TableResult):
 
 @dataclass(frozen=True, eq=False)
 class LeaveOneOut:
-    """Scores of k methods.
+    """Scores of k methods."""
 
-    methods : the methods. score : (k,) mean square of whitened leave-one-block-out residuals (1:
-        noise alone), infinite where a block cannot be left out. standard_error : (k,) of the score,
-        from the scatter over blocks. blocks : number of those with rows.
-    dof : (k,) effective number of parameters. estimate : (k, p) their estimates [SI].
-    """
-
-    methods: tuple[Method, ...]
+    methods: tuple[Method, ...]  # the methods
+    # (k,) mean square of whitened leave-one-block-out residuals (1: noise alone), infinite where
+    # a block cannot be left out
     score: FloatArray
-    dof: FloatArray
-    estimate: FloatArray
-    standard_error: FloatArray
-    blocks: int
+    dof: FloatArray  # (k,) effective number of parameters
+    estimate: FloatArray  # (k, p) their estimates [SI]
+    standard_error: FloatArray  # (k,) of the score, from the scatter over blocks
+    blocks: int  # number of those with rows
 
     @property
     def best(self) -> Method:
@@ -319,18 +315,14 @@ class Conditioning(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One set of free parameters.
+    """One set of free parameters."""
 
-    name : of the set. parameters : their names.
-    validation : cross-validation; None where without a fold too few equations remain, or the fit
-        does not converge.
-    conditioning : by all data, at the values before calibration.
-    """
-
-    name: str
-    parameters: tuple[str, ...]
+    name: str  # of the set
+    parameters: tuple[str, ...]  # their names
+    # cross-validation; None where without a fold too few equations remain, or the fit does not
+    # converge
     validation: CrossValidation | None
-    conditioning: Conditioning
+    conditioning: Conditioning  # by all data, at the values before calibration
 
     @property
     def score(self) -> float:

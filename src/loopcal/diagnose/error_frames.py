@@ -50,25 +50,20 @@ FIT_TOLERANCE = 1e-8
 
 
 class ErrorFrame(NamedTuple):
-    """A frame in which errors of poses are stated.
+    """A frame in which errors of poses are stated."""
 
-    name : "fitted", "base", "relative", or the name of the frame of an instrument.
-    size : of the robot [m]. by_parameters : (12, p) G, also by the errors of a model discrepancy,
-        see `list_error_twists`. own : (12, k) K.
-    fitted : frames of which motions are fitted: (), ("base",), ("platform",) or both.
-    undetermined : frames that the measurements do not determine, and that are not fitted.
-    origin : name of the pose to which others are relative; "" in other frames.
-    over : the poses over which frames are fitted: "measured", "home" (poses about home) or
-        "predicted" (the poses whose errors are stated).
-    """
-
-    name: str
-    size: float
+    name: str  # "fitted", "base", "relative", or the name of the frame of an instrument
+    size: float  # of the robot [m]
+    # (12, p) G, also by the errors of a model discrepancy, see `list_error_twists`
     by_parameters: FloatArray
-    own: FloatArray
+    own: FloatArray  # (12, k) K
+    # frames of which motions are fitted: (), ("base",), ("platform",) or both
     fitted: tuple[str, ...] = ()
+    # frames that the measurements do not determine, and that are not fitted
     undetermined: tuple[str, ...] = ()
-    origin: str = ""
+    origin: str = ""  # name of the pose to which others are relative; "" in other frames
+    # the poses over which frames are fitted: "measured", "home" (poses about home) or "predicted"
+    # (the poses whose errors are stated)
     over: Over = "measured"
 
     def relate(self, twists: FloatArray, T: FloatArray) -> FloatArray:
@@ -102,16 +97,12 @@ class ReferencePoses(NamedTuple):
 
 
 class FrameFit(NamedTuple):
-    """The best rigid fit of some motions of frames over m reference poses.
+    """The best rigid fit of some motions of frames over m reference poses."""
 
-    poses : (m, 4, 4). motions : (12, k) those that move these poses. size : of the robot [m].
-    solution : (12, 6 m) motion that fits stacked twists of these poses best.
-    """
-
-    poses: FloatArray
-    motions: FloatArray
-    size: float
-    solution: FloatArray
+    poses: FloatArray  # (m, 4, 4)
+    motions: FloatArray  # (12, k) those that move these poses
+    size: float  # of the robot [m]
+    solution: FloatArray  # (12, 6 m) motion that fits stacked twists of these poses best
 
     def __call__(self, twists: FloatArray) -> FloatArray:
         """Return the motions (12, r) that fit twists (m, 6, r) of the reference poses best."""
@@ -198,16 +189,12 @@ def choose_error_frame(
 
 @dataclass(frozen=True, eq=False)
 class FollowedMotion:
-    """Motions of both frames that a pose or an instrument makes, to which errors are relative.
+    """Motions of both frames that a pose or an instrument makes, to which errors are relative."""
 
-    by_frames : (12, 12) by motions of the base and platform frames. by_parameters : (12, p).
-    own : (12, k) by errors of its own, of variance 1. name : of the pose; else "".
-    """
-
-    by_frames: FloatArray
-    by_parameters: FloatArray
-    own: FloatArray
-    name: str = ""
+    by_frames: FloatArray  # (12, 12) by motions of the base and platform frames
+    by_parameters: FloatArray  # (12, p)
+    own: FloatArray  # (12, k) by errors of its own, of variance 1
+    name: str = ""  # of the pose; else ""
 
 
 def refer_errors(

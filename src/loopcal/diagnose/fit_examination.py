@@ -37,12 +37,10 @@ STRONG = 0.9
 
 @dataclass(frozen=True)
 class CorrelatedGroup:
-    """Parameters whose estimates are linked by correlations above STRONG, directly or in a chain.
+    """Parameters that correlations of estimates above STRONG link, directly or in a chain."""
 
-    names : in the order of the table. pair, correlation : the two most strongly correlated ones.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # in the order of the table
+    # pair, correlation: the two most strongly correlated ones
     pair: tuple[str, str]
     correlation: float
 
@@ -91,21 +89,16 @@ MOST_POSES = 200  # largest number of poses at which errors are predicted, evenl
 
 @dataclass(frozen=True)
 class CalibrationGain:
-    """Expected errors of the platform at the measured poses.
+    """Expected errors of the platform at the measured poses."""
 
-    position_before, position_after : root mean square over poses of the expected position error
-        [m].
-    angle_before, angle_after : the same of the orientation [rad].
-    is_worthwhile : whether either becomes smaller; None where it cannot be predicted.
-    finding : the expected errors, or the reason why there are none.
-    """
-
+    # position_before, position_after: expected position error, root mean square over poses [m]
     position_before: float
     position_after: float
+    # angle_before, angle_after: the same of the orientation [rad]
     angle_before: float
     angle_after: float
-    is_worthwhile: bool | None
-    finding: Finding
+    is_worthwhile: bool | None  # whether either becomes smaller; None where it cannot be predicted
+    finding: Finding  # the expected errors, or the reason why there are none
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes for JSON; `is_worthwhile` is called `calibrate` there."""

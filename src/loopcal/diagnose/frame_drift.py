@@ -41,48 +41,40 @@ RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class FrameDrift:
-    """The largest motion of the frame of an instrument from the first measurement of a session.
+    """The largest motion of the frame of an instrument from the first measurement of a session."""
 
-    frame, session : their names. targets : on the base.
-    row : number of the measurement in its session at which the motion is most significant, from 1.
-    rows : number of measurements of the session.
-    shift, shift_sd : displacement at the center of the targets [m]. angle, angle_sd : [rad].
-    chi_square, degrees : of the test that the frame kept its place in the whole session.
-    p_value : probability of a larger chi-square without motion.
-    """
-
+    # frame, session: their names
     frame: str
     session: str
-    targets: tuple[str, ...]
+    targets: tuple[str, ...]  # on the base
+    # number of the measurement in its session at which the motion is most significant, from 1
     row: int
-    rows: int
+    rows: int  # number of measurements of the session
+    # shift, shift_sd: displacement at the center of the targets [m]
     shift: float
     shift_sd: float
+    # angle, angle_sd: [rad]
     angle: float
     angle_sd: float
+    # chi_square, degrees: of the test that the frame kept its place in the whole session
     chi_square: float
     degrees: int
-    p_value: float
+    p_value: float  # probability of a larger chi-square without motion
 
 
 class ShapeTest(NamedTuple):
-    """The test whether targets on the base kept their distances in all measurements.
+    """The test whether targets on the base kept their distances in all measurements."""
 
-    frame : in which they were measured. targets : on the base.
-    suspects : targets without each of which the noise explains the others. With three targets there
-        is often more than one.
-    is_stated : whether their places are stated, and compared, too.
-    chi_square, degrees : of what no motion of frames explains.
-    p_value : probability of a larger chi-square if no target moved.
-    """
-
-    frame: str
-    targets: tuple[str, ...]
+    frame: str  # in which they were measured
+    targets: tuple[str, ...]  # on the base
+    # targets without each of which the noise explains the others. With three targets there is
+    # often more than one
     suspects: tuple[str, ...]
-    is_stated: bool
+    is_stated: bool  # whether their places are stated, and compared, too
+    # chi_square, degrees: of what no motion of frames explains
     chi_square: float
     degrees: int
-    p_value: float
+    p_value: float  # probability of a larger chi-square if no target moved
 
 
 class _Repeats(NamedTuple):

@@ -44,22 +44,17 @@ SAME_MOTION = 1e-6  # relative difference below which two motions count as equal
 
 @dataclass(frozen=True, eq=False)
 class FrameMotions:
-    """The d unobservable directions, and the frames that their combinations move.
+    """The d unobservable directions, and the frames that their combinations move."""
 
-    kept : (p, d) the directions without the combinations that move frames; columns are zero where
-        nothing else remains.
-    frames : names of the moved frames: (), ("base",), ("platform",) or both. count : number of
-        independent combinations that move frames.
-    motions : (12, g) motions of the two frames by these combinations, in the units of
-        `loopcal.estimate.frame_freedoms.frame_twists`, each of length one.
-    has_scale : whether a further combination enlarges all poses by one factor.
-    """
-
+    # (p, d) the directions without the combinations that move frames; columns are zero where
+    # nothing else remains
     kept: FloatArray
-    frames: tuple[str, ...]
-    count: int
+    frames: tuple[str, ...]  # names of the moved frames: (), ("base",), ("platform",) or both
+    count: int  # number of independent combinations that move frames
+    # (12, g) motions of the two frames by these combinations, in the units of
+    # `loopcal.estimate.frame_freedoms.frame_twists`, each of length one
     motions: FloatArray
-    has_scale: bool = False
+    has_scale: bool = False  # whether a further combination enlarges all poses by one factor
 
 
 def find_frame_motions(posterior: Posterior) -> FrameMotions:

@@ -58,22 +58,18 @@ MEANING = {
 
 @dataclass(frozen=True)
 class Observability:
-    """The five indices over the L observable directions.
+    """The five indices over the L observable directions."""
 
-    o1, o2, o3, o4, o5 : the larger the better. directions : L. left_out : number of null
-        directions, which would make all five zero.
-    equations : m. scaling : of rows and columns.
-    """
-
+    # o1, o2, o3, o4, o5: the larger the better
     o1: float
     o2: float
     o3: float
     o4: float
     o5: float
-    directions: int
-    left_out: int
-    equations: int
-    scaling: str = SCALING
+    directions: int  # L
+    left_out: int  # number of null directions, which would make all five zero
+    equations: int  # m
+    scaling: str = SCALING  # of rows and columns
 
     def rows(self) -> list[tuple[str, float, str]]:
         """Return index, value and meaning, for a table."""
@@ -119,16 +115,14 @@ NEARBY_TOLERANCES = (1e-2, 1e2)
 
 @dataclass(frozen=True)
 class ParameterIdentifiability:
-    """What the data determine of one parameter.
+    """What the data determine of one parameter."""
 
-    name : of the parameter. partners : parameters with which only a combination is determined;
-        only itself where it has no effect; empty where it is determined.
-    left : standard deviation with the tolerances as a prior, over the tolerance: 1 where nothing is
-        learned.
-    """
-
-    name: str
+    name: str  # of the parameter
+    # parameters with which only a combination is determined; only itself where it has no effect;
+    # empty where it is determined
     partners: tuple[str, ...]
+    # standard deviation with the tolerances as a prior, over the tolerance: 1 where nothing is
+    # learned
     left: float
 
     @property

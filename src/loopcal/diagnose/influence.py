@@ -38,19 +38,14 @@ UNDETERMINED = 1e6
 
 
 class Influence(NamedTuple):
-    """One entry for each of u blocks.
+    """One entry for each of u blocks."""
 
-    leverage : (u,) trace of w G: number of parameters that the block determines.
-    residuals : (u,) number of residuals. distance : (u,) d^2. degrees : (u,) its degrees of
-        freedom.
-    deleted : (u,) squared norm of the whitened leave-one-out residual r_(j), over the directions
-        that can be tested.
-    """
-
-    leverage: FloatArray
-    residuals: IntArray
-    distance: FloatArray
-    degrees: IntArray
+    leverage: FloatArray  # (u,) trace of w G: number of parameters that the block determines
+    residuals: IntArray  # (u,) number of residuals
+    distance: FloatArray  # (u,) d^2
+    degrees: IntArray  # (u,) its degrees of freedom
+    # (u,) squared norm of the whitened leave-one-out residual r_(j), over the directions that can
+    # be tested
     deleted: FloatArray
 
 

@@ -48,17 +48,13 @@ class ErrorPart(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ParameterChanges:
-    """Rows `slope` d = `value` + noise of unit variance for the change d of p parameters.
+    """Rows `slope` d = `value` + noise of unit variance for the change d of p parameters."""
 
-    names : (p,) of the parameters. unit : (p,) tolerances, which make columns comparable [SI].
-    slope : (k, p) [1 / SI]. value : (k,) [1].
-    errors : the independent parts of the noise; the sum of root root' is the unit matrix (k, k).
-    """
-
-    names: tuple[str, ...]
-    unit: FloatArray
-    slope: FloatArray
-    value: FloatArray
+    names: tuple[str, ...]  # (p,) of the parameters
+    unit: FloatArray  # (p,) tolerances, which make columns comparable [SI]
+    slope: FloatArray  # (k, p) [1 / SI]
+    value: FloatArray  # (k,) [1]
+    # the independent parts of the noise; the sum of root root' is the unit matrix (k, k)
     errors: tuple[ErrorPart, ...]
 
     def __repr__(self) -> str:
@@ -226,20 +222,15 @@ DISTINGUISHED = 0.05  # probability of distinguishing the true cause from a bett
 
 @dataclass(frozen=True)
 class ChangeCause:
-    """What explains a change.
+    """What explains a change."""
 
-    kind : "parameter", "limb", "limbs" (two of them) or "none" where no such cause suffices.
-    names : the best cause: a parameter, a limb or two limbs. parameters : those that may change.
-    alternatives : other causes of this kind that the data cannot distinguish from it.
-    left : chi-square that it leaves. degrees : of freedom of this chi-square.
-    """
-
-    kind: str
-    names: tuple[str, ...] = ()
-    parameters: tuple[str, ...] = ()
+    kind: str  # "parameter", "limb", "limbs" (two of them) or "none" where no such cause suffices
+    names: tuple[str, ...] = ()  # the best cause: a parameter, a limb or two limbs
+    parameters: tuple[str, ...] = ()  # those that may change
+    # other causes of this kind that the data cannot distinguish from it
     alternatives: tuple[tuple[str, ...], ...] = ()
-    left: float = float("nan")
-    degrees: int = 0
+    left: float = float("nan")  # chi-square that it leaves
+    degrees: int = 0  # of freedom of this chi-square
 
 
 def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:

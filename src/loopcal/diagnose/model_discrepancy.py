@@ -56,28 +56,21 @@ ROTATION, PLACE = 0, 1  # number of the errors of rotation and of place
 
 
 class SlowErrorRows(NamedTuple):
-    """What the elimination of the parameters leaves of residuals and slow errors.
+    """What the elimination of the parameters leaves of residuals and slow errors."""
 
-    errors : of unit amplitude. slope : (p, m) change of the estimates [SI] with the coefficients.
-    rows : (m, m) S. residuals : (m,) y.
-    """
-
-    errors: SmoothErrors
-    slope: FloatArray
-    rows: FloatArray
-    residuals: FloatArray
+    errors: SmoothErrors  # of unit amplitude
+    slope: FloatArray  # (p, m) change of the estimates [SI] with the coefficients
+    rows: FloatArray  # (m, m) S
+    residuals: FloatArray  # (m,) y
 
 
 class SlowErrors(NamedTuple):
-    """Slow errors that residuals show.
+    """Slow errors that residuals show."""
 
-    rows : that show them. components : PLACE or ROTATION -> size and probability of these errors.
-    is_slow : whether neighboring poses share them; otherwise each pose has its own.
-    """
-
-    rows: SlowErrorRows
+    rows: SlowErrorRows  # that show them
+    # PLACE or ROTATION -> size and probability of these errors
     components: Mapping[int, tuple[VarianceComponent, float]]
-    is_slow: bool = True
+    is_slow: bool = True  # whether neighboring poses share them; otherwise each pose has its own
 
 
 def find_slow_errors(

@@ -60,33 +60,25 @@ MOST_COMPARED = 10
 
 
 class JudgingNoise(NamedTuple):
-    """The noise by which each of u blocks is judged: that of the other fitted blocks.
+    """The noise by which each of u blocks is judged: that of the other fitted blocks."""
 
-    variance : (u,) of the whitened rows, in units of the stated one.
-    degrees : (u,) its degrees of freedom; infinite where the stated noise counts, 0 where nothing
-        is known of it.
-    """
-
-    variance: FloatArray
+    variance: FloatArray  # (u,) of the whitened rows, in units of the stated one
+    # (u,) its degrees of freedom; infinite where the stated noise counts, 0 where nothing is
+    # known of it
     degrees: FloatArray
 
 
 class PartialFit(NamedTuple):
-    """A linear fit without some of u blocks, and its influence on every block.
+    """A linear fit without some of u blocks, and its influence on every block."""
 
-    excluded : (u,) blocks that are not fitted. influence : of all blocks.
-    scale : factor on sigma; NaN where it is to be estimated and the fitted blocks do not show it.
-    directions : number of directions that the fit determines.
-    noise : by which noise each block is judged; by default that of `scale`, as if it were known.
-    left : degrees of freedom of `scale`; 0 where the stated noise counts.
-    """
-
-    excluded: BoolArray
-    influence: Influence
+    excluded: BoolArray  # (u,) blocks that are not fitted
+    influence: Influence  # of all blocks
+    # factor on sigma; NaN where it is to be estimated and the fitted blocks do not show it
     scale: float
-    directions: int
+    directions: int  # number of directions that the fit determines
+    # by which noise each block is judged; by default that of `scale`, as if it were known
     noise: JudgingNoise | None = None
-    left: float = 0.0
+    left: float = 0.0  # degrees of freedom of `scale`; 0 where the stated noise counts
 
     @property
     def tested(self) -> int:
@@ -130,16 +122,12 @@ class Refit(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class BlockSearch:
-    """A search for blocks that do not fit.
+    """A search for blocks that do not fit."""
 
-    refit : see `Refit`. whole : the fit to all blocks. limit : p-value below which a block is a
-        suspect. fits : the fit without the suspects, or all fits of a cycle.
-    """
-
-    refit: Refit
-    whole: PartialFit
-    limit: float
-    fits: tuple[PartialFit, ...]
+    refit: Refit  # see `Refit`
+    whole: PartialFit  # the fit to all blocks
+    limit: float  # p-value below which a block is a suspect
+    fits: tuple[PartialFit, ...]  # the fit without the suspects, or all fits of a cycle
 
     @property
     def end(self) -> PartialFit:
@@ -341,17 +329,12 @@ MOST_ROBUST = 20_000
 
 @dataclass(frozen=True)
 class Outlier:
-    """A block that does not fit the others.
+    """A block that does not fit the others."""
 
-    poses : its labels. distance : squared Mahalanobis norm of its residual against a fit of the
-        others. degrees : degrees of freedom of the distance. p_value : probability of a larger one,
-        for this block alone.
-    """
-
-    poses: tuple[str, ...]
-    distance: float
-    degrees: int
-    p_value: float
+    poses: tuple[str, ...]  # its labels
+    distance: float  # squared Mahalanobis norm of its residual against a fit of the others
+    degrees: int  # degrees of freedom of the distance
+    p_value: float  # probability of a larger one, for this block alone
 
     @property
     def finding(self) -> Finding:
@@ -367,14 +350,10 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Conflict:
-    """Blocks that contradict each other, any one of which may be wrong.
+    """Blocks that contradict each other, any one of which may be wrong."""
 
-    poses : labels of each block. times : largest distance from a fit to all, in units of the
-        expected noise.
-    """
-
-    poses: tuple[tuple[str, ...], ...]
-    times: float
+    poses: tuple[tuple[str, ...], ...]  # labels of each block
+    times: float  # largest distance from a fit to all, in units of the expected noise
 
     @property
     def finding(self) -> Finding:

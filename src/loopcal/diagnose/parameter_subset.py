@@ -37,17 +37,14 @@ SETTABLE, NONZERO = 0.1, 0.3
 
 @dataclass(frozen=True, eq=False)
 class MergedParameter:
-    """A parameter that is fixed because others have the same effect.
+    """A parameter that is fixed because others have the same effect."""
 
-    name, unit : of the parameter. into : names of the kept parameters that replace it.
-    changes : (k,) of each for one `unit` of it, to first order. units : (k,) symbols.
-    """
-
+    # name, unit: of the parameter
     name: str
     unit: str
-    into: tuple[str, ...]
-    changes: FloatArray
-    units: tuple[str, ...]
+    into: tuple[str, ...]  # names of the kept parameters that replace it
+    changes: FloatArray  # (k,) of each for one `unit` of it, to first order
+    units: tuple[str, ...]  # (k,) symbols
 
     @property
     def finding(self) -> Finding:
@@ -181,15 +178,12 @@ NEGLIGIBLE_GAIN = 1e-6  # part of a combination of length one that is rounding a
 
 @dataclass(frozen=True, eq=False)
 class AccurateCombination:
-    """A combination c'y of length one of the parameters, in units of the useful accuracy.
+    """A combination c'y of length one of the parameters, in units of the useful accuracy."""
 
-    names : (k,) strongest first. coefficients : (k,) c of y = deviation / useful accuracy.
-    sd : standard deviation by the data alone, in units of the useful accuracy; infinite where the
-        data do not determine it.
-    """
-
-    names: tuple[str, ...]
-    coefficients: FloatArray
+    names: tuple[str, ...]  # (k,) strongest first
+    coefficients: FloatArray  # (k,) c of y = deviation / useful accuracy
+    # standard deviation by the data alone, in units of the useful accuracy; infinite where the
+    # data do not determine it
     sd: float
 
     def to_dict(self) -> dict[str, Any]:
@@ -199,26 +193,21 @@ class AccurateCombination:
 
 @dataclass(frozen=True, eq=False)
 class UsefulAccuracy:
-    """What data determine to a useful accuracy.
+    """What data determine to a useful accuracy."""
 
-    free_parameters : the free parameters.
-    length, angle : the accuracy [m, rad].
-    sd : (p,) [SI] standard deviation of each parameter by the data alone; infinite where they do
-        not determine it.
-    is_useful : (p,) parameters whose own standard deviation is at most the accuracy.
-    determined, undetermined : combinations of length one that span what is known to the accuracy,
-        and what is not.
-    nearby : number of determined combinations at `NEIGHBORS` times the accuracy.
-    """
-
-    free_parameters: FreeParameters
+    free_parameters: FreeParameters  # the free parameters
+    # length, angle: the accuracy [m, rad]
     length: float
     angle: float
+    # (p,) [SI] standard deviation of each parameter by the data alone; infinite where they do not
+    # determine it
     sd: FloatArray
-    is_useful: BoolArray
+    is_useful: BoolArray  # (p,) parameters whose own standard deviation is at most the accuracy
+    # determined, undetermined: combinations of length one that span what is known to the
+    # accuracy, and what is not
     determined: tuple[AccurateCombination, ...]
     undetermined: tuple[AccurateCombination, ...]
-    nearby: tuple[int, ...]
+    nearby: tuple[int, ...]  # number of determined combinations at `NEIGHBORS` times the accuracy
 
     @property
     def findings(self) -> tuple[Finding, ...]:

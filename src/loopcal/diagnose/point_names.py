@@ -41,27 +41,23 @@ LEAST_SHARE = 1e-9  # share of the extent of all points below which a distance i
 
 @dataclass(frozen=True)
 class PointCheck:
-    """The points of a table against their predictions.
+    """The points of a table against their predictions."""
 
-    distance : median distance of a point from its prediction [m]. limit : of near points [m].
-    renamed : (row, target) of points and the (row, target) whose prediction they fit.
-    far : (row, target) of points that fit no prediction, and their distance [m].
-    moved_before : first row after the instrument has moved; None where it stood still.
-    move_gain : ratio of the distances with one instrument frame to those with two; 0: no move.
-        Between `DOUBTED` and `MOVED` the move is likely, but geometric errors hide it.
-    shift : 1 where the points of each row fit the row before, -1 where they fit the next one.
-    shifted_from : first row whose name is shifted.
-    distance_as_named : median distance with the names as they are [m], where they are shifted.
-    """
-
-    distance: float
-    limit: float
+    distance: float  # median distance of a point from its prediction [m]
+    limit: float  # of near points [m]
+    # (row, target) of points and the (row, target) whose prediction they fit
     renamed: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = ()
+    # (row, target) of points that fit no prediction, and their distance [m]
     far: tuple[tuple[tuple[int, int], float], ...] = ()
+    # first row after the instrument has moved; None where it stood still
     moved_before: int | None = None
+    # ratio of the distances with one instrument frame to those with two; 0: no move. Between
+    # `DOUBTED` and `MOVED` the move is likely, but geometric errors hide it
     move_gain: float = 0.0
+    # 1 where the points of each row fit the row before, -1 where they fit the next one
     shift: int = 0
-    shifted_from: int = 0
+    shifted_from: int = 0  # first row whose name is shifted
+    # median distance with the names as they are [m], where they are shifted
     distance_as_named: float = float("nan")
 
 

@@ -64,18 +64,16 @@ class ChosenValue:
 
 @dataclass(frozen=True, eq=False)
 class RegularizationCurve:
-    """Held-out scores of one family of methods.
+    """Held-out scores of one family of methods."""
 
-    name : "lam" or "k". values : (n,) increasing. score : (n,) mean square of whitened held-out
-        residuals; 1 is noise alone, infinite where poses cannot be left out.
-    standard_error : (n,) of the score. chosen : what rules choose, among them the lowest score and
-        the simplest value within one standard error of it.
-    """
-
-    name: Literal["lam", "k"]
-    values: FloatArray
+    name: Literal["lam", "k"]  # "lam" or "k"
+    values: FloatArray  # (n,) increasing
+    # (n,) mean square of whitened held-out residuals; 1 is noise alone, infinite where poses
+    # cannot be left out
     score: FloatArray
-    standard_error: FloatArray
+    standard_error: FloatArray  # (n,) of the score
+    # what rules choose, among them the lowest score and the simplest value within one standard
+    # error of it
     chosen: tuple[ChosenValue, ...]
 
     def score_at(self, value: float) -> tuple[float, float]:

@@ -37,26 +37,20 @@ LEVEL = 0.01  # probability below which the lack of fit exceeds the pure error
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Lack of fit against the pure error of repeated poses.
+    """Lack of fit against the pure error of repeated poses."""
 
-    groups : number of poses that were repeated.
-    pure, pure_degrees : sum of squares between repeats in units of the stated sigma, and its
-        degrees of freedom.
-    lack, lack_degrees : the remaining sum of squares of the fit, and its degrees of freedom.
-    sigma_scale : repeatability over the stated sigma.
-    p_value : probability of a larger F if the model is right; NaN where there is no test.
-    is_explained : whether the model explains the data; None where there is no test.
-    findings : the result of the test, and the repeatability where it contradicts the stated sigma.
-    """
-
-    groups: int
+    groups: int  # number of poses that were repeated
+    # pure, pure_degrees: sum of squares between repeats in units of the stated sigma, and its
+    # degrees of freedom
     pure: float
     pure_degrees: int
+    # lack, lack_degrees: the remaining sum of squares of the fit, and its degrees of freedom
     lack: float
     lack_degrees: float
-    sigma_scale: float
-    p_value: float
-    is_explained: bool | None
+    sigma_scale: float  # repeatability over the stated sigma
+    p_value: float  # probability of a larger F if the model is right; NaN where there is no test
+    is_explained: bool | None  # whether the model explains the data; None where there is no test
+    # the result of the test, and the repeatability where it contradicts the stated sigma
     findings: tuple[Finding, ...]
 
     def to_dict(self) -> dict[str, Any]:

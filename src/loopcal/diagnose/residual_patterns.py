@@ -40,24 +40,19 @@ EXPLAINED = 1e-6  # share of its length below which a column counts as explained
 
 @dataclass(frozen=True, eq=False)
 class ResidualRows:
-    """R whitened rows of a fit, those of one series (a kind and its column) in order.
+    """R whitened rows of a fit, those of one series (a kind and its column) in order."""
 
-    basis : (R, q) orthonormal, what is estimated. residual : (R,) of the least-squares fit.
-    gain : (R, k) change of the k directions of the fit by an error of each row.
-    root : (p, k) these directions [SI]: an error e of the rows changes the estimate by
-        root gain' e, up to its sign.
-    kind, row, column : (R,) number of the kind, of its row, and of its residual.
-    series : (R,) number of the series, in ascending order.
-    """
-
-    basis: FloatArray
-    residual: FloatArray
-    gain: FloatArray
+    basis: FloatArray  # (R, q) orthonormal, what is estimated
+    residual: FloatArray  # (R,) of the least-squares fit
+    gain: FloatArray  # (R, k) change of the k directions of the fit by an error of each row
+    # (p, k) these directions [SI]: an error e of the rows changes the estimate by root gain' e,
+    # up to its sign
     root: FloatArray
+    # kind, row, column: (R,) number of the kind, of its row, and of its residual
     kind: IntArray
     row: IntArray
     column: IntArray
-    series: IntArray
+    series: IntArray  # (R,) number of the series, in ascending order
 
     @property
     def degrees(self) -> int:
@@ -193,26 +188,19 @@ ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "se
 
 
 class EffectColumn(NamedTuple):
-    """One function of the quantity, for one measured component.
+    """One function of the quantity, for one measured component."""
 
-    component : its name, such as "z". dimension : of its size.
-    """
-
-    component: str
-    dimension: Dimension
+    component: str  # its name, such as "z"
+    dimension: Dimension  # of its size
 
 
 class Effect(NamedTuple):
-    """A dependence of the measured values on one quantity.
+    """A dependence of the measured values on one quantity."""
 
-    source : what it depends on, such as "time". name : of the temperature or actuator, else empty.
-    columns : (R, c) whitened rows by the sizes. labels : what the c columns are.
-    """
-
-    source: str
-    name: str
-    columns: FloatArray
-    labels: tuple[EffectColumn, ...]
+    source: str  # what it depends on, such as "time"
+    name: str  # of the temperature or actuator, else empty
+    columns: FloatArray  # (R, c) whitened rows by the sizes
+    labels: tuple[EffectColumn, ...]  # what the c columns are
 
 
 def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
@@ -269,14 +257,11 @@ def _list_trends(observations: Sequence[Observations]) -> tuple[list[list[FloatA
 
 
 class _ShiftedRows(NamedTuple):
-    """How an offset of each measured component shifts the whitened rows of a kind.
+    """How an offset of each measured component shifts the whitened rows of a kind."""
 
-    places : (k,) of these rows among all. row : (k,) number of the row of the kind. shifts : for
-    each component, the change (k,) by a unit of it.
-    """
-
-    places: IntArray
-    row: IntArray
+    places: IntArray  # (k,) of these rows among all
+    row: IntArray  # (k,) number of the row of the kind
+    # for each component, the change (k,) by a unit of it
     shifts: tuple[tuple[EffectColumn, FloatArray], ...]
 
 
@@ -337,38 +322,28 @@ FEWEST_LEFT = 3.0
 
 
 class EffectSizes(NamedTuple):
-    """The sizes of a significant effect, and how they act on the residuals.
+    """The sizes of a significant effect, and how they act on the residuals."""
 
-    effect : what the residuals depend on. p_value : probability that independent errors show an
-        effect as large, in any of the tests of a fit (Sidak).
-    sizes, errors : (c,) [SI] estimates and standard deviations.
-    moments : (c, c) [SI] expected products of the sizes.
-    """
-
-    effect: Effect
+    effect: Effect  # what the residuals depend on
+    # probability (Sidak) that independent errors show an effect as large in any test of a fit
     p_value: float
+    # sizes, errors: (c,) [SI] estimates and standard deviations
     sizes: FloatArray
     errors: FloatArray
-    moments: FloatArray
+    moments: FloatArray  # (c, c) [SI] expected products of the sizes
 
 
 class ResidualPatterns(NamedTuple):
-    """What the residuals of a fit show.
+    """What the residuals of a fit show."""
 
-    tests : number of tests. effects : that are significant, the first found first.
-    correlation : of neighboring residuals, less what a fit causes. p_value : probability of a
-        larger one for independent errors, in any of the tests (Sidak).
-    is_correlated : whether it is significant. order : "time" or "order", that of the rows.
-    rows : the residuals, as if the fit had estimated the effects.
-    """
-
-    tests: int
-    effects: tuple[EffectSizes, ...]
-    correlation: float
+    tests: int  # number of tests
+    effects: tuple[EffectSizes, ...]  # that are significant, the first found first
+    correlation: float  # of neighboring residuals, less what a fit causes
+    # probability of a larger one for independent errors, in any of the tests (Sidak)
     p_value: float
-    is_correlated: bool
-    order: str
-    rows: ResidualRows
+    is_correlated: bool  # whether it is significant
+    order: str  # "time" or "order", that of the rows
+    rows: ResidualRows  # the residuals, as if the fit had estimated the effects
 
 
 def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> ResidualPatterns:
@@ -515,23 +490,12 @@ LONGEST = 400  # rows of a series whose correlation is considered at once; longe
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedErrors:
-    """The covariance of a fit by correlated errors.
+    """The covariance of a fit by correlated errors."""
 
-    covariance : (k, k) of the directions of the rows' gain. degrees : degrees of freedom of its
-        size.
-    correlation : of neighboring errors, mean. sigma : their size over the stated sigma, mean.
-    """
-
-    covariance: FloatArray
-    degrees: float
-    correlation: float
-    sigma: float
-
-
-class _Segments(NamedTuple):
-    """Segments of equal length n: (S, n) numbers of their rows."""
-
-    rows: IntArray
+    covariance: FloatArray  # (k, k) of the directions of the rows' gain
+    degrees: float  # degrees of freedom of its size
+    correlation: float  # of neighboring errors, mean
+    sigma: float  # their size over the stated sigma, mean
 
 
 def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> CorrelatedErrors:

@@ -53,15 +53,12 @@ READINGS = "actuator readings"
 
 
 class Metric(NamedTuple):
-    """A number that sums up the sizes (e,) of errors, one or more.
+    """A number that sums up the sizes (e,) of errors, one or more."""
 
-    words : its name in tables. compute : it from the sizes.
-    find_noise_floor : its value for an exact geometry, from the variances (e, c) of the noise of
-        components, NaN where absent; None where tables do not compare it with the noise.
-    """
-
-    words: str
-    compute: Callable[[FloatArray], float]
+    words: str  # its name in tables
+    compute: Callable[[FloatArray], float]  # it from the sizes
+    # its value for an exact geometry, from the variances (e, c) of the noise of components, NaN
+    # where absent; None where tables do not compare it with the noise
     find_noise_floor: Callable[[FloatArray], float] | None = None
 
 
@@ -115,18 +112,13 @@ class Statistics(dict[str, float]):
 
 @dataclass(frozen=True, eq=False)
 class QuantityErrors:
-    """Errors of one quantity: one entry for each measured row and target.
+    """Errors of one quantity: one entry for each measured row and target."""
 
-    dimension : of the errors. components : (e, 3) differences [SI], NaN where not measured.
-    rows : (e,) number of the row of each entry. targets : (e,) names; empty for the only one.
-    measured : names of the components that are measured, such as ("z",).
-    """
-
-    dimension: Dimension
-    components: FloatArray
-    rows: IntArray
-    targets: tuple[str, ...]
-    measured: tuple[str, ...]
+    dimension: Dimension  # of the errors
+    components: FloatArray  # (e, 3) differences [SI], NaN where not measured
+    rows: IntArray  # (e,) number of the row of each entry
+    targets: tuple[str, ...]  # (e,) names; empty for the only one
+    measured: tuple[str, ...]  # names of the components that are measured, such as ("z",)
 
     @property
     def size(self) -> FloatArray:
@@ -164,11 +156,9 @@ NO_ERRORS = QuantityErrors(
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Errors of r rows by quantity: "position", "orientation", "length" and others.
+    """Errors of r rows by quantity: "position", "orientation", "length" and others."""
 
-    quantities : the errors of each quantity that some row measures.
-    """
-
+    # the errors of each quantity that some row measures
     quantities: Mapping[str, QuantityErrors] = field(default_factory=dict)
 
     def __getitem__(self, quantity: str) -> QuantityErrors:
@@ -217,10 +207,9 @@ class NoiseFloor:
     of the largest of e errors of that noise; the square of an error is taken as a multiple of
     chi-square with the same mean and variance, which is exact for components of equal sigma. The
     noise of uncertain joint readings is not part of it, so with such readings it is a lower bound.
-
-    metrics : metric of `SUMMARY` -> quantity -> its value [m] or [rad].
     """
 
+    # metric of `SUMMARY` -> quantity -> its value [m] or [rad]
     metrics: Mapping[str, Mapping[str, float]]
 
     def to_dict(self) -> Mapping[str, Mapping[str, float]]:
@@ -250,20 +239,16 @@ class NoiseFloor:
 
 @dataclass(frozen=True)
 class KindErrors:
-    """Whitened errors of one kind of measurement, or of all kinds.
+    """Whitened errors of one kind of measurement, or of all kinds."""
 
-    kind : its name; "all" for all kinds. count : measured components over all its rows.
-    before, after : root mean square of the whitened residuals [sigma].
-    noise_floor : the value for an exact geometry [sigma].
-    change : root mean square of their difference, which is that of the two predictions [sigma]; NaN
-        where it was not stored.
-    """
-
-    kind: str
-    count: int
+    kind: str  # its name; "all" for all kinds
+    count: int  # measured components over all its rows
+    # before, after: root mean square of the whitened residuals [sigma]
     before: float
     after: float
-    noise_floor: float = 1.0
+    noise_floor: float = 1.0  # the value for an exact geometry [sigma]
+    # root mean square of their difference, which is that of the two predictions [sigma]; NaN
+    # where it was not stored
     change: float = np.nan
 
     @property
@@ -416,18 +401,14 @@ def _join(errors_by_kind: Sequence[QuantityErrors]) -> QuantityErrors:
 
 @dataclass(frozen=True, eq=False)
 class PosePredictions:
-    """Poses that a geometry predicts, and the setup parameters with which it is compared.
+    """Poses that a geometry predicts, and the setup parameters with which it is compared."""
 
-    T : (1, n, 4, 4) [m]. joints : name -> (1, n) [SI].
-    setup : the setup parameters (frames, targets, surfaces, offsets) of the measurements.
-    values : (1, U) their values [SI]. kept : names of those that were given and not fitted.
-    """
-
-    T: FloatArray
-    joints: Mapping[str, FloatArray]
+    T: FloatArray  # (1, n, 4, 4) [m]
+    joints: Mapping[str, FloatArray]  # name -> (1, n) [SI]
+    # the setup parameters (frames, targets, surfaces, offsets) of the measurements
     setup: NuisanceParameters
-    values: FloatArray
-    kept: tuple[str, ...]
+    values: FloatArray  # (1, U) their values [SI]
+    kept: tuple[str, ...]  # names of those that were given and not fitted
 
     @property
     def fitted_count(self) -> int:
@@ -472,28 +453,21 @@ class PosePredictions:
 
 @dataclass(frozen=True, eq=False)
 class PredictionComparison:
-    """Two geometries at the same recorded readings, at the poses that both reach.
+    """Two geometries at the same recorded readings, at the poses that both reach."""
 
-    data : the measurements with the compared rows only. rows : (r,) labels of those rows.
-    usable : (n,) poses that are compared. predictable : (n,) poses that the data determine.
-    estimated : (n,) poses of these that were estimated together with their rows.
-    absorbed : (n,) number of residuals that each of these takes up.
-    solution : poses of the geometry after. before, after : predictions of the two geometries.
-    reached : poses that the geometry after reaches when it is commanded to those of `before`.
-    reading_fits : of the two geometries, the fits of redundant readings alone; None where there are
-        none.
-    """
-
-    data: Measurements
-    rows: tuple[str, ...]
-    usable: BoolArray
-    predictable: BoolArray
-    estimated: BoolArray
-    absorbed: IntArray
-    solution: Solution
+    data: Measurements  # the measurements with the compared rows only
+    rows: tuple[str, ...]  # (r,) labels of those rows
+    usable: BoolArray  # (n,) poses that are compared
+    predictable: BoolArray  # (n,) poses that the data determine
+    estimated: BoolArray  # (n,) poses of these that were estimated together with their rows
+    absorbed: IntArray  # (n,) number of residuals that each of these takes up
+    solution: Solution  # poses of the geometry after
+    # before, after: predictions of the two geometries
     before: PosePredictions
     after: PosePredictions
+    # poses that the geometry after reaches when it is commanded to those of `before`
     reached: PosePredictions
+    # of the two geometries, the fits of redundant readings alone; None where there are none
     reading_fits: tuple[PoseFit | None, PoseFit | None]
 
     def count_judged(self) -> int:

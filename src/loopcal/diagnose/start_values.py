@@ -52,20 +52,16 @@ class StartVerdict(Enum):
 
 @dataclass(frozen=True)
 class StartCheck:
-    """The geometry from which a fit started, compared with the fit.
+    """The geometry from which a fit started, compared with the fit."""
 
-    verdict : see `StartVerdict`.
-    before, after : root mean square of the residuals in units of the stated sigma, of the start and
-        of the fit [1].
-    p_value : probability of such a gain if the start is the truth; NaN where there is no test.
-    finding : the result.
-    """
-
-    verdict: StartVerdict
+    verdict: StartVerdict  # see `StartVerdict`
+    # before, after: root mean square of the residuals in units of the stated sigma, of the start
+    # and of the fit [1]
     before: float
     after: float
+    # probability of such a gain if the start is the truth; NaN where there is no test
     p_value: float
-    finding: Finding
+    finding: Finding  # the result
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes by name for JSON."""
@@ -74,14 +70,12 @@ class StartCheck:
 
 @dataclass(frozen=True)
 class StoredAnswer:
-    """A stored geometry and the optimum of the firmware's cost, from the same probes.
+    """A stored geometry and the optimum of the firmware's cost, from the same probes."""
 
-    stored, best : the cost of each [mm^2]. moved : parameter, stored value, best value and unit, of
-        those that differ.
-    """
-
+    # stored, best: the cost of each [mm^2]
     stored: float
     best: float
+    # parameter, stored value, best value and unit, of those that differ
     moved: tuple[tuple[str, float, float, str], ...]
 
     @property

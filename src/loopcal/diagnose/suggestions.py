@@ -57,15 +57,12 @@ SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
 
 @dataclass(frozen=True)
 class FurtherMeasurement:
-    """A further measurement that determines a combination.
+    """A further measurement that determines a combination."""
 
-    words : what is measured, such as `psi`. kind : its kind. left : standard deviation of the first
-        parameter of the combination over its tolerance, from the data, the further measurement and
-        the tolerances together.
-    """
-
-    words: str
-    kind: str
+    words: str  # what is measured, such as `psi`
+    kind: str  # its kind
+    # standard deviation of the first parameter of the combination over its tolerance, from the
+    # data, the further measurement and the tolerances together
     left: float
 
 

@@ -49,20 +49,14 @@ ON_BOUNDARY = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Poses that may be measured.
+    """Poses that may be measured."""
 
-    coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses.
-    is_uniform : (n,) True for those drawn evenly from the workspace, which represent it.
-    excluded : violation -> number of poses that it excluded.
-    n_drawn : number of poses before exclusion. checker : the constraints.
-    """
-
-    coordinates: FloatArray
-    solution: Solution
-    is_uniform: BoolArray
-    excluded: Mapping[Violation, int]
-    n_drawn: int
-    checker: ConstraintChecker
+    coordinates: FloatArray  # (n, c) controlled coordinates [m, rad]
+    solution: Solution  # their readings and poses
+    is_uniform: BoolArray  # (n,) True for those drawn evenly from the workspace, which represent it
+    excluded: Mapping[Violation, int]  # violation -> number of poses that it excluded
+    n_drawn: int  # number of poses before exclusion
+    checker: ConstraintChecker  # the constraints
 
     def __len__(self) -> int:
         return len(self.coordinates)

@@ -142,15 +142,11 @@ class Constraints:
 
 @dataclass(frozen=True)
 class Violation:
-    """The first constraint that a pose or a path violates.
+    """The first constraint that a pose or a path violates."""
 
-    code : of the reason; worded in `loopcal.findings.catalog.phrases`.
-    data : names and numbers of the reason.
-    on_path : whether it occurs on the straight path from home, not at the pose itself.
-    """
-
-    code: str
-    data: tuple[tuple[str, Any], ...] = ()
+    code: str  # of the reason; worded in `loopcal.findings.catalog.phrases`
+    data: tuple[tuple[str, Any], ...] = ()  # names and numbers of the reason
+    # whether it occurs on the straight path from home, not at the pose itself
     on_path: bool = False
 
     def to_dict(self) -> dict[str, Any]:
@@ -160,13 +156,10 @@ class Violation:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintCheck:
-    """Result of checking n poses or paths.
+    """Result of checking n poses or paths."""
 
-    allowed : (n,). violations : (n,) the first `Violation` of each; None where allowed.
-    """
-
-    allowed: BoolArray
-    violations: NDArray[np.object_]
+    allowed: BoolArray  # (n,)
+    violations: NDArray[np.object_]  # (n,) the first `Violation` of each; None where allowed
 
     def count_violations(self) -> dict[Violation, int]:
         """Return how often each violation was the first, most frequent first."""
@@ -175,14 +168,11 @@ class ConstraintCheck:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintChecker:
-    """The constraints of one robot with their reference values.
-
-    medians : of margin and drive margin over the workspace.
-    """
+    """The constraints of one robot with their reference values."""
 
     robot: Mechanism
     constraints: Constraints
-    medians: tuple[float, float]
+    medians: tuple[float, float]  # of margin and drive margin over the workspace
 
     def check_poses(self, solution: Solution, at_pose: bool = True) -> ConstraintCheck:
         """Check poses; `at_pose` False omits the line of sight, which only measuring needs."""

@@ -24,15 +24,12 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class PriorInformation:
-    """Information that exists before the first new pose.
+    """Information that exists before the first new pose."""
 
-    rows : (k, o + p) whitened and in tolerances: rows measured already, or identity rows for
-        tolerances.
-    n_nuisance : o, number of nuisance parameters; their columns come first.
-    """
-
+    # (k, o + p) whitened and in tolerances: rows measured already, or identity rows for
+    # tolerances
     rows: FloatArray
-    n_nuisance: int = 0
+    n_nuisance: int = 0  # o, number of nuisance parameters; their columns come first
 
     @classmethod
     def none(cls, machine: int, nuisance: int = 0) -> PriorInformation:
@@ -54,16 +51,11 @@ class PriorInformation:
 
 @dataclass(frozen=True, eq=False)
 class ObservableSpace:
-    """The directions that a set of rows can determine; designs are compared in this space.
+    """The directions that a set of rows can determine; designs are compared in this space."""
 
-    machine : (p, q) orthonormal directions of the machine's unknowns.
-    nuisance : (o, o') directions of the nuisance parameters.
-    singular_values : (p,) of the machine's columns after elimination, descending.
-    """
-
-    machine: FloatArray
-    nuisance: FloatArray
-    singular_values: FloatArray
+    machine: FloatArray  # (p, q) orthonormal directions of the machine's unknowns
+    nuisance: FloatArray  # (o, o') directions of the nuisance parameters
+    singular_values: FloatArray  # (p,) of the machine's columns after elimination, descending
 
     def __len__(self) -> int:
         return self.machine.shape[1]
@@ -83,21 +75,14 @@ class ObservableSpace:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A chosen set of groups.
+    """A chosen set of groups."""
 
-    chosen : (n,) indices of the candidates, ascending.
-    value : of the criterion.
-    history : values of the best start: after it began, and after each exchange.
-    values : final value of each start.
-    space : the directions in which the value counts.
-    is_converged : whether no single exchange improves it; False where the exchanges ran out.
-    """
-
-    chosen: IntArray
-    value: float
-    history: tuple[float, ...]
-    values: tuple[float, ...]
-    space: ObservableSpace
+    chosen: IntArray  # (n,) indices of the candidates, ascending
+    value: float  # of the criterion
+    history: tuple[float, ...]  # values of the best start: after it began, and after each exchange
+    values: tuple[float, ...]  # final value of each start
+    space: ObservableSpace  # the directions in which the value counts
+    # whether no single exchange improves it; False where the exchanges ran out
     is_converged: bool = True
 
 
@@ -221,14 +206,12 @@ class D:
 
 @dataclass(frozen=True, eq=False)
 class I:  # noqa: E742
-    """Mean variance of a prediction.
+    """Mean variance of a prediction."""
 
-    weights : (k, p) rows L: derivatives of all predicted quantities by the machine's unknowns [per
-        tolerance].
-    count : number of predictions (poses) in `weights`; the sum of the variances is divided by it.
-    """
-
+    # (k, p) rows L: derivatives of all predicted quantities by the machine's unknowns [per
+    # tolerance]
     weights: FloatArray
+    # number of predictions (poses) in `weights`; the sum of the variances is divided by it
     count: int = 1
     name: ClassVar[str] = "I"
 
@@ -304,20 +287,14 @@ RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Scoring:
-    """A criterion in the coordinates of the mean design.
+    """A criterion in the coordinates of the mean design."""
 
-    space : the observable directions.
-    transform : (o + p, Q) from given rows to scaled rows, Q = o' + q, nuisance directions first.
-    prior_rows : (k, Q) scaled rows of the prior.
-    prediction : (j, q) K of I and A, in the same coordinates; None for D.
-    offset : value of D where the score is zero.
-    """
-
-    space: ObservableSpace
+    space: ObservableSpace  # the observable directions
+    # (o + p, Q) from given rows to scaled rows, Q = o' + q, nuisance directions first
     transform: FloatArray
-    prior_rows: FloatArray
-    prediction: FloatArray | None
-    offset: float
+    prior_rows: FloatArray  # (k, Q) scaled rows of the prior
+    prediction: FloatArray | None  # (j, q) K of I and A, in the same coordinates; None for D
+    offset: float  # value of D where the score is zero
 
     @property
     def n_nuisance(self) -> int:
@@ -413,16 +390,12 @@ def build_scoring(
 
 @dataclass(frozen=True, eq=False)
 class ScaledCandidates:
-    """The allowed groups of a problem in the coordinates of its scoring.
+    """The allowed groups of a problem in the coordinates of its scoring."""
 
-    scoring : of designs. rows : (N, r, Q) scaled. indices : (N,) of the groups among all.
-    repeats : whether a group may be chosen more than once.
-    """
-
-    scoring: Scoring
-    rows: FloatArray
-    indices: IntArray
-    repeats: bool
+    scoring: Scoring  # of designs
+    rows: FloatArray  # (N, r, Q) scaled
+    indices: IntArray  # (N,) of the groups among all
+    repeats: bool  # whether a group may be chosen more than once
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -456,23 +429,16 @@ def scale_candidates(
 
 @dataclass(frozen=True, eq=False)
 class SwapTerms:
-    """Terms of the swap formulas for all groups at the present design.
+    """Terms of the swap formulas for all groups at the present design."""
 
-    Y : (N, r, Q). W : (N, r, r).
-    log_added : (N,) log det(I + G_kk).
-    nuisance : the same terms in the nuisance columns; None without any, and for I and A.
-    V : (N, r, j) for I and A; None for D.
-    gram : (N, r, r) V V'; None for D.
-    trace : |P|^2.
-    """
-
-    Y: FloatArray
-    W: FloatArray
-    log_added: FloatArray
+    Y: FloatArray  # (N, r, Q)
+    W: FloatArray  # (N, r, r)
+    log_added: FloatArray  # (N,) log det(I + G_kk)
+    # the same terms in the nuisance columns; None without any, and for I and A
     nuisance: SwapTerms | None = None
-    V: FloatArray | None = None
-    gram: FloatArray | None = None
-    trace: float = 0.0
+    V: FloatArray | None = None  # (N, r, j) for I and A; None for D
+    gram: FloatArray | None = None  # (N, r, r) V V'; None for D
+    trace: float = 0.0  # |P|^2
 
 
 def compute_swap_terms(scoring: Scoring, R: FloatArray, scaled: FloatArray) -> SwapTerms:

@@ -205,22 +205,17 @@ def round_weights(weights: FloatArray, n: int, repeats: bool) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class MovedDesign:
-    """A design of groups that were moved.
+    """A design of groups that were moved."""
 
-    design : (u, c) coordinates. rows : (u, r, o + p) of it. value : of the criterion.
-    history : value before the first sweep (-inf for D, inf for I and A where it is singular), and
-        after each.
-    evaluated : number of groups that were linearized in all.
-    space : the directions in which the value counts.
-    is_converged : whether the last sweep gained hardly anything; False where the sweeps ran out.
-    """
-
-    design: FloatArray
-    rows: FloatArray
-    value: float
+    design: FloatArray  # (u, c) coordinates
+    rows: FloatArray  # (u, r, o + p) of it
+    value: float  # of the criterion
+    # value before the first sweep (-inf for D, inf for I and A where it is singular), and after
+    # each
     history: tuple[float, ...]
-    evaluated: int
-    space: ObservableSpace
+    evaluated: int  # number of groups that were linearized in all
+    space: ObservableSpace  # the directions in which the value counts
+    # whether the last sweep gained hardly anything; False where the sweeps ran out
     is_converged: bool
 
 
@@ -349,15 +344,11 @@ BOUND_GAP = 3e-3  # gap of the relaxation where only the size is needed
 
 @dataclass(frozen=True, eq=False)
 class CertifiedDesign:
-    """A design and its certificate.
+    """A design and its certificate."""
 
-    design : the chosen groups. relaxed : weights and bound.
-    efficiency : lower bound on the efficiency relative to the best possible design.
-    """
-
-    design: Design
-    relaxed: RelaxedDesign
-    efficiency: float
+    design: Design  # the chosen groups
+    relaxed: RelaxedDesign  # weights and bound
+    efficiency: float  # lower bound on the efficiency relative to the best possible design
 
 
 def choose_design(
@@ -440,32 +431,22 @@ def _perturb(
 
 @dataclass(frozen=True, eq=False)
 class DesignCurve:
-    """Values of designs by their number of groups.
+    """Values of designs by their number of groups."""
 
-    sizes : (k,) numbers of groups, ascending.
-    values : (k,) of the criterion, never worse with more groups.
-    bounds : (k,) values that no design of the same size exceeds.
-    designs : k designs.
-    """
-
-    sizes: IntArray
-    values: FloatArray
-    bounds: FloatArray
-    designs: tuple[CertifiedDesign, ...]
+    sizes: IntArray  # (k,) numbers of groups, ascending
+    values: FloatArray  # (k,) of the criterion, never worse with more groups
+    bounds: FloatArray  # (k,) values that no design of the same size exceeds
+    designs: tuple[CertifiedDesign, ...]  # k designs
 
 
 @dataclass(frozen=True, eq=False)
 class SmallestDesign:
-    """The smallest design found that meets a target.
+    """The smallest design found that meets a target."""
 
-    n : its number of groups. at_least : no smaller number of groups can meet the target.
-    certified : the design. curve : all designs that the search made.
-    """
-
-    n: int
-    at_least: int
-    certified: CertifiedDesign
-    curve: DesignCurve
+    n: int  # its number of groups
+    at_least: int  # no smaller number of groups can meet the target
+    certified: CertifiedDesign  # the design
+    curve: DesignCurve  # all designs that the search made
 
 
 def compute_design_curve(

@@ -140,19 +140,15 @@ def _tilt_vector(coordinates: FloatArray, places: list[int]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class VisitingOrder:
-    """An order of n poses.
+    """An order of n poses."""
 
-    order : (n,) indices of the poses.
-    via_home : (n,) True where the path goes via home before the pose, because the straight path is
-        not allowed.
-    length : of the whole path from home to the last pose [m], see `measure_distance`.
-    is_converged : whether no reversal of a section makes it shorter; False where the search ran out
-        of steps. Paths that were not checked then go via home.
-    """
-
-    order: IntArray
+    order: IntArray  # (n,) indices of the poses
+    # (n,) True where the path goes via home before the pose, because the straight path is not
+    # allowed
     via_home: BoolArray
-    length: float
+    length: float  # of the whole path from home to the last pose [m], see `measure_distance`
+    # whether no reversal of a section makes it shorter; False where the search ran out of steps.
+    # Paths that were not checked then go via home
     is_converged: bool
 
 

@@ -128,18 +128,14 @@ DENSE = 20
 
 @dataclass(frozen=True, eq=False)
 class GroupRows:
-    """Rows of N groups of poses.
+    """Rows of N groups of poses."""
 
-    rows : (N, r, o + p) whitened, machine columns in tolerances; NaN where a pose is not reached.
-    members : (N, k) indices of the poses of each group.
-    nuisance : names of the o nuisance parameters of the instrument.
-    nuisance_prior : (b, o + p) rows of their stated tolerances and of targets on the base, which do
-        not depend on the choice of poses.
-    """
-
+    # (N, r, o + p) whitened, machine columns in tolerances; NaN where a pose is not reached
     rows: FloatArray
-    members: IntArray
-    nuisance: tuple[str, ...]
+    members: IntArray  # (N, k) indices of the poses of each group
+    nuisance: tuple[str, ...]  # names of the o nuisance parameters of the instrument
+    # (b, o + p) rows of their stated tolerances and of targets on the base, which do not depend
+    # on the choice of poses
     nuisance_prior: FloatArray
 
 

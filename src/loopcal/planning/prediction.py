@@ -47,18 +47,14 @@ DIMENSIONS: dict[Target, Dimension] = {
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Derivatives of the tool's pose at k poses of the workspace.
+    """Derivatives of the tool's pose at k poses of the workspace."""
 
-    rotations, displacements : (k, 3, p) derivatives of its rotation [rad] and displacement [m] by
-        the parameters in tolerances.
-    size : makes rotations comparable with displacements [m].
-    frame : in which errors are stated.
-    """
-
+    # rotations, displacements: (k, 3, p) derivatives of its rotation [rad] and displacement [m]
+    # by the parameters in tolerances
     rotations: FloatArray
     displacements: FloatArray
-    size: float
-    frame: ErrorFrame
+    size: float  # makes rotations comparable with displacements [m]
+    frame: ErrorFrame  # in which errors are stated
 
     def __len__(self) -> int:
         return len(self.displacements)

@@ -61,27 +61,18 @@ NO_MOTION = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
-    """Everything that a choice of poses depends on.
+    """Everything that a choice of poses depends on."""
 
-    free : the robot's free parameters. instrument : mounted on its tool.
-    options : of the plan. candidates : poses that may be measured. groups : their rows.
-    prior : information before the first new pose.
-    observable : decomposition of all candidates together, without tolerances.
-    prediction : of the tool's pose over the workspace.
-    n_earlier_equations : of measurements made already, less their own nuisance parameters.
-    used_names : names of poses that were measured already.
-    """
-
-    free: FreeParameters
-    instrument: Instrument
-    options: PlanOptions
-    candidates: Candidates
-    groups: GroupRows
-    prior: PriorInformation
-    observable: Decomposition
-    prediction: Prediction
-    n_earlier_equations: int = 0
-    used_names: tuple[str, ...] = ()
+    free: FreeParameters  # the robot's free parameters
+    instrument: Instrument  # mounted on its tool
+    options: PlanOptions  # of the plan
+    candidates: Candidates  # poses that may be measured
+    groups: GroupRows  # their rows
+    prior: PriorInformation  # information before the first new pose
+    observable: Decomposition  # decomposition of all candidates together, without tolerances
+    prediction: Prediction  # of the tool's pose over the workspace
+    n_earlier_equations: int = 0  # of measurements made already, less their own nuisance parameters
+    used_names: tuple[str, ...] = ()  # names of poses that were measured already
 
     @property
     def robot(self) -> Mechanism:
@@ -358,30 +349,20 @@ PERTURBATIONS = 4  # number of perturbations of each design of a curve
 
 @dataclass(frozen=True, eq=False)
 class ErrorCurve:
-    """Expected errors by the number of poses, or of pairs where poses are compared.
+    """Expected errors by the number of poses, or of pairs where poses are compared."""
 
-    numbers : (k,) of poses or pairs, ascending.
-    expected : errors after measuring a good design of each number.
-    target : the error that the designs make small.
-    values, bounds : (k,) that error [m, rad], and the smallest that any choice of so many
-        candidates can have.
-    goal : requested error [m, rad], or None.
-    enough : smallest of the numbers that reaches the goal.
-    at_least : no smaller number of candidates reaches the goal.
-    poses_per_group : 1 where each pose counts alone.
-    n_candidates : number of candidate poses or pairs.
-    """
-
-    numbers: IntArray
-    expected: tuple[ExpectedErrors, ...]
-    target: Target
+    numbers: IntArray  # (k,) of poses or pairs, ascending
+    expected: tuple[ExpectedErrors, ...]  # errors after measuring a good design of each number
+    target: Target  # the error that the designs make small
+    # values, bounds: (k,) that error [m, rad], and the smallest that any choice of so many
+    # candidates can have
     values: FloatArray
     bounds: FloatArray
-    goal: float | None = None
-    enough: int | None = None
-    at_least: int | None = None
-    poses_per_group: int = 1
-    n_candidates: int = 0
+    goal: float | None = None  # requested error [m, rad], or None
+    enough: int | None = None  # smallest of the numbers that reaches the goal
+    at_least: int | None = None  # no smaller number of candidates reaches the goal
+    poses_per_group: int = 1  # 1 where each pose counts alone
+    n_candidates: int = 0  # number of candidate poses or pairs
 
     @property
     def counted(self) -> str:

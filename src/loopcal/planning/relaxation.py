@@ -48,25 +48,17 @@ GROWTH = 20.0  # factor from one t to the next
 
 @dataclass(frozen=True, eq=False)
 class RelaxedDesign:
-    """The best design with fractional weights, and its certificate.
+    """The best design with fractional weights, and its certificate."""
 
-    weights : (N,) of sum n; at most 1 without repeats.
-    slopes : (N,) derivatives of the score by the weights; 0 where a group is not allowed.
-    value : of the criterion at these weights.
-    bound : no design of n groups is better than this value.
-    criterion : what is optimized. candidates : the allowed groups.
-    iterations : number of times that candidates entered.
-    converged : whether value and bound agree within the requested gap.
-    """
-
-    weights: FloatArray
+    weights: FloatArray  # (N,) of sum n; at most 1 without repeats
+    # (N,) derivatives of the score by the weights; 0 where a group is not allowed
     slopes: FloatArray
-    value: float
-    bound: float
-    criterion: Criterion
-    candidates: ScaledCandidates
-    iterations: int
-    converged: bool
+    value: float  # of the criterion at these weights
+    bound: float  # no design of n groups is better than this value
+    criterion: Criterion  # what is optimized
+    candidates: ScaledCandidates  # the allowed groups
+    iterations: int  # number of times that candidates entered
+    converged: bool  # whether value and bound agree within the requested gap
 
     @property
     def space(self) -> ObservableSpace:

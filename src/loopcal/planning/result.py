@@ -35,23 +35,16 @@ def round_shortfall(efficiency: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPoses:
-    """Poses in the order of visiting.
+    """Poses in the order of visiting."""
 
-    labels : (m,) names. coordinates : (m, c) controlled coordinates [m, rad].
-    readings : (m, a) actuator readings to command [m, rad].
-    held_out : (m,) True for validation poses.
-    via_home : (m,) True where the path goes via home before the pose.
-    groups : (u, k) indices of the poses that are measured together.
-    path_length : from home through all poses [m], rotations times the robot's size; None where it
-        was not computed.
-    """
-
-    labels: tuple[str, ...]
-    coordinates: FloatArray
-    readings: FloatArray
-    held_out: BoolArray
-    via_home: BoolArray
-    groups: IntArray
+    labels: tuple[str, ...]  # (m,) names
+    coordinates: FloatArray  # (m, c) controlled coordinates [m, rad]
+    readings: FloatArray  # (m, a) actuator readings to command [m, rad]
+    held_out: BoolArray  # (m,) True for validation poses
+    via_home: BoolArray  # (m,) True where the path goes via home before the pose
+    groups: IntArray  # (u, k) indices of the poses that are measured together
+    # from home through all poses [m], rotations times the robot's size; None where it was not
+    # computed
     path_length: float | None = None
 
     def __len__(self) -> int:
@@ -77,49 +70,36 @@ class PlannedPoses:
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """One stop of the machine: a pose of the plan, or home between two poses.
+    """One stop of the machine: a pose of the plan, or home between two poses."""
 
-    label : of the pose, or "home". is_via : only passed through. is_held_out : for validation.
-    coordinates : (c,) controlled coordinates [m, rad]. readings : (a,) of these coordinates [SI].
-    """
-
-    label: str
-    is_via: bool
-    is_held_out: bool
-    coordinates: FloatArray
-    readings: FloatArray
+    label: str  # of the pose, or "home"
+    is_via: bool  # only passed through
+    is_held_out: bool  # for validation
+    coordinates: FloatArray  # (c,) controlled coordinates [m, rad]
+    readings: FloatArray  # (a,) of these coordinates [SI]
 
 
 @dataclass(frozen=True)
 class DesignQuality:
-    """Quality of the poses for the fit.
+    """Quality of the poses for the fit."""
 
-    figures : D, I, A and E, in tolerances.
-    efficiency : lower bound on the efficiency relative to the best possible choice: (ratio of
-        determinants)^(1/p) for D, ratio of variances for I.
-    n_candidates : number of candidate groups; the efficiency holds among them.
-    """
-
-    figures: Mapping[str, float]
+    figures: Mapping[str, float]  # D, I, A and E, in tolerances
+    # lower bound on the efficiency relative to the best possible choice: (ratio of
+    # determinants)^(1/p) for D, ratio of variances for I
     efficiency: float
-    n_candidates: int
+    n_candidates: int  # number of candidate groups; the efficiency holds among them
 
 
 @dataclass(frozen=True)
 class ErrorForecast:
-    """Expected errors of the tool over the workspace.
+    """Expected errors of the tool over the workspace."""
 
-    before : with the prior information only; None where nothing bounds them.
-    random : with as many poses drawn evenly, median of several draws; None where there are too few
-        candidates.
-    after : with the planned poses.
-    frame : point, axes and frame of these errors.
-    """
-
-    before: ExpectedErrors | None
+    before: ExpectedErrors | None  # with the prior information only; None where nothing bounds them
+    # with as many poses drawn evenly, median of several draws; None where there are too few
+    # candidates
     random: ExpectedErrors | None
-    after: ExpectedErrors
-    frame: Finding
+    after: ExpectedErrors  # with the planned poses
+    frame: Finding  # point, axes and frame of these errors
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,18 +64,14 @@ from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_
 
 @dataclass(frozen=True, eq=False)
 class ObservedColumns:
-    """The whitened rows of one kind (one trial).
+    """The whitened rows of one kind (one trial)."""
 
-    residual : (r, m).
-    by_nuisance : (r, m, U) by the nuisance parameters, in units of their standard deviations.
-    by_parameters : (r, m, p) by the machine's deviations, as the nuisance parameters follow it.
-    by_coordinates : (r, links, m, k) by the coordinates of each linked pose; None where poses have
-        none.
-    """
-
-    residual: FloatArray
+    residual: FloatArray  # (r, m)
+    # (r, m, U) by the nuisance parameters, in units of their standard deviations
     by_nuisance: FloatArray
+    # (r, m, p) by the machine's deviations, as the nuisance parameters follow it
     by_parameters: FloatArray
+    # (r, links, m, k) by the coordinates of each linked pose; None where poses have none
     by_coordinates: FloatArray | None
 
 
@@ -121,20 +117,15 @@ def _make_empty(problem: Problem, rows: ObservationRows, width: int) -> Observed
 
 @dataclass(frozen=True, eq=False)
 class BlockErrors:
-    """Errors of the M present measured values, block by block.
+    """Errors of the M present measured values, block by block."""
 
-    residual : (M,) whitened residuals at the truth of the resamples.
-    error : (M,) those at the estimate, corrected for leverage.
-    block : (M,) number of the block of each, ascending. count : of blocks.
-    untested : of every block (M_g, d) an orthonormal basis of the directions without residuals.
-    places : of every kind, where (r, m) its components are among the M; -1 where absent.
-    """
-
-    residual: FloatArray
-    error: FloatArray
-    block: IntArray
-    count: int
+    residual: FloatArray  # (M,) whitened residuals at the truth of the resamples
+    error: FloatArray  # (M,) those at the estimate, corrected for leverage
+    block: IntArray  # (M,) number of the block of each, ascending
+    count: int  # of blocks
+    # of every block (M_g, d) an orthonormal basis of the directions without residuals
     untested: tuple[FloatArray, ...]
+    # of every kind, where (r, m) its components are among the M; -1 where absent
     places: tuple[IntArray, ...]
 
     def draw(
@@ -283,23 +274,18 @@ FALSE_ALARMS = 0.01
 
 @dataclass(frozen=True, eq=False)
 class BlockScatter:
-    """The scatter of blocks, parameter by parameter (p,).
+    """The scatter of blocks, parameter by parameter (p,)."""
 
-    ratio : cluster-robust standard deviation over the one of independent errors; NaN where the data
-        determine none.
-    noise_degrees : degrees of freedom of the part of the variance that the blocks show.
-    degrees : effective degrees of freedom of the whole variance (Welch-Satterthwaite): what a prior
-        contributes is known.
-    tail : probability of a larger ratio for independent errors of the stated size.
-    unit_sd : standard deviations [SI] for rows of unit variance. noise : factor on the stated
-        sigmas that the residuals show; NaN without degrees of freedom.
-    """
-
+    # cluster-robust standard deviation over the one of independent errors; NaN where the data
+    # determine none
     ratio: FloatArray
-    noise_degrees: FloatArray
+    noise_degrees: FloatArray  # degrees of freedom of the part of the variance that the blocks show
+    # effective degrees of freedom of the whole variance (Welch-Satterthwaite): what a prior
+    # contributes is known
     degrees: FloatArray
-    tail: FloatArray
-    unit_sd: FloatArray
+    tail: FloatArray  # probability of a larger ratio for independent errors of the stated size
+    unit_sd: FloatArray  # standard deviations [SI] for rows of unit variance
+    # factor on the stated sigmas that the residuals show; NaN without degrees of freedom
     noise: float
 
     def report(self, names: tuple[str, ...], ratio: FloatArray, blocks: Clusters) -> Finding:

@@ -45,25 +45,21 @@ from loopcal.typing import FloatArray, Progress, report_no_progress
 
 @dataclass(frozen=True, eq=False)
 class PosteriorDensity:
-    """The posterior of a fit in the coordinates v = (y, w) of its linear approximation.
+    """The posterior of a fit in the coordinates v = (y, w) of its linear approximation."""
 
-    fit, linear : the fit and its rows. prior : rows of an earlier calibration with them, or None.
-    decomposition, penalty : of rows divided by s; the penalty is that of a prior, or 0.
-    mean : (p,) of the linear posterior, in tolerances. root : (p, k) E.
-    setup_root : (U, u) T. scale : s. degrees : nu. directions : K.
-    """
-
+    # fit, linear: the fit and its rows
     fit: Identification
     linear: FitLinearization
-    prior: WithPrior | None
+    prior: WithPrior | None  # rows of an earlier calibration with them, or None
+    # decomposition, penalty: of rows divided by s; the penalty is that of a prior, or 0
     decomposition: Decomposition
     penalty: FloatArray
-    mean: FloatArray
-    root: FloatArray
-    setup_root: FloatArray
-    scale: float
-    degrees: float
-    directions: int
+    mean: FloatArray  # (p,) of the linear posterior, in tolerances
+    root: FloatArray  # (p, k) E
+    setup_root: FloatArray  # (U, u) T
+    scale: float  # s
+    degrees: float  # nu
+    directions: int  # K
 
     @property
     def size(self) -> int:

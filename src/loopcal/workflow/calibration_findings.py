@@ -140,16 +140,12 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
 
 @dataclass(frozen=True)
 class OpenFreedoms:
-    """The combinations that data do not determine.
+    """The combinations that data do not determine."""
 
-    motions : of frames by these combinations. count : of all. changing : combinations that may
-        change poses. names : of the parameters in these.
-    """
-
-    motions: FrameMotions
-    count: int
-    changing: tuple[Combination, ...]
-    names: tuple[str, ...]
+    motions: FrameMotions  # of frames by these combinations
+    count: int  # of all
+    changing: tuple[Combination, ...]  # combinations that may change poses
+    names: tuple[str, ...]  # of the parameters in these
 
     @property
     def changing_count(self) -> int:

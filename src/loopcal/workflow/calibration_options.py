@@ -119,17 +119,12 @@ UNKNOWN = np.array(np.inf)  # sigma of readings that may be missing
 
 @dataclass(frozen=True, eq=False)
 class DataSplit:
-    """The two sets of a calibration.
+    """The two sets of a calibration."""
 
-    fitted : measurements to fit. held_out : measurements for validation; None where there are none.
-    share : the share that was asked for; 0 where poses were named, or none were held out.
-    seed : of the random choice.
-    """
-
-    fitted: Measurements
-    held_out: Measurements | None
-    share: float
-    seed: int
+    fitted: Measurements  # measurements to fit
+    held_out: Measurements | None  # measurements for validation; None where there are none
+    share: float  # the share that was asked for; 0 where poses were named, or none were held out
+    seed: int  # of the random choice
 
     def list_repeats(self) -> tuple[str, ...]:
         """Return the labels of held-out poses that repeat a fitted one."""

@@ -42,15 +42,11 @@ FITTED_ERRORS = "Errors at the fitted poses, which are optimistic:"
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from, as far as it is known without files.
+    """Where a result comes from, as far as it is known without files."""
 
-    versions : of loopcal, numpy, scipy and python, and the engine that computed. seeds : by name.
-    options : the options in words.
-    """
-
-    versions: Mapping[str, str]
-    seeds: Mapping[str, int]
-    options: str
+    versions: Mapping[str, str]  # of loopcal, numpy, scipy and python, and the engine that computed
+    seeds: Mapping[str, int]  # by name
+    options: str  # the options in words
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes by name for JSON."""

@@ -36,20 +36,15 @@ FEW = 3  # combinations that change poses and that a summary lists one by one
 
 @dataclass(frozen=True, eq=False)
 class IdentifiabilityReport:
-    """What measurements determine.
+    """What measurements determine."""
 
-    analysis : rank, singular values and a statement on each parameter.
-    suggestions : further measurements for open combinations.
-    subset : a smallest set of parameters; None where it was not asked for.
-    useful : what is determined to a useful accuracy; None where none was stated.
-    is_readings_alone : whether nothing but redundant readings was measured.
-    """
-
-    analysis: Identifiability
-    suggestions: tuple[MeasurementSuggestion, ...]
+    analysis: Identifiability  # rank, singular values and a statement on each parameter
+    suggestions: tuple[MeasurementSuggestion, ...]  # further measurements for open combinations
+    # a smallest set of parameters; None where it was not asked for
     subset: IdentifiableSubset | None
+    # what is determined to a useful accuracy; None where none was stated
     useful: UsefulAccuracy | None = None
-    is_readings_alone: bool = False
+    is_readings_alone: bool = False  # whether nothing but redundant readings was measured
 
     @cached_property
     def summary(self) -> tuple[Finding, ...]:
@@ -149,15 +144,11 @@ ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
 
 @dataclass(frozen=True, eq=False)
 class RobotInspection:
-    """A robot and what it does at home.
+    """A robot and what it does at home."""
 
-    robot : the robot. home_readings : (a,) readings of the actuators at home [SI].
-    findings : notes of the robot file, and limits that home exceeds.
-    """
-
-    robot: Mechanism
-    home_readings: FloatArray
-    findings: tuple[Finding, ...]
+    robot: Mechanism  # the robot
+    home_readings: FloatArray  # (a,) readings of the actuators at home [SI]
+    findings: tuple[Finding, ...]  # notes of the robot file, and limits that home exceeds
 
     def to_dict(self) -> dict[str, Any]:
         """Return the robot by name for JSON, SI."""

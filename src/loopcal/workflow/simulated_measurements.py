@@ -160,24 +160,20 @@ DISTRIBUTIONS: Mapping[str, Callable[[FloatArray], Noise]] = {
 
 @dataclass(frozen=True)
 class InstrumentDescription:
-    """What is known of an instrument before anything is measured.
+    """What is known of an instrument before anything is measured."""
 
-    kinds : names of kinds of measurement. components : coordinates that the kind `component`
-        measures. orientation : form of measured angles; None for the default of the kind.
-    sigma_position, sigma_angle : standard deviations of each length [m] and angle [rad].
-    unknown_frames : of "base" (the frame of the instrument in the base) and "tool".
-    targets : names of targets on the platform whose places are unknown; none leaves the tool.
-    distribution : of simulated noise, one of DISTRIBUTIONS; both have the stated standard
-        deviations. Uniform noise lies within sqrt(3) of them.
-    """
-
-    kinds: Sequence[str] = ("pose",)
-    components: Sequence[str] = ()
-    orientation: str | None = None
+    kinds: Sequence[str] = ("pose",)  # names of kinds of measurement
+    components: Sequence[str] = ()  # coordinates that the kind `component` measures
+    orientation: str | None = None  # form of measured angles; None for the default of the kind
+    # sigma_position, sigma_angle: standard deviations of each length [m] and angle [rad]
     sigma_position: float = 1e-5
     sigma_angle: float = 5e-5
+    # of "base" (the frame of the instrument in the base) and "tool"
     unknown_frames: Sequence[str] = ()
+    # names of targets on the platform whose places are unknown; none leaves the tool
     targets: Sequence[str] = ()
+    # of simulated noise, one of DISTRIBUTIONS; both have the stated standard deviations. Uniform
+    # noise lies within sqrt(3) of them
     distribution: str = "normal"
 
 

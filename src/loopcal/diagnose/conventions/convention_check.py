@@ -242,27 +242,19 @@ FEWEST = 8  # smallest number of equations beyond the fitted parameters that sup
 
 
 class Contradiction(NamedTuple):
-    """Stated setup parameters that the data contradict.
+    """Stated setup parameters that the data contradict."""
 
-    comparison : of the measurements with these parameters estimated. misfit : the remaining misfit.
-    names : of the parameters. values : for each its name, estimate, stated value and certainty.
-    """
-
-    comparison: Comparison
-    misfit: float
-    names: tuple[str, ...]
-    values: tuple[dict[str, Any], ...]
+    comparison: Comparison  # of the measurements with these parameters estimated
+    misfit: float  # the remaining misfit
+    names: tuple[str, ...]  # of the parameters
+    values: tuple[dict[str, Any], ...]  # for each its name, estimate, stated value and certainty
 
 
 class MovedSetups(NamedTuple):
-    """Frames, targets and surfaces that are no longer where a fit located them.
+    """Frames, targets and surfaces that are no longer where a fit located them."""
 
-    names : of those that moved, or of all that may have moved. times : factor by which the errors
-        decrease when they are fitted again.
-    """
-
-    names: tuple[str, ...]
-    times: float
+    names: tuple[str, ...]  # of those that moved, or of all that may have moved
+    times: float  # factor by which the errors decrease when they are fitted again
 
 
 def find_contradiction(stated: Comparison, misfit: float, better: float) -> Contradiction | None:

@@ -68,20 +68,14 @@ Slip = tuple[str, dict[str, Any], Change]  # kind of a slip, what is read differ
 
 @dataclass(frozen=True, eq=False)
 class Interpretation:
-    """One other way to read measurements.
+    """One other way to read measurements."""
 
-    slip : kind of the slip, such as `unit`; its code in the catalog is `conventions.<slip>`.
-    details : what is read differently, such as quantity and factor.
-    source : file or kind that it concerns; empty where it concerns all data.
-    observation : index of the observations; None where the actuator readings are read differently.
-    change : of the measured values, row by row, or of the readings of all poses.
-    """
-
-    slip: str
-    details: Mapping[str, Any]
-    source: str
+    slip: str  # kind of the slip, such as `unit`; its code in the catalog is `conventions.<slip>`
+    details: Mapping[str, Any]  # what is read differently, such as quantity and factor
+    source: str  # file or kind that it concerns; empty where it concerns all data
+    # index of the observations; None where the actuator readings are read differently
     observation: int | None
-    change: Change
+    change: Change  # of the measured values, row by row, or of the readings of all poses
 
     @property
     def parts(self) -> tuple[Interpretation, ...]:

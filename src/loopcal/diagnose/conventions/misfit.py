@@ -80,18 +80,15 @@ class Reach(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Measurements in t interpretations of their values, compared with a robot at its values.
+    """Measurements in t interpretations of their values, compared with a robot at its values."""
 
-    data : the measurements, at poses that the robot reaches. problem : of all interpretations.
-    linearization : at the robot's values; None where the rows do not locate a target.
-    effort : for unknown frames. excluded : labels of the rows of the first interpretation that are
-        far off the others, and that the problem does not contain.
-    """
-
-    data: Measurements
-    problem: Problem
+    data: Measurements  # the measurements, at poses that the robot reaches
+    problem: Problem  # of all interpretations
+    # at the robot's values; None where the rows do not locate a target
     linearization: Linearization | None
-    effort: Effort
+    effort: Effort  # for unknown frames
+    # labels of the rows of the first interpretation that are far off the others, and that the
+    # problem does not contain
     excluded: tuple[str, ...] = ()
 
     @cached_property

@@ -62,15 +62,12 @@ BESIDE = 0.02  # share of the stroke by which readings may be outside: the strok
 
 
 class _Zero(NamedTuple):
-    """Readings `sign q + base + c` of some actuators, with c between two limits.
+    """Readings `sign q + base + c` of some actuators, with c between two limits."""
 
-    columns : of the actuators. sign : 1 or -1. base : (k,) of each of them [m or rad].
-    low, high : of c [m or rad].
-    """
-
-    columns: tuple[int, ...]
-    sign: float
-    base: FloatArray
+    columns: tuple[int, ...]  # of the actuators
+    sign: float  # 1 or -1
+    base: FloatArray  # (k,) of each of them [m or rad]
+    # low, high: of c [m or rad]
     low: float
     high: float
 
@@ -191,12 +188,9 @@ DECLARED = ("frame", "targets", "tool", "anchor")
 
 @dataclass(frozen=True, eq=False)
 class SetupInterpretation(Interpretation):
-    """Measurements some setup items of which are estimated; their values stay as written.
+    """Measurements some setup items of which are estimated; their values stay as written."""
 
-    items : of `DECLARED`, unknown in all kinds that allow them.
-    """
-
-    items: tuple[str, ...] = ()
+    items: tuple[str, ...] = ()  # of `DECLARED`, unknown in all kinds that allow them
 
     def apply(self, data: Measurements) -> Measurements:
         """Return the measurements with these items unknown."""
@@ -265,15 +259,11 @@ class Selection(NamedTuple):
 
 
 class Search(NamedTuple):
-    """A finished search.
+    """A finished search."""
 
-    selection : the interpretation that explains the data; None without one.
-    tried : slip -> number of single interpretations that were tested. pairs : number of pairs.
-    """
-
-    selection: Selection | None
-    tried: dict[str, int]
-    pairs: int
+    selection: Selection | None  # the interpretation that explains the data; None without one
+    tried: dict[str, int]  # slip -> number of single interpretations that were tested
+    pairs: int  # number of pairs
 
 
 class _Test(NamedTuple):

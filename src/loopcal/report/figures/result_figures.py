@@ -520,7 +520,7 @@ def draw_run_errors(comparison: RunComparison, show_unit: Callable[[str], Unit])
             error = of_run.get(quantity)
             if error is not None:
                 axes.bar(k, error.rms / unit.factor_to_si, 0.5, color=COLORS[k % len(COLORS)])
-                axes.plot(k, error.largest / unit.factor_to_si, "o", color="0.2", ms=DOT + 1.0)
+                axes.plot(k, error.max / unit.factor_to_si, "o", color="0.2", ms=DOT + 1.0)
         labels = [shorten(run.run) for run in comparison.errors]
         axes.set_xticks(x, labels, fontsize=SMALL)
         axes.set_xlim(-0.6, len(errors) - 0.4)
