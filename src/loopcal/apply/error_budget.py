@@ -454,9 +454,8 @@ def compute_error_budget(
 ) -> ErrorBudget | None:
     """Compute the uncertainty budget of a calibrated machine.
 
-    fit : an identification. data : the measurements it was made from.
-    frame : in which the errors of poses are stated, see `choose_error_frame`;
-        "relative" means relative to the home pose.
+    frame : in which the errors of poses are stated, see `choose_error_frame`; "relative" means
+        relative to the home pose.
     Returns ErrorBudget; None where the fit has no intervals, or where no pose is reached.
     Raises EstimationError: no such frame.
     """

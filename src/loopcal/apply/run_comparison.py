@@ -388,8 +388,7 @@ def compare_pair(
 ) -> PairComparison:
     """Compare a run with the first one.
 
-    names : of both runs. relation : of their data. tests : number of runs that are compared with
-        the first one.
+    relation : of their data. tests : number of runs that are compared with the first one.
     """
     words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
     if relation.kind == "same":

@@ -180,10 +180,8 @@ def check_clusters(
     The clusters are the largest independent units of which there are enough, see
     `divide_into_clusters`.
 
-    fit : an identification. data : the measurements it was made from.
-    frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means
-        relative to the home pose.
-    linear : of both, where the caller has it, see `linearize_fit`.
+    frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means relative
+        to the home pose.
     """
     check_fitted_data(fit, data)
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)

@@ -208,8 +208,7 @@ def score_leave_one_out(
 ) -> LeaveOneOut:
     """Score methods that keep the columns as they are: ridge, truncation, least squares, MAP.
 
-    robot : linearization point; best the robot of a fit. data : the measurements.
-    methods : at least one.
+    robot : linearization point; best the robot of a fit. methods : at least one.
     Raises EstimationError: the measurements have nuisance parameters.
     """
     free = select_free_parameters(robot)

@@ -280,10 +280,7 @@ class ReadingError:
 def compute_reading_errors(
     fit: Identification, data: Measurements
 ) -> tuple[ReadingError, ...] | None:
-    """Compare recorded readings with the estimated ones; None where the readings are exact.
-
-    fit : an identification. data : the measurements it was made from.
-    """
+    """Compare recorded readings with the estimated ones; None where the readings are exact."""
     if fit.poses is None:
         return None
     robot, estimated, sigma = fit.robot, fit.poses.readings, fit.poses.sigma

@@ -61,10 +61,7 @@ class LackOfFit:
 
 
 def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
-    """Test a fit against the pure error of repeated poses.
-
-    fit : an identification without a loss. data : the measurements it was made from.
-    """
+    """Test a fit against the pure error of repeated poses."""
     if fill_in_reading_sigma(fit.robot, data).reading_sigma is not None:
         return _untested("residuals.repeats-with-uncertain-readings")
     data = exclude_poses(data, fit.options.excluded_poses)

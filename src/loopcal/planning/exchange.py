@@ -65,8 +65,7 @@ def fedorov_exchange(
     """Choose n of N groups by exchange from several starts.
 
     rows : (N, r, o + p) whitened and in tolerances; NaN where a group is not allowed.
-    n : number of groups to choose. criterion : D, I or A. prior : information that exists before.
-    seed : of the random starts; start i always has the same stream. starts : their number.
+    n : number of groups to choose. starts : their number.
     repeats : whether a group may be chosen more than once.
     relaxed : the relaxed design of the same problem. Its rounding is one more start, and random
         starts are drawn with its weights instead of evenly.
@@ -236,9 +235,7 @@ def coordinate_exchange(
         the other groups valid.
     design0 : (u, c) coordinates to start from.
     levels : for each of the c coordinates its allowed values (k,); none for one that stays.
-    criterion : D, I or A. prior : information that exists before.
-    sweeps : largest number of passes over all coordinates. progress : receives the coordinates
-        that are done.
+    sweeps : largest number of passes over all coordinates.
     Returns MovedDesign; the same for the same arguments.
     Raises EstimationError: a group of the first design is not allowed, or the groups cannot
         determine the unknowns.
@@ -366,8 +363,7 @@ def choose_design(
     """Choose n of N groups, with a certificate.
 
     rows, n, criterion, prior, seed, repeats, first : see `fedorov_exchange`.
-    perturbations : their number; default PERTURBATIONS / n.
-    gap : of the relaxation. progress : receives the perturbations that are done.
+    perturbations : their number; default PERTURBATIONS / n. gap : of the relaxation.
     Raises EstimationError: n groups cannot determine the unknowns, or fewer are allowed than
         requested.
     """

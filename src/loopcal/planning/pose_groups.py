@@ -379,9 +379,8 @@ def add_informative_groups(
 ) -> IntArray:
     """Return members (M, k) of at most `most` further groups of the most informative poses.
 
-    rows : (N, r, c) of groups, whitened and in tolerances; NaN where not allowed. members : (N, k)
-        their poses.
-    poses : number of candidate poses.
+    rows : (N, r, c) of groups, whitened and in tolerances; NaN where not allowed.
+    members : (N, k) their poses.
     """
     good, k, c = is_allowed(rows), members.shape[1], rows.shape[2]
     if not good.any():

@@ -81,10 +81,9 @@ def relax_design(
     """Return the best fractional weights and the bound.
 
     rows : (N, r, o + p) whitened and in tolerances; NaN where a group is not allowed.
-    n : number of groups of the design. criterion : D, I or A.
-    prior : information that exists before. gap : of the efficiency at which to stop.
-    repeats : whether a group may be measured more than once. Without, weights are at most 1 and
-        the bound is tighter.
+    n : number of groups of the design. gap : of the efficiency at which to stop.
+    repeats : whether a group may be measured more than once. Without, weights are at most 1 and the
+        bound is tighter.
     Returns RelaxedDesign; the bound holds whether or not the gap was reached.
     Raises EstimationError: n groups cannot determine the unknowns, or fewer are allowed than
         requested.

@@ -59,7 +59,6 @@ def simulate_measurements(
     reading_sigma : (a,) [SI] noise of the recorded readings; None as the robot states.
     labels : (n,) names of the poses, which are numbered without them.
     places : (n,) places of the poses such as `poses.csv:12`, for messages.
-    seed : of poses, errors and noise.
     skip_unreachable : leave out poses outside the reach or the strokes of the nominal or the true
         machine, and name them in the result. Poses without names keep their numbers.
     Raises MechanismError, DataError: the robot states no workspace, or a pose is outside its reach
