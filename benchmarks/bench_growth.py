@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, time_once
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.compensation import compensate
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.data.measurement_writer import save_measurements
@@ -21,8 +23,6 @@ from loopcal.measure.kinds.poses import Component
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.model import Mechanism
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
 
 UM = 1e-6
 ROWS, FEW, MANY = 100_000, 10_000, 40_000

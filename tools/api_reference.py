@@ -21,14 +21,12 @@ from tools.markdown import format_table
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "api.md"
 
 SECTIONS = {
-    "loopcal.workflow": "Whole tasks",
+    "loopcal.apply": "Whole tasks, and use of a calibration",
     "loopcal.io": "Files",
     "loopcal.mechanism": "Robots and kinematics",
     "loopcal.measure": "Instruments and measurements",
     "loopcal.estimate": "Estimation",
-    "loopcal.diagnose": "Diagnosis",
-    "loopcal.apply": "Use of a calibration",
-    "loopcal.sampling": "Resampling and posterior draws",
+    "loopcal.diagnose": "Diagnosis, resampling and posterior draws",
     "loopcal.planning": "Planning",
     "loopcal.studies": "Simulation studies",
     "loopcal.documents": "Documents",

@@ -7,6 +7,9 @@ from .apply.accuracy import PoseUncertainty as PoseUncertainty
 from .apply.accuracy import accuracy_map as accuracy_map
 from .apply.accuracy import pose_uncertainty as pose_uncertainty
 from .apply.accuracy import simulate_accuracy as simulate_accuracy
+from .apply.calibration import calibrate as calibrate
+from .apply.calibration_options import CalibrationOptions as CalibrationOptions
+from .apply.calibration_report import CalibrationReport as CalibrationReport
 from .apply.compensation import Compensation as Compensation
 from .apply.compensation import compensate as compensate
 from .apply.conformity import Conformity as Conformity
@@ -19,6 +22,9 @@ from .apply.run_comparison import RunComparison as RunComparison
 from .apply.run_comparison import compare_runs as compare_runs
 from .apply.validation import Validation as Validation
 from .apply.validation import validate as validate
+from .apply.verdict import Verdict as Verdict
+from .diagnose.bootstrap import Bootstrap as Bootstrap
+from .diagnose.bootstrap import bootstrap as bootstrap
 from .diagnose.conventions.convention_check import ConventionCheck as ConventionCheck
 from .diagnose.conventions.convention_check import check_conventions as check_conventions
 from .diagnose.conventions.convention_check import compare_conventions as compare_conventions
@@ -30,9 +36,16 @@ from .diagnose.fit_examination import FitExamination as FitExamination
 from .diagnose.fit_examination import examine_fit as examine_fit
 from .diagnose.identifiable_parameters import Identifiability as Identifiability
 from .diagnose.identifiable_parameters import identifiability as identifiability
+from .diagnose.intervals import Intervals as Intervals
+from .diagnose.joint_regions import JointRegion as JointRegion
+from .diagnose.joint_regions import SimultaneousIntervals as SimultaneousIntervals
+from .diagnose.joint_regions import compute_joint_region as compute_joint_region
+from .diagnose.joint_regions import compute_simultaneous_intervals as compute_simultaneous_intervals
 from .diagnose.outliers import OutlierCheck as OutlierCheck
 from .diagnose.outliers import find_outliers as find_outliers
 from .diagnose.parameter_subset import choose_identifiable_subset as choose_identifiable_subset
+from .diagnose.posterior_sample import PosteriorSample as PosteriorSample
+from .diagnose.posterior_sample import sample_posterior as sample_posterior
 from .diagnose.regularization_curves import RegularizationCurves as RegularizationCurves
 from .diagnose.regularization_curves import (
     compute_regularization_curves as compute_regularization_curves,
@@ -132,15 +145,6 @@ from .planning.plane_line_planning import plan_surfaces as plan_surfaces
 from .planning.pose_planning import plan as plan
 from .planning.result import Plan as Plan
 from .progress_bar import ProgressBar as ProgressBar
-from .sampling.bootstrap import Bootstrap as Bootstrap
-from .sampling.bootstrap import bootstrap as bootstrap
-from .sampling.intervals import Intervals as Intervals
-from .sampling.joint_regions import JointRegion as JointRegion
-from .sampling.joint_regions import SimultaneousIntervals as SimultaneousIntervals
-from .sampling.joint_regions import compute_joint_region as compute_joint_region
-from .sampling.joint_regions import compute_simultaneous_intervals as compute_simultaneous_intervals
-from .sampling.posterior_sample import PosteriorSample as PosteriorSample
-from .sampling.posterior_sample import sample_posterior as sample_posterior
 from .studies.execution.executors import Dask as Dask
 from .studies.execution.executors import Processes as Processes
 from .studies.execution.executors import Ray as Ray
@@ -149,9 +153,5 @@ from .studies.files.study_file import load_study as load_study
 from .studies.results.study_result import StudyResult as StudyResult
 from .studies.running import study as study
 from .studies.specification.study import Study as Study
-from .workflow.calibration import calibrate as calibrate
-from .workflow.calibration_options import CalibrationOptions as CalibrationOptions
-from .workflow.calibration_report import CalibrationReport as CalibrationReport
-from .workflow.verdict import Verdict as Verdict
 
 __version__: str

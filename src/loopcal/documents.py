@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
@@ -41,7 +42,6 @@ from loopcal.report.document.other_documents import (
     build_robot_view,
 )
 from loopcal.report.validation_view import tabulate_comparison
-from loopcal.workflow.calibration_report import CalibrationReport
 
 # --- Records of calibrations from reports in memory and from run folders, with controllers'
 # values.

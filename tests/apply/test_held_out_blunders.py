@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.validation import validate
+from loopcal.apply.verdict import Verdict
 from loopcal.diagnose.blunders import check_held_out_rows
 from loopcal.estimate.fit_linearization import collect_uncertainty
 from loopcal.estimate.identification import identify
@@ -20,9 +23,6 @@ from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
-from loopcal.workflow.verdict import Verdict
 from tests.estimate.problems import UM
 from tests.findings.expectations import get_finding, list_codes
 

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.validation import report_reused_rows
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import exclude_poses
@@ -27,8 +29,6 @@ from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import simulate
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
 from tests.estimate.problems import hexapod, hexapod_data
 from tests.findings.expectations import expect_refusal, list_codes
 

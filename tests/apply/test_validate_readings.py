@@ -6,7 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions, split_data
 from loopcal.apply.validation import validate
+from loopcal.apply.verdict import Verdict
 from loopcal.errors import DataError, FileError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
@@ -20,9 +23,6 @@ from loopcal.measure.observations import Observations
 from loopcal.measure.simulation import simulate
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.validation_view import view_validation
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions, split_data
-from loopcal.workflow.verdict import Verdict
 from tests.estimate.problems import UM, hexapod, hexapod_data, hexapod_poses
 from tests.estimate.uncertain_reading_problems import build_hexapod_with_seven_legs
 from tests.findings.expectations import get_finding, list_codes

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from loopcal.apply.calibration import calibrate
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError
 from loopcal.io.data.measurement_file import load_measurements
@@ -15,7 +16,6 @@ from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.simulation import simulate
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.workflow.calibration import calibrate
 
 
 @pytest.fixture

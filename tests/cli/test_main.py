@@ -69,7 +69,7 @@ UNUSED = {
         "numpy.testing",
     ),
     *("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.sparse", "scipy.linalg"),
-    *("loopcal.planning", "loopcal.sampling", "loopcal.studies", "loopcal.documents"),
+    *("loopcal.planning", "loopcal.diagnose", "loopcal.studies", "loopcal.documents"),
     *("loopcal.report.figures", "loopcal.mechanism.families.limbs", "loopcal.apply.compensation"),
     *("loopcal.diagnose.cross_validation", "loopcal.apply.run_comparison"),
     *("loopcal.mechanism.chains", "loopcal.mechanism.actuation"),

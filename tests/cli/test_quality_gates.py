@@ -80,7 +80,7 @@ def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
         code = "residuals.calibrated-out-of-reach"
         raise DataError(report_finding(code, robot="hexapod-42", poses=10, before=10, after=0))
 
-    monkeypatch.setattr("loopcal.workflow.calibration.validate", raise_data_error)
+    monkeypatch.setattr("loopcal.apply.calibration.validate", raise_data_error)
     assert (
         main(["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()]) == 2
     )

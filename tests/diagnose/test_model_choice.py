@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.diagnose.cross_validation import (
     choose_model,
     cross_validate,
@@ -21,8 +23,6 @@ from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.simulation import simulate
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, tracker
 

@@ -11,12 +11,12 @@ from evidence.assumptions.cases import SETUPS, Case
 from evidence.assumptions.simulation import simulate_case
 from loopcal import load_robot
 from loopcal.apply.accuracy import pose_uncertainty
+from loopcal.diagnose.bootstrap import bootstrap
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.recalibration import recalibrate
 from loopcal.mechanism.solutions import forward
-from loopcal.sampling.bootstrap import bootstrap
 from tests.estimate.dense_delta import TOLERANCE, differentiate, fit_delta, locate_nozzle
 
 SETUP, ROBOT = SETUPS["linear-delta"], load_robot("linear-delta")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply.calibration_options import split_data
 from loopcal.errors import DataError, FileError
 from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements
 from loopcal.io.data.measurement_writer import save_measurements
@@ -17,7 +18,6 @@ from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import simulate
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.workflow.calibration_options import split_data
 
 POSES = 24
 HELD_OUT = ("3", "7", "11", "19", "20")

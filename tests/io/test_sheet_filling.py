@@ -13,6 +13,12 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
+from loopcal.apply.simulated_measurements import (
+    InstrumentDescription,
+    build_instrument,
+    place_targets,
+    simulate_measurements,
+)
 from loopcal.cli.entry_point import main
 from loopcal.cli.options import SHIPPED_PROFILES
 from loopcal.diagnose.conventions.convention_check import check_conventions
@@ -30,12 +36,6 @@ from loopcal.io.exports.sheet_filling import fill_sheet, save_filled_sheet
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
-from loopcal.workflow.simulated_measurements import (
-    InstrumentDescription,
-    build_instrument,
-    place_targets,
-    simulate_measurements,
-)
 
 TARGETS = ("SMR1", "SMR2", "SMR3")
 N = 14

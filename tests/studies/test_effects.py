@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import loopcal as lc
+from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
 from loopcal.measure.instrument import Gaussian, Uniform, make_random_stream
 from loopcal.measure.simulation import Disturbance, sample_truth, simulate_trials
 from loopcal.mechanism.kinematics import forward_trials
@@ -20,7 +21,6 @@ from loopcal.studies.simulation.preparation import (
 )
 from loopcal.studies.specification.levels import Backlash, EffectsLevel, Outliers, ThermalGrowth
 from loopcal.units import Dimension
-from loopcal.workflow.simulated_measurements import InstrumentDescription, build_instrument
 from tests.studies.studies import compute_cells, make_study
 
 SIGMA = np.array([1e-5, 2e-5])

@@ -134,7 +134,7 @@ class PoseShare(click.types.FloatParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the share, or fail with what is allowed and what was probably meant."""
-        from loopcal.workflow.calibration_options import describe_wrong_share
+        from loopcal.apply.calibration_options import describe_wrong_share
 
         try:
             share = float(value)
@@ -627,7 +627,7 @@ def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) 
     DataError
         Options that contradict each other, or an unknown kind, frame or component.
     """
-    from loopcal.workflow.simulated_measurements import (
+    from loopcal.apply.simulated_measurements import (
         InstrumentDescription,
         build_instrument,
         place_targets,

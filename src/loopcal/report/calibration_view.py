@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.apply.compensation import ROUNDING, Compensation
 from loopcal.apply.height_errors import HeightErrors
+from loopcal.apply.inspection import IdentifiabilityReport
 from loopcal.diagnose.parameter_subset import UsefulAccuracy
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
@@ -40,8 +42,6 @@ from loopcal.report.validation_view import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
-from loopcal.workflow.calibration_report import CalibrationReport
-from loopcal.workflow.inspection import IdentifiabilityReport
 
 if TYPE_CHECKING:
     from loopcal.diagnose.cross_validation import ModelChoice

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.apply.accuracy import COMPONENTS, AccuracyMap, AccuracySimulation, PoseUncertainty
+from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.apply.compensation import Compensation
 from loopcal.apply.conformity import Conformity
 from loopcal.apply.error_budget import ErrorBudget
@@ -21,10 +22,14 @@ from loopcal.apply.height_errors import HeightErrors
 from loopcal.apply.repeatability import DIMENSIONS, Repeatability
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import Validation
+from loopcal.diagnose.bootstrap import Bootstrap
 from loopcal.diagnose.cross_validation import CrossValidation, ModelChoice
 from loopcal.diagnose.fit_examination import FitExamination
 from loopcal.diagnose.identifiable_parameters import Identifiability
+from loopcal.diagnose.intervals import Intervals
+from loopcal.diagnose.joint_regions import JointRegion, SimultaneousIntervals
 from loopcal.diagnose.outliers import OutlierCheck
+from loopcal.diagnose.posterior_sample import PosteriorSample
 from loopcal.diagnose.regularization_curves import RegularizationCurves
 from loopcal.diagnose.value_comparison import ValueComparison
 from loopcal.estimate.free_parameters import FreeParameters
@@ -61,12 +66,7 @@ from loopcal.report.validation_view import (
     view_repeatability,
     view_validation,
 )
-from loopcal.sampling.bootstrap import Bootstrap
-from loopcal.sampling.intervals import Intervals
-from loopcal.sampling.joint_regions import JointRegion, SimultaneousIntervals
-from loopcal.sampling.posterior_sample import PosteriorSample
 from loopcal.units import SI_SYMBOLS
-from loopcal.workflow.calibration_report import CalibrationReport
 
 # --- Paragraphs and tables as HTML for notebooks.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal import geometry
+from loopcal.apply.inspection import RobotInspection
 from loopcal.findings.wording import name_count
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import TRIANGLE_TERMS, WEIGHT, compute_range
@@ -26,7 +27,6 @@ from loopcal.report.tables import (
     word_column,
 )
 from loopcal.units import Dimension, Unit
-from loopcal.workflow.inspection import RobotInspection
 
 if TYPE_CHECKING:
     from loopcal.mechanism.assembly import Actuator, Address

@@ -12,6 +12,10 @@ import numpy as np
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
 from loopcal.apply.run_comparison import PairComparison, RunComparison, RunSummary
 from loopcal.apply.validation import FEW_ROWS, ErrorChange, Validation
+from loopcal.diagnose.bootstrap import Bootstrap
+from loopcal.diagnose.intervals import Intervals
+from loopcal.diagnose.joint_regions import JointRegion, SimultaneousIntervals
+from loopcal.diagnose.posterior_sample import PosteriorSample
 from loopcal.diagnose.regularization_curves import RegularizationCurve, RegularizationCurves
 from loopcal.diagnose.row_errors import METRICS, SUMMARY, Statistics
 from loopcal.estimate.result import Identification
@@ -32,10 +36,6 @@ from loopcal.report.tables import (
     units_of,
     word_column,
 )
-from loopcal.sampling.bootstrap import Bootstrap
-from loopcal.sampling.intervals import Intervals
-from loopcal.sampling.joint_regions import JointRegion, SimultaneousIntervals
-from loopcal.sampling.posterior_sample import PosteriorSample
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
+from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.estimate.trial_identification import check_threads
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
@@ -25,9 +28,6 @@ from loopcal.studies.simulation.fits import refuse_per_leg
 from loopcal.studies.specification.levels import FACTORS
 from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
-from loopcal.workflow.calibration_report import CalibrationReport
 
 
 def study(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
+from loopcal.apply.calibration import calibrate
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import list_shipped_robots
@@ -26,7 +27,6 @@ from loopcal.mechanism.singularities import analyze_singularity
 from loopcal.mechanism.solutions import forward, inverse, jacobian
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.workflow.calibration import calibrate
 from tests.jacobians import central_difference, check_jacobian, compile_quickly
 from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot

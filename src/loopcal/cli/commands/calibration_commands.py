@@ -134,6 +134,8 @@ def calibrate(
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
       loopcal calibrate robot.yaml samples.csv -o run --compare published.yaml
     """  # noqa: D301
+    from loopcal.apply.calibration import calibrate
+    from loopcal.apply.calibration_options import CalibrationOptions
     from loopcal.io.robot.robot_file import load_robot, load_stored_values
     from loopcal.io.runs.run_folder import (
         build_document,
@@ -143,8 +145,6 @@ def calibrate(
         save_run,
     )
     from loopcal.report.calibration_view import view_calibration
-    from loopcal.workflow.calibration import calibrate
-    from loopcal.workflow.calibration_options import CalibrationOptions
 
     inputs = _list_inputs(robot, data, prior, compare)
     machine = load_robot(robot)

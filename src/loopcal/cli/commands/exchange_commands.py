@@ -35,11 +35,11 @@ from loopcal.errors import DataError
 from loopcal.units import Dimension, find_unit, list_symbols
 
 if TYPE_CHECKING:
+    from loopcal.apply.calibration_report import CalibrationReport
     from loopcal.findings import Finding
     from loopcal.io.formats.program_format import Format, Imported, ImportOptions
     from loopcal.mechanism.model import Mechanism
     from loopcal.report.tables import Block
-    from loopcal.workflow.calibration_report import CalibrationReport
 
 
 # --- `loopcal gcode` and `loopcal fill`: from a plan to the machine, and from the export of an
@@ -472,12 +472,12 @@ def _correct_file(
     source: Format, robot: Mechanism, file: Path, data: Path, output: Path, force: bool
 ) -> _Correction:
     """Calibrate with the imported measurements, and write the corrected file."""
+    from loopcal.apply.calibration import calibrate
     from loopcal.findings import report_finding
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import export_robot
     from loopcal.io.formats.program_format import ExportSource
     from loopcal.io.runs.run_folder import list_reasons
-    from loopcal.workflow.calibration import calibrate
 
     report = calibrate(robot, read_measurements([data], robot))
     print_convention_note(report.conventions, [data])

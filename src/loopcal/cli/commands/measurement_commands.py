@@ -43,10 +43,10 @@ from loopcal.cli.options import (
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
+    from loopcal.apply.inspection import IdentifiabilityReport
+    from loopcal.apply.simulated_measurements import SimulatedMeasurements
     from loopcal.diagnose.parameter_subset import IdentifiableSubset
     from loopcal.mechanism.model import Mechanism
-    from loopcal.workflow.inspection import IdentifiabilityReport
-    from loopcal.workflow.simulated_measurements import SimulatedMeasurements
 
 
 DETAILS = "the first combinations, the singular values and a table of all parameters"
@@ -120,12 +120,12 @@ def identifiability(
       loopcal identifiability hexapod-42 --poses poses.csv --measure x,y,z --sigma-position 5um
       loopcal identifiability hexapod-42 measurements.csv --useful 1um
     """  # noqa: D301
+    from loopcal.apply.inspection import analyze_identifiability
+    from loopcal.apply.simulated_measurements import predict_noise_free
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
     from loopcal.numerics.decomposition import RANK_TOLERANCE
     from loopcal.report.calibration_view import view_identifiability
-    from loopcal.workflow.inspection import analyze_identifiability
-    from loopcal.workflow.simulated_measurements import predict_noise_free
 
     if data:
         _refuse_beside_data(poses)
@@ -275,11 +275,11 @@ def simulate(
       loopcal simulate hexapod-42 --sigma-position 0.6um --distribution uniform -o measurements.csv
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
     """  # noqa: D301
+    from loopcal.apply.simulated_measurements import simulate_measurements
     from loopcal.findings import report_finding
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.data.measurement_writer import save_measurements
     from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
-    from loopcal.workflow.simulated_measurements import simulate_measurements
 
     refuse_outputs((output, truth), (find_robot_file(robot), poses, fill), force)
     machine = load_robot(robot)
@@ -342,6 +342,7 @@ def _fill_in(
     robot: Mechanism, sheet: Path, draw_errors: bool, seed: int
 ) -> tuple[SimulatedMeasurements, str]:
     """Return the filled-in data of a plan, and what they are."""
+    from loopcal.apply.simulated_measurements import fill_in_contacts, fill_in_measurements
     from loopcal.io.data.measurement_file import (
         has_empty_readings,
         load_contact_sheet,
@@ -350,7 +351,6 @@ def _fill_in(
     )
     from loopcal.io.runs.plan_folder import find_plan_sheet
     from loopcal.measure.kinds.joints import Closure
-    from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
     refuse_given(
         ("poses", "draw", *DESCRIPTION[3:], "distribution", "sigma_reading", "skip_unreachable"),

@@ -104,10 +104,10 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
       loopcal check linear-delta --expand
       loopcal check 3-prs --plot 3-prs.png
     """  # noqa: D301
+    from loopcal.apply.inspection import inspect_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_bytes
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
-    from loopcal.workflow.inspection import inspect_robot
 
     refuse_outputs((plot,), (find_robot_file(robot),), force)
     inspection = inspect_robot(load_robot(robot))

@@ -32,13 +32,13 @@ from loopcal.errors import EstimationError, LoopcalError
 from loopcal.findings import report_finding
 
 if TYPE_CHECKING:
+    from loopcal.diagnose.bootstrap import Bootstrap
+    from loopcal.diagnose.intervals import Intervals
+    from loopcal.diagnose.posterior_sample import PosteriorSample
     from loopcal.estimate.result import Identification
     from loopcal.io.runs.run_folder import Run
     from loopcal.measure.measurements import Measurements
     from loopcal.report.tables import Block
-    from loopcal.sampling.bootstrap import Bootstrap
-    from loopcal.sampling.intervals import Intervals
-    from loopcal.sampling.posterior_sample import PosteriorSample
     from loopcal.typing import FloatArray
 
 
@@ -208,8 +208,8 @@ def bootstrap(
       loopcal bootstrap run --unit session --count 2000 -o draws.csv
       loopcal bootstrap hexapod-42 measurements.csv --method ls
     """  # noqa: D301
+    from loopcal.diagnose.bootstrap import bootstrap as resample
     from loopcal.report.validation_view import view_bootstrap
-    from loopcal.sampling.bootstrap import bootstrap as resample
 
     _refuse_output(output, source, data, force)
     fit, measurements = load_fit(source, data, options)
@@ -280,8 +280,8 @@ def sample(
       loopcal sample linear-delta measurements.csv --method map
       loopcal sample run --region -p radius -p 'tower*.angle'
     """  # noqa: D301
+    from loopcal.diagnose.posterior_sample import sample_posterior
     from loopcal.report.validation_view import view_posterior
-    from loopcal.sampling.posterior_sample import sample_posterior
 
     if region:
         refuse_given(("count", "seed", "output", "force"), "with --region")
@@ -307,9 +307,9 @@ def _show_region(
     as_json: bool,
 ) -> None:
     """Print simultaneous intervals, and the joint region of parameters that were named."""
+    from loopcal.diagnose.joint_regions import compute_joint_region, compute_simultaneous_intervals
     from loopcal.io.runs.run_folder import load_run
     from loopcal.report.validation_view import view_region
-    from loopcal.sampling.joint_regions import compute_joint_region, compute_simultaneous_intervals
 
     if data:
         posterior = load_fit(source, data, options)[0].posterior

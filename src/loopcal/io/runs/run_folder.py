@@ -53,11 +53,11 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.presentation import HtmlResult
 
 if TYPE_CHECKING:
+    from loopcal.apply.calibration_report import CalibrationReport
     from loopcal.estimate.fit_linearization import FitUncertainty
     from loopcal.estimate.posterior import Posterior
     from loopcal.measure.fitted_rows import FittedRows
     from loopcal.measure.measurements import Measurements
-    from loopcal.workflow.calibration_report import CalibrationReport
 
 
 # --- Whether the numbers of a run may be written for a machine: corrected robot, controller,

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from loopcal.apply.verdict import Verdict
 from loopcal.report.calibration_view import (
     build_budget_table,
     build_height_map,
@@ -42,7 +43,6 @@ from loopcal.report.validation_view import (
     view_error_statistics,
     view_errors,
 )
-from loopcal.workflow.verdict import Verdict
 
 # --- Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
 

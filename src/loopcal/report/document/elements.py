@@ -20,6 +20,7 @@ import numpy as np
 
 from loopcal.apply.height_errors import HeightErrors, restore_heights
 from loopcal.apply.validation import Validation, restore_validation
+from loopcal.apply.verdict import Verdict
 from loopcal.estimate.posterior import Posterior, posterior_from_arrays
 from loopcal.estimate.result import KindResiduals, residuals_from_arrays
 from loopcal.mechanism.model import Mechanism
@@ -27,7 +28,6 @@ from loopcal.plain_text import escape
 from loopcal.report.scene.scene import load_script
 from loopcal.report.tables import Table
 from loopcal.serialization import restore_numbers
-from loopcal.workflow.verdict import Verdict
 
 if TYPE_CHECKING:
     from jinja2 import Template

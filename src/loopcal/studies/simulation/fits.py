@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.apply.accuracy import combine_errors, expand_length, pose_uncertainty, transport
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
+from loopcal.apply.verdict import Verdict
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.error_frames import FITTED, ReferencePoses, refer_errors
 from loopcal.diagnose.frame_motions import twist_weights
@@ -41,9 +44,6 @@ from loopcal.studies.simulation.machines import make_method
 from loopcal.studies.simulation.preparation import PreparedCell
 from loopcal.studies.specification.levels import MethodLevel
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
-from loopcal.workflow.verdict import Verdict
 
 # --- Calibrate the trials of a block by the methods of published studies, without uncertainties.
 

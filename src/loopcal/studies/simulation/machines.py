@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from msgspec import convert
 
+from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.estimate.losses import Huber, Loss, Tukey
 from loopcal.estimate.options import FitOptions
@@ -56,7 +57,6 @@ from loopcal.studies.specification.levels import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import parse_quantity
-from loopcal.workflow.simulated_measurements import InstrumentDescription, build_instrument
 
 KEPT_ROBOTS = 8
 """Robots that a process keeps; building one takes as long as fitting a few of its machines."""

@@ -6,6 +6,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from loopcal.apply.calibration_findings import (
+    check_split_instruments,
+    report_conventions,
+    report_fit,
+    report_freedoms,
+    report_repeats,
+    report_scale,
+    report_unexplained,
+    report_validation,
+)
+from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
+from loopcal.apply.calibration_report import CalibrationReport, describe_provenance
 from loopcal.apply.error_budget import compute_error_budget
 from loopcal.apply.height_errors import map_height_errors
 from loopcal.apply.validation import Validation, validate
@@ -30,18 +42,6 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
-from loopcal.workflow.calibration_findings import (
-    check_split_instruments,
-    report_conventions,
-    report_fit,
-    report_freedoms,
-    report_repeats,
-    report_scale,
-    report_unexplained,
-    report_validation,
-)
-from loopcal.workflow.calibration_options import CalibrationOptions, DataSplit, split_data
-from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 
 if TYPE_CHECKING:
     from loopcal.diagnose.cross_validation import ModelChoice

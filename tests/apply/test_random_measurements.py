@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
+from loopcal.apply.verdict import Verdict
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
-from loopcal.workflow.verdict import Verdict
 
 TARGETS = ("A", "B", "C")
 HEADER = """# format: 1

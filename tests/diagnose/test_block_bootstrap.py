@@ -9,6 +9,7 @@ from scipy.linalg import sqrtm
 from scipy.optimize import least_squares
 
 import loopcal as lc
+from loopcal.diagnose.bootstrap import compute_block_errors
 from loopcal.diagnose.cluster_covariance import Clusters
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import linearize_fit
@@ -16,7 +17,6 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.prior import prior_from
 from loopcal.estimate.resampling import Resamples, fit_resamples
-from loopcal.sampling.bootstrap import compute_block_errors
 from tests.diagnose.test_cluster_covariance import (
     EIGHT_TARGETS,
     KNOWN_POSE,

@@ -6,8 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from loopcal.apply.calibration_options import DataSplit
 from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation import FEW_ROWS, Validation
+from loopcal.apply.verdict import BASE_MOVED
 from loopcal.diagnose.conventions.convention_check import ConventionCheck
 from loopcal.diagnose.frame_motions import FrameMotions, find_frame_motions
 from loopcal.estimate.null_space import Combination
@@ -18,8 +20,6 @@ from loopcal.measure.kinds.joints import Closure
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import check_instruments
 from loopcal.units import Dimension
-from loopcal.workflow.calibration_options import DataSplit
-from loopcal.workflow.verdict import BASE_MOVED
 
 # Finding that a calibration is not expected to improve on the tolerances.
 NO_GAIN = "model.no-expected-gain"

@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions, split_data
+from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.observation_rows import BLOCK, EXACT_BLOCK
@@ -23,9 +26,6 @@ from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.simulation import sample_truth, simulate
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions, split_data
-from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
 from tests.estimate.problems import hexapod, hexapod_data
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.apply.calibration_options import CalibrationOptions, DataSplit
 from loopcal.apply.height_errors import store_heights
 from loopcal.apply.validation import store_differences
+from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict, recommend_values
 from loopcal.engine import collect_versions
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
@@ -20,8 +22,6 @@ from loopcal.measure.observations import InstrumentRecord, list_instruments
 from loopcal.mechanism.model import Mechanism
 from loopcal.presentation import TableResult
 from loopcal.serialization import to_json
-from loopcal.workflow.calibration_options import CalibrationOptions, DataSplit
-from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict, recommend_values
 
 if TYPE_CHECKING:
     from loopcal.apply.error_budget import ErrorBudget

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 import loopcal as lc
+from loopcal.apply.verdict import Verdict
 from loopcal.diagnose.frame_drift import compare_shapes, estimate_frame_drifts, report_base_targets
 from loopcal.diagnose.frame_motions import interpret_fit
 from loopcal.diagnose.repeated_poses import check_lack_of_fit
@@ -24,7 +25,6 @@ from loopcal.findings import Finding
 from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.workspace import resolve_poses
-from loopcal.workflow.verdict import Verdict
 from tests.estimate.dense_delta import NOMINAL, TOLERANCE, locate_nozzle
 
 ROBOT = lc.load_robot("linear-delta")

@@ -8,6 +8,13 @@ import pytest
 from scipy.stats import genpareto, t
 
 import loopcal as lc
+from loopcal.diagnose import posterior_sample
+from loopcal.diagnose.intervals import (
+    effective_size,
+    fit_tail_shape,
+    normalize_weights,
+    weighted_quantiles,
+)
 from loopcal.errors import EstimationError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
@@ -15,13 +22,6 @@ from loopcal.estimate.prior import prior_from
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import ParameterTable
-from loopcal.sampling import posterior_sample
-from loopcal.sampling.intervals import (
-    effective_size,
-    fit_tail_shape,
-    normalize_weights,
-    weighted_quantiles,
-)
 from tests.diagnose.test_cluster_covariance import THREE_TARGETS, measure
 from tests.estimate.problems import MM, UM, hexapod, hexapod_data
 from tests.estimate.uncertain_reading_problems import simulate_hexapod

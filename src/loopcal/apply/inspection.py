@@ -8,6 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from loopcal.apply.calibration_findings import (
+    is_readings_alone,
+    report_readings_gauge,
+    sort_open_freedoms,
+)
 from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
 from loopcal.diagnose.parameter_subset import (
     IdentifiableSubset,
@@ -25,11 +30,6 @@ from loopcal.mechanism.workspace import evaluate_limits
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray
-from loopcal.workflow.calibration_findings import (
-    is_readings_alone,
-    report_readings_gauge,
-    sort_open_freedoms,
-)
 
 FEW = 3  # combinations that change poses and that a summary lists one by one
 

@@ -13,12 +13,12 @@ import pytest
 from scipy.optimize import least_squares
 
 import loopcal as lc
+from loopcal.apply.inspection import analyze_identifiability
+from loopcal.apply.verdict import Verdict
 from loopcal.diagnose.frame_motions import find_frame_motions
 from loopcal.errors import DataError, FileError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.workflow.inspection import analyze_identifiability
-from loopcal.workflow.verdict import Verdict
 
 ANCHORS = 1e-3 * np.array([[-1800, -1200], [1800, -1200], [1800, 1200], [-1800, 1200.0]])
 SIGMA = 2e-4  # [m] of a reading, as the robot file states

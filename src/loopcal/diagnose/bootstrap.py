@@ -29,6 +29,14 @@ from loopcal.diagnose.cluster_covariance import (
     divide_into_clusters,
 )
 from loopcal.diagnose.influence import TESTABLE
+from loopcal.diagnose.intervals import (
+    NAMED,
+    OFF,
+    Intervals,
+    compare_ends,
+    half_widths,
+    report_intervals,
+)
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
@@ -48,14 +56,6 @@ from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_single_level
 from loopcal.presentation import TableResult
-from loopcal.sampling.intervals import (
-    NAMED,
-    OFF,
-    Intervals,
-    compare_ends,
-    half_widths,
-    report_intervals,
-)
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 # --- Whitened rows of a fit in the order of its kinds, with columns for everything that they

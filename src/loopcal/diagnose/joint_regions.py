@@ -24,6 +24,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from loopcal.diagnose.intervals import half_widths
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.residual_test import LEVEL
@@ -33,7 +34,6 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.statistics import compute_f_quantile, compute_single_level
 from loopcal.presentation import TableResult
-from loopcal.sampling.intervals import half_widths
 from loopcal.typing import FloatArray, IntArray
 
 Rule = Literal["maximum", "sidak", "bonferroni", "scheffe"]  # how simultaneous intervals are made

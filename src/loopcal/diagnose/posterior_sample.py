@@ -15,6 +15,16 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.diagnose.intervals import (
+    OFF,
+    Intervals,
+    compare_ends,
+    effective_size,
+    fit_tail_shape,
+    half_widths,
+    normalize_weights,
+    report_intervals,
+)
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
@@ -28,16 +38,6 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.presentation import TableResult
-from loopcal.sampling.intervals import (
-    OFF,
-    Intervals,
-    compare_ends,
-    effective_size,
-    fit_tail_shape,
-    half_widths,
-    normalize_weights,
-    report_intervals,
-)
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 # --- The exact posterior of a fit, and its linear approximation, at drawn parameters.

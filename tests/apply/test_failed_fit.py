@@ -10,6 +10,10 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
+from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.apply.verdict import Verdict
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.estimate.options import FitOptions
@@ -20,10 +24,6 @@ from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.report.calibration_view import view_calibration, view_fit
 from loopcal.report.tables import render_text
-from loopcal.workflow.calibration import calibrate
-from loopcal.workflow.calibration_options import CalibrationOptions
-from loopcal.workflow.calibration_report import CalibrationReport
-from loopcal.workflow.verdict import Verdict
 from tests.estimate.problems import hexapod, hexapod_data
 
 

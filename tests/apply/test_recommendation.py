@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply.verdict import Verdict, recommend_values
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.row_errors import compute_kind_errors
 from loopcal.estimate.identification import identify
@@ -18,7 +19,6 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
-from loopcal.workflow.verdict import Verdict, recommend_values
 
 SIGMA = 20e-6
 """Noise of the probe [m]."""
