@@ -19,6 +19,7 @@ from loopcal.diagnose.frame_motions import find_frame_motions
 from loopcal.errors import DataError, FileError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
+from loopcal.measure.data_checks import check_duplicates
 
 ANCHORS = 1e-3 * np.array([[-1800, -1200], [1800, -1200], [1800, 1200], [-1800, 1200.0]])
 SIGMA = 2e-4  # [m] of a reading, as the robot file states
@@ -180,7 +181,7 @@ def test_measurements_are_read_as_saved(robot, tmp_path):
     assert [rows.kind.name for rows in read.observations] == ["closure"]
     twice = make_data(robot, readings[[0, 1, 1]])
     with pytest.raises(DataError, match="have the same readings"):
-        lc.measure.check_duplicates(twice)
+        check_duplicates(twice)
 
 
 def test_readings_alone_without_redundancy_are_refused_in_one_sentence(tmp_path):
