@@ -5,22 +5,18 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
-import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from loopcal import optional_packages
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
 from loopcal.threads import use_one_thread
-
-if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
-    from multiprocessing.process import BaseProcess
 
 MOST_LOSSES = 5
 """Workers that one task may stop. After that it is given up, because it stops any worker."""
@@ -136,9 +132,6 @@ class TaskQueue(Generic[T]):
         return Answer(task, result, seconds, self._losses.pop(task.key, 0))
 
 
-# --- Computation in this process, one task after the other.
-
-
 @dataclass(frozen=True)
 class Serial:
     """No workers: this process computes."""
@@ -153,13 +146,49 @@ class Serial:
             yield Answer(task, result, seconds)
 
 
-# --- Worker processes on this computer.
+class WorkerLostError(Exception):
+    """The worker of a task has ended before its answer."""
 
-MOST_FAILED_STARTS = 3
-"""Processes that may end in a row before they are ready. After that none is started."""
 
-LONGEST_STOP = 5.0
-"""Seconds to wait for a worker that was told to stop."""
+class Pool(Protocol):
+    """Workers as `map_in_flight` sees them. A handle stands for a task that was submitted."""
+
+    def count_slots(self) -> int:
+        """Return how many tasks may be in flight now; workers may come and go."""
+        ...
+
+    def submit(self, function: Callable[[T], R], task: T, losses: int) -> Any:
+        """Begin a task that already lost so many workers; return its handle."""
+        ...
+
+    def wait(self, handles: Collection[Any]) -> Iterable[Any]:
+        """Wait until a task has ended; return the handles of those that have."""
+        ...
+
+    def take(self, handle: Any) -> tuple[Any, float]:
+        """Return a result and its seconds; raise WorkerLostError, or what the function raised."""
+        ...
+
+
+def map_in_flight(
+    pool: Pool, function: Callable[[T], R], tasks: Iterable[T | None]
+) -> Generator[Answer[T, R], None, None]:
+    """Keep every slot of a pool filled, and yield answers; see `Executor.map_blocks`."""
+    queue, in_flight = TaskQueue(tasks), dict[Any, T]()
+    while True:
+        while len(in_flight) < pool.count_slots() and (task := queue.take()) is not None:
+            in_flight[pool.submit(function, task, queue.count_losses(task))] = task
+        if not in_flight:
+            return
+        for handle in pool.wait(list(in_flight)):
+            task = in_flight.pop(handle)
+            try:
+                answer = queue.answer(task, *pool.take(handle))
+            except WorkerLostError:
+                if queue.give_back(task):
+                    continue
+                answer = queue.answer(task, None)
+            yield answer
 
 
 @dataclass(frozen=True)
@@ -177,124 +206,78 @@ class Processes:
         self, function: Callable[[T], R], tasks: Iterable[T | None]
     ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks by processes; see `Executor.map_blocks`."""
-        pool = _Pool(function, TaskQueue(tasks), self.workers)
+        pool = _ProcessPool(self.workers)
         try:
-            yield from pool.run()
+            yield from map_in_flight(pool, function, tasks)
         finally:
             pool.stop()
 
 
-@dataclass(eq=False)
-class _Worker(Generic[T]):
-    """A process, our end of its pipe, and its task."""
+class _ProcessPool:
+    """Worker processes of loky, each a pool of one: a lost process costs its own task only."""
 
-    process: BaseProcess
-    connection: Connection
-    is_ready: bool = False
-    task: T | None = None
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._free: list[Any] = []
+        self._busy: dict[Any, Any] = {}
 
+    def count_slots(self) -> int:
+        return self._size
 
-class _Pool(Generic[T, R]):
-    """The workers of one iteration."""
+    def submit(self, function: Callable[[T], R], task: T, losses: int) -> Any:
+        from loky import ProcessPoolExecutor
 
-    def __init__(self, function: Callable[[T], R], queue: TaskQueue[T], size: int) -> None:
-        self._function, self._queue, self._size = function, queue, size
-        self._workers: dict[Connection, _Worker[T]] = {}
-        self._failed_starts = 0
+        worker = (
+            self._free.pop()
+            if self._free
+            else ProcessPoolExecutor(1, initializer=_begin_worker, initargs=(os.getpid(),))
+        )
+        with use_one_thread(), _without_interrupts():  # the first task starts the process
+            future = worker.submit(compute_timed, function, task)
+        self._busy[future] = worker
+        return future
 
-    def run(self) -> Iterator[Answer[T, R]]:
-        """Yield answers until no task is left."""
-        from multiprocessing.connection import wait
+    def wait(self, handles: Collection[Any]) -> Iterable[Any]:
+        from concurrent.futures import FIRST_COMPLETED, wait
 
-        for _ in range(self._size):
-            task = self._queue.take()
-            if task is None and self._queue.is_exhausted:
-                break
-            self._start(task)  # also without a task, as starting takes time
-        while self._workers:
-            for connection in wait(list(self._workers)):
-                worker = self._workers[connection]  # pyright: ignore[reportArgumentType]
-                try:
-                    message = worker.connection.recv()
-                except (EOFError, OSError):  # the process has ended
-                    yield from self._replace(worker)
-                    continue
-                if not worker.is_ready:
-                    worker.is_ready, self._failed_starts = True, 0
-                    if worker.task is not None:
-                        self._send(worker, worker.task)
-                    continue
-                task, worker.task = worker.task, None
-                assert task is not None
-                if isinstance(message, BaseException):
-                    raise message
-                yield self._queue.answer(task, *message)
-            self._give_tasks()
+        return wait(handles, return_when=FIRST_COMPLETED).done
 
-    def _give_tasks(self) -> None:
-        """Give every free worker a task, replace lost ones, and end those that are not needed."""
-        for worker in [w for w in self._workers.values() if w.is_ready and w.task is None]:
-            task = self._queue.take()
-            if task is not None:
-                self._send(worker, task)
-            elif self._queue.is_exhausted:
-                self._forget(worker)
-        while len(self._workers) < self._size and (task := self._queue.take()) is not None:
-            self._start(task)
-        workers = self._workers.values()
-        assert not workers or any(w.task is not None or not w.is_ready for w in workers)
+    def take(self, handle: Any) -> tuple[Any, float]:
+        from loky import BrokenProcessPool
 
-    def _start(self, task: T | None) -> None:
-        """Start a worker for a task, which it receives when it is ready."""
-        from multiprocessing import get_context
-
-        context = get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, self._function), daemon=True)
-        with use_one_thread(), _without_interrupts():
-            process.start()
-        theirs.close()  # so that our end notices when the process ends
-        self._workers[ours] = _Worker(process, ours, task=task)
-
-    def _send(self, worker: _Worker[T], task: T) -> None:
-        """Send a worker its task."""
-        worker.task = task
-        with suppress(OSError):  # it has ended, which the next message shows
-            worker.connection.send(task)
-
-    def _replace(self, worker: _Worker[T]) -> Iterator[Answer[T, R]]:
-        """Forget a worker that has ended, and yield its task where that is given up."""
-        self._forget(worker)
-        task = worker.task
-        if not worker.is_ready:
-            self._failed_starts += 1
-            if self._failed_starts >= MOST_FAILED_STARTS:
-                code = worker.process.exitcode
-                raise StudyError(report_finding("workers.not-started", exit=code))
-            self._start(task)
-        elif task is not None and not self._queue.give_back(task):
-            yield self._queue.answer(task, None)
-
-    def _forget(self, worker: _Worker[T]) -> None:
-        """Close the pipe of a worker, which ends it."""
-        del self._workers[worker.connection]
-        worker.connection.close()
-        worker.process.join(LONGEST_STOP)
+        worker = self._busy.pop(handle)
+        try:
+            answer = handle.result()
+        except BrokenProcessPool as error:
+            worker.shutdown()
+            raise WorkerLostError from error
+        self._free.append(worker)
+        return answer
 
     def stop(self) -> None:
-        """Stop all workers at once."""
-        for worker in self._workers.values():
-            worker.process.kill()
-        for worker in list(self._workers.values()):
-            self._forget(worker)
+        for worker in [*self._free, *self._busy.values()]:
+            worker.shutdown(kill_workers=True)
+
+
+def _begin_worker(driver: int) -> None:
+    """Leave Ctrl-C to the driver, and end with it, however it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(driver,), daemon=True).start()
+
+
+def _end_with(driver: int) -> None:
+    """End this process when its parent is no longer the driver."""
+    while os.getppid() == driver:
+        time.sleep(PERIOD)
+    os._exit(1)
 
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
     """Delay Ctrl-C while a process starts, and keep it from that process.
 
-    A process whose start is interrupted, here or there, prints a traceback. It inherits the blocked
-    signal. Windows cannot block it.
+    A process whose start is interrupted prints a traceback. It inherits the blocked signal. Windows
+    cannot block it.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -304,27 +287,6 @@ def _without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
-    """Compute tasks from a pipe until its other end closes: the work of a worker process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with suppress(EOFError, OSError):
-        connection.send("ready")
-        while True:
-            connection.send(_compute(function, connection.recv()))
-
-
-def _compute(function: Callable[[Any], Any], task: Any) -> Any:
-    """Return a result with its seconds, or the exception of the function."""
-    try:
-        return compute_timed(function, task)
-    except Exception as error:  # noqa: BLE001 the driver raises it
-        error.add_note(traceback.format_exc())
-        return error
-
-
-# --- Packages that only some studies need, imported when they are used.
 
 
 def import_optional(module: str, extra: str) -> Any:
@@ -337,21 +299,19 @@ def import_optional(module: str, extra: str) -> Any:
     return optional_packages.import_optional(module, extra, StudyError)
 
 
-# --- The workers of a dask cluster (`dask.distributed`), by the address of its scheduler.
-
 QUEUED = 2
-"""Tasks in flight for each thread of the workers: one is computed, the next one waits there."""
+"""Tasks in flight for each thread of a cluster: one is computed, the next one waits there."""
 
 PATIENCE = 60.0
 """Seconds to wait for the scheduler, and for the first worker."""
 
 PERIOD = 1.0
-"""Seconds after which workers are counted again."""
+"""Seconds after which workers are counted again, and look for their driver."""
 
 
 @dataclass(frozen=True)
 class Dask:
-    """The workers of a dask cluster.
+    """The workers of a dask cluster (`dask.distributed`).
 
     Parameters
     ----------
@@ -368,63 +328,48 @@ class Dask:
 
         The scheduler itself computes the tasks of a lost worker again, a few times.
         """
-        distributed = import_optional("distributed", "dask")
-        with _connect(self.address, self.patience) as client:
-            queue, slots = TaskQueue(tasks), _Slots(client, self.address)
-            in_flight: dict[Any, T] = {}
-            finished = distributed.as_completed(loop=client.loop)
-
-            def submit() -> bool:
-                task = queue.take()
-                if task is None:
-                    return False
-                name = f"{function.__qualname__}-{task.key}-{queue.count_losses(task)}"
-                future = client.submit(compute_timed, function, task, key=name, pure=False)
-                in_flight[future] = task
-                finished.add(future)
-                return True
-
-            while len(in_flight) < slots.count() and submit():
-                pass
-            for future in finished:
-                task = in_flight.pop(future)
-                try:
-                    answer = queue.answer(task, *future.result())
-                except distributed.KilledWorker:
-                    answer = None if queue.give_back(task) else queue.answer(task, None)
-                except (distributed.client.FutureCancelledError, distributed.comm.CommClosedError):
-                    raise _report_lost(self.address) from None
-                del future  # the scheduler forgets the result
-                if answer is not None:
-                    yield answer
-                while len(in_flight) < slots.count() and submit():
-                    pass
+        with _connect_to_dask(self.address, self.patience) as client:
+            yield from map_in_flight(_DaskPool(client, self.address), function, tasks)
 
 
-class _Slots:
-    """How many tasks may be in flight; workers may come and go.
-
-    Parameters
-    ----------
-    client : asked once in `PERIOD`, as the answer grows with the number of workers.
-    """
+class _DaskPool:
+    """A dask cluster as a `Pool`."""
 
     def __init__(self, client: Any, address: str) -> None:
         self._client, self._address = client, address
         self._count, self._end = 0, 0.0
+        distributed = import_optional("distributed", "dask")
+        self._finished = distributed.as_completed(loop=client.loop)
 
-    def count(self) -> int:
-        """Return the number; raise StudyError where the scheduler is lost."""
+    def count_slots(self) -> int:
         if self._client.status != "running":
             raise _report_lost(self._address)
         now = time.monotonic()
-        if now > self._end:
+        if now > self._end:  # the answer grows with the number of workers
             try:
                 threads = sum(self._client.nthreads().values())
             except OSError:
                 raise _report_lost(self._address) from None
             self._count, self._end = QUEUED * max(threads, 1), now + PERIOD
         return self._count
+
+    def submit(self, function: Callable[[T], R], task: T, losses: int) -> Any:
+        name = f"{function.__qualname__}-{task.key}-{losses}"
+        future = self._client.submit(compute_timed, function, task, key=name, pure=False)
+        self._finished.add(future)
+        return future
+
+    def wait(self, handles: Collection[Any]) -> Iterable[Any]:
+        return [next(self._finished)]
+
+    def take(self, handle: Any) -> tuple[Any, float]:
+        distributed = import_optional("distributed", "dask")
+        try:
+            return handle.result()
+        except distributed.KilledWorker as error:
+            raise WorkerLostError from error
+        except (distributed.client.FutureCancelledError, distributed.comm.CommClosedError):
+            raise _report_lost(self._address) from None
 
 
 def _report_lost(address: str) -> StudyError:
@@ -433,7 +378,7 @@ def _report_lost(address: str) -> StudyError:
 
 
 @contextmanager
-def _connect(address: str, patience: float) -> Iterator[Any]:
+def _connect_to_dask(address: str, patience: float) -> Iterator[Any]:
     """Yield a client of a scheduler that has a worker."""
     distributed = import_optional("distributed", "dask")
     try:
@@ -454,11 +399,6 @@ def _connect(address: str, patience: float) -> Iterator[Any]:
             client.close()
 
 
-# --- The workers of a ray cluster, or of one that is started on this computer.
-
-"""Tasks in flight for each processor."""
-
-
 @dataclass(frozen=True)
 class Ray:
     """The workers of a ray cluster.
@@ -476,67 +416,58 @@ class Ray:
     def map_blocks(
         self, function: Callable[[T], R], tasks: Iterable[T | None]
     ) -> Generator[Answer[T, R], None, None]:
-        """Compute tasks on the cluster; see `Executor.map_blocks`.
-
-        Ray itself computes the tasks of a lost worker again, `MOST_LOSSES` - 1 times.
-        """
-        ray = import_optional("ray", "ray")
-        with _connect_to_ray(self.address, self.processors):
-            remote = ray.remote(num_cpus=1, max_retries=MOST_LOSSES - 1)(compute_timed)
-            queue = TaskQueue(tasks)
-            in_flight: dict[Any, T] = {}
-
-            def submit() -> bool:
-                task = queue.take()
-                if task is not None:
-                    in_flight[remote.remote(function, task)] = task
-                return task is not None
-
+        """Compute tasks on the cluster; see `Executor.map_blocks`."""
+        with _connect_to_ray(self.address, self.processors) as ray:
+            pool = _RayPool(ray)
             try:
-                while True:
-                    while len(in_flight) < _count_slots() and submit():
-                        pass
-                    if not in_flight:
-                        return
-                    finished, _ = ray.wait(list(in_flight), num_returns=1)
-                    for reference in finished:
-                        task = in_flight.pop(reference)
-                        yield _take_answer(queue, task, reference)
+                yield from map_in_flight(pool, function, tasks)
             finally:
-                for reference in in_flight:
+                for reference in pool.in_flight:
                     ray.cancel(reference, force=True)
 
 
-def _take_answer(queue: TaskQueue[T], task: T, reference: Any) -> Answer[T, Any]:
-    """Return the answer to a task; raise what the function raised."""
-    ray = import_optional("ray", "ray")
-    try:
-        return queue.answer(task, *ray.get(reference))
-    except ray.exceptions.RayTaskError as error:
-        cause = error.cause
-        if isinstance(cause, Exception):
-            raise cause from error
-        raise
-    except (
-        ray.exceptions.WorkerCrashedError,
-        ray.exceptions.NodeDiedError,
-        ray.exceptions.OutOfMemoryError,
-    ):
-        return Answer(task, None, losses=MOST_LOSSES)
+class _RayPool:
+    """A ray cluster as a `Pool`."""
 
+    def __init__(self, ray: Any) -> None:
+        self._ray = ray
+        self._compute = ray.remote(num_cpus=1, max_retries=0)(compute_timed)
+        self.in_flight: set[Any] = set()
 
-def _count_slots() -> int:
-    """Return how many tasks may be in flight now; nodes may come and go."""
-    ray = import_optional("ray", "ray")
-    return QUEUED * max(int(ray.cluster_resources().get("CPU", 0)), 1)
+    def count_slots(self) -> int:
+        return QUEUED * max(int(self._ray.cluster_resources().get("CPU", 0)), 1)
+
+    def submit(self, function: Callable[[T], R], task: T, losses: int) -> Any:
+        reference = self._compute.remote(function, task)
+        self.in_flight.add(reference)
+        return reference
+
+    def wait(self, handles: Collection[Any]) -> Iterable[Any]:
+        return self._ray.wait(list(handles), num_returns=1)[0]
+
+    def take(self, handle: Any) -> tuple[Any, float]:
+        exceptions = self._ray.exceptions
+        self.in_flight.discard(handle)
+        try:
+            return self._ray.get(handle)
+        except exceptions.RayTaskError as error:
+            if isinstance(error.cause, Exception):
+                raise error.cause from error
+            raise
+        except (
+            exceptions.WorkerCrashedError,
+            exceptions.NodeDiedError,
+            exceptions.OutOfMemoryError,
+        ) as error:
+            raise WorkerLostError from error
 
 
 @contextmanager
-def _connect_to_ray(address: str | None, processors: int | None) -> Iterator[None]:
-    """Use a cluster in the body."""
+def _connect_to_ray(address: str | None, processors: int | None) -> Iterator[Any]:
+    """Yield ray with a cluster in use."""
     ray = import_optional("ray", "ray")
     if ray.is_initialized():
-        yield
+        yield ray
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would report its use to its makers
     address = address or os.environ.get("RAY_ADDRESS")
@@ -549,6 +480,6 @@ def _connect_to_ray(address: str | None, processors: int | None) -> Iterator[Non
         finding = report_finding("workers.cluster-not-reached", address=address or "ray")
         raise StudyError(finding) from error
     try:
-        yield
+        yield ray
     finally:
         ray.shutdown()
