@@ -33,6 +33,7 @@ SECTIONS = {
     "loopcal.progress_bar": "Notebooks",
     "loopcal.findings": "Findings",
     "loopcal.errors": "Errors",
+    "loopcal.units": "Units",
 }
 """Headings by the package that defines the names."""
 

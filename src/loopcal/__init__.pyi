@@ -70,6 +70,7 @@ from .estimate.descent import StepControl as StepControl
 from .estimate.identification import identify as identify
 from .estimate.losses import Huber as Huber
 from .estimate.losses import Tukey as Tukey
+from .estimate.losses import register_loss as register_loss
 from .estimate.null_space import Combination as Combination
 from .estimate.options import FitOptions as FitOptions
 from .estimate.penalties import GCV as GCV
@@ -91,6 +92,10 @@ from .findings import Quantity as Quantity
 from .findings import Severity as Severity
 from .io.data.measurement_file import load_measurements as load_measurements
 from .io.data.measurement_writer import save_measurements as save_measurements
+from .io.formats import register_format as register_format
+from .io.formats.program_format import Exported as Exported
+from .io.formats.program_format import Format as Format
+from .io.formats.program_format import Imported as Imported
 from .io.robot.robot_file import load_robot as load_robot
 from .io.robot.robot_file import load_stored_values as load_stored_values
 from .io.robot.robot_file import save_robot as save_robot
@@ -102,6 +107,7 @@ from .measure.instrument import Instrument as Instrument
 from .measure.instrument import Sensor as Sensor
 from .measure.instrument import Uniform as Uniform
 from .measure.kinds import KINDS as KINDS
+from .measure.kinds import register_kind as register_kind
 from .measure.kinds.bearing import Bearing as Bearing
 from .measure.kinds.directions import Autocollimation as Autocollimation
 from .measure.kinds.directions import Direction as Direction
@@ -111,6 +117,9 @@ from .measure.kinds.distance import Separation as Separation
 from .measure.kinds.joints import Closure as Closure
 from .measure.kinds.joints import JointSensor as JointSensor
 from .measure.kinds.joints import Locked as Locked
+from .measure.kinds.kind import Column as Column
+from .measure.kinds.kind import Kind as Kind
+from .measure.kinds.points import TargetKind as TargetKind
 from .measure.kinds.poses import Component as Component
 from .measure.kinds.poses import Pose as Pose
 from .measure.kinds.position import Position as Position
@@ -153,5 +162,6 @@ from .studies.files.study_file import load_study as load_study
 from .studies.results.study_result import StudyResult as StudyResult
 from .studies.running import study as study
 from .studies.specification.study import Study as Study
+from .units import Dimension as Dimension
 
 __version__: str

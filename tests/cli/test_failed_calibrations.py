@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli.commands.exchange_commands import WRITTEN_FORMATS
 from loopcal.cli.entry_point import main
+from loopcal.io.formats.import_export import list_formats
 from loopcal.io.robot.robot_file import load_robot, save_robot
 from loopcal.io.runs.run_folder import FAILED_ROBOT, ROBOT, find_run_failure, load_run
 from loopcal.mechanism.solutions import inverse
@@ -70,7 +70,7 @@ def test_robot_of_a_failed_calibration_has_another_name(folder, capsys) -> None:
     assert run("export failed -o c.json") == 2  # the verdict stays
 
 
-@pytest.mark.parametrize("name", WRITTEN_FORMATS)
+@pytest.mark.parametrize("name", list_formats("write"))
 def test_no_format_is_written_from_a_failed_calibration(folder, capsys, name) -> None:
     for source in ("failed", f"failed/{FAILED_ROBOT}", "./failed/"):
         assert run(f"export {source} --format {name} -o out.txt") == 2

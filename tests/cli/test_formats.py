@@ -7,8 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.cli.commands.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
-from loopcal.cli.entry_point import main
+from loopcal.cli.entry_point import find_command, main
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.robot.robot_file import load_robot
@@ -205,8 +204,9 @@ def test_invalid_import_or_export_is_refused_in_one_sentence(
 def test_page_and_commands_list_every_format(root) -> None:
     page = (root / "docs" / "formats.md").read_text()
     assert all(f"`{name}`" in page for name in FORMATS)
-    assert {*READ_FORMATS} == {name for name, found in FORMATS.items() if found.read}
-    assert {*WRITTEN_FORMATS} == {name for name, found in FORMATS.items() if found.write}
+    for command, ability in (("import", "read"), ("export", "write")):
+        (option,) = [o for o in find_command(command).params if o.name == "format_name"]
+        assert set(option.type.choices) == {n for n, f in FORMATS.items() if getattr(f, ability)}
 
 
 def test_uncalibrated_five_bar_exports_to_the_same_urdf_file(folder, capsys, data_folder) -> None:

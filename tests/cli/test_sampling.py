@@ -66,6 +66,26 @@ def test_bootstrap_repeats_the_fit_of_a_run_and_writes_its_draws(folder, capsys)
     assert f"Written to {draws}" in text
 
 
+def test_a_run_of_python_is_repeated_with_the_constant_of_its_loss(folder, capsys) -> None:
+    robot, data = lc.load_robot("five-bar"), folder / "five-bar.csv"
+    words = ["simulate", "five-bar", "--kind", "position", "--draw", "25", "--draw-errors"]
+    assert main([*words, "-o", str(data)]) == 0
+    capsys.readouterr()
+    for name, loss in (("narrow", lc.Huber(0.5)), ("wide", lc.Huber(2.0))):
+        options = lc.CalibrationOptions(fit=lc.FitOptions(lc.LeastSquares(), loss))
+        report = lc.calibrate(robot, lc.load_measurements(data, robot), options)
+        run = lc.save_run(folder / name, report, {"data": data})
+        document = run_json(capsys, "bootstrap", str(run), "--count", "10")
+        assert document["resamples"] == 10
+    # with the loss of the other run, the estimate is another one
+    result = json.loads((folder / "wide" / "result.json").read_text())
+    assert result["options"]["fit"]["loss"] == {"name": "huber", "k": 2.0}
+    result["options"]["fit"]["loss"] = {"name": "huber", "k": 0.5}
+    (folder / "wide" / "result.json").write_text(json.dumps(result))
+    assert main(["bootstrap", str(folder / "wide"), "--count", "10"]) == 1
+    assert "cannot be repeated" in capsys.readouterr().err
+
+
 def test_sample_prints_the_size_of_the_sample_and_weights_its_draws(folder, capsys) -> None:
     run, draws = str(folder / "run"), folder / "posterior.csv"
     assert main(["sample", run, "--count", "600", "-o", str(draws)]) == 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from loopcal.studies.specification.levels import (
     EffectsLevel,
     InstrumentLevel,
     MethodLevel,
-    MethodName,
     PosesLevel,
     Scores,
 )
@@ -48,7 +46,7 @@ def test_coverage_and_rank_agree(case):
         block=250,
         instruments={"i": instrument},
         poses={"20": PosesLevel(20)},
-        methods={method: MethodLevel(cast(MethodName, method))},
+        methods={method: MethodLevel(method)},
         effects={"noise": EffectsLevel(noise=noise)},
     )
     values = np.concatenate([compute_block(task).values for task in list_tasks(study)])

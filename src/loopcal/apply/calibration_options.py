@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from loopcal.apply.validation import check_limit
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError, suggest_names
-from loopcal.estimate.options import FitOptions, check_labels
+from loopcal.estimate.options import OBJECT, FitOptions, check_labels
 from loopcal.estimate.posterior import Posterior
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_seed, check_type
@@ -99,6 +100,17 @@ class CalibrationOptions:
     def has_limit(self) -> bool:
         """Whether an error on held-out poses is limited."""
         return self.limit_position is not None or self.limit_angle is not None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options as plain data; an object is `{object: text}`, see `FitOptions`."""
+        plain = {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in vars(self).items()
+        }
+        for key in ("prior", "compare_with"):
+            if value := plain[key]:
+                plain[key] = dict(value) if isinstance(value, Mapping) else {OBJECT: repr(value)}
+        return {**plain, "fit": self.fit.to_dict()}
 
     def _check_prior(self) -> None:
         """Refuse what is no earlier calibration, and options that cannot be combined with it."""

@@ -46,16 +46,16 @@ class Provenance:
 
     versions: Mapping[str, str]  # of loopcal, numpy, scipy and python, and the engine that computed
     seeds: Mapping[str, int]  # by name
-    options: str  # the options in words
+    options: Mapping[str, Any]  # as plain data
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes by name for JSON."""
-        return {"versions": dict(self.versions), "seeds": dict(self.seeds), "options": self.options}
+        return dict(vars(self))
 
 
 def describe_provenance(options: CalibrationOptions) -> Provenance:
     """Return the versions in use, the seeds and the options."""
-    return Provenance(collect_versions(), {"hold_out": options.seed}, repr(options))
+    return Provenance(collect_versions(), {"hold_out": options.seed}, options.to_dict())
 
 
 def _count_fitted_poses(fit: Identification, data: Measurements) -> int:

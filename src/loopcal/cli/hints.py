@@ -87,7 +87,7 @@ HINTS = {
     "plan.target-unobservable": "give --accuracy as a length or as an angle",
     "plan.too-few-candidates": "use fewer --poses or --hold-out, or more --candidates",
     "plan.too-few-equations": "use more --poses",
-    "plan.few-groups": "use more --groups or --points; calibrate without --method ls",
+    "plan.few-groups": "use more --groups or --points; calibrate without --method least-squares",
     "plan.too-few-held-out": "use a smaller --hold-out, or more --candidates",
     "plan.weak-certificate": "use another --seed, or more --poses",
     "plan.workspace-excluded": "relax --min-margin, --max-tilt or --seen-from",

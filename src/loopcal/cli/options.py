@@ -6,13 +6,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
 from loopcal.errors import DataError, UnitError, suggest_names
-from loopcal.units import Dimension, parse_quantity
+from loopcal.registry import Registry
+from loopcal.units import Dimension, find_unit, parse_quantity
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +23,6 @@ if TYPE_CHECKING:
 
     from loopcal.diagnose.conventions.convention_check import ConventionCheck
     from loopcal.estimate.options import FitOptions
-    from loopcal.estimate.tolerance_components import By
     from loopcal.findings import Finding
     from loopcal.measure.instrument import Instrument
     from loopcal.measure.measurements import Measurements
@@ -103,6 +105,13 @@ class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  
             self.fail(f"{value!r} is not above 0; give a positive number", param, ctx)
         return number
 
+    def format(self, value: float) -> str:
+        """Return a number [SI] as text of the command line, in the unit that suits its size."""
+        unit = "mm"
+        if self.dimension is Dimension.ANGLE:
+            unit = "deg" if value > 1e-3 else "urad"
+        return f"{value / find_unit(unit).factor_to_si:g}{unit}"
+
 
 class Count(click.IntRange):
     """A whole number on the command line, up to a limit of `loopcal.io.core.limits`.
@@ -125,6 +134,68 @@ class Count(click.IntRange):
         if number > limit.most:
             self.fail(f"the limit is {limit}; give a smaller number.", param, ctx)
         return int(number)
+
+
+def _import(place: str) -> Any:
+    """Return what a place such as `package.module:NAME` names."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
+    """A word of the library on the command line, which is imported when it is needed.
+
+    Parameters
+    ----------
+    place : of a registry, whose names are allowed, or of a `Literal`. others : words beside these.
+    property : of the entries that are listed, such as `read` of formats; empty for all.
+    """
+
+    def __init__(self, place: str, *others: str, property: str = "") -> None:  # noqa: A002
+        self.place, self.others, self.property = place, others, property
+        self.case_sensitive = True
+
+    @property
+    def choices(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The words that are allowed, for help texts and messages."""
+        words = _import(self.place)
+        if isinstance(words, Registry) and self.property:
+            listed = [name for name, entry in words.items() if getattr(entry, self.property)]
+        else:
+            listed = list(words) if isinstance(words, Registry) else get_args(words)
+        return (*self.others, *listed)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the word, the listed one for another name of a registry."""
+        if value in self.others:
+            return value
+        words = _import(self.place)
+        if isinstance(words, Registry) and not self.property and value in words:
+            return words.resolve(value)
+        return super().convert(value, param, ctx)
+
+
+class LibraryOption(click.Option):
+    """An option whose default is that of the library.
+
+    Parameters
+    ----------
+    of : place of the function, or record of options, that has the option under the same name.
+    """
+
+    def __init__(self, *arguments: Any, of: str, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self.of = of
+
+    def get_default(self, ctx: click.Context, call: bool = True) -> Any:
+        """Return the default; for the help (without `call`) as a text."""
+        value = signature(_import(self.of)).parameters[self.name or ""].default
+        return self.type.format(value) if not call and isinstance(self.type, Quantity) else value
+
+
+def library_option(*names: str, of: str, **settings: Any) -> Decorator:
+    """Return an option with the default of the library, see `LibraryOption`."""
+    return click.option(*names, cls=LibraryOption, of=of, **settings)
 
 
 class PoseShare(click.types.FloatParamType):
@@ -210,9 +281,13 @@ def seed_option(what: str) -> Decorator:
     return click.option("--seed", type=kind, default=1, metavar="N", help=f"Seed of {what}.")
 
 
-def format_option(names: Sequence[str], help_text: str) -> Decorator:
-    """Return the option for the format of a file of another program."""
-    return click.option("--format", "format_name", type=click.Choice(names), help=help_text)
+def format_option(ability: str, help_text: str) -> Decorator:
+    """Return the option for the format of a file of another program that can be read or written.
+
+    ability : `read` or `write`.
+    """
+    words = Words("loopcal.io.formats:FORMATS", property=ability)
+    return click.option("--format", "format_name", type=words, help=help_text)
 
 
 def frame_option(names: str = "fitted, base, relative, or the frame of an instrument") -> Decorator:
@@ -385,33 +460,32 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
 
 # --- Options that choose the method, the loss and the noise of a fit.
 
-METHODS = ("auto", "map", "ls", "ridge", "tsvd")
-INFLATIONS = ("auto", "global", "groups", "heavy-tailed", "none")
-LOSSES = ("none", "huber", "tukey")
+FIT = "loopcal.estimate.options:FitOptions"
 
-rank_tolerance_option = click.option(
+rank_tolerance_option = library_option(
     "--rank-tolerance",
+    of=FIT,
     type=click.FloatRange(0, 1, min_open=True, max_open=True),
     metavar="SHARE",
-    help="Share of the largest singular value below which one counts as zero.  [default: 1e-11]",
+    help="Share of the largest singular value below which one counts as zero.",
 )
 """Decorator of a command that decides a rank."""
 
 fit_options = add_options(
     click.option(
         "--method",
-        type=click.Choice(METHODS),
-        default=METHODS[0],
+        type=Words("loopcal.estimate.methods:METHODS"),
+        default="auto",
         help="map: the tolerances are a prior. auto: map, with tolerances inflated where the "
-        "data contradict them. ls: least squares. ridge, tsvd: regularized least squares.",
+        "data contradict them. least-squares (or ls): without tolerances. ridge, truncated-svd "
+        "(or tsvd): regularized least squares.",
     ),
     click.option(
         "--inflation",
-        type=click.Choice(INFLATIONS),
-        default=INFLATIONS[0],
+        type=Words("loopcal.estimate.tolerance_components:By", "none"),
         help="For auto: which tolerances may be inflated. global: all by one factor. groups: also "
         "limbs and types of parameters, and what these have in common. heavy-tailed: also single "
-        "parameters. auto: all of these. none: as stated.",
+        "parameters. auto, the default: all of these. none: as stated.",
     ),
     click.option(
         "--lam",
@@ -423,31 +497,33 @@ fit_options = add_options(
         "--keep",
         type=click.IntRange(min=0),
         metavar="K",
-        help="For tsvd: number of directions; by default chosen by cross-validation.",
+        help="For truncated-svd: number of directions; by default chosen by cross-validation.",
     ),
-    click.option(
+    library_option(
         "--noise",
-        type=click.Choice(("given", "estimated")),
-        default="given",
+        of=FIT,
+        type=Words("loopcal.estimate.options:Noise"),
         help="Take the stated sigmas as true, or as true up to one common factor that is "
         "estimated.",
     ),
-    click.option(
+    library_option(
         "--sigma-uncertainty",
+        of=FIT,
         type=click.FloatRange(0, 1),
         metavar="SHARE",
         help="Relative standard uncertainty of given sigmas, which the intervals account for; 0 "
-        "takes them as exact.  [default: 0.25]",
+        "takes them as exact.",
     ),
     click.option(
         "--loss",
-        type=click.Choice(LOSSES),
-        default=LOSSES[0],
+        type=Words("loopcal.estimate.losses:LOSSES", "none"),
+        default="none",
         help="Reduce the weight of poses that are far from the fit.",
     ),
     rank_tolerance_option,
     click.option(
         "--drop",
+        "excluded_poses",
         multiple=True,
         metavar="POSE",
         help="Exclude this pose from fit and validation. May be given several times.",
@@ -455,15 +531,11 @@ fit_options = add_options(
 )
 """Decorator of a command that fits; `make_fit_options` takes their values."""
 
-
-def _make_default(inflation: By | Literal["none"]) -> Any:
-    """Return the default method, None, or MAP with another choice of what is inflated."""
-    from loopcal.estimate.penalties import MAP
-    from loopcal.estimate.tolerance_components import InflatedTolerances
-
-    if inflation == "auto":
-        return None
-    return MAP() if inflation == "none" else MAP(InflatedTolerances(inflation))
+FIT_OPTIONS = (
+    *("method", "inflation", "lam", "keep", "noise", "sigma_uncertainty", "loss"),
+    *("rank_tolerance", "excluded_poses"),
+)
+"""Names of `fit_options`, which are those of `FitOptions.from_dict`."""
 
 
 def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
@@ -474,52 +546,15 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     DataError
         A number that belongs to another method.
     """
-    from loopcal.estimate.losses import Huber, Tukey
-    from loopcal.estimate.options import FitOptions
-    from loopcal.estimate.penalties import (
-        GCV,
-        MAP,
-        LeastSquares,
-        Ridge,
-        TruncatedSVD,
-        TruncationGCV,
-    )
-    from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY
-    from loopcal.numerics.decomposition import RANK_TOLERANCE
+    from loopcal.estimate.options import FitOptions, find_foreign_setting
 
-    stated = options["sigma_uncertainty"]
-    name, lam, keep = options["method"], options["lam"], options["keep"]
-    for option, value, needed in (("--lam", lam, "ridge"), ("--keep", keep, "tsvd")):
-        if value is not None and name != needed:
-            raise DataError(
-                f"{option} belongs to --method {needed}, not to {name}; leave it out, or change "
-                "the method"
-            )
-    inflation = options["inflation"]
-    if inflation != INFLATIONS[0] and name != "auto":
+    stated = {name: options[name] for name in FIT_OPTIONS}
+    if (foreign := find_foreign_setting(stated)) is not None:
         raise DataError(
-            f"--inflation belongs to --method auto, not to {name}; leave it out, or change the "
-            "method"
+            f"--{foreign[0]} belongs to --method {foreign[1]}, not to {stated['method']}; leave it "
+            "out, or change the method"
         )
-    if name == "auto":
-        method = _make_default(inflation)
-    elif name == "ridge":
-        method = Ridge(GCV() if lam is None else lam)
-    elif name == "tsvd":
-        method = TruncatedSVD(TruncationGCV() if keep is None else keep)
-    else:
-        method = MAP() if name == "map" else LeastSquares()
-    loss = None
-    if options["loss"] != "none":
-        loss = Huber() if options["loss"] == "huber" else Tukey()
-    return FitOptions(
-        method=method,
-        loss=loss,
-        noise=options["noise"],
-        sigma_uncertainty=SIGMA_UNCERTAINTY if stated is None else stated,
-        excluded_poses=options["drop"],
-        rank_tolerance=options["rank_tolerance"] or RANK_TOLERANCE,
-    )
+    return FitOptions.from_dict(stated)
 
 
 # --- Options that describe an instrument, its noise and the poses at which it measures.

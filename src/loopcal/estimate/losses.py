@@ -6,18 +6,24 @@ freedom if the block belongs to the model. A loss is the weight w(d) of its squa
 reweighted least squares. Its constant is stated for a single residual and carried over to blocks of
 m by equal probability: P(|N(0, 1)| > k) = P(chi2_m > limit^2). Huber, Robust Statistics (1981); the
 usual constants give 95 % efficiency for a single normal residual.
+
+A new loss is one more class here and its line in `LOSSES`: a frozen dataclass whose fields are its
+settings.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from loopcal.errors import EstimationError
+from loopcal.errors import DataError, EstimationError
 from loopcal.numerics.statistics import compute_chi_square_quantile
+from loopcal.registry import Registry
 from loopcal.typing import FloatArray
+
+L = TypeVar("L")
 
 LARGEST = 8.0
 """Largest constant [standard deviations]; the probability of more is below double precision."""
@@ -29,6 +35,26 @@ class Loss(Protocol):
     def weight(self, distance: FloatArray, degrees: FloatArray) -> FloatArray:
         """Return the weight (u,) of blocks at distance d (u,) with this many residuals (u,)."""
         ...
+
+
+LOSSES: Registry[type[Loss]] = Registry(
+    "loss", "loopcal.losses", {"huber": f"{__name__}:Huber", "tukey": f"{__name__}:Tukey"}
+)
+"""Name of a loss on the command line, in study files and in results -> its class."""
+
+
+def register_loss(loss: type[L]) -> type[L]:
+    """Add a loss: a frozen dataclass with a `name` and the function `weight`; also a decorator.
+
+    See docs/extending.md.
+
+    Raises
+    ------
+    DataError : there is no function `weight` or no name, or the name is one of loopcal.
+    """
+    if not callable(getattr(loss, "weight", None)):
+        raise DataError(f"{loss!r} is no loss: it has no function 'weight(distance, degrees)'")
+    return LOSSES.register(loss)
 
 
 @dataclass(frozen=True)
@@ -46,6 +72,7 @@ class Huber:
     EstimationError : k is not above 0, or too large.
     """
 
+    name: ClassVar[str] = "huber"
     k: float = 1.345
 
     def __post_init__(self) -> None:
@@ -72,6 +99,7 @@ class Tukey:
     EstimationError : c is not above 0, or too large.
     """
 
+    name: ClassVar[str] = "tukey"
     c: float = 4.685
 
     def __post_init__(self) -> None:

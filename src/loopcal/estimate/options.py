@@ -1,24 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The options of a fit, as one value that `identify`, `identify_trials` and `recalibrate` share."""
+"""The options of a fit, as one value that `identify`, `identify_trials` and `recalibrate` share.
+
+As plain data (`FitOptions.to_dict`, `from_dict`) they have one vocabulary on the command line, in
+study files and in the results of runs. A method, loss or rule is its name in its registry, or
+`{name: ridge, lam: 2.0}` with settings other than the default ones.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from loopcal.errors import DataError, EstimationError
+from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.descent import StepControl
-from loopcal.estimate.losses import Loss
+from loopcal.estimate.losses import LOSSES, Loss
+from loopcal.estimate.methods import METHODS, RULES, SETTINGS
 from loopcal.estimate.penalties import Method
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.registry import Registry
 from loopcal.typing import FloatArray
 
 Noise = Literal["given", "estimated"]
@@ -118,12 +126,147 @@ class FitOptions:
     def __repr__(self) -> str:
         """Return the options that differ from their defaults."""
         shown = []
-        for entry in dataclasses.fields(self):
+        for entry in fields(self):
             value = getattr(self, entry.name)
             if not _is_default(value, entry):
                 text = f"<{value.shape} array>" if isinstance(value, np.ndarray) else repr(value)
                 shown.append(f"{entry.name}={text}")
         return f"FitOptions({', '.join(shown)})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options as plain data, which `from_dict` reads.
+
+        An object without a name in a registry is `{object: text}`, which cannot be read back.
+        """
+        plain = {entry.name: _to_plain(getattr(self, entry.name)) for entry in fields(self)}
+        plain["method"] = "auto" if self.method is None else _name_entry(METHODS, self.method)
+        plain["loss"] = NO_LOSS if self.loss is None else _name_entry(LOSSES, self.loss)
+        plain["control"] = _list_settings(self.control)
+        return plain
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> FitOptions:
+        """Return options from plain data.
+
+        Parameters
+        ----------
+        plain : some of the fields by name; those that are left out have their defaults. Settings of
+            the method may stand beside it, see `loopcal.estimate.methods.SETTINGS`; None stands for
+            a setting that nobody stated.
+
+        Raises
+        ------
+        DataError : an unknown key, name or setting, or an object that has no name.
+        EstimationError : a value that is not allowed.
+        """
+        beside = {key: plain[key] for key in SETTINGS if plain.get(key) is not None}
+        given = {key: value for key, value in plain.items() if key not in SETTINGS}
+        known = [entry.name for entry in fields(cls)]
+        for key in given:
+            if key not in known:
+                raise DataError(f"{key!r} is not an option of a fit{suggest_names(key, known)}")
+        for key in ("prior", "nuisance"):
+            if given.get(key) is not None:
+                _refuse_object(given[key])
+        method, loss = given.pop("method", "auto"), given.pop("loss", NO_LOSS)
+        if beside:
+            method = {"name": method} if isinstance(method, str) else dict(method)
+            method |= {SETTINGS[key][1]: value for key, value in beside.items()}
+        given = {key: _from_plain(value) for key, value in given.items() if key != "control"}
+        return cls(
+            method=_make_entry(METHODS, method),
+            loss=None if loss == NO_LOSS else _make_entry(LOSSES, loss),
+            control=StepControl(**plain.get("control", {})),
+            **given,
+        )
+
+
+def find_foreign_setting(plain: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return the first setting that stands beside the name of a method it does not belong to, with
+    the method that it belongs to; None where there is none.
+
+    Raises
+    ------
+    DataError : an unknown method.
+    """
+    method = METHODS.resolve(plain.get("method", "auto"))
+    for key, (owner, _) in SETTINGS.items():
+        if plain.get(key) is not None and method != owner:
+            return key, owner
+    return None
+
+
+NO_LOSS = "none"
+"""Name of the loss None."""
+
+OBJECT = "object"
+"""Key of the text of an object that has no name."""
+
+
+def _to_plain(value: Any) -> Any:
+    """Return a value of an option as plain data."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, tuple | list):
+        return [_to_plain(item) for item in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return _name_entry(RULES, value) if callable(value) else {OBJECT: repr(value)}
+
+
+def _name_entry(registry: Registry[Any], value: Any) -> Any:
+    """Return an instance of a registered class as its name, or as a mapping with its settings."""
+    name = getattr(type(value), "name", None)
+    is_plain = dataclasses.is_dataclass(value) or not vars(value)
+    if name not in registry or registry[name] is not type(value) or not is_plain:
+        return {OBJECT: repr(value)}
+    settings = _list_settings(value)
+    named = {"name": name, **settings}
+    # a rule inside a method is a mapping always, to be told from a word
+    return name if not settings and registry is not RULES else named
+
+
+def _list_settings(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass that differ from their defaults, as plain data."""
+    if not dataclasses.is_dataclass(value):
+        return {}
+    return {
+        entry.name: _to_plain(getattr(value, entry.name))
+        for entry in fields(value)
+        if entry.init and not _is_default(getattr(value, entry.name), entry)
+    }
+
+
+def _from_plain(value: Any) -> Any:
+    """Return the value of an option from plain data."""
+    if isinstance(value, Mapping):
+        return _make_entry(RULES, value)
+    return tuple(_from_plain(item) for item in value) if isinstance(value, list) else value
+
+
+def _make_entry(registry: Registry[Any], plain: str | Mapping[str, Any]) -> Any:
+    """Return the instance that a name, or a mapping with a name and settings, stands for."""
+    stated = {"name": plain} if isinstance(plain, str) else dict(plain)
+    _refuse_object(stated)
+    name = stated.pop("name", None)
+    if not isinstance(name, str):
+        raise DataError(f"{plain!r} names no {registry.noun}; known are {', '.join(registry)}")
+    make = registry[name]
+    allowed = inspect.signature(make).parameters
+    for key in stated:
+        if key not in allowed:
+            has = ", ".join(allowed) or "none"
+            raise DataError(f"the {registry.noun} {name} has no setting {key!r}; it has {has}")
+    return make(**{key: _from_plain(value) for key, value in stated.items()})
+
+
+def _refuse_object(plain: Any) -> None:
+    """Raise DataError for the text of an object that has no name."""
+    if isinstance(plain, Mapping) and OBJECT in plain:
+        raise DataError(
+            f"{plain[OBJECT]} has no name by which it could be made again; register its class "
+            "(docs/extending.md)"
+        )
 
 
 def merge_options(

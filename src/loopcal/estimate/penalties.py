@@ -13,15 +13,15 @@ total deviation, the estimate is z = sum_i f_i (c_i / s_i) v_i with the filter f
                                contradict them
 
 The penalty acts on the total deviation from nominal in units of tolerance, never on the step, so
-the answer does not depend on the number of iterations. A new method is one more class here. See
-docs/theory/estimation.md.
+the answer does not depend on the number of iterations. A new method is one more class here, and
+its line in `loopcal.estimate.methods`. See docs/theory/estimation.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.residual_test import FEWEST_DEGREES
 from loopcal.estimate.tolerance_components import (
+    By,
     InflatedTolerances,
     ToleranceComponent,
     compute_prior_covariance,
@@ -39,9 +40,124 @@ from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decomp
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 Rule = Callable[[Decomposition], FloatArray | IntArray]
-"""Choose one number per trial, (t,), from a decomposition; see
-`loopcal.estimate.penalties`.
-"""
+"""Choose one number per trial, (t,), from a decomposition."""
+
+
+# Rules that choose the ridge parameter or the truncation from the decomposition itself.
+
+PER_DECADE = 16
+"""Grid points per factor of ten; around their minimum the criteria are flat over much more."""
+
+LOWEST, HIGHEST = 1e-12, 1e4
+"""Range of lam in units of the largest squared singular value: no effect to hardly any data."""
+
+
+@dataclass(frozen=True)
+class GCV:
+    """Choose the ridge parameter that minimizes generalized cross-validation."""
+
+    name: ClassVar[str] = "gcv"
+
+    def __call__(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam (t,)."""
+        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
+
+    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+        """Return RSS / (m - sum f)^2 (t,) at lam (t,)."""
+        penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
+        return _gcv(decomposition, penalty)
+
+    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+        """Return which lam (t,) are ends of the range."""
+        return _is_end_of_range(decomposition, lam)
+
+
+@dataclass(frozen=True)
+class MarginalLikelihood:
+    """Choose the ridge parameter under which the whitened data are most probable."""
+
+    name: ClassVar[str] = "marginal-likelihood"
+
+    def __call__(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam (t,)."""
+        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
+
+    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+        """Return which lam (t,) are ends of the range."""
+        return _is_end_of_range(decomposition, lam)
+
+    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+        """Return minus twice the log density of the data at lam (t,), up to a constant."""
+        # directions of unpenalized parameters contain no information on lam
+        unpenalized = decomposition.unpenalized
+        counted = np.ones(1) if unpenalized is None else ~unpenalized
+        square = decomposition.singular_values**2 * counted
+        projected = decomposition.projections**2 * counted
+        variance = 1.0 + square / lam[:, None]
+        return (np.log(variance) + projected / variance).sum(axis=1)
+
+
+@dataclass(frozen=True)
+class TruncationGCV:
+    """Choose the truncation k that minimizes generalized cross-validation."""
+
+    name: ClassVar[str] = "truncation-gcv"
+
+    def __call__(self, decomposition: Decomposition) -> IntArray:
+        """Return k (t,)."""
+        count = decomposition.singular_values.shape[1] + 1
+        trials = np.ones(len(decomposition.singular_values))
+        return np.argmin(
+            np.stack([self.score(decomposition, k * trials) for k in range(count)]), axis=0
+        )
+
+    def score(self, decomposition: Decomposition, k: FloatArray) -> FloatArray:
+        """Return RSS / (m - k)^2 (t,) at k (t,)."""
+        order = np.arange(decomposition.singular_values.shape[1])
+        kept = (order < k[:, None]) & decomposition.used
+        return _gcv(decomposition, np.where(kept, 0.0, np.inf))
+
+
+def _is_end_of_range(decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+    """Return which lam (t,) are within one grid point of an end of the grid."""
+    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
+    point = 10.0 ** (1.0 / PER_DECADE)
+    return (lam <= LOWEST * reference * point) | (lam >= HIGHEST * reference / point)
+
+
+def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
+    """Return generalized cross-validation (t,); infinite where no equation is left over."""
+    left = decomposition.rows - decomposition.filter_factors(penalty).sum(axis=1)
+    spare = left > 1e-6
+    return np.where(
+        spare, decomposition.remaining(penalty) / np.where(spare, left, 1.0) ** 2, np.inf
+    )
+
+
+def _minimize(
+    criterion: Callable[[FloatArray], FloatArray], decomposition: Decomposition
+) -> FloatArray:
+    """Minimize a criterion of lam (t,) over the grid.
+
+    The parabola through the best grid point and its neighbors refines the minimum.
+    """
+    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
+    decades = np.log10(HIGHEST / LOWEST)
+    grid = np.linspace(np.log10(LOWEST), np.log10(HIGHEST), int(PER_DECADE * decades) + 1)
+    values = np.stack([criterion(reference * 10.0**g) for g in grid])
+    best = np.clip(np.argmin(values, axis=0), 1, len(grid) - 2)
+    trial = np.arange(values.shape[1])
+    low, middle, high = (values[best + shift, trial] for shift in (-1, 0, 1))
+    curvature = low - 2.0 * middle + high
+    with np.errstate(invalid="ignore"):
+        shift = np.where(
+            curvature > 0.0, 0.5 * (low - high) / np.where(curvature > 0.0, curvature, 1.0), 0.0
+        )
+    shift = np.clip(np.nan_to_num(shift), -1.0, 1.0)
+    return reference * 10.0 ** (grid[best] + shift * (grid[1] - grid[0]))
+
+
+# The methods.
 
 
 class Method(Protocol):
@@ -90,6 +206,8 @@ class LeastSquares(Method):
     LeastSquares()
     """
 
+    name: ClassVar[str] = "least-squares"
+
     def required_equations(self, parameters: int) -> int:
         """Return the number of parameters."""
         return parameters
@@ -105,15 +223,16 @@ class TruncatedSVD(Method):
 
     Parameters
     ----------
-    k : number of directions, or a rule that chooses it. Directions beyond the numerical rank are
-        never used.
+    k : number of directions, or a rule that chooses it, by default cross-validation. Directions
+        beyond the numerical rank are never used.
 
     Raises
     ------
     EstimationError : k is negative or no integer.
     """
 
-    k: int | Rule
+    name: ClassVar[str] = "truncated-svd"
+    k: int | Rule = TruncationGCV()
 
     def __post_init__(self) -> None:
         if not callable(self.k) and (not isinstance(self.k, int | np.integer) or self.k < 0):
@@ -142,14 +261,15 @@ class Ridge(Method):
     Parameters
     ----------
     lam : a number, one number per free parameter in the order of the parameter table (0 for an
-        unpenalized one), or a rule that chooses one number.
+        unpenalized one), or a rule that chooses one number, by default cross-validation.
 
     Raises
     ------
     EstimationError : lam is negative or not finite.
     """
 
-    lam: float | tuple[float, ...] | Rule
+    name: ClassVar[str] = "ridge"
+    lam: float | tuple[float, ...] | Rule = GCV()
 
     def __post_init__(self) -> None:
         if callable(self.lam):
@@ -246,6 +366,7 @@ class MAP(Method):
     EstimationError : inflation is not positive and finite.
     """
 
+    name: ClassVar[str] = "map"
     inflation: float | Rule = 1.0
     free: tuple[bool, ...] = ()
     noise: Literal["given", "estimated"] = "given"
@@ -367,6 +488,13 @@ def decompose_for(
     )
 
 
+def make_default_method(inflation: By | Literal["none"] = "auto") -> Method | None:
+    """Return the default method, None, or MAP with another choice of what may be inflated."""
+    if inflation == "auto":
+        return None
+    return MAP() if inflation == "none" else MAP(InflatedTolerances(inflation))
+
+
 def adapt_method(
     method: Method | None,
     assumed: BoolArray,
@@ -465,114 +593,6 @@ def describe_regularization(
         rank=int(decomposition.rank[0]),
         is_at_limit=is_at_limit,
     )
-
-
-# --- Rules that choose the ridge parameter or the truncation from the decomposition itself.
-
-PER_DECADE = 16
-"""Grid points per factor of ten; around their minimum the criteria are flat over much more."""
-
-LOWEST, HIGHEST = 1e-12, 1e4
-"""Range of lam in units of the largest squared singular value: no effect to hardly any data."""
-
-
-@dataclass(frozen=True)
-class GCV:
-    """Choose the ridge parameter that minimizes generalized cross-validation."""
-
-    def __call__(self, decomposition: Decomposition) -> FloatArray:
-        """Return lam (t,)."""
-        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
-
-    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
-        """Return RSS / (m - sum f)^2 (t,) at lam (t,)."""
-        penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
-        return _gcv(decomposition, penalty)
-
-    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
-        """Return which lam (t,) are ends of the range."""
-        return _is_end_of_range(decomposition, lam)
-
-
-@dataclass(frozen=True)
-class MarginalLikelihood:
-    """Choose the ridge parameter under which the whitened data are most probable."""
-
-    def __call__(self, decomposition: Decomposition) -> FloatArray:
-        """Return lam (t,)."""
-        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
-
-    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
-        """Return which lam (t,) are ends of the range."""
-        return _is_end_of_range(decomposition, lam)
-
-    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
-        """Return minus twice the log density of the data at lam (t,), up to a constant."""
-        # directions of unpenalized parameters contain no information on lam
-        unpenalized = decomposition.unpenalized
-        counted = np.ones(1) if unpenalized is None else ~unpenalized
-        square = decomposition.singular_values**2 * counted
-        projected = decomposition.projections**2 * counted
-        variance = 1.0 + square / lam[:, None]
-        return (np.log(variance) + projected / variance).sum(axis=1)
-
-
-@dataclass(frozen=True)
-class TruncationGCV:
-    """Choose the truncation k that minimizes generalized cross-validation."""
-
-    def __call__(self, decomposition: Decomposition) -> IntArray:
-        """Return k (t,)."""
-        count = decomposition.singular_values.shape[1] + 1
-        trials = np.ones(len(decomposition.singular_values))
-        return np.argmin(
-            np.stack([self.score(decomposition, k * trials) for k in range(count)]), axis=0
-        )
-
-    def score(self, decomposition: Decomposition, k: FloatArray) -> FloatArray:
-        """Return RSS / (m - k)^2 (t,) at k (t,)."""
-        order = np.arange(decomposition.singular_values.shape[1])
-        kept = (order < k[:, None]) & decomposition.used
-        return _gcv(decomposition, np.where(kept, 0.0, np.inf))
-
-
-def _is_end_of_range(decomposition: Decomposition, lam: FloatArray) -> BoolArray:
-    """Return which lam (t,) are within one grid point of an end of the grid."""
-    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
-    point = 10.0 ** (1.0 / PER_DECADE)
-    return (lam <= LOWEST * reference * point) | (lam >= HIGHEST * reference / point)
-
-
-def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
-    """Return generalized cross-validation (t,); infinite where no equation is left over."""
-    left = decomposition.rows - decomposition.filter_factors(penalty).sum(axis=1)
-    spare = left > 1e-6
-    return np.where(
-        spare, decomposition.remaining(penalty) / np.where(spare, left, 1.0) ** 2, np.inf
-    )
-
-
-def _minimize(
-    criterion: Callable[[FloatArray], FloatArray], decomposition: Decomposition
-) -> FloatArray:
-    """Minimize a criterion of lam (t,) over the grid.
-
-    The parabola through the best grid point and its neighbors refines the minimum.
-    """
-    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
-    decades = np.log10(HIGHEST / LOWEST)
-    grid = np.linspace(np.log10(LOWEST), np.log10(HIGHEST), int(PER_DECADE * decades) + 1)
-    values = np.stack([criterion(reference * 10.0**g) for g in grid])
-    best = np.clip(np.argmin(values, axis=0), 1, len(grid) - 2)
-    trial = np.arange(values.shape[1])
-    low, middle, high = (values[best + shift, trial] for shift in (-1, 0, 1))
-    curvature = low - 2.0 * middle + high
-    with np.errstate(invalid="ignore"):
-        shift = np.where(
-            curvature > 0.0, 0.5 * (low - high) / np.where(curvature > 0.0, curvature, 1.0), 0.0
-        )
-    shift = np.clip(np.nan_to_num(shift), -1.0, 1.0)
-    return reference * 10.0 ** (grid[best] + shift * (grid[1] - grid[0]))
 
 
 # --- The penalty of a method as rows beside the measured ones, where it does not depend on these.

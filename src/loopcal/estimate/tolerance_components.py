@@ -16,7 +16,7 @@ from __future__ import annotations
 import string
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -66,6 +66,7 @@ class InflatedTolerances:
     EstimationError : another word.
     """
 
+    name: ClassVar[str] = "inflated-tolerances"
     by: By = "auto"
 
     def __post_init__(self) -> None:

@@ -614,7 +614,8 @@ def regularize(
     """Show how the error at held-out poses depends on the ridge parameter lam and on the number k
     of directions of truncated SVD, for your own DATA, and which values the rules choose.
 
-    Use a chosen value with loopcal calibrate --method ridge --lam, or --method tsvd --keep.
+    Use a chosen value with loopcal calibrate --method ridge --lam, or --method truncated-svd
+    --keep.
 
     \b
     Examples:

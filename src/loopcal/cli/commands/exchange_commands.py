@@ -276,8 +276,6 @@ def convert_instrument_export(
     return 0
 
 
-READ_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
-WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "linuxcnc-ini", "urdf", "json", "csv")
 CORRECTED_ALONE = (
     "--corrected calibrates with the measurements in the file; state where to write them, such as "
     "--data data.csv"
@@ -291,7 +289,7 @@ TAPED = (
 
 @click.command("import")
 @click.argument("file", metavar="FILE", type=FILE)
-@format_option(READ_FORMATS, "Format of FILE; by default chosen by the ending of its name.")
+@format_option("read", "Format of FILE; by default chosen by the ending of its name.")
 @profile_option("Instead of --format: how to read FILE, the export of an instrument.")
 @decimal_option
 @file_option(
@@ -422,11 +420,13 @@ def import_(
 
 def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
     """Return the function that reads a format; DataError where loopcal only writes it."""
+    from loopcal.io.formats.import_export import list_formats
+
     if source.read is None:
         raise DataError(
             f"loopcal writes the format {source.name}, but cannot read it; it reads "
-            f"{', '.join(READ_FORMATS)}, and an instrument's export with a profile (--profile, "
-            "docs/exports.md)"
+            f"{', '.join(list_formats('read'))}, and an instrument's export with a profile "
+            "(--profile, docs/exports.md)"
         )
     return source.read
 
@@ -525,7 +525,7 @@ def _view_import(
 
 @click.command()
 @click.argument("source", metavar="RUN|ROBOT")
-@format_option(WRITTEN_FORMATS, "Format to write; by default chosen by the ending of -o.")
+@format_option("write", "Format to write; by default chosen by the ending of -o.")
 @file_option(
     "--into",
     help="File of the controller to correct; everything else in it stays as it is.",

@@ -97,7 +97,7 @@ def identifiability(
     output: Path | None,
     force: bool,
     sigma_reading: str | None,
-    rank_tolerance: float | None,
+    rank_tolerance: float,
     useful: float | None,
     useful_angle: float | None,
     verbose: bool,
@@ -124,7 +124,6 @@ def identifiability(
     from loopcal.apply.simulated_measurements import predict_noise_free
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
-    from loopcal.numerics.decomposition import RANK_TOLERANCE
     from loopcal.report.calibration_view import view_identifiability
 
     if data:
@@ -148,9 +147,8 @@ def identifiability(
             reading_sigma=parse_reading_sigma(sigma_reading, machine),
             seed=seed,
         )
-    tolerance = rank_tolerance or RANK_TOLERANCE
     accuracy = None if useful is None else (useful, useful_angle)
-    report = analyze_identifiability(machine, measurements, reduced, tolerance, accuracy)
+    report = analyze_identifiability(machine, measurements, reduced, rank_tolerance, accuracy)
     if report.subset is not None and output is not None:
         _write_subset(output, report.subset)
     if as_json:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
-import numpy as np
 
 from loopcal.cli import terminal
 from loopcal.cli.options import (
@@ -28,24 +27,19 @@ from loopcal.cli.options import (
     seed_option,
     take_flags,
 )
-from loopcal.errors import EstimationError, LoopcalError
-from loopcal.findings import report_finding
+from loopcal.errors import LoopcalError
 
 if TYPE_CHECKING:
     from loopcal.diagnose.bootstrap import Bootstrap
     from loopcal.diagnose.intervals import Intervals
     from loopcal.diagnose.posterior_sample import PosteriorSample
     from loopcal.estimate.result import Identification
-    from loopcal.io.runs.run_folder import Run
     from loopcal.measure.measurements import Measurements
     from loopcal.report.tables import Block
     from loopcal.typing import FloatArray
 
 
 # --- The fit that a command examines further: that of a run folder, repeated, or a new one.
-
-EQUAL = 1e-2
-"""Largest difference of a repeated estimate from that of the run, in standard deviations."""
 
 
 def load_fit(
@@ -66,7 +60,7 @@ def load_fit(
     from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
     from loopcal.estimate.identification import identify
     from loopcal.io.robot.robot_file import load_robot
-    from loopcal.io.runs.run_folder import load_run
+    from loopcal.io.runs.run_folder import load_run, repeat_fit
 
     if data:
         robot = load_robot(source)
@@ -83,51 +77,10 @@ def load_fit(
                 "that of the robot"
             )
         refuse_given(options, "with a run folder")
-        fit, measurements = _repeat_run(load_run(source))
+        run = load_run(source)
+        with terminal.ProgressBar() as progress:
+            fit, measurements = repeat_fit(run, progress)
     return adjust_uncertainty(fit, measurements), measurements
-
-
-def _repeat_run(run: Run) -> tuple[Identification, Measurements]:
-    """Return the fit of a run, made again from its files and the options of its command line."""
-    from dataclasses import replace
-
-    from loopcal.estimate.identification import identify
-    from loopcal.estimate.options import FitOptions
-    from loopcal.estimate.recalibration import recalibrate
-    from loopcal.io.runs.run_folder import load_run
-
-    stated = _read_options(run)
-    accepted = ("allow_outside_stroke", "allow_duplicates")
-    data, _ = run.load_measurements(**{name: bool(stated.get(name)) for name in accepted})
-    options = make_fit_options(stated) if stated else FitOptions()
-    options = replace(options, excluded_poses=())  # they are no longer among the measurements
-    with terminal.ProgressBar() as progress:
-        if stated.get("prior") is not None:
-            earlier, limb = load_run(stated["prior"]).load_posterior(), stated.get("free_limb")
-            fit, _ = recalibrate(
-                run.initial_robot, data, earlier, limb, options=options, progress=progress
-            )
-        else:
-            fit = identify(run.initial_robot, data, options=options, progress=progress)
-    estimate, sd = run.arrays["estimate"], fit.standard_deviations
-    if len(estimate) != len(sd):
-        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
-    off = np.abs(fit.estimate - estimate) > EQUAL * np.where(np.isfinite(sd), sd, np.inf)
-    if off.any():
-        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
-    return fit, data
-
-
-def _read_options(run: Run) -> dict[str, Any]:
-    """Return the options of the command `calibrate` that made a run; none for a run of Python."""
-    from loopcal.cli.commands.calibration_commands import calibrate
-
-    words: list[str] = list((run.result.get("made_by") or {}).get("command") or ())
-    if "calibrate" not in words:
-        return {}
-    given = words[words.index("calibrate") + 1 :]
-    context: click.Context = calibrate.make_context("calibrate", given, resilient_parsing=True)
-    return context.params
 
 
 MOST_DIGITS = 10
@@ -206,7 +159,7 @@ def bootstrap(
     Examples:
       loopcal bootstrap run
       loopcal bootstrap run --unit session --count 2000 -o draws.csv
-      loopcal bootstrap hexapod-42 measurements.csv --method ls
+      loopcal bootstrap hexapod-42 measurements.csv --method least-squares
     """  # noqa: D301
     from loopcal.diagnose.bootstrap import bootstrap as resample
     from loopcal.report.validation_view import view_bootstrap

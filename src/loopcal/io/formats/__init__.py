@@ -1,27 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of other programs: read as robot file and measurements, written corrected.
 
-A format is a `Format` with `read`, `write` or both, in a module of its own, and an entry here.
+A format is a `Format` with `read`, `write` or both, in a module of its own, and a line here.
 """
 
-from collections.abc import Mapping
+from __future__ import annotations
 
-from loopcal.io.formats import delta_gcode, hangprinter, klipper, linuxcnc, parameter_table
-from loopcal.io.formats.program_format import Format
-from loopcal.io.formats.urdf import urdf_format
+from typing import TYPE_CHECKING
 
-FORMATS: Mapping[str, Format] = {
-    entry.name: entry
-    for entry in (
-        klipper.FORMAT,
-        delta_gcode.MARLIN,
-        delta_gcode.REPRAP,
-        linuxcnc.FORMAT,
-        linuxcnc.INI_FORMAT,
-        urdf_format.FORMAT,
-        hangprinter.FORMAT,
-        parameter_table.JSON,
-        parameter_table.CSV,
-    )
-}
-"""Name -> format."""
+from loopcal.registry import Registry
+
+if TYPE_CHECKING:
+    from loopcal.io.formats.program_format import Format
+
+FORMATS: Registry[Format] = Registry(
+    "format of another program",
+    "loopcal.formats",
+    {
+        "klipper": "loopcal.io.formats.klipper:FORMAT",
+        "marlin": "loopcal.io.formats.delta_gcode:MARLIN",
+        "reprap": "loopcal.io.formats.delta_gcode:REPRAP",
+        "linuxcnc": "loopcal.io.formats.linuxcnc:FORMAT",
+        "linuxcnc-ini": "loopcal.io.formats.linuxcnc:INI_FORMAT",
+        "urdf": "loopcal.io.formats.urdf.urdf_format:FORMAT",
+        "hangprinter": "loopcal.io.formats.hangprinter:FORMAT",
+        "json": "loopcal.io.formats.parameter_table:JSON",
+        "csv": "loopcal.io.formats.parameter_table:CSV",
+    },
+)
+"""Name -> format, which is imported when it is looked up."""
+
+
+def register_format(entry: Format) -> Format:
+    """Add a format of another program, and return it. See docs/extending.md.
+
+    Raises
+    ------
+    DataError : its name is one of loopcal.
+    """
+    return FORMATS.register(entry)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import report_finding
@@ -17,21 +18,24 @@ from loopcal.io.runs.run_folder import Run, load_run_or_robot
 from loopcal.mechanism.model import Mechanism
 
 
+def list_formats(ability: Literal["read", "write"]) -> tuple[str, ...]:
+    """Return the names of the formats that can be read, or written."""
+    return tuple(name for name, known in FORMATS.items() if getattr(known, ability) is not None)
+
+
 def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> Format:
     """Return the format of this name, or the one with the ending of a file to read or to write.
 
     Raises
     ------
-    FileError : no format has this ending.
+    DataError : there is no format of this name. FileError : no format has this ending.
     """
     if name is not None:
         return FORMATS[name]
     for entry in FORMATS.values():
         if path.suffix.lower() in entry.endings:
             return entry
-    names = tuple(
-        entry for entry, known in FORMATS.items() if (known.write if is_written else known.read)
-    )
+    names = list_formats("write" if is_written else "read")
     raise FileError(report_finding("files.format-unknown", formats=names), path)
 
 
@@ -96,8 +100,8 @@ def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exp
     FileError : the file to correct cannot be read, or is of another kind.
     """
     if target.write is None:
-        writable = ", ".join(name for name, known in FORMATS.items() if known.write is not None)
-        raise DataError(f"loopcal cannot write the format {target.name}; it writes {writable}")
+        known = ", ".join(list_formats("write"))
+        raise DataError(f"loopcal cannot write the format {target.name}; it writes {known}")
     if into is not None and not target.takes_file:
         raise DataError(report_finding("files.format-takes-no-file", format=target.name))
     return target.write(source, into)

@@ -536,9 +536,11 @@ def describe_type(annotation: Any) -> str:
     """Return what an annotation allows, in terms of a file."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        marks = [mark for mark in arguments[1:] if isinstance(mark, Dimension)]
-        names = {Dimension.LENGTH: "length", Dimension.ANGLE: "angle"}
-        return names.get(marks[0], "number") if marks else describe_type(arguments[0])
+        if isinstance(arguments[1], Dimension):
+            names = {Dimension.LENGTH: "length", Dimension.ANGLE: "angle"}
+            return names.get(arguments[1], "number")
+        words = [(mark,) if isinstance(mark, str) else mark for mark in arguments[1:]]
+        return " or ".join(f"`{name}`" for names in words for name in names)  # of registries
     if origin in (Union, types.UnionType):
         branches = (describe_type(a) for a in arguments if a is not type(None))
         return " or ".join(dict.fromkeys(branches))

@@ -14,7 +14,7 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.engine import collect_versions
-from loopcal.errors import DataError, FileError
+from loopcal.errors import DataError, EstimationError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.result_folder import (
     FolderKind,
@@ -48,16 +48,20 @@ from loopcal.io.runs.run_result import (
     read_run_arrays,
     refuse_other_estimates,
     refuse_other_parameters,
+    report_damage,
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.presentation import HtmlResult
+from loopcal.typing import report_no_progress
 
 if TYPE_CHECKING:
     from loopcal.apply.calibration_report import CalibrationReport
     from loopcal.estimate.fit_linearization import FitUncertainty
     from loopcal.estimate.posterior import Posterior
+    from loopcal.estimate.result import Identification
     from loopcal.measure.fitted_rows import FittedRows
     from loopcal.measure.measurements import Measurements
+    from loopcal.typing import Progress
 
 
 # --- Whether the numbers of a run may be written for a machine: corrected robot, controller,
@@ -244,6 +248,52 @@ class Run(HtmlResult):
         fitted = [label not in (*self.held_out, *self.excluded) for label in data.labels]
         held_out = [label in self.held_out for label in data.labels]
         return data.take(fitted), data.take(held_out) if any(held_out) else None
+
+
+EQUAL = 1e-2
+"""Largest difference of a repeated estimate from that of a run, in standard deviations."""
+
+
+def repeat_fit(
+    run: Run, progress: Progress = report_no_progress
+) -> tuple[Identification, Measurements]:
+    """Return the fit of a run, made again from its files and its options, and its measurements.
+
+    Runs of earlier versions do not state their options as data; theirs are taken as the usual ones.
+
+    Raises
+    ------
+    EstimationError : the estimate is another one. DataError : an option is an object without a
+        name. FileError : see `Run.load_measurements`.
+    """
+    from loopcal.estimate.identification import identify
+    from loopcal.estimate.options import FitOptions
+    from loopcal.estimate.recalibration import recalibrate
+
+    stated = run.result.get("options")
+    stated = stated if isinstance(stated, dict) else {}
+    try:
+        options = FitOptions.from_dict(stated.get("fit", {}))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise report_damage(run.path / RESULT, f"'options.fit' is {stated['fit']!r}") from error
+    options = replace(options, excluded_poses=())  # they are not among the measurements
+    data, _ = run.load_measurements(allow_outside_stroke=True, allow_duplicates=True)
+    if (prior := list_inputs(run.result).get("prior")) is None:
+        fit = identify(run.initial_robot, data, options=options, progress=progress)
+    else:
+        earlier = load_run(Path(prior["path"]).parent).load_posterior()
+        limb = stated.get("free_limb")
+        fit, _ = recalibrate(
+            run.initial_robot, data, earlier, limb, options=options, progress=progress
+        )
+    estimate, sd = run.arrays["estimate"], fit.standard_deviations
+    is_other = len(estimate) != len(sd)
+    if not is_other:
+        allowed = EQUAL * np.where(np.isfinite(sd), sd, np.inf)
+        is_other = bool((np.abs(fit.estimate - estimate) > allowed).any())
+    if is_other:
+        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
+    return fit, data
 
 
 def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:

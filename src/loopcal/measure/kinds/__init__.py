@@ -1,24 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinds of measurements, one file each, grouped by the measured object.
+"""Kinds of measurements, one file each and one line here.
 
 `KINDS` is the registry that files, templates, documentation and tests read.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import is_dataclass
+from typing import TYPE_CHECKING, TypeVar
 
-from loopcal.lazy_names import LazyRegistry
+from loopcal.errors import DataError
+from loopcal.registry import Registry
 
 if TYPE_CHECKING:
     from loopcal.measure.kinds.kind import Kind
+
+K = TypeVar("K")
 
 READINGS, CLOSURE = "readings", "closure"
 """Names of the kinds that contain actuator readings alone: uncertain ones, and those of poses
 without a measured value.
 """
 
-KINDS: LazyRegistry[type[Kind]] = LazyRegistry(
+KINDS: Registry[type[Kind]] = Registry(
+    "kind of measurement",
+    "loopcal.kinds",
     {
         "pose": "loopcal.measure.kinds.poses:Pose",
         "component": "loopcal.measure.kinds.poses:Component",
@@ -35,6 +41,22 @@ KINDS: LazyRegistry[type[Kind]] = LazyRegistry(
         "joint": "loopcal.measure.kinds.joints:JointSensor",
         "locked": "loopcal.measure.kinds.joints:Locked",
         "closure": "loopcal.measure.kinds.joints:Closure",
-    }
+    },
 )
 """From the name of a kind in files to its class, which is imported when it is looked up."""
+
+
+def register_kind(kind: type[K]) -> type[K]:
+    """Add a kind of measurement: a frozen dataclass that extends `Kind`; also a decorator.
+
+    See docs/extending.md.
+
+    Raises
+    ------
+    DataError : the class does not extend `Kind`, or its name is missing or one of loopcal.
+    """
+    from loopcal.measure.kinds.kind import Kind
+
+    if not (isinstance(kind, type) and issubclass(kind, Kind) and is_dataclass(kind)):
+        raise DataError(f"{kind!r} is no kind of measurement: it is no dataclass that extends Kind")
+    return KINDS.register(kind)

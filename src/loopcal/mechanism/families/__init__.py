@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from loopcal.lazy_names import LazyRegistry
+from loopcal.registry import Registry
 
 if TYPE_CHECKING:
     from loopcal.mechanism.families.records import RobotRecord
 
-FAMILIES: LazyRegistry[type[RobotRecord]] = LazyRegistry(
+FAMILIES: Registry[type[RobotRecord]] = Registry(
+    "family of robots",
+    "",
     {
         "3-prs": "loopcal.mechanism.families.prs:ThreePrs",
         "gough": "loopcal.mechanism.families.gough:Gough",
@@ -21,6 +23,6 @@ FAMILIES: LazyRegistry[type[RobotRecord]] = LazyRegistry(
         "linear-delta": "loopcal.mechanism.families.linear_delta:LinearDelta",
         "ru-pus-prs": "loopcal.mechanism.families.prs:RuPusPrs",
         "stages": "loopcal.mechanism.families.stages:Stages",
-    }
+    },
 )
 """Records by the name of their family, imported when a robot file names it."""

@@ -379,7 +379,7 @@ def build_provenance_section(record: CalibrationRecord) -> Section:
         *((_label_version(name), value) for name, value in made_by.get("versions", {}).items()),
         *((f"seed: {name}", str(seed)) for name, seed in made_by.get("seeds", {}).items()),
         ("method", describe_call(str(record.result["fit"].get("method") or "unknown"))),
-        *list_options(str(record.result.get("options") or "")),
+        *list_options(record.result.get("options")),
     ]
     files = [
         *((f"input: {i}", f["path"], f["sha256"]) for i, f in made_by.get("inputs", {}).items()),

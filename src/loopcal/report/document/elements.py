@@ -21,6 +21,7 @@ import numpy as np
 from loopcal.apply.height_errors import HeightErrors, restore_heights
 from loopcal.apply.validation import Validation, restore_validation
 from loopcal.apply.verdict import Verdict
+from loopcal.estimate.options import OBJECT, FitOptions
 from loopcal.estimate.posterior import Posterior, posterior_from_arrays
 from loopcal.estimate.result import KindResiduals, residuals_from_arrays
 from loopcal.mechanism.model import Mechanism
@@ -312,19 +313,42 @@ def build_record(
 UNITS = {"limit_position": "m", "limit_angle": "rad"}
 """Units of options that are numbers [SI]."""
 
-OBJECT = re.compile(r"(?<==)<([A-Za-z_]+)[^<>]*>")
+PYTHON_OBJECT = re.compile(r"(?<==)<([A-Za-z_]+)[^<>]*>")
 """What Python writes of an argument that is an object."""
 
 UNSTATED = ("None", "()", "[]", "{}")
 """Values of options that nobody stated."""
 
 
-def list_options(text: str) -> list[tuple[str, str]]:
-    """Return name and value of each stated option; the text itself where it is no call."""
-    call = _parse_call(text)
-    if call is None:
-        return [("options", text or "unknown")]
-    return [(f"option: {name.replace('_', ' ')}", value) for name, value in _list_values(call)]
+def list_options(options: object) -> list[tuple[str, str]]:
+    """Return name and value of each stated option; the text of a run of an earlier version."""
+    if not isinstance(options, Mapping):
+        return [("options", str(options or "unknown"))]
+    usual, fit = FitOptions().to_dict(), options.get("fit")
+    stated = {k: v for k, v in fit.items() if v != usual.get(k)} if isinstance(fit, dict) else {}
+    stated |= {key: value for key, value in options.items() if key != "fit"}
+    return [
+        (
+            f"option: {key.replace('_', ' ')}",
+            f"{describe_value(value)} {UNITS.get(key, '')}".strip(),
+        )
+        for key, value in stated.items()
+        if value not in (None, [], {})
+    ]
+
+
+def describe_value(value: Any) -> str:
+    """Return an option of plain data in words, such as `ridge (lam 0.1)`."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(map(describe_value, value))
+    if not isinstance(value, dict):
+        return str(value)
+    if OBJECT in value:  # `<Posterior of ...>` of Python
+        return str(value[OBJECT]).strip("<>").split(" ")[0]
+    settings = ", ".join(f"{k} {describe_value(v)}" for k, v in value.items() if k != "name")
+    return f"{value['name']} ({settings})" if "name" in value else settings
 
 
 def describe_call(text: str) -> str:
@@ -336,32 +360,20 @@ def describe_call(text: str) -> str:
 def _parse_call(text: str) -> ast.Call | None:
     """Return the call that a text is; None for other text."""
     try:
-        node = ast.parse(OBJECT.sub(r"\1()", text), mode="eval").body
+        node = ast.parse(PYTHON_OBJECT.sub(r"\1()", text), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return None
     return node if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else None
 
 
-def _list_values(call: ast.Call) -> list[tuple[str, str]]:
-    """Return name and value of each argument that was stated; those of options within options have
-    names of their own.
-    """
-    values: list[tuple[str, str]] = []
-    for keyword in call.keywords:
-        name, node = keyword.arg or "", keyword.value
-        if ast.unparse(node) in UNSTATED:
-            continue
-        if isinstance(node, ast.Call) and name == "fit":
-            values += _list_values(node)
-        else:
-            values.append((name, " ".join([_describe_option(node), *UNITS.get(name, "").split()])))
-    return values
-
-
 def _describe_option(node: ast.expr) -> str:
     """Return a value in words."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-        arguments = [f"{name.replace('_', ' ')} {value}" for name, value in _list_values(node)]
+        arguments = [
+            f"{(keyword.arg or '').replace('_', ' ')} {_describe_option(keyword.value)}"
+            for keyword in node.keywords
+            if ast.unparse(keyword.value) not in UNSTATED
+        ]
         arguments = [*(_describe_option(value) for value in node.args), *arguments]
         return f"{node.func.id} ({', '.join(arguments)})" if arguments else node.func.id
     if isinstance(node, ast.Tuple | ast.List):

@@ -15,17 +15,8 @@ from msgspec import convert
 
 from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
 from loopcal.errors import DataError, UnitError, suggest_names
-from loopcal.estimate.losses import Huber, Loss, Tukey
 from loopcal.estimate.options import FitOptions
-from loopcal.estimate.penalties import (
-    GCV,
-    MAP,
-    LeastSquares,
-    Method,
-    Ridge,
-    TruncatedSVD,
-    TruncationGCV,
-)
+from loopcal.estimate.penalties import MAP, LeastSquares, Method
 from loopcal.estimate.plane_line_products import Layout
 from loopcal.estimate.tolerance_components import InflatedTolerances
 from loopcal.io.core.yaml_file import parse_yaml
@@ -366,24 +357,16 @@ def is_planned(level: PosesLevel) -> bool:
 
 def make_method(level: MethodLevel) -> Method:
     """Return the method of a level; the default is that of `identify`."""
-    if level.has_steps:  # fitted in published_fits.py
+    if level.has_steps:  # fitted in fits.py
         return LeastSquares()
-    if level.method == "map":
-        return MAP()
-    if level.method == "least-squares":
-        return LeastSquares()
-    if level.method == "ridge":
-        return Ridge(GCV() if level.lam is None else level.lam)
-    if level.method == "truncated-svd":
-        return TruncatedSVD(TruncationGCV() if level.keep is None else level.keep)
-    return MAP(InflatedTolerances())
-
-
-def make_loss(level: MethodLevel) -> Loss | None:
-    """Return the loss of a level."""
-    return {"none": None, "huber": Huber(), "tukey": Tukey()}[level.loss]
+    return make_fit_options(level).method or MAP(InflatedTolerances())
 
 
 def make_fit_options(level: MethodLevel) -> FitOptions:
-    """Return the options of a fit."""
-    return FitOptions(method=make_method(level), loss=make_loss(level), noise=level.noise)
+    """Return the options of a fit; without uncertainties, those of published steps."""
+    if level.has_steps:
+        return FitOptions(LeastSquares())
+    stated = {key: getattr(level, key) for key in ("method", "lam", "keep", "loss", "noise")}
+    options = FitOptions.from_dict(stated)
+    # a method that is stated does not refuse fewer equations than parameters
+    return options if options.method else replace(options, method=MAP(InflatedTolerances()))

@@ -20,6 +20,10 @@ from typing import (
     get_type_hints,
 )
 
+from loopcal.errors import suggest_names
+from loopcal.estimate.losses import LOSSES
+from loopcal.estimate.methods import METHODS, SETTINGS
+from loopcal.estimate.options import NO_LOSS, Noise
 from loopcal.measure.instrument import Distribution
 from loopcal.units import SI_SYMBOLS, Angle, Dimension, Length
 
@@ -46,7 +50,8 @@ MOST_STEPS = 1_000_000
 MOST_SWEEPS, FEWEST_POINTS = 100, 4
 """Largest number of sweeps of an exchange; smallest number of points of a plane with its line."""
 
-MethodName = Literal["auto", "map", "least-squares", "ridge", "truncated-svd", "per-leg"]
+PER_LEG = "per-leg"
+"""Method of a level beside those of `loopcal.estimate.methods`."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +192,8 @@ class MethodLevel:
 
     Parameters
     ----------
-    method : "auto" is the default of `identify`, see `loopcal.estimate.penalties`.
-        "per-leg" identifies a hexapod leg by leg from full poses, as a published study does.
+    method : "auto" is the default of `identify`, see `loopcal.estimate.methods`. "per-leg"
+        identifies a hexapod leg by leg from full poses, as a published study does.
     lam : weight of the penalty of ridge. keep : directions of truncated-svd. Both are chosen by
         cross-validation where they are not stated.
     loss, noise : as in `FitOptions`.
@@ -202,11 +207,11 @@ class MethodLevel:
     """
 
     PLAIN: ClassVar[str] = "method"
-    method: MethodName = "auto"
+    method: Annotated[str, METHODS, PER_LEG] = "auto"
     lam: float | None = None
     keep: int | None = None
-    loss: Literal["none", "huber", "tukey"] = "none"
-    noise: Literal["given", "estimated"] = "given"
+    loss: Annotated[str, NO_LOSS, LOSSES] = NO_LOSS
+    noise: Noise = "given"
     rows: Literal["weighted", "raw", "products", "products-printed"] = "weighted"
     epsilon: float | None = None
     steps: int | None = None
@@ -214,12 +219,12 @@ class MethodLevel:
     @property
     def is_published(self) -> bool:
         """Whether the method is one of published studies, without uncertainties."""
-        return self.rows != "weighted" or self.method == "per-leg"
+        return self.rows != "weighted" or self.method == PER_LEG
 
     @property
     def has_steps(self) -> bool:
         """Whether the fit takes full steps until they are small."""
-        return self.rows == "raw" or self.method == "per-leg"
+        return self.rows == "raw" or self.method == PER_LEG
 
     @property
     def is_of_products(self) -> bool:
@@ -227,11 +232,18 @@ class MethodLevel:
         return self.rows.startswith("products")
 
     def __post_init__(self) -> None:
+        for key, registry, other in (("method", METHODS, PER_LEG), ("loss", LOSSES, NO_LOSS)):
+            value = getattr(self, key)
+            if value in registry:
+                object.__setattr__(self, key, registry.resolve(value))
+            elif value != other:
+                allowed = (*registry, other)
+                hint = suggest_names(value, allowed)
+                raise ValueError(f"{key} is {value!r}{hint}; it must be {' or '.join(allowed)}")
         self._check_published()
-        for key, value, method in (
-            ("lam", self.lam, "ridge"),
-            ("keep", self.keep, "truncated-svd"),
-        ):
+        stated = {"lam": self.lam, "keep": self.keep}
+        for key, value in stated.items():
+            method = SETTINGS[key][0]
             if value is not None and self.method != method:
                 raise ValueError(
                     f"{key} belongs to the method {method}, not to {self.method}; remove it, or "
@@ -249,14 +261,14 @@ class MethodLevel:
                     )
         if not self.is_published:
             return
-        what = "the method per-leg" if self.method == "per-leg" else f"'rows: {self.rows}'"
-        if self.loss != "none" or self.noise != "given":
+        what = "the method per-leg" if self.method == PER_LEG else f"'rows: {self.rows}'"
+        if self.loss != NO_LOSS or self.noise != "given":
             raise ValueError(f"{what} has no loss and no estimated noise; remove them")
-        if self.method == "per-leg" and self.rows != "weighted":
+        if self.method == PER_LEG and self.rows != "weighted":
             raise ValueError("the rows of per-leg are raw ones always; remove 'rows'")
-        needed = {"ridge": "lam", "truncated-svd": "keep"}.get(self.method)
-        if needed is not None and getattr(self, needed) is None:
-            raise ValueError(f"{self.method} with {what} needs {needed}; add it")
+        for needed in ("lam", "keep"):
+            if SETTINGS[needed][0] == self.method and getattr(self, needed) is None:
+                raise ValueError(f"{self.method} with {what} needs {needed}; add it")
         if self.method == "auto" or (self.method == "map" and self.rows == "raw"):
             raise ValueError(
                 f"{self.method} needs weighted rows; remove {what}, or take another method"
@@ -492,8 +504,8 @@ def _list_units(record: type, prefix: str = "") -> dict[str, str]:
     units: dict[str, str] = {}
     for name, hint in get_type_hints(record, include_extras=True).items():
         for part in (hint, *get_args(hint)):
-            if get_origin(part) is Annotated:
-                units[prefix + name] = SI_SYMBOLS[get_args(part)[1]]
+            if get_origin(part) is Annotated and isinstance(mark := get_args(part)[1], Dimension):
+                units[prefix + name] = SI_SYMBOLS[mark]
             elif isinstance(part, type) and is_dataclass(part):
                 units |= _list_units(part, f"{prefix}{name}.")
     return units

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registries: from the name of a kind, loss, method or format to what implements it.
+
+loopcal fills a registry by one line for each entry. Another package adds its own by a call of
+`register`, or by an entry point of the registry's group, so that the command line finds it, too
+(docs/extending.md). An entry is imported when it is looked up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, TypeVar
+
+from loopcal.errors import DataError, suggest_names
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+T = TypeVar("T")
+E = TypeVar("E")
+
+
+class UnknownNameError(DataError, KeyError):
+    """A name that a registry does not have; the text lists those that it has."""
+
+    __str__ = Exception.__str__
+
+
+class Registry(Mapping[str, T]):
+    """Entries by name; an unknown name is an `UnknownNameError`.
+
+    Parameters
+    ----------
+    noun : what an entry is, for messages. group : of entry points of other packages, which are
+        read only if loopcal itself does not have a name, or if all names are listed; empty for
+        entries of loopcal alone.
+    places : name -> module and name of an entry of loopcal, as in `package.module:Name`.
+    aliases : other names that are accepted, but not listed -> name.
+    """
+
+    def __init__(
+        self,
+        noun: str,
+        group: str,
+        places: Mapping[str, str] | None = None,
+        aliases: Mapping[str, str] | None = None,
+    ) -> None:
+        self.noun, self.group = noun, group
+        self._places, self._aliases = dict(places or {}), dict(aliases or {})
+        self._registered: dict[str, T] = {}
+
+    def register(self, entry: E, /) -> E:
+        """Add an entry under its attribute `name`, and return it; also a decorator of classes.
+
+        It replaces an earlier entry of this name, as when a notebook executes a cell again, but
+        none of loopcal itself.
+
+        Raises
+        ------
+        DataError : the entry has no name, or the name of an entry of loopcal.
+        """
+        name = getattr(entry, "name", None)
+        if not isinstance(name, str) or not name:
+            raise DataError(f"{entry!r} has no name; a {self.noun} needs the attribute 'name'")
+        if name in self._places or name in self._aliases:
+            raise DataError(f"{name!r} is the name of a {self.noun} of loopcal; choose another")
+        self._registered[name] = entry  # type: ignore[assignment]  # what is registered is a T
+        return entry
+
+    def resolve(self, name: str) -> str:
+        """Return the listed name of an entry for a name or alias.
+
+        Raises
+        ------
+        UnknownNameError : there is none.
+        """
+        name = self._aliases.get(name, name)
+        if name in self._places or name in self._registered or name in self._offered:
+            return name
+        raise UnknownNameError(
+            f"{name!r} is not a {self.noun}{suggest_names(name, self)}; known are {', '.join(self)}"
+        )
+
+    def __getitem__(self, name: str) -> T:
+        name = self.resolve(name)
+        if name in self._places:
+            module, _, attribute = self._places[name].partition(":")
+            return getattr(import_module(module), attribute)
+        if name in self._registered:
+            return self._registered[name]
+        try:
+            return self._offered[name].load()
+        except (ImportError, AttributeError) as error:
+            place = f"the {self.noun} {name!r} of {self._offered[name].value}"
+            raise DataError(f"{place} cannot be loaded: {error}") from error
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self._places, *self._registered, *sorted(self._offered))))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __contains__(self, name: object) -> bool:
+        known = (self._places, self._registered, self._aliases)
+        return any(name in names for names in known) or name in self._offered
+
+    # a registry is itself, not its entries: it may stand in an annotation
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
+    def __repr__(self) -> str:
+        return f"<Registry of {self.noun}: {', '.join(self)}>"
+
+    @property
+    def _offered(self) -> Mapping[str, EntryPoint]:
+        """The entry points of other packages by name."""
+        return _list_entry_points(self.group) if self.group else {}
+
+
+@cache
+def _list_entry_points(group: str) -> Mapping[str, EntryPoint]:
+    """Return name -> entry point of all installed packages (cached: listing takes 30 ms)."""
+    from importlib.metadata import entry_points
+
+    return {point.name: point for point in entry_points(group=group)}

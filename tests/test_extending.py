@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/extending.md: a package with a kind, a loss and a format of its own."""
+
+import json
+import re
+import runpy
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.cli.entry_point import main
+from loopcal.errors import DataError
+from loopcal.estimate.losses import LOSSES
+from loopcal.io.formats import FORMATS
+from loopcal.measure.kinds import KINDS
+from loopcal.registry import _list_entry_points
+
+PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+
+
+def find_block(language: str) -> str:
+    """Return the block of the page in a language."""
+    (block,) = re.findall(
+        rf"^```{language}\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL
+    )
+    return block
+
+
+def run_module(folder: Path) -> dict:
+    """Return the names of the module of the page, after it was executed as in a notebook."""
+    (folder / "notebook.py").write_text(find_block("python"))
+    return runpy.run_path(str(folder / "notebook.py"))
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Forget what a test registers."""
+    for registry in (LOSSES, KINDS, FORMATS):
+        monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.delitem(sys.modules, "acme", raising=False)
+    _list_entry_points.cache_clear()
+    yield
+    _list_entry_points.cache_clear()
+
+
+@pytest.fixture
+def package(registered, tmp_path, monkeypatch) -> Path:
+    """An installed package with the module of the page, without its calls of `register`."""
+    text = re.sub(r"^@lc\.register_\w+\n", "", find_block("python"), flags=re.MULTILINE)
+    text = text.replace("lc.register_format(\n    lc.Format", "(\n    lc.Format")
+    assert "register" not in text
+    site = tmp_path / "site"
+    (site / "acme-1.dist-info").mkdir(parents=True)
+    (site / "acme.py").write_text(text)
+    (site / "acme-1.dist-info" / "METADATA").write_text("Name: acme\nVersion: 1\n")
+    points = tomllib.loads(find_block("toml"))["project"]["entry-points"]
+    lines = [
+        line
+        for group, entries in points.items()
+        for line in (f"[{group}]", *(f"{name} = {value}" for name, value in entries.items()))
+    ]
+    (site / "acme-1.dist-info" / "entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(str(site))
+    return tmp_path
+
+
+def test_the_commands_of_the_page_use_an_installed_package(package, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(package)
+    Path("printer.acme").write_text("RADIUS 105\nARM 220\n")
+    for line in find_block("sh").splitlines():
+        words = shlex.split(line)
+        monkeypatch.setattr("sys.argv", words)
+        assert main(words[1:]) == 0, (line, capsys.readouterr())
+    assert "runout" in Path("data.csv").read_text()
+    result = json.loads(Path("run/result.json").read_text())
+    assert result["options"]["fit"]["loss"] == "cauchy"
+    radius, _ = Path("calibrated.acme").read_text().split()[1::2]
+    assert float(radius) == pytest.approx(1e3 * lc.load_run("run").robot.values[0], abs=1e-6)
+    capsys.readouterr()
+    assert main(["calibrate", "--help"]) == 0
+    assert "[none|huber|tukey|cauchy]" in capsys.readouterr().out
+
+
+def test_the_module_of_the_page_registers_itself(registered, tmp_path, capsys) -> None:
+    names = run_module(tmp_path)
+    robot = lc.load_robot("linear-delta")
+    truth = robot.with_values(lc.sample_truth(robot, 1, seed=1)[0])
+    sensors = (
+        lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-5))),
+        lc.Sensor(names["Runout"](), lc.Gaussian(np.full(1, 1e-5))),
+    )
+    poses = lc.sample_workspace(robot, 20, seed=1).coordinates
+    data = lc.simulate(truth, poses, lc.Instrument(sensors), seed=1)
+    options = lc.FitOptions(loss=names["Cauchy"](3.0))
+    fit = lc.identify(robot, data, options=options)
+    assert fit.converged
+    assert options.to_dict()["loss"] == {"name": "cauchy", "c": 3.0}
+    assert lc.FitOptions.from_dict(options.to_dict()).loss == names["Cauchy"](3.0)
+    assert "runout" in lc.KINDS
+    assert main(["export", "linear-delta", "--format", "acme"]) == 0
+    assert capsys.readouterr().out == "RADIUS 105.000000\nARM 220.000000\n"
+
+
+def test_the_kind_of_the_page_has_the_derivatives_of_its_columns(registered, tmp_path) -> None:
+    names = run_module(tmp_path)
+    kind = names["Runout"]()
+    x, step = np.array([[[0.03, -0.02, 0.5]]]), 1e-6
+    _, slope, _ = kind.predict(x, np.zeros((1, 0)))
+    for axis in range(3):
+        move = np.eye(3)[axis] * step
+        high, low = (kind.predict(x + sign * move, np.zeros((1, 0)))[0] for sign in (1, -1))
+        assert slope[0, 0, 0, axis] == pytest.approx((high - low).item() / (2 * step), abs=1e-8)
+
+
+def test_what_is_no_kind_and_no_loss_cannot_be_registered(registered) -> None:
+    with pytest.raises(DataError, match="extends Kind"):
+        lc.register_kind(int)
+    with pytest.raises(DataError, match="no function 'weight"):
+        lc.register_loss(int)
+    with pytest.raises(DataError, match="'huber' is the name of a loss of loopcal"):
+        lc.register_loss(lc.Huber)
+    with pytest.raises(DataError, match="'json' is the name of a format"):
+        lc.register_format(lc.Format("json", "another one"))
