@@ -352,7 +352,7 @@ def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> Floa
     return geometry.transport_matrix(arm, R.swapaxes(1, 2) if axes == "platform" else None)
 
 
-# --- Uncertainty of poses over the workspace, compared with that of the measured poses.
+# Uncertainty of poses over the workspace, compared with that of the measured poses.
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,7 +469,7 @@ def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
         return np.where(values == largest, 1.0, values / largest)
 
 
-# --- Check the linear prediction of pose errors by many simulated calibrations.
+# Check the linear prediction of pose errors by many simulated calibrations.
 
 BATCH = 250  # trials that are identified at once; progress is reported between them
 

@@ -135,7 +135,7 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     return findings
 
 
-# --- What combinations of parameters that data leave open do: move frames only, or change poses.
+# What combinations of parameters that data leave open do: move frames only, or change poses.
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def sort_open_freedoms(
     return OpenFreedoms(find_frame_motions(posterior), count, changing, tuple(names))
 
 
-# --- What redundant readings alone leave open, in one sentence.
+# What redundant readings alone leave open, in one sentence.
 
 
 def is_readings_alone(data: Measurements) -> bool:

@@ -124,7 +124,7 @@ class CalibrationOptions:
                 raise DataError(report_finding("workflow.option-excludes-prior", option=option))
 
 
-# --- Measurements divided into those to fit and those held out for validation.
+# Measurements divided into those to fit and those held out for validation.
 
 UNKNOWN = np.array(np.inf)  # sigma of readings that may be missing
 
@@ -167,8 +167,6 @@ def split_data(
     hold_out : share of the poses to hold out, drawn by whole blocks, and with all repeats of a
         pose, as `data.split` does. 0 holds nothing out.
     held_out : labels of the poses to hold out, instead of a share.
-    Raises DataError: a label that the data do not have, two choices of poses, or no pose is left
-        to fit.
     """
     stated = tuple(label for label, out in zip(data.labels, data.is_held_out, strict=True) if out)
     if stated and (hold_out or (held_out and set(held_out) != set(stated))):

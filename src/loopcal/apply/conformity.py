@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.diagnose.row_errors import PoseErrors
+from loopcal.diagnose.row_errors import PoseErrors, invert_increasing
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.kind import list_error_groups
@@ -167,7 +167,9 @@ def judge_largest_error(
     exceed = _find_distribution(mean, noise)
     size = np.sqrt((mean**2).sum(axis=1))
     widest = 2.0 * float(size.max() + 10.0 * np.sqrt(np.nansum(noise, axis=1).max()))
-    low, estimate, high, bound = (_invert(exceed, p, widest) for p in (*INTERVAL, level))
+    low, estimate, high, bound = (
+        invert_increasing(exceed, p, widest, BISECTIONS) for p in (*INTERVAL, level)
+    )
     return Conformity(
         limit, estimate, low, high, bound, float(exceed(limit)), level, count=len(mean)
     )
@@ -348,12 +350,3 @@ def _weigh_scales(errors: FloatArray, noise: FloatArray) -> tuple[FloatArray, Fl
     nodes, weight = weigh(float(nodes[first]), float(nodes[last]))
     kept = weight > NEGLIGIBLE
     return np.exp(nodes[kept]), weight[kept] / weight[kept].sum()
-
-
-def _invert(distribution: Callable[[float], float], probability: float, widest: float) -> float:
-    """Return the value with this probability below it, by bisection from 0 to `widest`."""
-    low, high = 0.0, widest
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if distribution(middle) < probability else (low, middle)
-    return high

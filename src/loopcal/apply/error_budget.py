@@ -21,6 +21,7 @@ from loopcal.diagnose.error_frames import (
     FITTED,
     RELATIVE,
     ToolErrors,
+    compute_mean_squares,
     linearize_tool_errors,
     locate_measured_poses,
 )
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- Split the covariance of a fit by the sources of its errors, and compute it for other sigmas.
+# Split the covariance of a fit by the sources of its errors, and compute it for other sigmas.
 
 INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
 # Kinds of sources; others are the codes of the findings with which a covariance was added.
@@ -457,7 +458,6 @@ def compute_error_budget(
     frame : in which the errors of poses are stated, see `choose_error_frame`; "relative" means
         relative to the home pose.
     Returns ErrorBudget; None where the fit has no intervals, or where no pose is reached.
-    Raises EstimationError: no such frame.
     """
     check_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals):
@@ -516,13 +516,13 @@ def _list_sources(
         if source.kind == SETUP and not is_relative:
             twists = np.concatenate([twists, effects.by_frame], axis=2)
         variances = np.where(split.undetermined, np.nan, (root**2).sum(axis=1))
-        angle, position = _mean_squares(twists)
+        angle, position = compute_mean_squares(twists)
         lines.append(SourceBudget(source, position, angle, variances, None))
     repeated = effects.by_readings
     if is_relative:
         repeated = np.concatenate([repeated, effects.by_frame], axis=2)
     if repeated.any():
-        angle, position = _mean_squares(repeated)
+        angle, position = compute_mean_squares(repeated)
         nothing = np.where(split.undetermined, np.nan, 0.0)
         source = Source(REPEATABILITY, "", "B", np.inf)
         lines.append(SourceBudget(source, position, angle, nothing, None))
@@ -568,7 +568,7 @@ def _halve(
             effects = linearize_tool_errors(posterior, solution, frame)
         D, own = effects.by_parameters / fit.posterior.unit, effects.by_frame
         own = own[..., :0] if frame == RELATIVE else own
-        angle, place = _mean_squares(np.concatenate([D @ root, own], axis=2))
+        angle, place = compute_mean_squares(np.concatenate([D @ root, own], axis=2))
         kept = [each for each in lines if each.source.kind not in _OF_ROWS]
         place += sum(each.position for each in kept)
         angle += sum(each.orientation for each in kept)
@@ -590,14 +590,6 @@ def _add_kinds(lines: list[SourceBudget]) -> tuple[ErrorSources, ErrorSources]:
         for total, name in zip(sums, _LENGTHS, strict=True):
             total[kind if kind in total else "other"] += getattr(line, name)
     return ErrorSources(**sums[0]), ErrorSources(**sums[1])
-
-
-def _mean_squares(twists: FloatArray) -> tuple[float, float]:
-    """Return the mean over poses of the squares of rotations [rad^2] and displacements [m^2] of
-    twists (n, 6, k) by independent errors of variance 1.
-    """
-    squares = (twists**2).sum(axis=2)
-    return float(squares[:, :3].sum(axis=1).mean()), float(squares[:, 3:].sum(axis=1).mean())
 
 
 def _word(

@@ -137,7 +137,7 @@ def analyze_identifiability(
     return IdentifiabilityReport(analysis, suggestions, subset, accuracy, is_readings_alone(data))
 
 
-# --- Inspect a robot: its readings at home, and the limits that home exceeds.
+# Inspect a robot: its readings at home, and the limits that home exceeds.
 
 ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
 

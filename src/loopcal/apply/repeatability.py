@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- The result of `assess_repeatability`: what each visited pose shows.
+# The result of `assess_repeatability`: what each visited pose shows.
 
 # Dimensions of the quantities.
 DIMENSIONS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- What a comparison needs of a calibration, as `loopcal.Run` has it.
+# What a comparison needs of a calibration, as `loopcal.Run` has it.
 
 
 class StoredRun(Protocol):
@@ -124,17 +124,14 @@ def list_data_digests(run: StoredRun) -> tuple[str, ...]:
     return tuple(sorted(f["sha256"] for r, f in files.items() if r.partition("-")[0] in roles))
 
 
-# --- Refuse calibrations whose numbers cannot be compared, and say why.
+# Refuse calibrations whose numbers cannot be compared, and say why.
 
 # Attributes by which an argument is recognized as a run.
 NEEDED = ("path", "result", "robot", "arrays", "load_posterior")
 
 
 def check_runs(runs: Sequence[StoredRun]) -> None:
-    """Refuse too few runs, the same one twice, and what is no run.
-
-    Raises DataError: `runs.too-few`, `runs.given-twice` or `runs.no-calibration`.
-    """
+    """Refuse too few runs, the same one twice, and what is no run."""
     is_list = isinstance(runs, Sequence) and not isinstance(runs, str)
     if not is_list or not all(hasattr(run, name) for run in runs for name in NEEDED):
         raise DataError("runs: give a list of runs, such as [load_run('may'), load_run('june')]")
@@ -157,16 +154,16 @@ def refuse_incomparable(
 
     names : of both runs. is_same_data : whether both were fitted to the same rows; then they may
         identify different parameters, because only methods and models are compared.
-    Raises DataError: `runs.other-...`; EstimationError : `comparison.other-dimensions`.
     """
     words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
     mine, theirs = first.robot, second.robot
     if name := _find_lonely(mine.parameters.names, theirs.parameters.names):
         place = names[0] if name in mine.parameters.names else names[1]
         raise DataError(report_finding("runs.other-parameters", **words, name=name, place=place))
-    for what, first_text, second_text in _list_structure(mine, theirs):
-        if first_text != second_text:
-            data: dict[str, Any] = {"what": what, "mine": first_text, "theirs": second_text}
+    structure = _list_structure(theirs)
+    for what, text in _list_structure(mine).items():
+        if text != structure[what]:
+            data: dict[str, Any] = {"what": what, "mine": text, "theirs": structure[what]}
             raise DataError(report_finding("runs.other-mechanism", **words, **data))
     free = [list_free(run) for run in (first, second)]
     if not is_same_data and (name := _find_lonely(*free)):
@@ -187,8 +184,7 @@ def refuse_incomparable(
 
 def _find_lonely(first: Sequence[str], second: Sequence[str]) -> str:
     """Return the first name that only one of two lists has; empty without any."""
-    different = [n for n in (*first, *second) if (n in first) != (n in second)]
-    return different[0] if different else ""
+    return next((n for n in (*first, *second) if (n in first) != (n in second)), "")
 
 
 def list_free(run: StoredRun) -> tuple[str, ...]:
@@ -196,24 +192,20 @@ def list_free(run: StoredRun) -> tuple[str, ...]:
     return tuple(row["name"] for row in run.result["fit"]["parameters"])
 
 
-def _list_structure(first: Mechanism, second: Mechanism) -> list[tuple[str, str, str]]:
-    """Return what must be equal, in words, and its text in both robots."""
-    table = second.parameters
-    theirs = [table.dimensions[table.index(name)] for name in first.parameters.names]
-    pairs = zip(first.parameters.names, first.parameters.dimensions, theirs, strict=True)
-    return [
-        ("actuators", _name_actuators(first), _name_actuators(second)),
-        ("controlled coordinates", ", ".join(first.controlled), ", ".join(second.controlled)),
-        *((f"physical dimensions of {n}", a.value, b.value) for n, a, b in pairs),
-    ]
+def _list_structure(robot: Mechanism) -> dict[str, str]:
+    """Return what must be equal in two robots of the same parameters: name and text."""
+    table = robot.parameters
+    return {
+        "actuators": ", ".join(f"{a.name} ({a.dimension.value})" for a in robot.actuators),
+        "controlled coordinates": ", ".join(robot.controlled),
+        **{
+            f"physical dimensions of {name}": dimension.value
+            for name, dimension in zip(table.names, table.dimensions, strict=True)
+        },
+    }
 
 
-def _name_actuators(robot: Mechanism) -> str:
-    """Return the actuators with their physical dimensions."""
-    return ", ".join(f"{a.name} ({a.dimension.value})" for a in robot.actuators)
-
-
-# --- The errors of several calibrations at the same held-out poses.
+# The errors of several calibrations at the same held-out poses.
 
 QUANTITIES = ("position", "orientation", "length")  # quantities whose errors are compared
 
@@ -295,7 +287,7 @@ def _read_errors(run: StoredRun, poses: Sequence[str] | None) -> dict[str, Stati
     return result
 
 
-# --- Two calibrations: whether the machine has changed, and by what.
+# Two calibrations: whether the machine has changed, and by what.
 
 # Probability that any of the compared machines is declared changed although none is.
 CHANGE_LEVEL = 0.05
@@ -395,19 +387,21 @@ def compare_pair(
         finding = report_finding("runs.same-data", **words, shared=relation.shared)
         return _leave_open(first, names, relation, finding)
     if relation.kind == "shared":
-        data: dict[str, Any] = {"shared": relation.shared, "total": relation.total}
-        finding = report_finding("runs.rows-shared", **words, **data)
+        counts: dict[str, Any] = {"shared": relation.shared, "total": relation.total}
+        finding = report_finding("runs.rows-shared", **words, **counts)
         return _leave_open(first, names, relation, finding)
-    for name, run in zip(names, (first, second), strict=True):
-        if reason := _find_obstacle(run):
-            finding = report_finding("runs.not-tested", **words, run=name, reason=reason)
-            return _leave_open(first, names, relation, finding)
-    posteriors = (first.load_posterior(), second.load_posterior())
-    changes = compare_information(*posteriors)
-    if not changes.degrees:
-        finding = report_finding("runs.not-tested", **words, run="", reason="nothing")
-        return _leave_open(first, names, relation, finding)
-    return _test(posteriors[0], changes, words, relation, tests)
+    run, reason = "", "nothing"
+    for name, each in zip(names, (first, second), strict=True):
+        if obstacle := _find_obstacle(each):
+            run, reason = name, obstacle
+            break
+    else:
+        earlier = first.load_posterior()
+        changes = compare_information(earlier, second.load_posterior())
+        if changes.degrees:
+            return _test(earlier, changes, words, relation, tests)
+    finding = report_finding("runs.not-tested", **words, run=run, reason=reason)
+    return _leave_open(first, names, relation, finding)
 
 
 def _test(
@@ -423,20 +417,20 @@ def _test(
     moved = p_value < level
     cause, nothing = ChangeCause("none"), np.zeros(0)
     cause_shift, cause_sd = nothing, nothing
-    numbers: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
+    judged: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
     if moved:
         cause = explain_change(changes, CAUSE_LEVEL)
         if cause.parameters:
             cause_shift, cause_sd = estimate_cause(changes, cause)
-        more = _word_cause(earlier, cause, cause_shift, cause_sd)
-        judged = {**numbers, "p_value": p_value, "level": CHANGE_LEVEL, **more}
-        finding = report_finding("runs.machine-changed", **words, **judged)
-    elif p_value > 1.0 - TOO_WELL:
-        judged = {**numbers, "probability": 1.0 - p_value}
-        finding = report_finding("runs.agree-too-well", **words, **judged)
+        code = "runs.machine-changed"
+        judged |= _word_cause(earlier, cause, cause_shift, cause_sd)
     else:
-        judged = {**numbers, "p_value": p_value, "level": CHANGE_LEVEL}
-        finding = report_finding("runs.machine-unchanged", **words, **judged)
+        code = "runs.agree-too-well" if p_value > 1.0 - TOO_WELL else "runs.machine-unchanged"
+    if code == "runs.agree-too-well":
+        judged["probability"] = 1.0 - p_value
+    else:
+        judged |= {"p_value": p_value, "level": CHANGE_LEVEL}
+    finding = report_finding(code, **words, **judged)
     shift, sd = changes.estimate_shifts()
     single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shift).sum()))
     return PairComparison(
@@ -492,7 +486,7 @@ def _leave_open(
     run: StoredRun, names: tuple[str, str], relation: DataRelation, finding: Finding
 ) -> PairComparison:
     """Return a comparison without a test."""
-    free = tuple(row["name"] for row in run.result["fit"]["parameters"])
+    free = list_free(run)
     unknown = np.full(len(free), np.nan)
     return PairComparison(
         *names,

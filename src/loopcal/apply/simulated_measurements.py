@@ -61,8 +61,6 @@ def simulate_measurements(
     places : (n,) places of the poses such as `poses.csv:12`, for messages.
     skip_unreachable : leave out poses outside the reach or the strokes of the nominal or the true
         machine, and name them in the result. Poses without names keep their numbers.
-    Raises MechanismError, DataError: the robot states no workspace, or a pose is outside its reach
-        or strokes, with `skip_unreachable` every pose.
     """
     truth = draw_true_machine(robot, seed) if draw_errors else robot
     targets = resolve_poses(truth.nominal, poses, seed)
@@ -146,7 +144,7 @@ def predict_noise_free(
     )
 
 
-# --- Build an instrument from a short description: kinds, noise, and which frames are unknown.
+# Build an instrument from a short description: kinds, noise, and which frames are unknown.
 
 # A frame that may be unknown -> the names that kinds have for it.
 FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
@@ -177,11 +175,7 @@ class InstrumentDescription:
 
 
 def build_instrument(description: InstrumentDescription) -> Instrument:
-    """Return the instrument of a description.
-
-    Raises DataError: an unknown kind, frame or component, or a setting that belongs to none of the
-        kinds.
-    """
+    """Return the instrument of a description."""
     possible = {"components": tuple(description.components), "orientation": description.orientation}
     settings = {name: value for name, value in possible.items() if value}
     sigma = {Dimension.LENGTH: description.sigma_position, Dimension.ANGLE: description.sigma_angle}

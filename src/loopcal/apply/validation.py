@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- Findings of a validation: limits, setup parameters that moved, and poses that were left out.
+# Findings of a validation: limits, setup parameters that moved, and poses that were left out.
 
 # Number of rows below which an error cannot be judged. At 4 rows the rms of noise alone varies by
 # a third.
@@ -241,7 +241,7 @@ def check_limits(
     return findings
 
 
-# --- Held-out poses that do not fit: the search, and findings with their largest errors.
+# Held-out poses that do not fit: the search, and findings with their largest errors.
 
 # Factor by which an rms error must fall without the blunders to be called dominated by them.
 DOMINATES = 2.0
@@ -649,7 +649,7 @@ def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, 
     }
 
 
-# --- Rows that a calibration was fitted to are no independent validation.
+# Rows that a calibration was fitted to are no independent validation.
 
 REFUSED_SHARE = 0.5  # share of reused rows from which data are refused for validation
 
@@ -658,7 +658,6 @@ def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding
     """Return the finding that some rows belong to a calibration; None where no row does.
 
     fitted : the rows of the calibration; None where they are not known. data : for validation.
-    Raises DataError: half of the rows or more belong to it.
     """
     reused = (fitted or FittedRows()).find_in(data)
     if not reused.count:
@@ -674,7 +673,7 @@ def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding
     return finding
 
 
-# --- A validation in a run folder: its numbers in result.json, and its differences as arrays.
+# A validation in a run folder: its numbers in result.json, and its differences as arrays.
 
 ERRORS = ("before", "after")  # errors whose differences are stored
 # First word of the names of the stored arrays, `held_out_<before or after>_<quantity>`.

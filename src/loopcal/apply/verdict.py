@@ -167,7 +167,7 @@ def _choose_validation(findings: Sequence[Finding], recommendation: str) -> str:
     return "workflow.next-hold-out"
 
 
-# --- Whether a machine is given the identified values or keeps its current ones.
+# Whether a machine is given the identified values or keeps its current ones.
 
 
 def recommend_values(

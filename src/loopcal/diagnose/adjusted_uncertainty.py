@@ -226,7 +226,7 @@ def _without_doubt_of_sigma(fit: Identification) -> Identification:
     return replace(fit, findings=findings)
 
 
-# --- Test whether large residuals are more frequent than normal noise makes them.
+# Test whether large residuals are more frequent than normal noise makes them.
 
 LEVEL = 0.01  # probability that normal noise is reported; below `SIGNIFICANCE` it is a warning
 DRAWS, BATCH = 10_000, 500  # draws of normal errors at most, and at once

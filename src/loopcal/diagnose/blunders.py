@@ -40,7 +40,7 @@ from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-# --- Test held-out blocks against what a fit predicts: noise plus the uncertainty of the fit.
+# Test held-out blocks against what a fit predicts: noise plus the uncertainty of the fit.
 
 # Probability of naming any block where none is wrong. It is small, because a named block changes
 # the verdict.

@@ -58,7 +58,7 @@ from loopcal.numerics.statistics import compute_single_level
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
-# --- Whitened rows of a fit in the order of its kinds, with columns for everything that they
+# Whitened rows of a fit in the order of its kinds, with columns for everything that they
 # determine.
 
 
@@ -112,7 +112,7 @@ def _make_empty(problem: Problem, rows: ObservationRows, width: int) -> Observed
     return ObservedColumns(np.zeros((r, m)), np.zeros((r, m, width)), by_parameters, coordinates)
 
 
-# --- Errors of the blocks of a fit, estimated from its residuals and corrected for leverage.
+# Errors of the blocks of a fit, estimated from its residuals and corrected for leverage.
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +266,7 @@ def _find_range(columns: FloatArray) -> FloatArray:
     return u[:, are_nonzero(s, NUISANCE_TOLERANCE)]
 
 
-# --- The scatter of the errors of blocks against the stated uncertainty of each parameter.
+# The scatter of the errors of blocks against the stated uncertainty of each parameter.
 
 # Probability that any parameter is reported where errors are independent and as stated.
 FALSE_ALARMS = 0.01
@@ -343,7 +343,7 @@ def describe_scatter(
     return BlockScatter(ratio, degrees, effective, tail, unit_sd, noise)
 
 
-# --- Choose which poses are resampled together.
+# Choose which poses are resampled together.
 
 # Blocks of a unit with which it is resampled by default: with fewer, the scatter of the resamples
 # is itself known to 20 % at best.
@@ -357,7 +357,6 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
     unit : "pose", "block", "session" or "day", or the number of consecutive poses of a block, in
         the order of the column `time`, or else of the file. None takes the largest unit with at
         least `ENOUGH_BLOCKS` blocks, or else the smallest.
-    Raises EstimationError: the data do not contain enough units of this name.
     """
     if isinstance(unit, int):
         return _consecutive(data, unit)

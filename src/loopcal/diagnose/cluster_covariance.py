@@ -42,7 +42,7 @@ from loopcal.numerics.elimination import find_connected_groups, fold_at
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- Divide poses into the units that may share an error: days, sessions, blocks or single poses.
+# Divide poses into the units that may share an error: days, sessions, blocks or single poses.
 
 # Clusters that a cluster-robust variance needs. The variance of a mean has one degree of freedom
 # less, and with fewer than 4 its distribution is not known well enough (Tipton, 2015).

@@ -121,8 +121,6 @@ def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...
     """Draw the poses held out in each of `count` folds: whole blocks, folds of nearly equal size.
 
     Poses that a row compares, such as a distance, are in one block: otherwise no fold has the row.
-
-    Raises DataError: there are fewer than two folds, or more folds than blocks.
     """
     names, member = np.unique(linked_blocks(data), return_inverse=True)
     if count < 2 or len(names) < count:
@@ -209,7 +207,6 @@ def score_leave_one_out(
     """Score methods that keep the columns as they are: ridge, truncation, least squares, MAP.
 
     robot : linearization point; best the robot of a fit. methods : at least one.
-    Raises EstimationError: the measurements have nuisance parameters.
     """
     free = select_free_parameters(robot)
     problem = problem_of(free, data)
@@ -291,7 +288,7 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
     return total / equations if np.isfinite(total) and equations else np.inf
 
 
-# --- Choose the simplest set of free parameters that predicts held-out poses as well as any.
+# Choose the simplest set of free parameters that predicts held-out poses as well as any.
 
 # Names of parameters that shift an actuator reading.
 OFFSETS = re.compile(r"(^|\.)(offset|stop|zero|home)$|^q\d+$")

@@ -155,8 +155,6 @@ def choose_error_frame(
         base frame in any case; "relative" is the first pose; the name of the frame of an
         instrument, such as "tracker", is that frame.
     origin : pose (1,) of the calibrated robot to which others are relative. origin_name : its name.
-    Raises EstimationError: no such frame (the text lists those that exist), or an unreachable
-        origin.
     """
     robot = posterior.robot
     instruments = {} if posterior.frames is None else posterior.frames.instruments
@@ -338,7 +336,7 @@ def _as_base_motion(by_base: FloatArray, twists: FloatArray) -> FloatArray:
     return np.concatenate([motion, np.zeros_like(motion)])
 
 
-# --- What the parameters, the frame and the readings of a calibrated robot do to its tool at
+# What the parameters, the frame and the readings of a calibrated robot do to its tool at
 # poses.
 
 # Measured poses, evenly chosen, by which two uncertainties are compared: ratios over more poses
@@ -364,7 +362,6 @@ def linearize_tool_errors(posterior: Posterior, solution: Solution, frame: str) 
 
     solution : poses that the calibrated robot reaches.
     frame : see `choose_error_frame`; "relative" means relative to the home pose.
-    Raises EstimationError: no such frame.
     """
     robot = posterior.robot
     chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")
@@ -383,6 +380,14 @@ def linearize_tool_errors(posterior: Posterior, solution: Solution, frame: str) 
         by_discrepancy,
         chosen.describe(axes=""),
     )
+
+
+def compute_mean_squares(twists: FloatArray) -> tuple[float, float]:
+    """Return the mean over poses of the squares of rotations [rad^2] and displacements [m^2] of
+    twists (n, 6, k) by independent errors of variance 1.
+    """
+    squares = (twists**2).sum(axis=2)
+    return float(squares[:, :3].sum(axis=1).mean()), float(squares[:, 3:].sum(axis=1).mean())
 
 
 def locate_measured_poses(

@@ -12,7 +12,12 @@ import numpy as np
 
 from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
 from loopcal.diagnose.cluster_covariance import ClusterCheck, check_clusters
-from loopcal.diagnose.error_frames import FITTED, linearize_tool_errors, locate_measured_poses
+from loopcal.diagnose.error_frames import (
+    FITTED,
+    compute_mean_squares,
+    linearize_tool_errors,
+    locate_measured_poses,
+)
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.repeated_poses import LackOfFit, check_lack_of_fit
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
@@ -28,7 +33,7 @@ from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.units import Dimension
 
-# --- Find parameters whose estimates are strongly correlated.
+# Find parameters whose estimates are strongly correlated.
 
 # Correlation above which the error of one parameter is mostly that of another (81 % of its
 # variance).
@@ -78,7 +83,7 @@ def find_correlated_groups(
     return tuple(sorted(groups, key=lambda g: -abs(g.correlation)))
 
 
-# --- Predict the gain of a calibration: pose errors expected from the tolerances, and after the
+# Predict the gain of a calibration: pose errors expected from the tolerances, and after the
 # fit.
 
 GAIN = 1.1  # factor by which an expected error must become smaller to count as an improvement
@@ -116,7 +121,6 @@ def estimate_calibration_gain(
         from, or other readings.
     frame : in which the errors are stated, see `choose_error_frame`; "relative"
         means relative to the home pose.
-    Raises EstimationError: no such frame.
     """
     free = fit.free_parameters
     if free.assumed.any():
@@ -161,9 +165,7 @@ def _rms_errors(factor: FloatArray, size: float) -> tuple[float, float]:
 
     They are 0 where they are rounding, such as the orientation of a delta of this size [m].
     """
-    square = (factor**2).sum(axis=2)
-    orientation = float(np.sqrt(square[:, :3].sum(axis=1).mean()))
-    position = float(np.sqrt(square[:, 3:].sum(axis=1).mean()))
+    orientation, position = (float(np.sqrt(square)) for square in compute_mean_squares(factor))
     return orientation * (orientation > ROUNDING), position * (position > ROUNDING * size)
 
 
@@ -253,7 +255,7 @@ def examine_fit(
     )
 
 
-# --- Compute the errors of recorded actuator readings, per actuator and in terms of the driven
+# Compute the errors of recorded actuator readings, per actuator and in terms of the driven
 # joint.
 
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- The observability indices O1 to O5. Formulas and sources: docs/theory/observability.md.
+# The observability indices O1 to O5. Formulas and sources: docs/theory/observability.md.
 
 # Units of the singular values; every index depends on them.
 SCALING = "rows divided by sigma, columns multiplied by tolerance"

@@ -24,7 +24,7 @@ from loopcal.numerics.statistics import compute_single_level
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray
 
-# --- Statistics of weighted draws, and how well the draws determine them.
+# Statistics of weighted draws, and how well the draws determine them.
 
 LARGEST_TAIL = 0.2  # share of the draws whose weights are the tail, at most; see `fit_tail_shape`
 

@@ -215,7 +215,7 @@ def _whiten(
     )
 
 
-# --- Which parameter, limb or pair of limbs explains the change of a machine.
+# Which parameter, limb or pair of limbs explains the change of a machine.
 
 DISTINGUISHED = 0.05  # probability of distinguishing the true cause from a better one by chance
 

@@ -48,7 +48,7 @@ from loopcal.numerics.statistics import (
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
-# --- Search the observation blocks that a fit to all others does not explain.
+# Search the observation blocks that a fit to all others does not explain.
 
 MOST_ROUNDS = 20  # largest number of searches with other suspects
 MOST_EXCLUDED = 0.5  # largest share of excluded blocks; beyond it nothing can be said of the others

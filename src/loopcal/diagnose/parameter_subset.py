@@ -168,7 +168,7 @@ def _merge(
     return MergedParameter(free.names[place], symbols[place], names, changes, units)
 
 
-# --- Separate the combinations of parameters that data determine to a useful accuracy from the
+# Separate the combinations of parameters that data determine to a useful accuracy from the
 # others.
 
 # Multiples of the accuracy for which the number of combinations is stated, too.
@@ -257,7 +257,6 @@ def judge_useful_accuracy(
     length : accuracy of lengths [m], a standard deviation.
     angle : accuracy of angles [rad]; default: the length over the robot's size, by which an angle
         moves a point at that distance as far as the length.
-    Raises EstimationError: an accuracy is not above 0 and finite.
     """
     free = analysis.free_parameters
     angle = length / free.robot.size if angle is None else angle

@@ -21,7 +21,7 @@ from loopcal.mechanism.solutions import forward
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, find_unit, list_symbols
 
-# --- Whether measured points have the names of the poses and targets at which they were measured.
+# Whether measured points have the names of the poses and targets at which they were measured.
 
 # Distance from its prediction, in medians, above which a point is not where its name says.
 FAR = 8.0
@@ -300,8 +300,6 @@ def examine_points(robot: Mechanism, data: Measurements, unit: str) -> tuple[Fin
     Rows of other kinds than `position` are not examined.
 
     unit : in which the points were read, for messages.
-    Raises DataError: points have each other's names, all names are shifted by one pose, another
-        unit explains the points, or the instrument has moved.
     """
     findings: list[Finding] = []
     solution = forward(robot, data.readings)

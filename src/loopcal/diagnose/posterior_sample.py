@@ -40,7 +40,7 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
-# --- The exact posterior of a fit, and its linear approximation, at drawn parameters.
+# The exact posterior of a fit, and its linear approximation, at drawn parameters.
 
 
 @dataclass(frozen=True, eq=False)

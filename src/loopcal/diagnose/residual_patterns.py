@@ -33,7 +33,7 @@ from loopcal.numerics.statistics import compute_any_probability, compute_f_tail,
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-# --- The residuals of a fit that no parameter explains, in the order of measurement.
+# The residuals of a fit that no parameter explains, in the order of measurement.
 
 EXPLAINED = 1e-6  # share of its length below which a column counts as explained by other columns
 
@@ -180,7 +180,7 @@ def _iterate_rows(
             yield part.rows[i, column], kind, part.numbers[i], column
 
 
-# --- Effects that the residuals of a fit may depend on: time, temperature, session, actuator
+# Effects that the residuals of a fit may depend on: time, temperature, session, actuator
 # reading.
 
 # What residuals may depend on.
@@ -212,26 +212,46 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
     rows : of a fit. data : its measurements, without excluded poses. robot : names the actuators.
     """
     observations = [o for o in data.observations if len(o)]
-    total, shifts = len(rows.residual), _shift_components(rows, observations)
-    trend, has_time = _list_trends(observations)
-    effects = [_build(total, shifts, trend, TIME if has_time else ORDER)]
-    names = dict.fromkeys(name for o in observations for name in o.context if name != TIME)
-    for name in names:
+    kinds = []  # of each kind: places among all rows, its rows, and what a unit of a component adds
+    for number, o in enumerate(observations):
+        chosen = np.flatnonzero(rows.kind == number)
+        whitener = o.whitener[rows.row[chosen], rows.column[chosen]]
+        shifts = [(each, whitener[:, members].sum(axis=1)) for each, members in list_components(o)]
+        kinds.append((chosen, rows.row[chosen], shifts))
+
+    def build(functions: Sequence[Sequence[FloatArray]], source: str, name: str = "") -> Effect:
+        """Return an effect from functions (r,) of the rows of each kind, less their means: an
+        offset of all rows is no such effect.
+        """
+        columns, labels = [np.zeros((len(rows.residual), 0))], []
+        for (places, row, shifts), of_kind in zip(kinds, functions, strict=True):
+            centered = [(function - function.mean())[row] for function in of_kind]
+            for label, shift in shifts:
+                for function in centered:
+                    column = np.zeros(len(rows.residual))
+                    column[places] = -shift * function
+                    if column.any():
+                        columns.append(column[:, None])
+                        labels.append(label)
+        return Effect(source, name, np.concatenate(columns, axis=1), tuple(labels))
+
+    has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
+    place = [o.context[TIME] if has_time else order_rows(o).astype(float) for o in observations]
+    effects = [build([[scale_to_range(x)] for x in place], TIME if has_time else ORDER)]
+    for name in dict.fromkeys(name for o in observations for name in o.context if name != TIME):
         functions = [
             [scale_to_range(o.context[name])] if name in o.context else [] for o in observations
         ]
-        effects.append(_build(total, shifts, functions, TEMPERATURE, name))
+        effects.append(build(functions, TEMPERATURE, name))
     functions = [
         [(o.session == name).astype(float) for name in find_distinct(o.session)]
         for o in observations
     ]
-    effects.append(_build(total, shifts, functions, SESSION))
+    effects.append(build(functions, SESSION))
     for i, actuator in enumerate(robot.actuators):
-        functions = []
-        for o in observations:
-            x = scale_to_range(data.readings[o.rows.reshape(len(o), -1)[:, 0], i])
-            functions.append([x, 4.0 * x**2])
-        effects.append(_build(total, shifts, functions, READING, actuator.name))
+        readings = (data.readings[o.rows.reshape(len(o), -1)[:, 0], i] for o in observations)
+        functions = [[x, 4.0 * x**2] for x in map(scale_to_range, readings)]
+        effects.append(build(functions, READING, actuator.name))
     return tuple(effects)
 
 
@@ -244,63 +264,6 @@ def scale_to_range(values: FloatArray) -> FloatArray:
         return np.zeros(len(values))
     low, high = values[known].min(), values[known].max()
     return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
-
-
-def _list_trends(observations: Sequence[Observations]) -> tuple[list[list[FloatArray]], bool]:
-    """Return the time of the rows of each kind, or their order, and whether it is the time."""
-    has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
-    functions = []
-    for o in observations:
-        values = o.context[TIME] if has_time else order_rows(o).astype(float)
-        functions.append([scale_to_range(values)])
-    return functions, has_time
-
-
-class _ShiftedRows(NamedTuple):
-    """How an offset of each measured component shifts the whitened rows of a kind."""
-
-    places: IntArray  # (k,) of these rows among all
-    row: IntArray  # (k,) number of the row of the kind
-    # for each component, the change (k,) by a unit of it
-    shifts: tuple[tuple[EffectColumn, FloatArray], ...]
-
-
-def _shift_components(
-    rows: ResidualRows, observations: Sequence[Observations]
-) -> tuple[_ShiftedRows, ...]:
-    """Return the shifts of the rows of each kind."""
-    kinds = []
-    for number, o in enumerate(observations):
-        chosen = np.flatnonzero(rows.kind == number)
-        whitener = o.whitener[rows.row[chosen], rows.column[chosen]]
-        shifts = (
-            (label, whitener[:, members].sum(axis=1)) for label, members in list_components(o)
-        )
-        kinds.append(_ShiftedRows(chosen, rows.row[chosen], tuple(shifts)))
-    return tuple(kinds)
-
-
-def _build(
-    count: int,
-    kinds: Sequence[_ShiftedRows],
-    functions: Sequence[Sequence[FloatArray]],
-    source: str,
-    name: str = "",
-) -> Effect:
-    """Return an effect on `count` rows from functions (r,) of the rows of each kind, less their
-    means: an offset of all rows is no such effect.
-    """
-    columns, labels = [np.zeros((count, 0))], []
-    for kind, of_kind in zip(kinds, functions, strict=True):
-        centered = [(function - function.mean())[kind.row] for function in of_kind]
-        for label, shift in kind.shifts:
-            for function in centered:
-                column = np.zeros(count)
-                column[kind.places] = -shift * function
-                if column.any():
-                    columns.append(column[:, None])
-                    labels.append(label)
-    return Effect(source, name, np.concatenate(columns, axis=1), tuple(labels))
 
 
 def list_components(rows: Observations) -> Iterator[tuple[EffectColumn, list[int]]]:
@@ -408,7 +371,10 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
     tau2 = max(excess, noise) / float((s[is_observable] ** 2).sum())
     variance = 1.0 / (s**2 / noise + 1.0 / tau2)
     mean = vt.T @ (variance * s * c / noise)
-    spread = _span_rows(scaled) @ (vt.T * np.sqrt(variance))
+    # only combinations of the columns that change a row
+    _, size, axes = np.linalg.svd(scaled, full_matrices=False)
+    kept = axes[size > 1e-10 * size.max(initial=0.0)]
+    spread = (kept.T @ kept) @ (vt.T * np.sqrt(variance))
     back = 1.0 / length
     return EffectSizes(
         effect,
@@ -417,13 +383,6 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
         back * np.linalg.norm(spread, axis=1),
         back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back,
     )
-
-
-def _span_rows(columns: FloatArray) -> FloatArray:
-    """Return the projection (c, c) on the combinations of columns (R, c) that change a row."""
-    _, s, vt = np.linalg.svd(columns, full_matrices=False)
-    kept = vt[s > 1e-10 * s.max(initial=0.0)]
-    return kept.T @ kept
 
 
 def test_correlation(rows: ResidualRows) -> tuple[float, float]:
@@ -478,7 +437,7 @@ def _list_testable(
     return testable
 
 
-# --- The covariance of a fit whose errors are correlated in the order of measurement.
+# The covariance of a fit whose errors are correlated in the order of measurement.
 
 # Correlations of neighbors between which the average is taken.
 RHO = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.92, 0.96, 0.98, 0.99)
@@ -504,7 +463,12 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
     rows : of a fit. sigma_degrees : degrees of freedom nu0 that the stated sigmas count for,
         infinite where they are exact.
     """
-    segments = _cut_series(rows.series)
+    starts = np.flatnonzero(np.r_[True, np.diff(rows.series) != 0])
+    by_length: dict[int, list[IntArray]] = {}
+    for first, last in zip(starts, np.r_[starts[1:], len(rows.series)], strict=True):
+        for part in np.array_split(np.arange(first, last), -(-(last - first) // LONGEST)):
+            by_length.setdefault(len(part), []).append(part)
+    segments = [np.array(segments) for segments in by_length.values()]
     nu = rows.degrees + sigma_degrees
     logs, scales, covariances, neighbors = [], [], [], []
     for rho in RHO:
@@ -531,16 +495,6 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
         float(weight @ np.array(neighbors)),
         float(np.sqrt(weight @ np.array(scales))),
     )
-
-
-def _cut_series(series: IntArray) -> list[IntArray]:
-    """Return the rows (S, n) of the segments of each length."""
-    starts = np.flatnonzero(np.r_[True, np.diff(series) != 0])
-    by_length: dict[int, list[IntArray]] = {}
-    for first, last in zip(starts, np.r_[starts[1:], len(series)], strict=True):
-        for part in np.array_split(np.arange(first, last), -(-(last - first) // LONGEST)):
-            by_length.setdefault(len(part), []).append(part)
-    return [np.array(segments) for segments in by_length.values()]
 
 
 def _evaluate(

@@ -47,7 +47,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 MOST_COMPONENTS = 3  # components of the largest error
-BISECTIONS = 60  # bisections of the median of the largest error: each halves its interval
 # Kind of the readings of redundant actuators, which must agree on one pose.
 READINGS = "actuator readings"
 
@@ -69,13 +68,24 @@ def _median_of_largest(variances: FloatArray) -> float:
     if not len(mean):
         return float("nan")
     degrees, unit = mean**2 / square, square / mean
-    low, high = 0.0, 1e3 * float(mean.max())
-    for _ in range(BISECTIONS):
+
+    def compute_log_probability(limit: float) -> float:
+        tail = compute_chi_square_tail(degrees, limit / unit)
+        return float(np.log1p(-np.minimum(tail, 1.0 - 1e-300)).sum())
+
+    highest = 1e3 * float(mean.max())
+    return float(np.sqrt(invert_increasing(compute_log_probability, np.log(0.5), highest, 60)))
+
+
+def invert_increasing(
+    function: Callable[[float], float], value: float, highest: float, bisections: int
+) -> float:
+    """Return where an increasing function has a value, by bisection from 0 to `highest`."""
+    low, high = 0.0, highest
+    for _ in range(bisections):
         middle = 0.5 * (low + high)
-        tail = compute_chi_square_tail(degrees, middle / unit)
-        is_below = np.log1p(-np.minimum(tail, 1.0 - 1e-300)).sum() < np.log(0.5)
-        low, high = (middle, high) if is_below else (low, middle)
-    return float(np.sqrt(high))
+        low, high = (middle, high) if function(middle) < value else (low, middle)
+    return high
 
 
 def _root_mean_square(sizes: FloatArray) -> float:
@@ -396,7 +406,7 @@ def _join(errors_by_kind: Sequence[QuantityErrors]) -> QuantityErrors:
     )
 
 
-# --- Predict the same measurements with two geometries of a robot.
+# Predict the same measurements with two geometries of a robot.
 
 
 @dataclass(frozen=True, eq=False)
@@ -525,7 +535,6 @@ def compare_predictions(
     before, after : the geometries. data : the measurements.
     setup_before, setup_after : values [SI] by name of setup parameters that are kept; the others
         are fitted to these rows.
-    Raises DataError: no row counts, or no pose is reached by both geometries.
     """
     counted = (o.take((o.weight > 0.0) & o.present.any(axis=1)) for o in data.observations)
     data = _take_rows(replace(data, observations=tuple(counted)), np.ones(data.n_poses, dtype=bool))

@@ -46,7 +46,7 @@ from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-# --- Measure by how much second-order effects of a change of parameters exceed the noise.
+# Measure by how much second-order effects of a change of parameters exceed the noise.
 
 # Poses at which machines are compared; without a stated workspace their distance from home: a
 # share of the robot's size, or radians.
@@ -298,8 +298,6 @@ def refuse_other_dimensions(
     robot or, where it reaches no pose with them, the stored ones.
 
     names : of both in messages; default: those of the robots.
-    Raises EstimationError: other parameters, `comparison.other-dimensions` or
-        `comparison.nothing-reached`.
     """
     called, given = names or (robot.name, stored.name)
     if stored.parameters.names != robot.parameters.names:

@@ -75,11 +75,7 @@ def draw_candidates(
     count: int = 1000,
     seed: int | np.random.Generator = 0,
 ) -> Candidates:
-    """Draw about `count` allowed poses from the workspace of a robot, half of them at its boundary.
-
-    Raises MechanismError: the robot states no workspace, the constraints exclude all of it, or
-        home itself violates one.
-    """
+    """Draw about `count` allowed poses from the workspace, half of them at its boundary."""
     rng = np.random.default_rng(seed)
     checker, bounds = _build_home_checker(robot, constraints), workspace_ranges(robot)
     excluded: Counter[Violation] = Counter()
@@ -95,8 +91,6 @@ def check_listed_poses(
 ) -> Candidates:
     """Return those of the given poses (n, c) [m, rad] that are allowed; they represent the
     workspace themselves.
-
-    Raises MechanismError: none of them is allowed, or home itself violates a constraint.
     """
     checker = _build_home_checker(robot, constraints)
     poses = np.unique(poses, axis=0)

@@ -267,7 +267,7 @@ def mark_on_path(counts: Mapping[Violation, int]) -> dict[Violation, int]:
     return {replace(violation, on_path=True): count for violation, count in counts.items()}
 
 
-# --- Options of a plan: number of poses or accuracy goal, criterion, constraints, candidates,
+# Options of a plan: number of poses or accuracy goal, criterion, constraints, candidates,
 # seed.
 
 # Error that a plan makes small; that of a pose counts rotations times the robot's size.

@@ -143,12 +143,7 @@ def factor_design(rows: FloatArray, prior: PriorInformation, space: ObservableSp
 def require_enough(
     n: int, rows: FloatArray, prior: PriorInformation, space: ObservableSpace, repeats: bool = True
 ) -> None:
-    """Refuse a number of groups that cannot determine all directions.
-
-    Raises EstimationError: no candidate is allowed; nothing is observable; n groups have fewer
-        rows than the prior leaves unknowns; or, without repeats, fewer candidates are allowed than
-        n.
-    """
+    """Refuse a number of groups that cannot determine all directions."""
     count = int(is_allowed(rows).sum())
     if count == 0:
         raise EstimationError(report_finding("plan.no-candidate-allowed", total=len(rows)))
@@ -191,7 +186,7 @@ def _pad_factor(R: FloatArray) -> FloatArray:
     return np.concatenate([R, np.zeros((max(R.shape[1] - len(R), 0), R.shape[1]))])
 
 
-# --- Criteria of optimal design: scalar figures of the covariance C of the machine's unknowns.
+# Criteria of optimal design: scalar figures of the covariance C of the machine's unknowns.
 
 
 @dataclass(frozen=True)
@@ -275,7 +270,7 @@ def compute_efficiency(criterion: Criterion, value: float, best: float, n_direct
     return float(best / value)
 
 
-# --- Score of a design in scaled coordinates, and the change of score by every swap at once.
+# Score of a design in scaled coordinates, and the change of score by every swap at once.
 
 # A design is singular where it determines a direction with less than this share of the mean
 # design's information, as a ratio of standard deviations.
@@ -362,8 +357,6 @@ def build_scoring(
     """Return the scoring whose mean design is the prior and every group with the same weight.
 
     rows : (N, r, o + p), finite. weight : of each group.
-    Raises EstimationError: the criterion is E, or the weights of I depend on no observable
-        direction.
     """
     if isinstance(criterion, E):
         raise EstimationError("criterion E cannot be optimized; choose D, I or A")
@@ -416,10 +409,7 @@ class ScaledCandidates:
 def scale_candidates(
     rows: FloatArray, n: int, criterion: Criterion, prior: PriorInformation, repeats: bool
 ) -> ScaledCandidates:
-    """Return the allowed groups scaled by the mean design of n of them.
-
-    Raises EstimationError: see `require_enough` and `build_scoring`.
-    """
+    """Return the allowed groups scaled by the mean design of n of them."""
     space = find_observable_space(rows, prior)
     require_enough(n, rows, prior, space, repeats)
     usable = np.flatnonzero(is_allowed(rows))

@@ -72,8 +72,6 @@ def fedorov_exchange(
     first : more designs to start from; one of fewer than n groups is completed by the groups that
         gain most.
     Returns Design; the best of all starts.
-    Raises EstimationError: n groups cannot determine the unknowns, fewer are allowed than
-        requested, or there is no start.
     """
     candidates, weights = (
         (scale_candidates(rows, n, criterion, prior, repeats), None)
@@ -110,10 +108,7 @@ def list_starts(
 
 
 def require_determined(score: float, n: int, count: int, space: ObservableSpace) -> None:
-    """Refuse the best of n of `count` groups where its score says that it is singular.
-
-    Raises EstimationError: the score is not finite.
-    """
+    """Refuse the best of n of `count` groups where its score says that it is singular."""
     if not np.isfinite(score):
         raise EstimationError(
             report_finding(
@@ -237,8 +232,6 @@ def coordinate_exchange(
     levels : for each of the c coordinates its allowed values (k,); none for one that stays.
     sweeps : largest number of passes over all coordinates.
     Returns MovedDesign; the same for the same arguments.
-    Raises EstimationError: a group of the first design is not allowed, or the groups cannot
-        determine the unknowns.
     """
     design = np.array(design0, dtype=np.float64)
     indices = np.arange(len(design))
@@ -325,7 +318,7 @@ def _choose_levels(scoring: Scoring, rows: FloatArray, trials: FloatArray) -> In
     return best
 
 
-# --- A good design with its certificate: relaxation, rounding, exchange and perturbation.
+# A good design with its certificate: relaxation, rounding, exchange and perturbation.
 
 # Default number of perturbations: the first over the number of groups, at least the second.
 PERTURBATIONS, LEAST_PERTURBATIONS = 1600, 20
@@ -364,8 +357,6 @@ def choose_design(
 
     rows, n, criterion, prior, seed, repeats, first : see `fedorov_exchange`.
     perturbations : their number; default PERTURBATIONS / n. gap : of the relaxation.
-    Raises EstimationError: n groups cannot determine the unknowns, or fewer are allowed than
-        requested.
     """
     relaxed = relax_design(rows, n, criterion, prior, gap, repeats)
     candidates, random = relaxed.candidates, np.random.default_rng(seed)
@@ -458,9 +449,6 @@ def compute_design_curve(
     """Return designs of several sizes with their values and bounds; arguments as `choose_design`.
 
     `progress` receives the sizes that are done.
-
-    Raises EstimationError: the smallest size cannot determine the unknowns, or fewer candidates
-        are allowed than the largest.
     """
     designs: list[CertifiedDesign] = []
     for done, n in enumerate(sorted(set(sizes))):
@@ -487,8 +475,6 @@ def find_smallest_design(
     target : value of the criterion (for I a variance: the square of an rms standard deviation).
     most : largest number of groups; default: all that are allowed.
     others : see `choose_design`.
-    Raises EstimationError: no design of this many groups meets the target (so the bound says), or
-        none was found.
     """
     count = int(is_allowed(rows).sum())
     most = count if most is None else most if repeats else min(most, count)

@@ -237,7 +237,7 @@ def _reverse_sections(cost: FloatArray, tour: IntArray) -> tuple[IntArray, bool]
     return tour, False
 
 
-# --- Check a given order of stops: from home through all of them and back, straight in between.
+# Check a given order of stops: from home through all of them and back, straight in between.
 
 
 def check_route(robot: Mechanism, labels: tuple[str, ...], coordinates: FloatArray) -> FloatArray:
@@ -246,7 +246,6 @@ def check_route(robot: Mechanism, labels: tuple[str, ...], coordinates: FloatArr
     Strokes, joint limits, cones and singularities count; other constraints are those of a plan.
 
     labels : names of the stops. coordinates : (n, c) controlled coordinates [m, rad].
-    Raises MechanismError: a straight path is not allowed.
     """
     home = locate_home(robot)
     stops = np.vstack([home, coordinates, home])

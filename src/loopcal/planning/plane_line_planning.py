@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- Groups of poses whose points lie on a plane and on a line perpendicular to it, as candidates.
+# Groups of poses whose points lie on a plane and on a line perpendicular to it, as candidates.
 
 AXIS = 3  # column of the axis in a design
 # Levels of every coordinate, in half ranges from the middle of the workspace.
@@ -129,8 +129,6 @@ class PlaneLineGroups:
 
         Lines are drawn long enough. Groups with a pose out of reach are drawn anew, nearer and
         nearer to the middle.
-
-        Raises EstimationError: no group near the middle of the workspace is allowed.
         """
         rng = np.random.default_rng(seed)
         design, left = np.zeros((groups, len(self.names))), np.arange(groups)
@@ -277,7 +275,7 @@ def eliminate_surfaces(F: FloatArray, A: FloatArray) -> tuple[FloatArray, BoolAr
     return done.rest[:, SURFACE:], done.rank == SURFACE
 
 
-# --- What an instrument measures at groups of points on planes and perpendicular lines: the kinds
+# What an instrument measures at groups of points on planes and perpendicular lines: the kinds
 # `plane` and `line`, whose surfaces are unknown and shared by each group.
 
 
@@ -565,7 +563,6 @@ def _draw_allowed(
     """Draw groups that satisfy the constraints: at least `count`, and enough to find the rank.
 
     Returns design : (u, c). rows : (u, k - 2, p).
-    Raises EstimationError: hardly any group satisfies the constraints.
     """
     enough = max(count, -(-len(groups.free) // (groups.points - SPENT)))
     designs: list[FloatArray] = []
@@ -594,10 +591,7 @@ def _draw_allowed(
 
 
 def _require_paths(checker: ConstraintChecker, x: FloatArray) -> BoolArray:
-    """Return before which points (u * k,), in their order, the path goes via home.
-
-    Raises EstimationError: no straight path leads from home to a point.
-    """
+    """Return before which points (u * k,), in their order, the path goes via home."""
     flat = x.reshape(-1, x.shape[2])
     home = np.broadcast_to(locate_home(checker.robot), flat.shape)
     from_home = check_paths(checker, home, flat)

@@ -48,7 +48,7 @@ from loopcal.planning.design_space import (
 )
 from loopcal.typing import FloatArray, IntArray
 
-# --- Rows of pose groups of a machine with redundant actuators, whose readings are measurements,
+# Rows of pose groups of a machine with redundant actuators, whose readings are measurements,
 # too.
 
 
@@ -56,8 +56,6 @@ def add_redundant_readings(instrument: Instrument, robot: Mechanism) -> Instrume
     """Return the instrument with the readings of redundant actuators as one more sensor.
 
     None where the robot has none, or states no sigma of its readings.
-
-    Raises DataError: some readings of redundant actuators are stated to be exact.
     """
     if robot.program.sigma is None or resolve_reading_sigma(robot, None, 1) is None:
         return None
@@ -148,7 +146,6 @@ def linearize_candidate_groups(
     drawn and half are made of the most informative poses.
 
     readings : (n, a) of the candidate poses [m, rad].
-    Raises DataError: see `list_groups`.
     """
     n, k = len(readings), count_poses_per_group(instrument)
     most = MOST if k == 1 or comb(n, k) <= MOST else MOST // 2
@@ -344,10 +341,7 @@ def _linearize_block(
 
 
 def count_poses_per_group(instrument: Instrument) -> int:
-    """Return how many poses are measured together.
-
-    Raises DataError: the instrument has kinds that compare different numbers of poses.
-    """
+    """Return how many poses are measured together."""
     links = sorted({sensor.kind.poses_per_row for sensor in instrument.sensors} - {1})
     if len(links) > 1:
         raise DataError(
@@ -360,10 +354,7 @@ def count_poses_per_group(instrument: Instrument) -> int:
 def list_groups(
     poses: int, instrument: Instrument, rng: np.random.Generator, most: int = MOST
 ) -> IntArray:
-    """Return the members (N, k) of groups: each pose alone, or combinations, all or `most` drawn.
-
-    Raises DataError: the instrument compares more poses than there are.
-    """
+    """Return members (N, k) of groups: each pose alone, or combinations, all or `most` drawn."""
     k = count_poses_per_group(instrument)
     if k == 1:
         return np.arange(poses)[:, None]

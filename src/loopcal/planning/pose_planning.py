@@ -103,10 +103,7 @@ def plan_poses(problem: PlanningProblem, progress: Progress = report_no_progress
 
 
 def _plan_for_goal(problem: PlanningProblem, progress: Progress) -> Plan:
-    """Plan the smallest number of poses whose expected error reaches the goal.
-
-    Raises EstimationError: no number of poses reaches it.
-    """
+    """Plan the smallest number of poses whose expected error reaches the goal."""
     options, k = problem.options, problem.poses_per_group
     curve = find_sample_size(problem, progress)
     assert curve.enough is not None, "a goal was given"

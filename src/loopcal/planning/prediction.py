@@ -84,7 +84,6 @@ def linearize_prediction(
     unfixed : (12, k) motions of frames that the measurements will not determine.
     frame : "fitted": after the best rigid fit of these motions over the poses to predict; "base":
         in the base frame of the robot file; "relative": relative to the home pose.
-    Raises EstimationError: no such frame.
     """
     check_frame(frame, FRAMES)
     poses = observe_poses(free, solution.q)

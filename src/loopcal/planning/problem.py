@@ -122,11 +122,7 @@ class PlanningProblem:
         return max(-(-missing // self.groups.rows.shape[1]), 1)
 
     def build_criterion(self, name: str | None = None, target: Target | None = None) -> Criterion:
-        """Return criterion D, or I for a target; by default those of the options.
-
-        Raises EstimationError: the name is another one, or the target does not move or is not
-            observable.
-        """
+        """Return criterion D, or I for a target; by default those of the options."""
         name, target = name or self.options.criterion, target or self.options.target
         if name == "D":
             return D()
@@ -172,10 +168,7 @@ class PlanningProblem:
         return ExpectedErrors(*rms)
 
     def require_equations(self, n: int) -> None:
-        """Refuse n groups that give fewer equations than there are unknowns.
-
-        Raises EstimationError: with the smallest number of poses.
-        """
+        """Refuse n groups that give fewer equations than there are unknowns."""
         k = self.poses_per_group
         if n < self.min_groups:
             raise EstimationError(
@@ -204,9 +197,6 @@ def prepare_problem(
     robot : at its present values, with its free parameters and tolerances.
     instrument : what will measure, with its noise. options : constraints, candidates, measurements
         made already (the instrument is taken to be set up anew after them), seed.
-    Raises EstimationError: the robot has no free parameter, or the instrument determines none of
-        them. Raises MechanismError, DataError: see `draw_candidates`,
-        `linearize_candidate_groups`, `check_closure`.
     """
     check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
     options = options or PlanOptions()
@@ -339,7 +329,7 @@ def _select_predicted(candidates: Candidates, options: PlanOptions) -> Solution:
     return solution.take(np.sort(rng.permutation(reached)[:PREDICTED]))
 
 
-# --- Number of poses: expected errors by number, and the smallest number that reaches a goal.
+# Number of poses: expected errors by number, and the smallest number that reaches a goal.
 
 SIZES = 6  # numbers of poses on a curve
 RANGE = 4  # a curve goes from the smallest number to this many times the requested one
@@ -428,9 +418,6 @@ def find_sample_size(
     """Return the smallest number of poses that reaches the goal of the options.
 
     The curve covers the expected errors from the smallest number to twice that one.
-
-    Raises EstimationError: the goal is not a number above 0, or out of reach; then with the best
-        possible error.
     """
     options, robot, rows = problem.options, problem.robot, problem.groups.rows
     target, goal, dimension = options.target, options.goal, DIMENSIONS[options.target]

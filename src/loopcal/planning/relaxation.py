@@ -85,8 +85,6 @@ def relax_design(
     repeats : whether a group may be measured more than once. Without, weights are at most 1 and the
         bound is tighter.
     Returns RelaxedDesign; the bound holds whether or not the gap was reached.
-    Raises EstimationError: n groups cannot determine the unknowns, or fewer are allowed than
-        requested.
     """
     candidates = scale_candidates(rows, n, criterion, prior, repeats)
     scoring, solution = candidates.scoring, _solve(candidates, n, gap)

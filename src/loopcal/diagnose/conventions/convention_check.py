@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose.conventions.interpretations import Interpretation
 
 
-# --- The result of a convention check.
+# The result of a convention check.
 
 # Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
 # three times too small, give about 3 each.
@@ -229,7 +229,7 @@ def _has_uncertain_readings(data: Measurements) -> bool:
     return sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
 
 
-# --- Check setup parameters (frames, targets, surfaces): stated values, and values kept from a
+# Check setup parameters (frames, targets, surfaces): stated values, and values kept from a
 # fit.
 
 # Number of stated parameters up to which each is estimated alone, to find the wrong one.
@@ -342,7 +342,7 @@ def _describe_value(robot: Mechanism, entry: Parameter, estimate: float) -> dict
     }
 
 
-# --- Judge measurements that the robot does not explain in one step of a fit: a few rows far off,
+# Judge measurements that the robot does not explain in one step of a fit: a few rows far off,
 # a wrong statement about frames or targets, another interpretation, or none that is tested.
 
 # Smallest number of equations beyond those of unknown frames by which data are refused. With
@@ -481,7 +481,7 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
     return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
 
 
-# --- Explain readings outside their strokes by another unit, order, sign or zero.
+# Explain readings outside their strokes by another unit, order, sign or zero.
 
 
 def explain_outside_strokes(

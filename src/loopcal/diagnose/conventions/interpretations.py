@@ -27,7 +27,7 @@ from loopcal.mechanism.assembly import Actuator
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-# --- Changes of tables of numbers: pure functions that scale or permute columns.
+# Changes of tables of numbers: pure functions that scale or permute columns.
 
 # From written values (r, c), or readings (n, a), to those that the stated convention would write
 # [SI].
@@ -151,7 +151,7 @@ def name_source(i: int, data: Measurements) -> str:
     return f"part {i + 1} of the data"
 
 
-# --- Interpretations of measured values: other units, orders, signs and columns.
+# Interpretations of measured values: other units, orders, signs and columns.
 
 DEGREES = 180.0 / np.pi
 
@@ -326,7 +326,7 @@ def _orientation_columns(kind: Kind) -> tuple[OrientationForm, list[int], list[i
     return kind.form, [names.index(n) for n in kind.form.columns], position
 
 
-# --- Interpretations of actuator readings: other units, factors, signs, orders and rows.
+# Interpretations of actuator readings: other units, factors, signs, orders and rows.
 
 # Factors by which true readings are larger than the written ones where microsteps, a gear or a
 # pulley are stated wrongly.

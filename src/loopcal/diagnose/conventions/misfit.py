@@ -357,7 +357,7 @@ def _row_rms(whitened: FloatArray, sd: FloatArray) -> FloatArray:
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-# --- Judge single interpretations: their frames, their misfit, and whether their fit is evidence.
+# Judge single interpretations: their frames, their misfit, and whether their fit is evidence.
 
 # Factor by which another interpretation must fit better before data are refused: true data of a
 # robot far beyond its tolerances fit twice as well in none of them.
@@ -459,7 +459,7 @@ def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
     return np.where(is_changed, np.nanmedian(new, axis=0), new)
 
 
-# --- Refine the misfit of one interpretation by Gauss-Newton steps within the tolerances, or far
+# Refine the misfit of one interpretation by Gauss-Newton steps within the tolerances, or far
 # beyond them.
 
 # Gauss-Newton steps by which the stated convention and the best other one are compared finally; a

@@ -53,7 +53,7 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-# --- Interpretations of actuator readings that are counted from another zero, in either direction.
+# Interpretations of actuator readings that are counted from another zero, in either direction.
 
 # Number of constants in a scan, factor by which the next scan is narrower, and number of scans.
 SCANNED, NARROWER, SCANS = 25, 8.0, 4
@@ -179,7 +179,7 @@ def _compute_sizes(
     return np.nan_to_num(sizes, nan=np.inf).reshape(len(zeros), SCANNED)
 
 
-# --- Interpretations of measurements with a frame, target or anchor that no file declares unknown.
+# Interpretations of measurements with a frame, target or anchor that no file declares unknown.
 
 # Setup items that a user may forget to declare unknown. Surfaces with their frames and offsets
 # are none of them: the errors of the machine explain those, too.
@@ -539,7 +539,7 @@ def _select_promising(misfits: FloatArray, misfit: float) -> IntArray:
     return np.flatnonzero((misfits <= bound) & np.isfinite(misfits))
 
 
-# --- Find other orders of the actuators that explain data of a redundant robot as well as the
+# Find other orders of the actuators that explain data of a redundant robot as well as the
 # stated one, which explains them: the data cannot show which is true.
 
 # Number of measured residuals from which the order of a redundant robot's actuators is certain:
@@ -578,7 +578,7 @@ def select_measured(data: Measurements) -> IntArray:
     return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)
 
 
-# --- Report interpretations that explain data as well as the stated one, which explains them: the
+# Report interpretations that explain data as well as the stated one, which explains them: the
 # data cannot show which is true.
 
 # Columns of a height, and standard deviations of the noise from which its sign matters.
