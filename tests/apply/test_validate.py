@@ -248,13 +248,13 @@ def make_error_size(*moved, base=1.0, by=50.0, left=30):
 def test_moved_setups_are_named():
     result = find_moved_setups(("trk", "tool", "probe"), make_error_size("trk", "probe"))
     assert result is not None
-    assert result.names == ("trk", "probe")
-    assert result.times == pytest.approx(50.0)
+    assert result[0] == ("trk", "probe")
+    assert result[1] == pytest.approx(50.0)
     # a shift of the frame is a shift of the target: refitting either is enough, so that neither
     # alone brings it back
     either = find_moved_setups(("trk", "tool"), lambda refit: (1.0 if refit else 50.0, 30))
     assert either is not None
-    assert either.names == ("trk", "tool")
+    assert either[0] == ("trk", "tool")
 
 
 def test_moved_setups_need_large_differing_errors_and_enough_rows():

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from loopcal.apply.calibration_findings import (
@@ -46,7 +46,6 @@ from loopcal.typing import Progress, StepCounter, report_no_progress
 if TYPE_CHECKING:
     from loopcal.diagnose.cross_validation import ModelChoice
     from loopcal.diagnose.suggestions import MeasurementSuggestion
-    from loopcal.diagnose.value_comparison import ValueComparison
     from loopcal.estimate.recalibration import Change
 
 # Codes of data that a geometry cannot reach.
@@ -134,19 +133,10 @@ def calibrate(
     if split.held_out is not None and not split.held_out.n_rows and not redundant:
         raise DataError(report_finding("data.no-held-out-value"))
     held_out = 0 if split.held_out is None else split.held_out.n_poses
-    result = _fit(robot, split.fitted, options, count, held_out)
+    fit, choice, change = _fit(robot, split.fitted, options, count, held_out)
     count.begin("testing the residuals for patterns and slow errors")
-    result = replace(result, fit=adjust_uncertainty(result.fit, split.fitted))
-    return _report(result, split, conventions, options, count)
-
-
-@dataclass(frozen=True, eq=False)
-class _FitResult:
-    """A fit, with the choice of its parameters and the comparison with an earlier calibration."""
-
-    fit: Identification
-    choice: ModelChoice | None = None
-    change: Change | None = None
+    fit = adjust_uncertainty(fit, split.fitted)
+    return _report(fit, choice, change, split, conventions, options, count)
 
 
 def _fit(
@@ -155,8 +145,10 @@ def _fit(
     options: CalibrationOptions,
     count: StepCounter,
     held_out: int = 0,
-) -> _FitResult:
-    """Identify from the tolerances, or again with an earlier calibration as the prior."""
+) -> tuple[Identification, ModelChoice | None, Change | None]:
+    """Identify from the tolerances, or again with an earlier calibration as the prior: the fit, the
+    choice of its parameters, and the comparison with the earlier calibration.
+    """
     excluded = tuple(p for p in options.fit.excluded_poses if p in data.labels)
     fit_options = replace(options.fit, excluded_poses=excluded)
     count.begin("choosing the parameters" if options.choose_model else "preparing")
@@ -172,7 +164,7 @@ def _fit(
             options=fit_options,
             progress=count.progress,
         )
-        return _FitResult(fit, change=change)
+        return fit, None, change
     choice = None
     if options.choose_model:
         from loopcal.diagnose.cross_validation import choose_model
@@ -197,18 +189,20 @@ def _fit(
         )
     count.begin(f"fitting {free} parameters")
     fit = identify(chosen, data, options=fit_options, progress=count.progress)
-    return _FitResult(fit, choice=choice)
+    return fit, choice, None
 
 
 def _report(
-    result: _FitResult,
+    fit: Identification,
+    choice: ModelChoice | None,
+    change: Change | None,
     split: DataSplit,
     conventions: ConventionCheck,
     options: CalibrationOptions,
     count: StepCounter,
 ) -> CalibrationReport:
     """Validate and examine a fit, and return the report."""
-    fit, fitted, held_out = interpret_fit(result.fit), split.fitted, split.held_out
+    fit, fitted, held_out = interpret_fit(fit), split.fitted, split.held_out
     count.begin("predicting the held-out poses" if held_out is not None else "computing errors")
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
     count.begin("examining the residuals")
@@ -218,7 +212,11 @@ def _report(
     count.begin("looking for further measurements")
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)
-    comparison = _compare_with_stored(fit, options)
+    comparison = None
+    if options.compare_with is not None:
+        from loopcal.diagnose.value_comparison import compare_with_values
+
+        comparison = compare_with_values(fit, options.compare_with)
     examined = () if examination is None else examination.findings
     findings = [
         *report_conventions(conventions),
@@ -233,7 +231,7 @@ def _report(
         *report_base_targets(fitted),
         start.finding,
         *examined,
-        *(() if result.choice is None else (result.choice.finding,)),
+        *(() if choice is None else (choice.finding,)),
         *(() if comparison is None else (comparison.outcome,)),
     ]
     count.begin("done")
@@ -251,8 +249,8 @@ def _report(
         examination=examination,
         suggestions=suggestions,
         reading_errors=compute_reading_errors(fit, fitted) if fit.converged else None,
-        model_choice=result.choice,
-        change=result.change,
+        model_choice=choice,
+        change=change,
         comparison=comparison,
         provenance=describe_provenance(options),
     )
@@ -276,17 +274,6 @@ def _validate(
         if error.code in NOTHING_TO_COMPARE:
             return None, [report_finding("workflow.nothing-to-validate", reason=str(error))]
         raise
-
-
-def _compare_with_stored(
-    fit: Identification, options: CalibrationOptions
-) -> ValueComparison | None:
-    """Return the comparison with stored values; None where none are given."""
-    if options.compare_with is None:
-        return None
-    from loopcal.diagnose.value_comparison import compare_with_values
-
-    return compare_with_values(fit, options.compare_with)
 
 
 def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSuggestion, ...] | None:

@@ -472,8 +472,8 @@ def compute_error_budget(
     lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)
-    places = _Places(solution, frame, effects)
-    lines = [replace(each, halved=_halve(fit, data, linear, each, lines, places)) for each in lines]
+    halved = [_halve(fit, data, linear, each, lines, solution, frame, effects) for each in lines]
+    lines = [replace(line, halved=of_line) for line, of_line in zip(lines, halved, strict=True)]
     position, orientation = _add_kinds(lines)
     n = len(solution.q)
     finding = _word(fit, (position, orientation), n, is_workspace, effects.reference)
@@ -529,24 +529,17 @@ def _list_sources(
     return lines
 
 
-class _Places(NamedTuple):
-    """Poses, the frame in which their errors are stated, and these errors by the parameters."""
-
-    solution: Solution
-    frame: str
-    effects: ToolErrors
-
-
 def _halve(
     fit: Identification,
     data: Measurements,
     linear: FitLinearization,
     line: SourceBudget,
     lines: list[SourceBudget],
-    places: _Places,
+    solution: Solution,
+    frame: str,
+    effects: ToolErrors,
 ) -> HalvedErrors | None:
     """Return the errors from all sources with half the sigma of one."""
-    solution, frame, effects = places
     position, orientation = (sum(getattr(each, name) for each in lines) for name in _LENGTHS)
     parameters = sum(each.parameters for each in lines)
     if line.source.kind in _OF_ROWS:

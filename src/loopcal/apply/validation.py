@@ -200,7 +200,7 @@ def report_moved_setup(
     moved = find_moved_setups(tuple(names), measure_errors)
     if moved is None:
         return []
-    return [report_finding("validation.setup-moved", names=moved.names, times=moved.times)]
+    return [report_finding("validation.setup-moved", names=moved[0], times=moved[1])]
 
 
 def check_limit(name: str, limit: float | None) -> None:

@@ -37,6 +37,7 @@ from loopcal.diagnose.intervals import (
     half_widths,
     report_intervals,
 )
+from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
@@ -385,12 +386,8 @@ def _consecutive(data: Measurements, length: int) -> Clusters:
     if length < 1:
         raise EstimationError(f"blocks of {length} poses: give a number of at least 1")
     n, linked = data.n_poses, linked_blocks(data)
-    order = np.arange(n)
-    time = data.context.get("time")
-    if time is not None and not np.isnan(time).any():
-        order = np.argsort(time, kind="stable")
     run = np.empty(n, dtype=np.int64)
-    run[order] = np.arange(n) // length
+    run[order_by_time(data.context.get("time"), n)] = np.arange(n) // length
     links: IntArray = np.column_stack([run, run.max() + 1 + linked])
     joined = find_connected_groups(links, int(links.max()) + 1)[run]
     names, member = np.unique(joined, return_inverse=True)

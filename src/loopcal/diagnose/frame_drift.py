@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import engine, geometry
+from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
@@ -251,11 +252,8 @@ def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[
 
 def _order_rows(rows: Observations) -> IntArray:
     """Return the rows that count in the order of their time if all state it, else as they are."""
-    counted = np.flatnonzero(rows.weight > 0.0)
-    time = rows.context.get("time")
-    if time is None or not np.isfinite(time[counted]).all():
-        return counted
-    return counted[np.argsort(time[counted], kind="stable")]
+    counted, time = np.flatnonzero(rows.weight > 0.0), rows.context.get("time")
+    return counted[order_by_time(None if time is None else time[counted], len(counted))]
 
 
 def _spans_plane(points: FloatArray) -> bool:

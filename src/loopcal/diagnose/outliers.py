@@ -18,9 +18,10 @@ geometry so far that right poses seem wrong. Blocks are then compared at a robus
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -112,12 +113,7 @@ class PartialFit(NamedTuple):
         return self.directions >= whole.directions and bool(np.isfinite(self.scale))
 
 
-class Refit(Protocol):
-    """From the excluded blocks (u,) to the linear fit without them."""
-
-    def __call__(self, excluded: BoolArray) -> PartialFit:
-        """Fit without these blocks."""
-        ...
+Refit = Callable[[BoolArray], PartialFit]  # from the excluded blocks (u,) to the fit without them
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,8 +313,8 @@ def _join_groups(groups: list[BoolArray]) -> list[BoolArray]:
     """Join groups that share a block."""
     joined: list[BoolArray] = []
     for group in groups:
-        apart = [other for other in joined if not (other & group).any()]
         shared = [other for other in joined if (other & group).any()]
+        apart = [other for other in joined if not (other & group).any()]
         joined = [*apart, np.any([group, *shared], axis=0)]
     return joined
 

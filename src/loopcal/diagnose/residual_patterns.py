@@ -161,11 +161,16 @@ def order_rows(rows: Observations) -> IntArray:
     """Return the place (r,) of each row in the order of measurement: by time where all rows state
     it, else as in the file.
     """
-    place = np.arange(len(rows))
-    time = rows.context.get("time")
-    if time is not None and np.isfinite(time).all():
-        place[np.argsort(time, kind="stable")] = np.arange(len(rows))
+    place = np.empty(len(rows), dtype=np.int64)
+    place[order_by_time(rows.context.get(TIME), len(rows))] = np.arange(len(rows))
     return place
+
+
+def order_by_time(time: FloatArray | None, count: int) -> IntArray:
+    """Return the order (count,) by time where all state it; without that as they are."""
+    if time is None or not np.isfinite(time).all():
+        return np.arange(count)
+    return np.argsort(time, kind="stable")
 
 
 def _iterate_rows(

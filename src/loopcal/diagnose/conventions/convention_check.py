@@ -250,13 +250,6 @@ class Contradiction(NamedTuple):
     values: tuple[dict[str, Any], ...]  # for each its name, estimate, stated value and certainty
 
 
-class MovedSetups(NamedTuple):
-    """Frames, targets and surfaces that are no longer where a fit located them."""
-
-    names: tuple[str, ...]  # of those that moved, or of all that may have moved
-    times: float  # factor by which the errors decrease when they are fitted again
-
-
 def find_contradiction(stated: Comparison, misfit: float, better: float) -> Contradiction | None:
     """Find stated setup parameters without which measurements fit far better.
 
@@ -281,8 +274,9 @@ def find_contradiction(stated: Comparison, misfit: float, better: float) -> Cont
 
 def find_moved_setups(
     names: Sequence[str], sizes: Callable[[tuple[str, ...]], tuple[float, int]]
-) -> MovedSetups | None:
-    """Find frames, targets and surfaces that were moved since a fit.
+) -> tuple[tuple[str, ...], float] | None:
+    """Return the frames, targets and surfaces that were moved since a fit, or all that may have
+    moved, and the factor by which errors decrease when they are fitted again; None without any.
 
     names : of those whose values are kept.
     sizes : from the names that are fitted again to the root mean square [1] of whitened errors,
@@ -303,7 +297,7 @@ def find_moved_setups(
             for name in names
             if sizes(tuple(other for other in names if other != name))[0] > SMALLER * fitted
         )
-    return MovedSetups(moved or names, kept / fitted)
+    return moved or names, kept / fitted
 
 
 def _estimate_stated(stated: Comparison, names: tuple[str, ...]) -> Contradiction:

@@ -418,9 +418,7 @@ def _drop_same(
     data: Measurements, interpretations: Sequence[Interpretation]
 ) -> list[Interpretation]:
     """Return the interpretations without those that make the same data as an earlier one."""
-    kept: list[Interpretation] = []
-    tables: list[list[FloatArray]] = []
-    setups: list[list[tuple[str, ...]]] = []
+    kept: list[tuple[Interpretation, list[FloatArray], list[tuple[str, ...]]]] = []
     for interpretation in interpretations:
         changed = interpretation.apply(data)
         table = [changed.readings, *(o.measured for o in changed.observations)]
@@ -428,12 +426,10 @@ def _drop_same(
         if not any(
             setup == other_setup
             and all(np.allclose(a, b, equal_nan=True) for a, b in zip(table, other, strict=True))
-            for other, other_setup in zip(tables, setups, strict=True)
+            for _, other, other_setup in kept
         ):
-            kept.append(interpretation)
-            tables.append(table)
-            setups.append(setup)
-    return kept
+            kept.append((interpretation, table, setup))
+    return [interpretation for interpretation, _, _ in kept]
 
 
 def _select_few(data: Measurements) -> IntArray:
