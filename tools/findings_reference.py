@@ -9,9 +9,8 @@ import re
 import sys
 from pathlib import Path
 
-from loopcal.findings import catalog
+from loopcal.findings import Severity, catalog
 from loopcal.findings.catalog import Entry
-from loopcal.findings.finding import Severity
 from loopcal.findings.wording import depends_on_data, fill_template
 from tools.markdown import format_table
 

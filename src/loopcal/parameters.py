@@ -114,11 +114,9 @@ class ParameterTable:
 
         They are those of the whole deviation: sqrt(own^2 + sum of common^2).
         """
-        # None becomes NaN
-        own = np.array([p.tolerance for p in self.entries], dtype=float)
-        if not self.common:
-            return _freeze(own)
-        return _freeze(np.asarray(np.sqrt(own**2 + (self.common_effects**2).sum(axis=1))))
+        own = np.array([p.tolerance for p in self.entries], dtype=float)  # None becomes NaN
+        common = (self.common_effects**2).sum(axis=1)
+        return _freeze(np.asarray(np.sqrt(own**2 + common)) if self.common else own)
 
     @cached_property
     def common_effects(self) -> FloatArray:

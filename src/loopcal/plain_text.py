@@ -44,7 +44,9 @@ def escape(text: str, allowed: str = "") -> str:
     >>> escape("leg 1\x1b[31m")
     'leg 1\\x1b[31m'
     """
-    return _NOT_PLAIN.sub(lambda m: m[0] if m[0] in allowed else _escape_one(m[0]), text)
+    return _NOT_PLAIN.sub(
+        lambda m: m[0] if m[0] in allowed else m[0].encode("unicode_escape").decode("ascii"), text
+    )
 
 
 def escape_formula(text: str) -> str:
@@ -72,10 +74,10 @@ def escape_json(text: str) -> str:
 
 def quote(value: Any) -> str:
     """Return a text in quotes and escaped, or another value; of long ones the first characters."""
-    if isinstance(value, str):
-        return escape(repr(value if len(value) <= SHOWN else value[:SHOWN] + "…"))
-    text = repr(value)
-    return escape(text if len(text) <= SHOWN else text[:SHOWN] + "…")
+    is_text = isinstance(value, str)
+    text = value if is_text else repr(value)
+    text = text if len(text) <= SHOWN else text[:SHOWN] + "…"
+    return escape(repr(text) if is_text else text)
 
 
 def name_character(character: str) -> str:
@@ -84,7 +86,3 @@ def name_character(character: str) -> str:
     kind = {"Cc": "a control character", "Cs": "half of a character"}
     name = name or kind.get(unicodedata.category(character), "no character")
     return f"U+{ord(character):04X} ({name})"
-
-
-def _escape_one(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")

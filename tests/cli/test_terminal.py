@@ -11,10 +11,9 @@ import pytest
 from loopcal.cli import terminal
 from loopcal.cli.commands.calibration_commands import calibrate, validate
 from loopcal.cli.hints import HINTS, find_hint, hint_for
-from loopcal.findings import report_finding
+from loopcal.findings import IMPORTANCE, report_finding, sort_by_importance
 from loopcal.findings.catalog import load_catalog
 from loopcal.findings.catalog.phrases import MACHINE
-from loopcal.findings.importance import IMPORTANCE, sort_by_importance
 from loopcal.report.calibration_view import no_hint, with_hint
 
 WORK = """
@@ -30,7 +29,7 @@ print("end")
 
 
 def test_hints_and_importance_use_codes_of_the_catalog():
-    assert [code for code in (*HINTS, *IMPORTANCE) if code not in load_catalog()] == []
+    assert [code for code in (*HINTS, *IMPORTANCE.split()) if code not in load_catalog()] == []
 
 
 def test_hint_names_the_poses_of_its_finding():

@@ -34,6 +34,7 @@ LEGS = ({"leg": "a", "error": 0.12345}, {"leg": "b", "error": 2.0})
         ("{legs:each|{leg} {error}}", {"legs": LEGS}, "a 0.123 and b 2"),
         ("{legs:each 1|{leg}}", {"legs": LEGS}, "a and 1 more"),
         ("{rows:each; |{item}{sign}}", {"rows": "ab", "sign": "+"}, "a+; b+"),
+        ("{n+u:each, |{n} in {u}}", {"n": (1, 2), "u": ("mm", "deg")}, "1 in mm, 2 in deg"),
         ("{a:if|{b:if|both|one}|none}", {"a": 1, "b": 1}, "both"),
     ],
 )

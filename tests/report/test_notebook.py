@@ -232,7 +232,7 @@ def test_missing_package_is_named_with_the_command_that_installs_it(
             raise ImportError(name)
         return real(name, *arguments)
 
-    monkeypatch.setattr("loopcal.optional_packages.import_module", refuse)
+    monkeypatch.setattr("loopcal.environment.import_module", refuse)
     with pytest.raises(lc.MissingPackageError, match=re.escape("pip install 'loopcal[tables]'")):
         getattr(five_bar.fit, method)()
     with pytest.raises(builtins.ImportError):

@@ -35,8 +35,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.information import count_equations
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
-from loopcal.findings.importance import sort_by_importance
+from loopcal.findings import Finding, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma

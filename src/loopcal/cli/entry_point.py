@@ -31,10 +31,10 @@ import click
 from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
 from loopcal.cli.hints import find_hint, word_hint
+from loopcal.environment import THREADS
 from loopcal.errors import LoopcalError
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
-from loopcal.threads import THREADS
 
 # --- Ctrl-C where Python cannot raise it.
 

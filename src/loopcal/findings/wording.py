@@ -14,7 +14,9 @@ In addition to the formats of Python, where `...` is a template again:
 | `{key:choose|a=...|b=...|...}` | the part of this key; the last part for any other |
 | `{rows:each|...}` | a part for each row (fields: its keys, or `item`), joined like names |
 | `{rows:each 3|...}`, `{rows:each; |...}` | the same, for the first 3 rows; joined by `; ` |
-| `{name()}`, `{subject.code()}` | a phrase of `catalog/phrases.py`; the text of another finding |
+| `{names+units:each|...}` | rows from tuples of equal length, with their names as fields |
+| `{name()}` | a phrase of the catalog: of `phrases.toml`, or a function of `phrases.py` |
+| `{subject.code()}`, `{row:finding}` | the text of another finding with these data, or of a row |
 
 A number without a format has three significant digits; a `Quantity` also its unit.
 """
@@ -23,16 +25,12 @@ from __future__ import annotations
 
 import math
 import string
-from collections.abc import Iterator, Mapping, Sequence, Sized
+from collections.abc import Mapping, Sequence, Sized
 from functools import cache
-from importlib import import_module
 from typing import Any, NamedTuple
 
 SHOWN_NAMES = 10
 """Names that a sentence lists before it counts the others."""
-
-PHRASES = ("phrases", "conformity_phrases", "mechanism_phrases")
-"""Modules of the catalog with the phrases of templates, those that are used most first."""
 
 _PYTHON = string.Formatter()
 
@@ -82,12 +80,24 @@ def list_names(names: Sequence[Any], shown: int = SHOWN_NAMES) -> str:
 
 def fill_template(template: str, /, **data: Any) -> str:
     """Return a template filled with data."""
-    return _fill(template, data)
+    words = []
+    for text, name, spec, conversion in _parse(template):
+        words.append(text)
+        if name is not None:
+            value = _PYTHON.convert_field(_look_up(name, data), conversion)
+            words.append(_word_parts(value, spec, data) if "|" in spec else _word(value, spec))
+    return "".join(words)
 
 
 def list_fields(template: str) -> frozenset[str]:
     """Return the names of the data that a template shows, those of optional parts included."""
-    return frozenset(_find_fields(template))
+    fields: set[str] = set()
+    for _, name, spec, _ in _parse(template):
+        if name and not name.endswith("()"):
+            fields.update(part.split(".")[0].split("[")[0] for part in name.split("+"))
+        if "|" in spec and not spec.startswith("each"):
+            fields |= list_fields(spec)
+    return frozenset(fields)
 
 
 def depends_on_data(template: str) -> bool:
@@ -101,8 +111,10 @@ def depends_on_data(template: str) -> bool:
 @cache
 def _parse(template: str) -> tuple[tuple[str, str | None, str, str | None], ...]:
     """Return literal text, name, format and conversion of each field."""
-    parsed = string.Formatter().parse(template)
-    return tuple((text, name, spec or "", conversion) for text, name, spec, conversion in parsed)
+    return tuple(
+        (text, name, spec or "", conversion)
+        for text, name, spec, conversion in _PYTHON.parse(template)
+    )
 
 
 @cache
@@ -118,70 +130,49 @@ def _split(text: str) -> tuple[str, ...]:
     return tuple(branches)
 
 
-def _find_fields(template: str) -> Iterator[str]:
-    for _, name, spec, _ in _parse(template):
-        if name and not name.endswith("()"):
-            yield name.split(".")[0].split("[")[0]
-        if "|" in spec and not spec.startswith("each"):
-            yield from _find_fields(spec)
-
-
-def _fill(template: str, data: Mapping[str, Any]) -> str:
-    words = []
-    for text, name, spec, conversion in _parse(template):
-        words.append(text)
-        if name is not None:
-            value = _PYTHON.convert_field(_look_up(name, data), conversion)
-            words.append(_word_parts(value, spec, data) if "|" in spec else _word(value, spec))
-    return "".join(words)
-
-
 def _look_up(name: str, data: Mapping[str, Any]) -> Any:
-    """Return the value of a field: data, a phrase, or the text of another finding."""
-    if not name.endswith("()"):
-        return _PYTHON.get_field(name, (), data)[0]
-    from loopcal.findings.catalog import find_entry
+    """Return the value of a field: data, rows of several data, a phrase, or another finding."""
+    if name.endswith("()"):
+        from loopcal.findings.catalog import word_phrase
 
-    name = name.removesuffix("()")
-    if "." in name:
-        return find_entry(name).word(data)
-    modules = (import_module(f"loopcal.findings.catalog.{module}") for module in PHRASES)
-    module = next(m for m in modules if hasattr(m, name))
-    return getattr(module, name)(data)
+        return word_phrase(name.removesuffix("()"), data)
+    if "+" in name:
+        names = name.split("+")
+        rows = zip(*(data[name] for name in names), strict=True)
+        return [dict(zip(names, row, strict=True)) for row in rows]
+    return _PYTHON.get_field(name, (), data)[0]
 
 
 def _word_parts(value: Any, spec: str, data: Mapping[str, Any]) -> str:
     """Word a field that chooses or repeats templates."""
     rule, _, text = spec.partition("|")
-    branches = _split(text)
     if rule.startswith("each"):
-        return _word_rows(value, rule.removeprefix("each"), text, data)
+        rows = [{"item": row, **(row if isinstance(row, Mapping) else {})} for row in value]
+        words = [fill_template(text, **{**data, **row}) for row in rows]
+        joint = rule.removeprefix("each")
+        if joint and not joint.strip().isdigit():
+            return joint.join(words)
+        return list_names(words, int(joint or SHOWN_NAMES))
+    branches = _split(text)
     if rule == "choose":
         named = dict(part.split("=", 1) for part in branches[:-1])
-        return _fill(named.get(str(value), branches[-1]), data)
+        return fill_template(named.get(str(value), branches[-1]), **data)
     if rule == "plural":
         is_first = (len(value) if isinstance(value, Sized) else value) == 1
     else:
         assert rule == "if", spec
         is_first = bool(value)
-    return _fill((*branches, "")[0 if is_first else 1], data)
-
-
-def _word_rows(rows: Sequence[Any], joint: str, template: str, data: Mapping[str, Any]) -> str:
-    """Word each row, and join the words as a list or with a joint of their own."""
-    words = [
-        _fill(template, {**data, **(row if isinstance(row, Mapping) else {"item": row})})
-        for row in rows
-    ]
-    if joint and not joint.strip().isdigit():
-        return joint.join(words)
-    return list_names(words, int(joint or SHOWN_NAMES))
+    return fill_template((*branches, "")[0 if is_first else 1], **data)
 
 
 def _word(value: Any, spec: str) -> str:
     """Word a value in one of the formats, or in one of Python's."""
     if spec == "list":
         return list_names(value)
+    if spec == "finding":
+        from loopcal.findings.catalog import find_entry
+
+        return find_entry(value["code"]).word(value)
     if isinstance(value, float) and not math.isfinite(value):
         return round_to_digits(value)
     if spec == "percent":

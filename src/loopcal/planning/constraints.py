@@ -144,7 +144,7 @@ class Constraints:
 class Violation:
     """The first constraint that a pose or a path violates."""
 
-    code: str  # of the reason; worded in `loopcal.findings.catalog.phrases`
+    code: str  # of the reason; worded by `violation` of `phrases.toml`
     data: tuple[tuple[str, Any], ...] = ()  # names and numbers of the reason
     # whether it occurs on the straight path from home, not at the pose itself
     on_path: bool = False

@@ -32,6 +32,7 @@ from loopcal.diagnose.outliers import OutlierCheck
 from loopcal.diagnose.posterior_sample import PosteriorSample
 from loopcal.diagnose.regularization_curves import RegularizationCurves
 from loopcal.diagnose.value_comparison import ValueComparison
+from loopcal.environment import import_optional
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.nuisance_estimate import NuisanceEstimate
 from loopcal.estimate.recalibration import Change
@@ -42,7 +43,6 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.mechanism.solutions import Jacobian, Solution
 from loopcal.mechanism.states import Status
-from loopcal.optional_packages import import_optional
 from loopcal.plain_text import escape
 from loopcal.planning.plane_line_planning import SurfacePlan
 from loopcal.planning.result import Plan

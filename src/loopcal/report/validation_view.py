@@ -19,8 +19,7 @@ from loopcal.diagnose.posterior_sample import PosteriorSample
 from loopcal.diagnose.regularization_curves import RegularizationCurve, RegularizationCurves
 from loopcal.diagnose.row_errors import METRICS, SUMMARY, Statistics
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Severity
-from loopcal.findings.importance import sort_by_importance
+from loopcal.findings import Finding, Severity, sort_by_importance
 from loopcal.findings.wording import list_names
 from loopcal.mechanism.model import Mechanism
 from loopcal.report.tables import (

@@ -19,10 +19,11 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from loopcal.findings.finding import Severity
+from loopcal.findings import Severity
 from loopcal.findings.wording import Quantity, depends_on_data, fill_template, list_fields
 
 FILES: Mapping[str, tuple[str, ...]] = {
@@ -100,6 +101,21 @@ def find_entry(code: str) -> Entry:
     return _make_entry(code, tomllib.loads(text)[subject][name])
 
 
+def word_phrase(name: str, data: Mapping[str, Any]) -> str:
+    """Return a phrase of `phrases.toml` or `phrases.py`, or the text of a code, for these data."""
+    if "." in name:
+        return find_entry(name).word(data)
+    if template := _read_phrases().get(name):
+        return fill_template(template, **data)
+    return getattr(import_module("loopcal.findings.catalog.phrases"), name)(data)
+
+
+@cache
+def _read_phrases() -> dict[str, str]:
+    """Return the templates that several texts share, by name."""
+    return {name: _join_lines(text) for name, text in read_document("phrases").items()}
+
+
 def load_catalog() -> dict[str, Entry]:
     """Return all entries by code."""
     return {code: entry for file in FILES for code, entry in read_entries(file).items()}
@@ -109,12 +125,11 @@ def load_catalog() -> dict[str, Entry]:
 def read_entries(file: str) -> dict[str, Entry]:
     """Return the entries of a file by code."""
     subjects = read_document(file)
-    codes = {
-        f"{subject}.{name}": keys
+    return {
+        f"{subject}.{name}": _make_entry(f"{subject}.{name}", keys)
         for subject in FILES[file]
         for name, keys in subjects[subject].items()
     }
-    return {code: _make_entry(code, keys) for code, keys in codes.items()}
 
 
 def read_document(file: str) -> dict[str, Any]:
@@ -130,12 +145,15 @@ def _divide_file(file: str) -> dict[str, str]:
 
 
 def _read_text(file: str) -> str:
-    """Return the text of a file."""
     return Path(__file__).with_name(f"{file}.toml").read_text("utf-8")
 
 
+def _join_lines(text: str) -> str:
+    return " ".join(text.strip().split("\n"))
+
+
 def _make_entry(code: str, keys: Mapping[str, Any]) -> Entry:
-    texts = {k: " ".join(v.strip().split("\n")) for k, v in keys.items() if isinstance(v, str)}
+    texts = {name: _join_lines(text) for name, text in keys.items() if isinstance(text, str)}
     (severity,) = texts.keys() - {"when", "action"}
     text = texts.pop(severity)
     example = _convert(keys.get("example", {}))

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.engine import collect_versions
-from loopcal.findings.importance import sort_by_importance
+from loopcal.findings import sort_by_importance
 from loopcal.mechanism.model import Mechanism
 from loopcal.report.document.calibration_document import describe_maker, summarize
 from loopcal.report.document.elements import CalibrationRecord, Document, Element, Listing, Section

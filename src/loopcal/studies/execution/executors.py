@@ -13,10 +13,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from loopcal import optional_packages
+from loopcal import environment
+from loopcal.environment import use_one_thread
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
-from loopcal.threads import use_one_thread
 
 MOST_LOSSES = 5
 """Workers that one task may stop. After that it is given up, because it stops any worker."""
@@ -290,13 +290,13 @@ def _without_interrupts() -> Iterator[None]:
 
 
 def import_optional(module: str, extra: str) -> Any:
-    """Return a module of an optional package, see `loopcal.optional_packages.import_optional`.
+    """Return a module of an optional package, see `loopcal.environment.import_optional`.
 
     Raises
     ------
     StudyError : it is not installed.
     """
-    return optional_packages.import_optional(module, extra, StudyError)
+    return environment.import_optional(module, extra, StudyError)
 
 
 QUEUED = 2

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many threads libraries of linear algebra use."""
+"""The environment of a program: optional packages, and threads of linear algebra."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+from loopcal.errors import LoopcalError, MissingPackageError
+from loopcal.findings import report_finding
 
 THREADS = (
     "OMP_NUM_THREADS",
@@ -36,3 +41,19 @@ def use_one_thread() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def import_optional(
+    module: str, extra: str, error: type[LoopcalError] = MissingPackageError
+) -> Any:
+    """Return a module of an optional package, which the extra of this name installs.
+
+    Raises
+    ------
+    MissingPackageError or `error` : it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as cause:
+        finding = report_finding("workers.package-missing", package=module, extra=extra)
+        raise error(finding) from cause
