@@ -77,15 +77,19 @@ def check_pose(value: ArrayLike, what: str) -> FloatArray:
     return T
 
 
+def check_point(value: ArrayLike, what: str) -> FloatArray:
+    """Return a read-only point (3,) [m]."""
+    return check_array(value, what, (3,))
+
+
 def check_direction(value: ArrayLike, what: str) -> FloatArray:
     """Return the read-only unit vector (3,) along a vector; DataError where its length is zero."""
-    vector = check_array(value, what, (3,))
+    vector = check_point(value, what)
     length = float(np.linalg.norm(vector))
     if not length > 0.0:
         raise DataError(f"{what} is 0, 0, 0; give a vector of any length above 0")
-    unit = vector / length
     # a vector of length 1 is kept bit by bit, so that files are written as they were read
-    return vector if abs(length - 1.0) < 1e-15 else check_array(unit, what, (3,))
+    return vector if abs(length - 1.0) < 1e-15 else check_point(vector / length, what)
 
 
 def check_names(names: str | Iterable[str], what: str) -> tuple[str, ...]:

@@ -98,20 +98,16 @@ class Bearing(TargetKind):
         angles = np.stack([np.arctan2(b, a), np.arctan2(c, level)], axis=-1)
         return angles, np.stack(slopes, axis=-2), {}
 
-    def convert_to_rays(self, measured: FloatArray) -> FloatArray:
-        """Return the unit vectors (.., 3) of measured angles (.., 2)."""
-        if self.form == "camera":
-            return convert_camera_angles(measured)
-        azimuth, elevation = measured[..., 0], measured[..., 1]
-        level = np.cos(elevation)
-        return np.stack(
-            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
-        )
-
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the station by resection, with the targets at their stated places."""
         _, _, points, angles = self.collect_points(T, measured)
         if "frame" not in self.unknown or len(angles) < 4 or self.is_of_base:
             return self.nominal_values[None]
-        frames = solve_resection(self.convert_to_rays(angles), points)
+        rays = convert_camera_angles(angles)
+        if self.form == "theodolite":
+            (azimuth, elevation), level = angles.T, np.cos(angles[:, 1])
+            rays = np.stack(
+                [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
+            )
+        frames = solve_resection(rays, points)
         return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frames)})

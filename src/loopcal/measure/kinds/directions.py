@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -15,13 +15,14 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.geometry import solve_directions
-from loopcal.measure.array_checks import check_direction, check_pose, set_fields
+from loopcal.measure.array_checks import check_direction, check_pose
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import (
     Column,
     Evaluation,
     InvalidRows,
     Kind,
+    checked,
     is_incomplete,
     list_rows,
 )
@@ -29,6 +30,8 @@ from loopcal.measure.kinds.points import convert_camera_angles, predict_camera_a
 from loopcal.measure.kinds.setup_parameters import make_perpendicular_basis
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
+
+UPWARD = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -62,11 +65,12 @@ class DirectionKind(Kind):
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Orientation and direction."""
         orientation, S, direction, a = self.stated
-        items = (
-            setup.make_orientation_item(orientation, S),
-            setup.make_direction_item(direction, a),
-        )
-        return dict(zip(self.allowed_unknown, items, strict=True))
+        of_orientation, of_direction = self.allowed_unknown
+        rotations = setup.make_parameters(direction, setup.DIRECTION_AXES, Dimension.ANGLE)
+        return {
+            of_orientation: setup.make_orientation_item(orientation, S),
+            of_direction: setup.SetupItem(rotations, {direction: a}),
+        }
 
     def locate_direction(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the direction d (.., 3) and its derivative (.., 3, 6 + u)."""
@@ -110,24 +114,22 @@ class DirectionKind(Kind):
             return self.nominal_values[None]
         R = T[complete, :3, :3]
         Q = np.swapaxes(R, -1, -2) if self.inward else R
-        directions = self.convert_to_directions(measured[complete])
-        return np.concatenate([self._solve(Q, d) for d in directions])
-
-    def _solve(self, Q: FloatArray, d: FloatArray) -> FloatArray:
-        """Return candidates (k, u) from measured directions d (r, 3)."""
         _, S, _, a = self.stated
         of_orientation, of_direction = self.allowed_unknown
-        if of_orientation in self.unknown:
-            known = None if of_direction in self.unknown else a
-            rotations, directions = solve_directions(d, Q, known)
-        else:
-            mean = np.einsum("rji,jk,rk->i", Q, S, d)
-            rotations, directions = S[None], (mean / np.linalg.norm(mean))[None]
-        items = {
-            of_orientation: setup.encode_rotation(S, rotations),
-            of_direction: setup.encode_direction(a, directions),
-        }
-        return self.assemble_values(items)
+        candidates = []
+        for d in self.convert_to_directions(measured[complete]):
+            if of_orientation in self.unknown:
+                known = None if of_direction in self.unknown else a
+                rotations, directions = solve_directions(d, Q, known)
+            else:
+                mean = np.einsum("rji,jk,rk->i", Q, S, d)
+                rotations, directions = S[None], (mean / np.linalg.norm(mean))[None]
+            items = {
+                of_orientation: setup.encode_rotation(S, rotations),
+                of_direction: setup.encode_direction(a, directions),
+            }
+            candidates.append(self.assemble_values(items))
+        return np.concatenate(candidates)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -143,22 +145,15 @@ class AxisKind(DirectionKind):
     Others: see `DirectionKind`.
     """
 
-    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+    T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
     frame: str = "frame"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        set_fields(self, T_base_frame=check_pose(self.T_base_frame, "T_base_frame"))
-
-
-# --- Kind `direction`: an axis of the platform as a unit vector in a frame, such as the normal of
-# a probed face.
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Direction(AxisKind):
-    """Direction of an axis. Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to
-    the measured direction m.
+    """Direction of an axis as a unit vector, such as the normal of a probed face.
+
+    Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to the measured direction m.
 
     The residual is twice the tangent of half the angle between the predicted direction d and m,
     along the two vectors B. It equals the angle where that is small, and is unbounded where d is
@@ -187,15 +182,11 @@ class Direction(AxisKind):
     array([[[0., 0., 1.]]])
     """
 
-    axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    axis: FloatArray = checked(check_direction, "the axis", UPWARD)
     axis_name: str = "axis"
 
     name: ClassVar[str] = "direction"
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "axis")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        set_fields(self, axis=check_direction(self.axis, "the axis"))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -228,7 +219,7 @@ class Direction(AxisKind):
     @property
     def placeholder(self) -> FloatArray:
         """The z axis, where no direction was measured."""
-        return np.array([0.0, 0.0, 1.0])
+        return UPWARD
 
     def detect_present(self, measured: FloatArray) -> BoolArray:
         """Return both residuals as present, or none where a component is missing."""
@@ -277,12 +268,10 @@ class Direction(AxisKind):
         return (geometry.exp_so3(rotation) @ d[..., None])[..., 0]
 
 
-# --- Kind `inclination`: two tilts of the platform against gravity, by inclinometers on it.
-
-
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Inclination(DirectionKind):
-    """Elevations of a sensor's x and y axis above the horizontal. Residual: differences of angles.
+    """Elevations of a sensor's x and y axis above the horizontal, by inclinometers on the platform.
+    Residual: differences of angles.
 
     With the upward vertical d in axes of the sensor: `tilt_x = atan2(d_x, hypot(d_y, d_z))`,
     `tilt_y` likewise.
@@ -314,18 +303,13 @@ class Inclination(DirectionKind):
     array([[[0. , 0.1]]])
     """
 
-    up: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    T_platform_sensor: FloatArray = field(default_factory=lambda: np.eye(4))
+    up: FloatArray = checked(check_direction, "the vertical", UPWARD)
+    T_platform_sensor: FloatArray = checked(check_pose, "T_platform_sensor", np.eye(4))
     sensor: str = "inclinometer"
 
     name: ClassVar[str] = "inclination"
     allowed_unknown: ClassVar[tuple[str, ...]] = ("mounting", "gravity")
     inward: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        mounting = check_pose(self.T_platform_sensor, "T_platform_sensor")
-        set_fields(self, up=check_direction(self.up, "the vertical"), T_platform_sensor=mounting)
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -369,25 +353,20 @@ class Inclination(DirectionKind):
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows whose two tilts are impossible together."""
-        sentence = (
-            "has tilts of {:.6g} and {:.6g} deg, which are impossible together: elevations of two "
-            "perpendicular axes add up to at most 90 deg; check the unit"
-        )
         is_beyond_vertical = np.any(np.abs(measured) > np.pi / 2, axis=-1)
         return list_rows(
             is_beyond_vertical | (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0),
-            lambda i: sentence.format(*np.rad2deg(measured[i])),
+            lambda i: (
+                "has tilts of {:.6g} and {:.6g} deg, which are impossible together: elevations of "
+                "two perpendicular axes add up to at most 90 deg; check the unit"
+            ).format(*np.rad2deg(measured[i])),
         )
-
-
-# --- Kind `autocollimation`: two angles of a mirror on the platform against the optical axis of
-# an autocollimator.
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Autocollimation(AxisKind):
-    """Angles of a mirror's normal. Residual: differences of `atan2(d_x, d_z)` and `atan2(d_y,
-    d_z)`, wrapped.
+    """Angles of a mirror on the platform, by an autocollimator. Residual: differences of
+    `atan2(d_x, d_z)` and `atan2(d_y, d_z)`, wrapped.
 
     d is the normal of the mirror in the frame of the instrument. The z axis of that frame is the
     optical axis and has the direction of the normal, towards the instrument. Angles are those of
@@ -418,15 +397,11 @@ class Autocollimation(AxisKind):
     array([[[0.01, 0.  ]]])
     """
 
-    normal: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    normal: FloatArray = checked(check_direction, "the normal of the mirror", UPWARD)
     mirror: str = "mirror"
 
     name: ClassVar[str] = "autocollimation"
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "mirror")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        set_fields(self, normal=check_direction(self.normal, "the normal of the mirror"))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -453,9 +428,11 @@ class Autocollimation(AxisKind):
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows whose mirror faces away from the instrument."""
-        away = np.argwhere(np.abs(measured) >= np.pi / 2)
-        sentence = (
-            "has an angle of {:.6g} deg, at which the mirror faces away from the instrument; check "
-            "the unit"
+        away = np.abs(measured) >= np.pi / 2
+        return list_rows(
+            away.any(axis=-1),
+            lambda i: (
+                f"has an angle of {np.rad2deg(measured[i][away[i]][0]):.6g} deg, at which the "
+                "mirror faces away from the instrument; check the unit"
+            ),
         )
-        return tuple((int(i), sentence.format(np.rad2deg(measured[i, j]))) for i, j in away)

@@ -6,7 +6,7 @@ ball bar.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -14,12 +14,47 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.geometry import FLATNESS, solve_trilateration
-from loopcal.measure.array_checks import check_array, set_fields
+from loopcal.measure.array_checks import check_point
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column, Evaluation
-from loopcal.measure.kinds.points import LengthKind, Prediction
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, checked, list_rows
+from loopcal.measure.kinds.points import Prediction, TargetKind
+from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class LengthKind(TargetKind):
+    """A kind that measures one length above 0 for each target, with a common offset."""
+
+    @cached_property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Also the offset of all readings."""
+        offset = Parameter(f"{self.name}.offset", Dimension.LENGTH, 0.0, scope="session")
+        return {**super().possible_setup, "offset": setup.SetupItem((offset,))}
+
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return lengths of vectors x (.., k, 3) plus the offset."""
+        length, unit = measure_lengths(x)
+        offset = self.stated_or_unknown(values, "offset")
+        return length + offset[..., None, :], unit[..., None, :], {"offset": np.ones((1, 1, 1))}
+
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
+        """Return rows with a length that is not above zero."""
+        return list_rows(
+            np.any(measured <= 0.0, axis=1),
+            lambda i: (
+                f"has a distance of {measured[i][measured[i] <= 0.0][0]:.6g} m; a distance is "
+                "above 0: correct it, or leave the cell empty if nothing was measured"
+            ),
+        )
+
+
+def measure_lengths(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return lengths (.., 1) of vectors (.., 3) and unit vectors, zero where a length is 0."""
+    square = np.sum(x * x, axis=-1, keepdims=True)
+    safe = np.sqrt(np.where(square > 0.0, square, 1.0))
+    return np.where(square > 0.0, safe, 0.0), x / safe
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -50,16 +85,12 @@ class Distance(LengthKind):
     array([[[2.]]])
     """
 
-    anchor: FloatArray = field(default_factory=lambda: np.zeros(3))
+    anchor: FloatArray = checked(check_point, "the anchor", np.zeros(3))
     anchor_name: str = "anchor"
 
     name: ClassVar[str] = "distance"
     per_target: ClassVar[tuple[Column, ...]] = (Column("distance", Dimension.LENGTH),)
     allowed_unknown: ClassVar[tuple[str, ...]] = ("anchor", "targets", "offset")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        set_fields(self, anchor=check_array(self.anchor, "the anchor", (3,)))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -80,9 +111,7 @@ class Distance(LengthKind):
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 1) and unit vectors."""
-        anchor = self.item_values(values, "anchor")
-        if anchor is None:
-            return super().predict(x - self.anchor, values)
+        anchor = self.stated_or_unknown(values, "anchor")
         distance, unit, by_item = super().predict(x - anchor[..., None, :], values)
         return distance, unit, {**by_item, "anchor": -unit}
 
@@ -104,34 +133,25 @@ class Distance(LengthKind):
             for flag in {False, with_offset}
         ]
         centers, offsets = (np.concatenate(arrays) for arrays in zip(*solutions, strict=True))
-        side = self._is_on_stated_side(inside, centers)
-        return self.assemble_values({"anchor": centers[side], "offset": offsets[side, None]})
-
-    def _is_on_stated_side(self, points: FloatArray, centers: FloatArray) -> BoolArray:
-        """Return which centers (k,) are on the stated side of the plane of all points (q, 3); all
-        where the points are not coplanar.
-        """
-        middle = points.mean(axis=0)
-        _, s, axes = np.linalg.svd(points - middle, full_matrices=False)
-        if s[2] > FLATNESS * s[0] or "targets" in self.unknown:
-            return np.ones(len(centers), dtype=bool)
-        stated = (self.anchor - middle) @ axes[2]
-        if not self.anchor.any() or abs(stated) <= FLATNESS * s[0]:
-            raise DataError(
-                f"all distances to {self.anchor_name!r} were measured from points in one plane, so "
-                "it can be on either side of that plane; state an approximate 'anchor', or measure "
-                "poses off the plane"
-            )
-        return (centers - middle) @ axes[2] * stated >= 0.0
-
-
-# --- Kind `separation`: the distance between the places of a point at two poses, by a ball bar or
-# by calipers on a printed part.
+        middle = inside.mean(axis=0)
+        _, s, axes = np.linalg.svd(inside - middle, full_matrices=False)
+        if s[2] <= FLATNESS * s[0] and "targets" not in self.unknown:
+            stated = (self.anchor - middle) @ axes[2]
+            if not self.anchor.any() or abs(stated) <= FLATNESS * s[0]:
+                raise DataError(
+                    f"all distances to {self.anchor_name!r} were measured from points in one "
+                    "plane, so it can be on either side of that plane; state an approximate "
+                    "'anchor', or measure poses off the plane"
+                )
+            side = (centers - middle) @ axes[2] * stated >= 0.0
+            centers, offsets = centers[side], offsets[side]
+        return self.assemble_values({"anchor": centers, "offset": offsets[:, None]})
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Separation(LengthKind):
-    """Distance of each target between two poses. Residual: `|x_2 - x_1| + offset - measured`.
+    """Distance of each target between two poses, by a ball bar or by calipers on a printed part.
+    Residual: `|x_2 - x_1| + offset - measured`.
 
     A row names two poses. The frame does not matter.
 

@@ -150,13 +150,11 @@ class Locked(JointSensor):
         return tuple(Column(f"{name}.slip", self.dimension) for name in self.joints)
 
 
-# --- The recorded actuator readings as a measurement of the true ones.
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class ActuatorReadings(Kind):
-    """Readings of all actuators. Residual: `true - recorded`. Angles are not wrapped: a full turn
-    too much is an error of a full turn.
+    """Recorded readings of all actuators. Residual: `true - recorded`.
+
+    Angles are not wrapped: a full turn too much is an error of a full turn.
 
     Parameters
     ----------
@@ -187,9 +185,6 @@ class ActuatorReadings(Kind):
         m = len(self.actuators)
         by_joint = np.broadcast_to(np.eye(m), (*joints.shape, m))
         return Evaluation(joints, np.zeros((*joints.shape, 6)), None, by_joint)
-
-
-# --- Kind `closure`: nothing is measured but the actuator readings of the pose.
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

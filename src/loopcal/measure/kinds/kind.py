@@ -20,8 +20,8 @@ m residuals (often c), u nuisance parameters of the kind, j joints that it sense
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self, cast
 
@@ -38,10 +38,16 @@ from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-# --- Rows of a kind: their columns, residuals and derivatives, and rows that are invalid.
-
 InvalidRows = tuple[tuple[int, str], ...]
 """Index of each invalid row, and the end of a sentence that says why."""
+
+BIAS, DRIFT = SHARED_ERRORS = ("bias", "drift")
+"""Errors that all rows of a session share, a constant and a linear drift: setup items that any kind
+may list as unknown.
+"""
+
+BASE = "base"
+"""Name of the base among the bodies that a kind may be `of`; no stage has it."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,6 @@ class Column:
 
 
 POSITION_COLUMNS = tuple(Column(name, Dimension.LENGTH) for name in ("x", "y", "z"))
-"""Columns of a position."""
 
 
 class Evaluation(NamedTuple):
@@ -100,66 +105,6 @@ class MeasuredColumns(NamedTuple):
         return MeasuredColumns(*arrays, self.is_complete)
 
 
-def list_rows(wrong: BoolArray, describe: Callable[[int], str]) -> InvalidRows:
-    """Return the rows of a mask (r,), each with its description."""
-    return tuple((int(i), describe(int(i))) for i in np.flatnonzero(wrong))
-
-
-def is_incomplete(columns: FloatArray) -> BoolArray:
-    """Return the rows of columns (.., c) in which some values are missing, but not all."""
-    missing = np.isnan(columns)
-    return np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
-
-
-def drop_rounding(evaluation: Evaluation) -> Evaluation:
-    """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as those by
-    the place of a target do between parallel poses.
-
-    They are compared with derivatives by the platform twist. A meter is compared with a radian
-    there; the tolerance is so small that the size of a machine does not matter.
-    """
-    if evaluation.nuisance is None:
-        return evaluation
-    by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
-    by_twist = by_twist.sum(axis=-2) if evaluation.jacobian.ndim > 4 else by_twist
-    return evaluation._replace(nuisance=without_rounding(evaluation.nuisance, by_twist[..., None]))
-
-
-def zero_absent(evaluation: Evaluation, present: BoolArray) -> Evaluation:
-    """Return the evaluation with zeros for components that are not `present` (t, r, m)."""
-    by_row = present[..., None]
-    has_links = evaluation.jacobian.ndim > present.ndim + 1
-    by_nuisance, by_joints = (
-        None if derivative is None else np.where(by_row, derivative, 0.0)
-        for derivative in (evaluation.nuisance, evaluation.joints)
-    )
-    return Evaluation(
-        np.where(present, evaluation.residual, 0.0),
-        np.where(present[..., None, :, None] if has_links else by_row, evaluation.jacobian, 0.0),
-        by_nuisance,
-        by_joints,
-    )
-
-
-# --- The settings of a kind that differ from their defaults, as text.
-
-
-def list_changed_settings(kind: Any) -> Iterator[str]:
-    """Give `name=value` of each setting of a kind (a dataclass) that differs from its default."""
-    for setting in fields(kind):
-        value, factory = getattr(kind, setting.name), setting.default_factory
-        usual = cast(Any, setting.default) if factory is MISSING else factory()
-        if setting.init and not np.array_equal(value, usual):
-            text = repr(value)
-            if isinstance(value, np.ndarray):
-                is_small = value.size <= 16
-                text = f"{np.round(value, 6).tolist() if is_small else f'<array {value.shape}>'}"
-            yield f"{setting.name}={text}"
-
-
-# --- The errors that the residuals of a kind are: of which quantity, and of which target.
-
-
 class ErrorGroup(NamedTuple):
     """Residuals that are the components of one error.
 
@@ -178,14 +123,30 @@ class ErrorGroup(NamedTuple):
     columns: tuple[int, ...]
 
 
+def checked(check: Callable[[Any, str], FloatArray], what: str, default: Any = None) -> Any:
+    """Return the field of a setting that `check(value, what)` copies and checks, unless None."""
+    return field(default_factory=lambda: default, metadata={"check": check, "what": what})
+
+
+def list_rows(wrong: BoolArray, describe: Callable[[int], str]) -> InvalidRows:
+    """Return the rows of a mask (r,), each with its description."""
+    return tuple((int(i), describe(int(i))) for i in np.flatnonzero(wrong))
+
+
+def is_incomplete(columns: FloatArray) -> BoolArray:
+    """Return the rows of columns (.., c) in which some values are missing, but not all."""
+    missing = np.isnan(columns)
+    return np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
+
+
 def list_error_groups(kind: Kind) -> tuple[ErrorGroup, ...]:
-    """Return the errors of one row of a kind."""
+    """Return the errors that the residuals of one row of a kind are."""
     residuals = kind.noise_columns
-    targets = {"": tuple(range(len(residuals)))}
+    targets: Mapping[str, tuple[int, ...]] = {"": tuple(range(len(residuals)))}
     if kind.sensed_joints and not kind.of:
         targets = {name: (i,) for i, name in enumerate(kind.sensed_joints)}
     elif residuals == kind.columns:
-        targets = dict(kind.target_columns)
+        targets = kind.target_columns
     quantities = {Dimension.LENGTH: kind.length_error, Dimension.ANGLE: kind.angle_error}
     groups = []
     for target, places in targets.items():
@@ -196,13 +157,6 @@ def list_error_groups(kind: Kind) -> tuple[ErrorGroup, ...]:
                 label = target if len(targets) > 1 else ""
                 groups.append(ErrorGroup(quantity, dimension, label, names, columns))
     return tuple(groups)
-
-
-# --- Errors that all rows of a session share, as unknowns of any kind: a bias, and a linear drift.
-
-BIAS, DRIFT = "bias", "drift"
-SHARED_ERRORS = (BIAS, DRIFT)
-"""Setup items that any kind may list as unknown."""
 
 
 def list_components(kind: Kind) -> dict[tuple[str, Dimension], list[int]]:
@@ -228,57 +182,6 @@ def name_shared_error(kind: Kind, item: str, component: str) -> str:
     return f"{owner}.{item}.{component}"
 
 
-def make_shared_errors(kind: Kind) -> Mapping[str, SetupItem]:
-    """Return the bias and the drift of a kind: one parameter for each component."""
-    return {
-        item: SetupItem(
-            tuple(
-                Parameter(name_shared_error(kind, item, component), dimension, 0.0, scope="session")
-                for component, dimension in list_components(kind)
-            )
-        )
-        for item in SHARED_ERRORS
-    }
-
-
-def spread_components(kind: Kind) -> FloatArray:
-    """Return the matrix (m, b) that adds a value for each component to its noise columns."""
-    components = list_components(kind).values()
-    matrix = np.zeros((len(kind.noise_columns), len(components)))
-    for i, columns in enumerate(components):
-        matrix[columns, i] = 1.0
-    return matrix
-
-
-def sum_shared_errors(kind: Kind, values: FloatArray) -> FloatArray:
-    """Return the errors (.., b) of the components, from the values (.., u) of the nuisance
-    parameters: of the drift, those are the parts that the rows take.
-    """
-    items = [kind.item_values(values, name) for name in kind.shared_errors]
-    return np.asarray(sum(item for item in items if item is not None))
-
-
-def add_shared_errors(
-    kind: Kind, evaluation: Evaluation, measured: FloatArray, values: FloatArray
-) -> Evaluation:
-    """Return the evaluation of rows whose noise columns share a bias and a drift.
-
-    Parameters
-    ----------
-    evaluation : without them. measured : (.., r, c) [SI]. values : (.., r, u) of all nuisance
-        parameters.
-    """
-    slope = kind.linearize_noise(measured) @ spread_components(kind)
-    error = slope @ sum_shared_errors(kind, values)[..., None]
-    residual = evaluation.residual + error[..., 0]
-    shape = residual.shape
-    columns = [np.broadcast_to(slope, (*shape, slope.shape[-1]))] * len(kind.shared_errors)
-    if evaluation.nuisance is not None:
-        own = np.broadcast_to(evaluation.nuisance, (*shape, evaluation.nuisance.shape[-1]))
-        columns.insert(0, own)
-    return evaluation._replace(residual=residual, nuisance=np.concatenate(columns, axis=-1))
-
-
 def measure_progress(session: np.ndarray, time: FloatArray | None) -> FloatArray:
     """Return the progress (r,) of rows through their session, from -0.5 to 0.5: by time [s] where
     all rows state one, else in their order.
@@ -287,81 +190,15 @@ def measure_progress(session: np.ndarray, time: FloatArray | None) -> FloatArray
     ----------
     session : (r,) its name. time : (r,) or None.
     """
-    known = time is not None and bool(np.isfinite(time).all())
+    by_time = time is not None and np.isfinite(time).all()
     progress = np.zeros(len(session))
     for name in find_distinct(session):
         chosen = np.flatnonzero(session == name)
-        values = time[chosen] if known and time is not None else np.arange(float(len(chosen)))
+        values = time[chosen] if by_time and time is not None else np.arange(float(len(chosen)))
         low, high = values.min(), values.max()
         if high > low:
             progress[chosen] = (values - 0.5 * (low + high)) / (high - low)
     return progress
-
-
-# --- Rows that measure another body than the end platform: that of a stage of a chain, or the
-# base.
-
-BASE = "base"
-"""Name of the base among the bodies that a kind may be `of`; no stage has it."""
-
-
-def check_stage(kind: str, of: str, poses_per_row: int, measures_points: bool) -> None:
-    """Refuse a stage of a kind that compares poses, and the base of one that measures no points.
-
-    Raises
-    ------
-    DataError
-    """
-    if of and poses_per_row > 1:
-        raise DataError(
-            f"the kind {kind!r} compares poses of the end platform; leave out `of: {of}`"
-        )
-    if of == BASE and not measures_points:
-        raise DataError(
-            f"the kind {kind!r} measures a moving body, but `of: {BASE}` is for targets that are "
-            "fixed to the base; leave it out, or use the kind position, bearing or distance"
-        )
-
-
-def list_sensed_numbers(of: str) -> tuple[str, ...]:
-    """Return the names of the numbers of the platform of a stage; none without a stage, or of the
-    base.
-    """
-    return name_platform_entries(of) if of not in ("", BASE) else ()
-
-
-def find_platform(of: str, T: FloatArray, joints: FloatArray) -> FloatArray:
-    """Return the measured platforms (.., 4, 4): T, those of the stage `of`, or the base.
-
-    joints : (.., 12) of a stage.
-
-    Raises
-    ------
-    DataError
-        The numbers of the stage's platform are missing.
-    """
-    if not of:
-        return T
-    if of == BASE:
-        return np.broadcast_to(np.eye(4), T.shape)
-    if joints.shape[-1] != 12:
-        raise DataError(f"the platform of stage {of!r} is not given; pass its numbers as `joints`")
-    rows = joints.reshape(*joints.shape[:-1], 3, 4)
-    last = np.broadcast_to(np.eye(4)[3:], (*rows.shape[:-2], 1, 4))
-    return np.concatenate([rows, last], axis=-2)
-
-
-def depend_on_platform(of: str, result: Evaluation, T: FloatArray) -> Evaluation:
-    """Return an evaluation at platforms T (t, r, 4, 4), of a stage by the numbers of its platform.
-
-    Its rows do not depend on the twist of the end platform, those of the base on no motion.
-    """
-    if not of:
-        return result
-    if of == BASE:
-        return result._replace(jacobian=np.zeros_like(result.jacobian))
-    by_entries = result.jacobian @ geometry.differentiate_by_entries(T)
-    return result._replace(jacobian=np.zeros_like(result.jacobian), joints=by_entries)
 
 
 class Kind(ABC):
@@ -416,13 +253,36 @@ class Kind(ABC):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
         set_fields(self, unknown=names)
-        check_stage(self.name, self.of, self.poses_per_row, self.measures_points)
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if "check" in setting.metadata and value is not None:
+                checked = setting.metadata["check"](value, setting.metadata["what"])
+                set_fields(self, **{setting.name: checked})
+        if self.of and self.poses_per_row > 1:
+            raise DataError(
+                f"the kind {self.name!r} compares poses of the end platform; leave out "
+                f"`of: {self.of}`"
+            )
+        if self.is_of_base and not self.measures_points:
+            raise DataError(
+                f"the kind {self.name!r} measures a moving body, but `of: {BASE}` is for targets "
+                "that are fixed to the base; leave it out, or use the kind position, bearing or "
+                "distance"
+            )
 
     def __repr__(self) -> str:
         """Return the settings that differ from their defaults, on one line."""
-        return f"{type(self).__name__}({', '.join(list_changed_settings(self))})"
-
-    # --- what a kind states about itself
+        changed = []
+        for setting in fields(self):
+            value, factory = getattr(self, setting.name), setting.default_factory
+            usual = cast(Any, setting.default) if factory is MISSING else factory()
+            if setting.init and not np.array_equal(value, usual):
+                text = repr(value)
+                if isinstance(value, np.ndarray):
+                    text = f"<array {value.shape}>"
+                    text = str(np.round(value, 6).tolist()) if value.size <= 16 else text
+                changed.append(f"{setting.name}={text}")
+        return f"{type(self).__name__}({', '.join(changed)})"
 
     @property
     @abstractmethod
@@ -451,8 +311,10 @@ class Kind(ABC):
 
     @property
     def sensed_joints(self) -> tuple[str, ...]:
-        """Names of the j joints, driven or passive, whose values the residual depends on."""
-        return list_sensed_numbers(self.of)
+        """Names of the j joints, driven or passive, whose values the residual depends on; of a
+        stage, the twelve numbers of its platform.
+        """
+        return name_platform_entries(self.of) if self.of not in ("", BASE) else ()
 
     def stack_joints(self, joints: Mapping[str, FloatArray], rows: IntArray) -> FloatArray | None:
         """Return the values (.., r, j) of the sensed joints at the poses of rows (r,), from those
@@ -482,14 +344,6 @@ class Kind(ABC):
         """Whether the kind knows the tool, or does not need it."""
         return True
 
-    # --- setup items and their parameters, computed once
-
-    @cached_property
-    def setup_items(self) -> Mapping[str, SetupItem]:
-        """The setup items that are unknown, in order; errors that rows share come last."""
-        possible = {**self.possible_setup, **make_shared_errors(self)}
-        return {**self.own_items, **{name: possible[name] for name in self.shared_errors}}
-
     @cached_property
     def own_items(self) -> Mapping[str, SetupItem]:
         """The frames, targets, surfaces and offsets that are unknown, in order."""
@@ -500,6 +354,22 @@ class Kind(ABC):
     def shared_errors(self) -> tuple[str, ...]:
         """Which of "bias" and "drift" are unknown."""
         return tuple(name for name in SHARED_ERRORS if name in self.unknown)
+
+    @cached_property
+    def setup_items(self) -> Mapping[str, SetupItem]:
+        """The setup items that are unknown, in order. Errors that rows share come last: one
+        parameter for each component.
+        """
+        shared = {
+            item: SetupItem(
+                tuple(
+                    Parameter(name_shared_error(self, item, name), dimension, 0.0, scope="session")
+                    for name, dimension in list_components(self)
+                )
+            )
+            for item in self.shared_errors
+        }
+        return {**self.own_items, **shared}
 
     @cached_property
     def is_drift(self) -> BoolArray:
@@ -515,6 +385,22 @@ class Kind(ABC):
     def without_shared_errors(self) -> Self:
         """Return the kind without a bias or drift."""
         return replace(cast(Any, self), unknown=tuple(self.own_items))
+
+    @cached_property
+    def _spread(self) -> FloatArray:
+        """The matrix (m, b) that adds a shared error of each component to its noise columns."""
+        components = list_components(self).values()
+        matrix = np.zeros((len(self.noise_columns), len(components)))
+        for i, columns in enumerate(components):
+            matrix[columns, i] = 1.0
+        return matrix
+
+    def _sum_shared_errors(self, values: FloatArray) -> FloatArray:
+        """Return bias plus drift (.., b) of the components, at values (.., u), which for a drift
+        are the parts that the rows take.
+        """
+        items = [self.item_values(values, name) for name in self.shared_errors]
+        return np.asarray(sum(item for item in items if item is not None))
 
     @property
     def references(self) -> Mapping[str, FloatArray]:
@@ -541,6 +427,12 @@ class Kind(ABC):
         """Return the values (.., w) of one setup item, None where it is known."""
         return values[..., self._slices[name]] if name in self._slices else None
 
+    def stated_or_unknown(self, values: FloatArray, name: str) -> FloatArray:
+        """Return the values (.., w) of one setup item, the stated ones (w,) where it is known."""
+        if name in self._slices:
+            return values[..., self._slices[name]]
+        return np.array([parameter.nominal for parameter in self.possible_setup[name].parameters])
+
     def assemble_values(self, items: Mapping[str, FloatArray]) -> FloatArray:
         """Return candidates (k, u) from values (k, w) or (w,) of some setup items; the other items
         stay nominal.
@@ -560,8 +452,6 @@ class Kind(ABC):
         """
         del T, measured
         return self.nominal_values[None]
-
-    # --- rows
 
     def detect_present(self, measured: FloatArray) -> BoolArray:
         """Return which residuals (..., m) exist for columns (..., c); NaN is not measured."""
@@ -615,14 +505,70 @@ class Kind(ABC):
         if not isinstance(measured, MeasuredColumns):
             measured = self.prepare_columns(measured)
         values = self.nominal_values[None, None] if nuisance is None else nuisance
-        T = find_platform(self.of, T, joints)
+        T = self._find_platform(T, joints)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
-        result = drop_rounding(self._evaluate(T, measured.reference, values, joints))
-        result = depend_on_platform(self.of, result, T)
+        result = self._evaluate(T, measured.reference, values, joints)
+        if result.nuisance is not None:
+            # Derivatives by the place of a target cancel between parallel poses: what is rounding
+            # beside the derivative by the twist is zero. A meter is compared with a radian there;
+            # the tolerance is so small that the size of a machine does not matter.
+            by_twist = np.linalg.norm(result.jacobian, axis=-1)
+            by_twist = by_twist.sum(axis=-2) if self.poses_per_row > 1 else by_twist
+            nuisance = without_rounding(result.nuisance, by_twist[..., None])
+            result = result._replace(nuisance=nuisance)
+        if self.of:  # rows of a stage depend on its platform, those of the base on no motion
+            by_entries = (
+                None if self.is_of_base else result.jacobian @ geometry.differentiate_by_entries(T)
+            )
+            result = result._replace(jacobian=np.zeros_like(result.jacobian), joints=by_entries)
         if self.shared_errors:
-            result = add_shared_errors(self, result, measured.columns, values)
-        return result if measured.is_complete else zero_absent(result, measured.present)
+            result = self._add_shared_errors(result, measured.columns, values)
+        return result if measured.is_complete else self._zero_absent(result, measured.present)
+
+    def _add_shared_errors(
+        self, evaluation: Evaluation, measured: FloatArray, values: FloatArray
+    ) -> Evaluation:
+        """Return the evaluation with the bias and drift of columns (.., r, c)."""
+        slope = self.linearize_noise(measured) @ self._spread
+        error = slope @ self._sum_shared_errors(values)[..., None]
+        residual = evaluation.residual + error[..., 0]
+        blocks = [slope] * len(self.shared_errors)
+        if evaluation.nuisance is not None:
+            blocks.insert(0, evaluation.nuisance)
+        columns = [np.broadcast_to(b, (*residual.shape, b.shape[-1])) for b in blocks]
+        return evaluation._replace(residual=residual, nuisance=np.concatenate(columns, axis=-1))
+
+    def _zero_absent(self, evaluation: Evaluation, present: BoolArray) -> Evaluation:
+        """Return the evaluation with zeros for components that are not `present` (t, r, m)."""
+        by_row = present[..., None]
+        by_twist = present[..., None, :, None] if self.poses_per_row > 1 else by_row
+        by_nuisance, by_joints = (
+            None if derivative is None else np.where(by_row, derivative, 0.0)
+            for derivative in (evaluation.nuisance, evaluation.joints)
+        )
+        return Evaluation(
+            np.where(present, evaluation.residual, 0.0),
+            np.where(by_twist, evaluation.jacobian, 0.0),
+            by_nuisance,
+            by_joints,
+        )
+
+    def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
+        """Return the measured bodies (.., 4, 4): the end platforms T, those of a stage from their
+        numbers (.., 12), or the base.
+        """
+        if not self.of:
+            return T
+        if self.is_of_base:
+            return np.broadcast_to(np.eye(4), T.shape)
+        if joints.shape[-1] != 12:
+            raise DataError(
+                f"the platform of stage {self.of!r} is not given; pass its numbers as `joints`"
+            )
+        rows = joints.reshape(*joints.shape[:-1], 3, 4)
+        last = np.broadcast_to(np.eye(4)[3:], (*rows.shape[:-2], 1, 4))
+        return np.concatenate([rows, last], axis=-2)
 
     def measure(
         self,
@@ -646,9 +592,8 @@ class Kind(ABC):
         values = self.nominal_values[None, None] if nuisance is None else nuisance
         joints = np.zeros_like(noise) if joints is None else joints
         if self.shared_errors:
-            noise = noise + sum_shared_errors(self, values) @ spread_components(self).T
-        T = find_platform(self.of, T, joints)
-        return self._measure(T, noise, values, joints)
+            noise = noise + self._sum_shared_errors(values) @ self._spread.T
+        return self._measure(self._find_platform(T, joints), noise, values, joints)
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
         """Return the derivative (..., m, m) of the residuals by errors of the noise columns, up to
@@ -656,8 +601,6 @@ class Kind(ABC):
         """
         m = len(self.noise_columns)
         return np.broadcast_to(np.eye(m), (*measured.shape[:-1], m, m))
-
-    # --- for the kinds themselves
 
     def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         """Return columns without noise in place of residuals, and their derivatives."""
@@ -687,11 +630,10 @@ class Kind(ABC):
         difference = predicted - measured
         if not any(self._is_wrapped):
             return difference
-        return np.where(np.array(self._is_wrapped), geometry.wrap_angle(difference), difference)
+        return np.where(self._is_wrapped, geometry.wrap_angle(difference), difference)
 
     @cached_property
     def _is_wrapped(self) -> tuple[bool, ...]:
-        """Columns whose differences are wrapped."""
         return tuple(self.wraps_angles and c.dimension is Dimension.ANGLE for c in self.columns)
 
     def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:

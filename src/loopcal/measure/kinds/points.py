@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -15,7 +15,7 @@ from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, Kind
+from loopcal.measure.kinds.kind import Column, Evaluation, Kind, checked
 from loopcal.typing import FloatArray
 
 Prediction = tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]
@@ -64,7 +64,7 @@ class TargetKind(Kind):
 
     targets: tuple[str, ...] = ("target",)
     places: FloatArray | None = None
-    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+    T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
     of: str = ""
@@ -76,13 +76,11 @@ class TargetKind(Kind):
     def __post_init__(self) -> None:
         super().__post_init__()
         targets = check_names(self.targets, "targets")
-        set_fields(
-            self, targets=targets, T_base_frame=check_pose(self.T_base_frame, "T_base_frame")
-        )
+        set_fields(self, targets=targets)
+        shape = (len(targets), 3)
         if self.places is not None:
-            is_single_place = np.ndim(self.places[0]) == 0 if len(self.places) else False
+            is_single_place = len(self.places) > 0 and np.ndim(self.places[0]) == 0
             places = [self.places] if is_single_place else self.places
-            shape = (len(targets), 3)
             if len(places) != len(targets):
                 raise DataError(
                     f"the number of places is {len(places)}, but there are {len(targets)} targets "
@@ -95,7 +93,7 @@ class TargetKind(Kind):
                 "state `places` in the base frame, or list targets in `unknown`"
             )
         elif self.is_of_base:
-            set_fields(self, places=np.zeros((len(targets), 3)))
+            set_fields(self, places=np.zeros(shape))
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """Return the kind with its targets at the origin of the tool, or of the stage's platform,
@@ -159,10 +157,7 @@ class TargetKind(Kind):
         k = len(self.targets)
         of_frame, places = (self.item_values(values, name) for name in ("frame", "targets"))
         frame = setup.place_frame(self.T_base_frame, of_frame)
-        if places is None:
-            p = self._stated_places()
-        else:
-            p = places.reshape(*places.shape[:-1], k, 3)
+        p = self._stated_places() if places is None else places.reshape(*places.shape[:-1], k, 3)
         R, Q = T[..., None, :3, :3], np.swapaxes(frame[..., None, :3, :3], -1, -2)
         arm = (R @ p[..., None])[..., 0]
         lever = arm + T[..., None, :3, 3] - frame[..., None, :3, 3]
@@ -208,46 +203,9 @@ class TargetKind(Kind):
         return self.places
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class LengthKind(TargetKind):
-    """A kind that measures one length above 0 for each target, with a common offset."""
-
-    @cached_property
-    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
-        """Also the offset of all readings."""
-        return {**super().possible_setup, "offset": setup.make_offset_item(f"{self.name}.offset")}
-
-    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
-        """Return lengths of vectors x (.., k, 3) plus the offset."""
-        length, unit = measure_lengths(x)
-        offset = self.item_values(values, "offset")
-        if offset is None:
-            return length, unit[..., None, :], {}
-        return length + offset[..., None, :], unit[..., None, :], {"offset": np.ones((1, 1, 1))}
-
-    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
-        """Return rows with a length that is not above zero."""
-        sentence = (
-            "has a distance of {:.6g} m; a distance is above 0: correct it, or leave the cell "
-            "empty if nothing was measured"
-        )
-        wrong = np.argwhere(measured <= 0.0)
-        return tuple((int(i), sentence.format(measured[i, j])) for i, j in wrong)
-
-
-def measure_lengths(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return lengths (.., 1) of vectors (.., 3) and unit vectors, zero where a length is 0."""
-    square = np.sum(x * x, axis=-1, keepdims=True)
-    safe = np.sqrt(np.where(square > 0.0, square, 1.0))
-    return np.where(square > 0.0, safe, 0.0), x / safe
-
-
-# --- Two angles of a vector about an optical axis z, as cameras and autocollimators measure them.
-
-
 def predict_camera_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `atan2(x, z)` and `atan2(y, z)` (.., 2) of vectors (.., 3), and their derivatives
-    (.., 2, 3).
+    """Return the angles `atan2(x, z)` and `atan2(y, z)` (.., 2) of vectors (.., 3) about an optical
+    axis z, and their derivatives (.., 2, 3).
     """
     a, b, c = x[..., 0], x[..., 1], x[..., 2]
     zero = np.zeros_like(a)

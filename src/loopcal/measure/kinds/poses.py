@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base of the kinds that measure the robot's tool in the frame of an instrument."""
+"""Kinds that measure the robot's tool in the frame of an instrument: poses and components."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -21,6 +21,7 @@ from loopcal.measure.kinds.kind import (
     Evaluation,
     InvalidRows,
     Kind,
+    checked,
     is_incomplete,
     list_rows,
 )
@@ -56,21 +57,14 @@ class ToolKind(Kind):
         If a frame is not a pose, or `unknown` lists something else.
     """
 
-    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
-    T_platform_tool: FloatArray | None = None
+    T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
+    T_platform_tool: FloatArray | None = checked(check_pose, "T_platform_tool")
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
 
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "tool")
     length_error: ClassVar[str] = "position"
     angle_error: ClassVar[str] = "orientation"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        set_fields(self, T_base_frame=check_pose(self.T_base_frame, "T_base_frame"))
-        if self.T_platform_tool is not None:
-            tool = check_pose(self.T_platform_tool, "T_platform_tool")
-            set_fields(self, T_platform_tool=tool)
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """Return the kind with this tool (4, 4), unless it states one."""
@@ -143,14 +137,11 @@ class ToolKind(Kind):
         return self.T_platform_tool
 
 
-# --- Kind `pose`: position and full orientation of the tool in a frame.
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Pose(ToolKind):
-    """Full pose of the tool. Residual: `(log(R_predicted R_measured'), t_predicted - t_measured)`,
-    in axes of the frame.
+    """Position and orientation of the tool, in axes of the frame.
 
+    Residual: `(log(R_predicted R_measured'), t_predicted - t_measured)`.
     With r the rotation part, Q the rotation from base to frame and a the arm from platform origin
     to tool: `d r = J_left^-1(r) Q omega` and `d t = Q (v + omega x a)`.
 
@@ -337,18 +328,14 @@ def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, Flo
     return residual, setup.stack_diagonally(inverse, np.eye(3))
 
 
-# --- Kind `component`: some coordinates of the tool in a frame; z alone is a probed height.
-
 SINGULAR_RATES = 1e-3
-"""Smallest |det E| of measured angles [1]; below it a and c are the same rotation to
-a thousandth.
-"""
+"""Smallest |det E| of measured angles; below it a and c are the same rotation to a thousandth."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Component(ToolKind):
-    """Some coordinates of the tool. Residual: `predicted - measured` of each, angles wrapped into
-    (-pi, pi].
+    """Some coordinates of the tool; z alone is a probed height. Residual: `predicted - measured` of
+    each, angles wrapped into (-pi, pi].
 
     With E the rates of the declared angles, Q the rotation from base to frame and a the arm from
     platform origin to tool: `d(angles) = E^-1 Q omega` and `d t = Q (v + omega x a)`. Where the
@@ -406,7 +393,7 @@ class Component(ToolKind):
                     f"{hint}"
                 )
         check_names(self.components, "components")
-        if self._has_azimuth and "theta" not in self.components:
+        if "phi" in self.components and "theta" not in self.components:
             raise DataError(
                 "phi is measured without theta, but phi is not defined where theta is zero; "
                 "measure both or neither"
@@ -468,7 +455,7 @@ class Component(ToolKind):
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
         """Replace phi and theta by the normal where the measured tilt is small."""
-        if not self._has_azimuth:
+        if "phi" not in self.components:
             return super()._evaluate(T, measured, values, joints)
         tool, by_tool = self.locate_tool(T, values)
         predicted, slopes = self._predict_components(tool)
@@ -496,7 +483,7 @@ class Component(ToolKind):
         tool, _ = self.locate_tool(T, values)
         exact, _ = self._predict_components(tool)
         noisy = exact + noise
-        if not self._has_azimuth:
+        if "phi" not in self.components:
             return noisy
         theta, phi = self._normal_indices
         x, y = tool[..., 0, 2] + noise[..., theta], tool[..., 1, 2] + noise[..., phi]
@@ -520,16 +507,10 @@ class Component(ToolKind):
         frame = align_point_sets(positions, points)
         return setup.encode_frame(self.T_base_frame, frame)[None]
 
-    # --- predictions and derivatives
-
     @property
     def _coordinates(self) -> tuple[str, ...]:
         """All coordinates that can be measured: three angles (if declared), then x y z."""
         return (() if self.form is None else self.form.columns) + POSITION_AXES
-
-    @property
-    def _has_azimuth(self) -> bool:
-        return "phi" in self.components
 
     @property
     def _normal_indices(self) -> tuple[int, int]:

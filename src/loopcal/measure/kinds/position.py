@@ -67,7 +67,12 @@ class Position(TargetKind):
             If the frame is unknown and all points are collinear.
         """
         if self.is_of_base:
-            return self._guess_station(measured)
+            base = np.broadcast_to(np.eye(4), (len(measured), 4, 4))
+            _, _, points, positions = self.collect_points(base, measured)
+            if not self.locates_frame or len(positions) < 3:
+                return self.nominal_values[None]
+            frame = align_point_sets(positions, points)
+            return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frame)})
         moving, origin, points, positions = self.collect_points(T, measured)
         if not self.unknown or len(positions) < 3:
             return self.nominal_values[None]
@@ -96,12 +101,3 @@ class Position(TargetKind):
             return False
         extent = np.linalg.svd(self.places - self.places.mean(axis=0), compute_uv=False)
         return len(self.places) > 2 and bool(extent[1] > FLATNESS * extent[0])
-
-    def _guess_station(self, measured: FloatArray) -> FloatArray:
-        """Return the frame (1, u) from targets on the base, at their stated places."""
-        base = np.broadcast_to(np.eye(4), (len(measured), 4, 4))
-        _, _, points, positions = self.collect_points(base, measured)
-        if not self.locates_frame or len(positions) < 3:
-            return self.nominal_values[None]
-        frame = align_point_sets(positions, points)
-        return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frame)})

@@ -24,9 +24,6 @@ from loopcal.units import Dimension
 ROTATION_AXES, POSITION_AXES, DIRECTION_AXES = ("rx", "ry", "rz"), ("x", "y", "z"), ("u", "v")
 
 
-# --- items and their parameters
-
-
 @dataclass(frozen=True, eq=False)
 class SetupItem:
     """A frame, direction, target, surface or offset that may be unknown.
@@ -68,11 +65,6 @@ def make_orientation_item(name: str, R: FloatArray) -> SetupItem:
     return SetupItem(make_parameters(name, ROTATION_AXES, Dimension.ANGLE), {name: R})
 
 
-def make_direction_item(name: str, direction: FloatArray) -> SetupItem:
-    """Return a direction that is stated as a unit vector (3,): two rotations."""
-    return SetupItem(make_parameters(name, DIRECTION_AXES, Dimension.ANGLE), {name: direction})
-
-
 def make_points_item(names: Sequence[str], points: FloatArray, scope: str = "session") -> SetupItem:
     """Return points that are stated as (k, 3): three coordinates of each."""
     of_each = (
@@ -80,14 +72,6 @@ def make_points_item(names: Sequence[str], points: FloatArray, scope: str = "ses
         for name, point in zip(names, points, strict=True)
     )
     return SetupItem(tuple(parameter for parameters in of_each for parameter in parameters))
-
-
-def make_offset_item(name: str) -> SetupItem:
-    """Return an offset of all readings of a session: one length."""
-    return SetupItem((Parameter(name, Dimension.LENGTH, 0.0, scope="session"),))
-
-
-# --- frames
 
 
 def place_frame(stated: FloatArray, values: FloatArray | None) -> FloatArray:
@@ -119,9 +103,6 @@ def linearize_frame(values: FloatArray) -> FloatArray:
 def stack_diagonally(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return matrices (.., 6, 6) with two blocks (.., 3, 3), which broadcast, on their diagonal."""
     return stack_blocks(((first, None), (None, second)))
-
-
-# --- directions
 
 
 def make_perpendicular_basis(direction: FloatArray) -> FloatArray:

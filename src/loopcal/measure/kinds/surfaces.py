@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -18,10 +18,12 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.geometry import solve_least_squares, solve_trilateration
-from loopcal.measure.array_checks import check_array, check_direction, set_fields
+from loopcal.measure.array_checks import check_direction, check_point
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column
-from loopcal.measure.kinds.points import Prediction, TargetKind, measure_lengths
+from loopcal.measure.kinds.directions import UPWARD
+from loopcal.measure.kinds.distance import measure_lengths
+from loopcal.measure.kinds.kind import Column, checked
+from loopcal.measure.kinds.points import Prediction, TargetKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Length
@@ -51,20 +53,15 @@ class SurfaceKind(TargetKind):
         As `TargetKind`, and if the length of a direction is zero.
     """
 
-    through: FloatArray = field(default_factory=lambda: np.zeros(3))
-    along: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    through: FloatArray = checked(check_point, "the point of the surface", np.zeros(3))
+    along: FloatArray = checked(check_direction, "the direction of the surface", UPWARD)
     surface: str = "surface"
 
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "surface", "targets")
     changes_with_pose: ClassVar[bool] = False
     measures_points: ClassVar[bool] = False
     length_error: ClassVar[str] = "gap"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        through = check_array(self.through, "the point of the surface", (3,))
-        along = check_direction(self.along, "the direction of the surface")
-        set_fields(self, through=through, along=along)
+    fewest_points: ClassVar[int] = 3
 
     @property
     @abstractmethod
@@ -75,31 +72,30 @@ class SurfaceKind(TargetKind):
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Also the surface."""
         stated = {f"{self.surface}.through": self.through, f"{self.surface}.along": self.along}
-        return {
-            **super().possible_setup,
-            "surface": setup.SetupItem(self.surface_parameters, stated),
-        }
+        surface = setup.SetupItem(self.surface_parameters, stated)
+        return {**super().possible_setup, "surface": surface}
 
-    def make_parameters(
+    def _make_parameters(
         self, names: tuple[str, ...], dimension: Dimension, nominal: FloatArray | None = None
     ) -> tuple[Parameter, ...]:
-        """Return parameters of the surface with these names."""
         return setup.make_parameters(self.surface, names, dimension, nominal, "group")
 
-    def collect_contacts(
-        self, T: FloatArray, measured: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return points (q, 3) in the frame, for targets at their stated places, and gaps."""
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the surface in closed form, with the targets at their stated places."""
         _, _, points, gaps = self.collect_points(T, measured)
-        return self.to_frame(points), gaps
+        if "surface" not in self.unknown or len(points) < self.fewest_points:
+            return self.nominal_values[None]
+        return self.assemble_values({"surface": self._fit_surface(self.to_frame(points), gaps)})
 
-
-# --- Kind `plane`: points of the platform on a plane, such as a probed bed or plate.
+    @abstractmethod
+    def _fit_surface(self, x: FloatArray, gaps: FloatArray) -> FloatArray:
+        """Return values (k, w) or (w,) of the surface from points (q, 3) in the frame and gaps."""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Plane(SurfaceKind):
-    """Points on a plane with normal n. Residual: `n'(x - through) - height - gap`.
+    """Points on a plane with normal n, such as a probed bed. Residual: `n'(x - through) - height -
+    gap`.
 
     An unknown plane has three parameters for each group of rows: two rotations u, v of the normal
     and the height above the stated point.
@@ -142,16 +138,13 @@ class Plane(SurfaceKind):
     @property
     def surface_parameters(self) -> tuple[Parameter, ...]:
         """Two rotations and a height."""
-        return self.make_parameters(("u", "v"), Dimension.ANGLE) + self.make_parameters(
+        return self._make_parameters(("u", "v"), Dimension.ANGLE) + self._make_parameters(
             ("height",), Dimension.LENGTH
         )
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return heights (.., k, 1) above the plane."""
-        surface = self.item_values(values, "surface")
-        lever = x - self.through
-        if surface is None:
-            return lever @ self.along[:, None], self.along[None], {}
+        surface, lever = self.stated_or_unknown(values, "surface"), x - self.through
         normal = setup.place_direction(self.along, surface[..., :2])[..., None, None, :]
         by_rotation = (
             lever[..., None, :]
@@ -161,13 +154,10 @@ class Plane(SurfaceKind):
         by_surface = np.concatenate([by_rotation, -np.ones_like(by_rotation[..., :1])], axis=-1)
         return height, normal, {"surface": by_surface}
 
-    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def _fit_surface(self, x: FloatArray, gaps: FloatArray) -> FloatArray:
         """Return the planes of least scatter, and, where the gaps differ, the one that the gaps
         determine.
         """
-        x, gaps = self.collect_contacts(T, measured)
-        if "surface" not in self.unknown or len(x) < 3:
-            return self.nominal_values[None]
         middle = x.mean(axis=0)
         normals = [np.linalg.svd(x - middle, full_matrices=False)[2][2]]
         gradient = solve_least_squares(x - middle, gaps[:, 0] - gaps.mean())
@@ -175,17 +165,13 @@ class Plane(SurfaceKind):
             normals.append(gradient / np.linalg.norm(gradient))
         n = np.array([normal if normal @ self.along >= 0.0 else -normal for normal in normals])
         height = n @ (middle - self.through) - gaps.mean()
-        values = np.concatenate([setup.encode_direction(self.along, n), height[:, None]], axis=-1)
-        return self.assemble_values({"surface": values})
-
-
-# --- Kind `line`: points of the platform on a straight line, such as a ruler, an edge or a beam.
+        return np.concatenate([setup.encode_direction(self.along, n), height[:, None]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Line(SurfaceKind):
-    """Points on a line. Residual: `B'R'(x - through) - shift - gap`, with B two unit vectors
-    perpendicular to the stated direction.
+    """Points on a line, such as a ruler, an edge or a beam. Residual: `B'R'(x - through) - shift -
+    gap`, with B two unit vectors perpendicular to the stated direction.
 
     R rotates the stated direction to the true one. An unknown line has four parameters for each
     group of rows: two rotations u, v and two shifts a, b along the rotated B.
@@ -209,6 +195,7 @@ class Line(SurfaceKind):
     surface: str = "line"
 
     name: ClassVar[str] = "line"
+    fewest_points: ClassVar[int] = 2
     mixes_components: ClassVar[bool] = True
     per_target: ClassVar[tuple[Column, ...]] = (
         Column("gap_a", Dimension.LENGTH),
@@ -223,16 +210,14 @@ class Line(SurfaceKind):
     @property
     def surface_parameters(self) -> tuple[Parameter, ...]:
         """Two rotations and two shifts."""
-        return self.make_parameters(("u", "v"), Dimension.ANGLE) + self.make_parameters(
+        return self._make_parameters(("u", "v"), Dimension.ANGLE) + self._make_parameters(
             ("a", "b"), Dimension.LENGTH
         )
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 2) from the line along B."""
-        surface = self.item_values(values, "surface")
+        surface = self.stated_or_unknown(values, "surface")
         B, lever = setup.make_perpendicular_basis(self.along), x - self.through
-        if surface is None:
-            return lever @ B, B.T, {}
         R, S = setup.rotate_basis(self.along, surface[..., :2])
         rows = np.swapaxes(R @ B, -1, -2)[..., None, :, :]
         # d (R b)'x = (w x R b)'x = (R b)'(x x w)
@@ -241,11 +226,8 @@ class Line(SurfaceKind):
         gaps = (rows @ lever[..., None])[..., 0] - surface[..., None, 2:]
         return gaps, rows, {"surface": np.concatenate([by_rotation, by_shift], axis=-1)}
 
-    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def _fit_surface(self, x: FloatArray, gaps: FloatArray) -> FloatArray:
         """Return the line of largest scatter of the points."""
-        x, gaps = self.collect_contacts(T, measured)
-        if "surface" not in self.unknown or len(x) < 2:
-            return self.nominal_values[None]
         middle = x.mean(axis=0)
         direction = np.linalg.svd(x - middle, full_matrices=False)[2][0]
         rotations = setup.encode_direction(
@@ -254,15 +236,12 @@ class Line(SurfaceKind):
         R, _ = setup.rotate_basis(self.along, rotations)
         across = R @ setup.make_perpendicular_basis(self.along)
         shifts = (middle - self.through) @ across - gaps.mean(axis=0)
-        return self.assemble_values({"surface": np.concatenate([rotations, shifts])})
-
-
-# --- Kind `sphere`: points of the platform on a sphere, such as a probed master ball.
+        return np.concatenate([rotations, shifts])
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Sphere(SurfaceKind):
-    """Points on a sphere about c. Residual: `|x - c| - radius - gap`.
+    """Points on a sphere about c, such as a probed ball. Residual: `|x - c| - radius - gap`.
 
     An unknown sphere has four parameters for each group of rows: its center and its radius, which
     includes that of the probe.
@@ -292,6 +271,7 @@ class Sphere(SurfaceKind):
     radius: Length = 0.0125
 
     name: ClassVar[str] = "sphere"
+    fewest_points: ClassVar[int] = 4
     per_target: ClassVar[tuple[Column, ...]] = (Column("gap", Dimension.LENGTH),)
 
     def __post_init__(self) -> None:
@@ -309,26 +289,19 @@ class Sphere(SurfaceKind):
     def surface_parameters(self) -> tuple[Parameter, ...]:
         """Center and radius."""
         nominal = np.array([*self.through, self.radius])
-        return self.make_parameters(("x", "y", "z", "radius"), Dimension.LENGTH, nominal)
+        return self._make_parameters(("x", "y", "z", "radius"), Dimension.LENGTH, nominal)
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 1) from the sphere."""
-        surface = self.item_values(values, "surface")
-        if surface is None:
-            distance, unit = measure_lengths(x - self.through)
-            return distance - self.radius, unit[..., None, :], {}
+        surface = self.stated_or_unknown(values, "surface")
         distance, unit = measure_lengths(x - surface[..., None, :3])
         unit = unit[..., None, :]
         by_surface = -np.concatenate([unit, np.ones_like(unit[..., :1])], axis=-1)
         return distance - surface[..., None, 3:], unit, {"surface": by_surface}
 
-    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def _fit_surface(self, x: FloatArray, gaps: FloatArray) -> FloatArray:
         """Return center and radius by trilateration: a distance from the center is a gap plus the
         radius, which is a common offset.
         """
-        x, gaps = self.collect_contacts(T, measured)
-        if "surface" not in self.unknown or len(x) < 4:
-            return self.nominal_values[None]
         centers, offsets = solve_trilateration(x, gaps[:, 0], with_offset=True)
-        values = np.concatenate([centers, -offsets[:, None]], axis=-1)
-        return self.assemble_values({"surface": values})
+        return np.concatenate([centers, -offsets[:, None]], axis=-1)
