@@ -1,38 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks of arrays that measurements and kinds store: float64, read-only, of a stated shape."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 
 def check_array(
     value: ArrayLike, what: str, shape: Sequence[int | None], *, allow_nan: bool = False
 ) -> FloatArray:
-    """Return a read-only float64 copy of an array after checking its shape and its numbers.
-
-    Parameters
-    ----------
-    value : array_like
-    what : str
-        Name of the array in error messages.
-    shape : sequence of int or None
-        Required shape; None allows any length.
-    allow_nan : bool
-        Whether NaN (not measured) is allowed; infinity never is.
-
-    Returns
-    -------
-    array : ndarray, read-only
+    """Return a read-only float64 copy of an array of this shape, where None is any length.
 
     Raises
     ------
     DataError
-        If the value is not numeric, the shape differs, or a number is not finite.
+        If the value, which messages call `what`, is not numeric, has another shape, or a number is
+        infinite or, unless `allow_nan`, not measured.
     """
     wanted = ", ".join("any" if n is None else str(n) for n in shape)
     try:
@@ -46,25 +33,39 @@ def check_array(
     ):
         raise DataError(f"{what} has shape {array.shape}; give an array of shape ({wanted})")
     wrong = np.isinf(array) if allow_nan else ~np.isfinite(array)
-    if np.any(wrong):
-        place = tuple(int(i) + 1 for i in np.argwhere(wrong)[0])
-        where = f"row {place[0]}" + (f", column {place[1]}" if len(place) > 1 else "")
-        value = array[tuple(i - 1 for i in place)]
-        raise DataError(
-            f"{what}: {where} is {value}; give a finite number" + (" or NaN" if allow_nan else "")
-        )
+
+    def describe_entry(*place: int) -> str:
+        where = f"row {place[0] + 1}" + (f", column {place[1] + 1}" if len(place) > 1 else "")
+        advice = "give a finite number" + (" or NaN" if allow_nan else "")
+        return f"{what}: {where} is {array[place]}; {advice}"
+
+    refuse_first(wrong, describe_entry)
     array.setflags(write=False)
     return array
 
 
-def check_pose(value: ArrayLike, what: str) -> FloatArray:
-    """Return a read-only pose (4, 4) after checking that it is one.
+def refuse_first(wrong: BoolArray, describe: Callable[..., str]) -> None:
+    """Raise a DataError with the description of the first wrong entry, by its indices, if any."""
+    if np.any(wrong):
+        raise DataError(describe(*(int(i) for i in np.argwhere(wrong)[0])))
 
-    Raises
-    ------
-    DataError
-        If it is not a rotation and a translation, to 1e-9.
-    """
+
+def broadcast_array(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> FloatArray:
+    """Return a copy of an array, broadcast to a shape; DataError if it does not fit."""
+    try:
+        if np.iscomplexobj(value):
+            raise TypeError
+        given = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(f"{what}: got {describe(value)}; give {wanted}") from None
+    try:
+        return np.array(np.broadcast_to(given, shape))
+    except ValueError:
+        raise DataError(f"{what} has shape {given.shape}; give {wanted}") from None
+
+
+def check_pose(value: ArrayLike, what: str) -> FloatArray:
+    """Return a read-only pose (4, 4); DataError unless it is one to 1e-9."""
     T = check_array(value, what, (4, 4))
     R = T[:3, :3]
     error = float(np.max(np.abs(R @ R.T - np.eye(3))))
@@ -102,12 +103,7 @@ def check_names(names: str | Iterable[str], what: str) -> tuple[str, ...]:
 
 
 def check_type(value: object, wanted: type, what: str, hint: str) -> None:
-    """Raise a DataError that says what to pass unless a value is an instance of a class.
-
-    Parameters
-    ----------
-    value : of the argument. wanted : its class. what : its name. hint : how to obtain one.
-    """
+    """Raise a DataError that calls an argument `what`, and says how to obtain one of the class."""
     accepted = (float, int) if wanted is float else wanted
     if not isinstance(value, accepted):
         raise DataError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")

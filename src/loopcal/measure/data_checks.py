@@ -26,16 +26,12 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
-# --- Checks of readings alone, the kind `closure`: they need redundant actuators of stated noise.
-
 
 def check_closure(
     robot: Mechanism, kinds: Sequence[Kind], reading_sigma: FloatArray | None, n_poses: int
 ) -> None:
     """Refuse the kind `closure` for a robot without redundant actuators, or for exact readings.
 
-    Parameters
-    ----------
     reading_sigma : (n, a) [SI] of the readings; None as the robot states.
 
     Raises
@@ -51,12 +47,8 @@ def check_closure(
 
 
 def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
-    """Refuse the kind `closure` for a robot that does not have more actuators than freedoms.
-
-    Raises
-    ------
-    DataError
-        `data.closure-without-redundancy`.
+    """Raise the DataError `data.closure-without-redundancy` for the kind `closure` of a robot that
+    does not have more actuators than freedoms.
     """
     if robot.program.sigma is None and any(kind.name == CLOSURE for kind in kinds):
         raise DataError(
@@ -120,18 +112,10 @@ def find_outside_strokes(readings: FloatArray, robot: Mechanism) -> FloatArray:
 def describe_outside_strokes(
     measurements: Measurements, robot: Mechanism, places: Mapping[int, str] | None = None
 ) -> dict[str, Any] | None:
-    """Describe the readings outside their strokes for a finding; None without any.
+    """Return the data of a finding on readings outside their strokes; None without any.
 
-    Parameters
-    ----------
-    measurements, robot : see `check_strokes`.
-    places : place of each pose by its index, such as `data.csv:12`.
-
-    Returns
-    -------
-    dict
-        The reading that is farthest outside, as a share of its stroke, and the number and the
-        actuators of all of them.
+    They are the reading that is farthest outside, as a share of its stroke, and the number and the
+    actuators of all of them. `places` are those of poses by index, such as `data.csv:12`.
     """
     beyond = find_outside_strokes(measurements.readings, robot)
     if not beyond.any():
@@ -165,21 +149,8 @@ def check_strokes(
     allow: bool = False,
     places: Mapping[int, str] | None = None,
 ) -> None:
-    """Refuse readings outside the stroke of their actuator.
-
-    Parameters
-    ----------
-    measurements : Measurements
-    robot : Mechanism
-    allow : bool
-        True accepts them.
-    places : int -> str, optional
-        Place of each pose by its index, such as `data.csv:12`, for the message.
-
-    Raises
-    ------
-    DataError
-        `data.outside-stroke`, with the farthest of these readings and their number.
+    """Raise the DataError `data.outside-stroke` for readings outside the stroke of their actuator,
+    unless they are allowed; `places` as for `describe_outside_strokes`.
     """
     check_actuators(measurements, robot)
     described = None if allow else describe_outside_strokes(measurements, robot, places)
@@ -198,11 +169,7 @@ def check_duplicates(
 
     Parameters
     ----------
-    measurements : Measurements
-    allow : bool
-        True accepts them.
-    places : sequence of sequence of str
-        Place of each row of each of the observations, those of the base last, such as
+    places : place of each row of each of the observations, those of the base last, such as
         `data.csv:12`, for the message.
 
     Raises
@@ -270,13 +237,8 @@ def check_targets_move(
 
     Parameters
     ----------
-    measurements : Measurements
-    T : (n, 4, 4)
-        T_base_platform of each pose, of the nominal robot.
-    size : float [m]
-        Size of the robot, by which translations and rotations are compared.
-    allow : bool
-        True accepts them.
+    T : (n, 4, 4) T_base_platform of each pose, of the nominal robot.
+    size : of the robot [m], by which translations and rotations are compared.
 
     Raises
     ------
@@ -299,18 +261,19 @@ def check_targets_move(
         if np.any(moves) and not _is_rigid_motion(static, predicted, possible, T[rows.rows], size):
             worst = int(np.argmax(np.where(moves, expected / static.noise, 0.0)))
             shown = DISPLAY_UNITS[kind.columns[static.columns[worst]].dimension]
-            moved, planned = (
-                Quantity(float(range_[worst]) / shown.factor_to_si, shown.symbol)
-                for range_ in (static.range, expected)
+
+            numbers = [rows.measured[static.present][0, static.columns[0]], static.range[worst]]
+            value, moved, planned = (
+                Quantity(float(number) / shown.factor_to_si, shown.symbol)
+                for number in (*numbers, expected[worst])
             )
             if static.target not in kind.target_columns:
-                value = float(rows.measured[static.present][0, static.columns[0]])
                 raise DataError(
                     report_finding(
                         "conventions.column-never-changes",
                         column=static.target,
                         kind=kind.name,
-                        value=Quantity(value / shown.factor_to_si, shown.symbol),
+                        value=value,
                         expected=planned,
                     )
                 )
@@ -425,22 +388,19 @@ def _list_columns(kind: Kind) -> dict[str, tuple[int, ...]]:
 
 
 def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:
-    """Return observations in groups of equal kinds and settings, as two files of one instrument
+    """Return observations in groups of one class and equal settings, as two files of one instrument
     give them.
     """
     groups: list[list[Observations]] = []
     for rows in observations:
-        group = next((g for g in groups if _have_equal_settings(g[0].kind, rows.kind)), None)
-        if group is None:
-            groups.append([rows])
+        settings = [field.name for field in fields(cast(Any, rows.kind)) if field.init]
+        for group in groups:
+            other = group[0].kind
+            if type(other) is type(rows.kind) and all(
+                np.array_equal(getattr(other, s), getattr(rows.kind, s)) for s in settings
+            ):
+                group.append(rows)
+                break
         else:
-            group.append(rows)
+            groups.append([rows])
     return groups
-
-
-def _have_equal_settings(first: Kind, second: Kind) -> bool:
-    """Return whether two kinds are of one class and all their settings are equal."""
-    settings = [field.name for field in fields(cast(Any, first)) if field.init]
-    return type(first) is type(second) and all(
-        np.array_equal(getattr(first, s), getattr(second, s)) for s in settings
-    )

@@ -20,8 +20,6 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- Compare rows of measurements by their numbers: which are copies, and which are repeats.
-
 SAME = 1e-8
 """Share of what a column spans up to which two numbers are the same."""
 
@@ -62,11 +60,8 @@ class ComparedRows(NamedTuple):
 
 
 def find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> BoolArray:
-    """Return which rows (r,) are copies of one of the fitted rows (k, c).
+    """Return which rows (r,) are copies of one of the fitted rows (k, c) [SI].
 
-    Parameters
-    ----------
-    rows : in question. fitted : readings and measured values [SI].
     is_same_form : whether the columns of both mean the same; otherwise values are looked for in all
         columns, as where a pose became a position.
     """
@@ -75,15 +70,14 @@ def find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) ->
         return agree
     chance = _estimate_chance(rows, fitted, is_same_form)
     largest = float(chance[agree].max())
-    return agree & (largest <= CHANCE or _is_no_chance(rows, fitted, int(agree.sum()), largest))
-
-
-def _is_no_chance(rows: ComparedRows, fitted: FloatArray, count: int, chance: float) -> bool:
-    """Return whether more rows agree than repeats by chance would, each with this probability."""
+    if largest <= CHANCE:
+        return agree
     from loopcal.numerics.special_functions import bdtrc
 
+    # whether more rows agree than repeats by chance would, each with this probability
+    count = int(agree.sum())
     repeats = sum(len(near) > 0 for near in _find_repeats(rows, fitted))
-    return bool(bdtrc(count - 1, max(repeats, count), chance) < CHANCE)
+    return agree & bool(bdtrc(count - 1, max(repeats, count), largest) < CHANCE)
 
 
 def _estimate_chance(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> FloatArray:
@@ -282,12 +276,7 @@ class FittedRows:
         return count
 
     def find_in(self, data: Measurements) -> ReusedRows:
-        """Return which rows of other measurements are among these; rows of weight 0 do not count.
-
-        Parameters
-        ----------
-        data : the other measurements.
-        """
+        """Return which rows of other measurements, of weight above 0, are among these."""
         labels: list[str] = []
         total, kinds = 0, {kind for kind, _ in self.groups}
         for rows in _list_rows(data):
@@ -303,12 +292,8 @@ class FittedRows:
 
 
 def collect_fitted_rows(data: Measurements, are_readings_fitted: bool = False) -> FittedRows:
-    """Return the rows of measurements that a fit uses: those with a weight above 0.
-
-    Parameters
-    ----------
-    data : the fitted measurements.
-    are_readings_fitted : whether readings alone are fitted, as where actuators are redundant.
+    """Return the rows of measurements that a fit uses, with a weight above 0; with readings alone
+    if these are fitted, as where actuators are redundant.
     """
     groups = [
         (o.kind.name, _take_content(o, data.readings)[1])
@@ -334,7 +319,11 @@ def _list_rows(data: Measurements) -> list[ComparedRows]:
     for o in data.observations:
         counts, content, poses = _take_content(o, data.readings)
         width = content.shape[1] - o.measured.shape[1]
-        noise = np.concatenate([np.zeros((len(content), width)), _state_noise(o)[counts]], axis=1)
+        variance = np.einsum("rii->ri", o.covariance)
+        if variance.shape != o.measured.shape:  # other residuals than values: noise is not known
+            variance = np.zeros(o.measured.shape)
+        sd = np.sqrt(np.where(np.isfinite(variance) & (variance > 0.0), variance, 0.0))
+        noise = np.concatenate([np.zeros((len(content), width)), sd[counts]], axis=1)
         result.append(ComparedRows(o.kind.name, width, content, noise, poses))
     is_alone = _find_lonely_readings(data)
     alone, poses = data.readings[is_alone], np.flatnonzero(is_alone)[:, None]
@@ -362,13 +351,3 @@ def _find_lonely_readings(data: Measurements) -> BoolArray:
     if data.reading_sigma is not None:
         is_alone &= np.isfinite(data.reading_sigma).any(axis=1)
     return is_alone
-
-
-def _state_noise(rows: Observations) -> FloatArray:
-    """Return the standard deviation (r, c) of each measured value; zero where the kind has other
-    residuals than values.
-    """
-    variance = np.einsum("rii->ri", rows.covariance)
-    if variance.shape != rows.measured.shape:
-        return np.zeros(rows.measured.shape)
-    return np.sqrt(np.where(np.isfinite(variance) & (variance > 0.0), variance, 0.0))

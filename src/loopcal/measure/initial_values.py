@@ -23,8 +23,6 @@ from loopcal.measure.observations import Observations
 from loopcal.numerics.gauss_newton import STEPS, minimize_from_starts, sum_squares
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- Whitened rows of measurements at given poses and nuisance parameters, without any robot.
-
 
 class EvaluatedRows(NamedTuple):
     """Residuals and derivatives of one kind; l poses per row, l = 1 unless rows compare poses.
@@ -57,34 +55,43 @@ def evaluate_measurements(
     nuisance: NuisanceParameters | None = None,
     joints: Mapping[str, FloatArray] | None = None,
 ) -> tuple[EvaluatedRows, ...]:
-    """Evaluate every kind at poses.
+    """Return the evaluated rows of every kind at poses, those of targets on the base last.
 
     Parameters
     ----------
-    measurements : Measurements
-    T : (t, n, 4, 4)
-        T_base_platform of each pose.
-    values : (t or 1, U)
-        Of the nuisance parameters.
-    nuisance : NuisanceParameters, optional
-        Default: collected from the measurements; collect them once for repeated calls.
-    joints : name -> (t or 1, n), optional
-        Values of the joints that kinds sense, see `loopcal.measure.readings.select_joint_values`.
-
-    Returns
-    -------
-    evaluated : one `EvaluatedRows` for each kind, in order; those of targets on the base last
-
-    Raises
-    ------
-    DataError
-        If a joint's values are missing.
+    T : (t, n, 4, 4) T_base_platform of each pose.
+    values : (t or 1, U) of the nuisance parameters.
+    nuisance : default: collected from the measurements; collect them once for repeated calls.
+    joints : name -> (t or 1, n) of the joints that kinds sense, see
+        `loopcal.measure.readings.select_joint_values`; DataError if one is missing.
     """
     collected = measurements.nuisance_parameters if nuisance is None else nuisance
-    return tuple(
-        _evaluate_kind(rows, T, collected.select(i, values), i, collected, joints or {})
-        for i, rows in enumerate(measurements.all_observations)
-    )
+    evaluated = []
+    for i, rows in enumerate(measurements.all_observations):
+        kind, indices, factor = rows.kind, collected.indices[i], collected.factor(i)
+        own = kind.stack_joints(joints or {}, rows.rows)
+        evaluation = rows.evaluate(T, collected.select(i, values), own)
+        t, r, m = evaluation.residual.shape
+        jacobian = evaluation.jacobian
+        by_nuisance = np.zeros((t, r, m, len(collected)))
+        if evaluation.nuisance is not None:
+            part = collected.table.free[indices] * (1.0 if factor is None else factor)
+            used = evaluation.nuisance * part[:, None, :]
+            used = np.broadcast_to(used, (t, r, m, indices.shape[1]))
+            columns = np.broadcast_to(indices[:, None, :], used.shape)
+            np.put_along_axis(by_nuisance, columns, used, axis=-1)
+        evaluated.append(
+            EvaluatedRows(
+                rows.rows.reshape(r, -1),
+                evaluation.residual,
+                jacobian[:, :, None] if kind.poses_per_row == 1 else jacobian,
+                by_nuisance,
+                np.zeros((t, r, m, 0)) if evaluation.joints is None else evaluation.joints,
+                kind.sensed_joints,
+                rows.whitener,
+            )
+        )
+    return tuple(evaluated)
 
 
 def whiten_rows(
@@ -92,20 +99,13 @@ def whiten_rows(
     twists: FloatArray,
     joints: Mapping[str, FloatArray] | None = None,
 ) -> FloatArray:
-    """Return the whitened rows [machine | nuisance | residual] of all kinds, stacked.
+    """Return the whitened rows (t, M, p + U + 1) [machine | nuisance | residual] of all kinds.
 
     Parameters
     ----------
-    evaluated : from `evaluate_measurements`
-    twists : (t or 1, n, 6, p)
-        Derivative of the platform's twist by the machine's parameters; p = 0 for nuisance
-        parameters alone.
-    joints : name -> (t or 1, n, p), optional
-        Derivatives of the joints' values by these parameters; default: zero.
-
-    Returns
-    -------
-    rows : (t, M, p + U + 1)
+    twists : (t or 1, n, 6, p) derivative of the platform's twist by the machine's parameters; p = 0
+        for nuisance parameters alone.
+    joints : name -> (t or 1, n, p) derivatives of the joints' values; default: zero.
     """
     p = twists.shape[-1]
     whitened = []
@@ -128,56 +128,19 @@ def whiten_rows(
     return np.concatenate(whitened, axis=1)
 
 
-def _evaluate_kind(
-    rows: Observations,
-    T: FloatArray,
-    values: FloatArray,
-    number: int,
-    nuisance: NuisanceParameters,
-    joints: Mapping[str, FloatArray],
-) -> EvaluatedRows:
-    kind, indices, factor = rows.kind, nuisance.indices[number], nuisance.factor(number)
-    evaluation = rows.evaluate(T, values, kind.stack_joints(joints, rows.rows))
-    t, r, m = evaluation.residual.shape
-    jacobian = evaluation.jacobian
-    by_nuisance = np.zeros((t, r, m, len(nuisance)))
-    if evaluation.nuisance is not None:
-        part = nuisance.table.free[indices] * (1.0 if factor is None else factor)
-        used = np.broadcast_to(evaluation.nuisance * part[:, None, :], (t, r, m, indices.shape[1]))
-        columns = np.broadcast_to(indices[:, None, :], used.shape)
-        np.put_along_axis(by_nuisance, columns, used, axis=-1)
-    return EvaluatedRows(
-        rows.rows.reshape(r, -1),
-        evaluation.residual,
-        jacobian[:, :, None] if kind.poses_per_row == 1 else jacobian,
-        by_nuisance,
-        np.zeros((t, r, m, 0)) if evaluation.joints is None else evaluation.joints,
-        kind.sensed_joints,
-        rows.whitener,
-    )
-
-
 def guess_nuisance_values(
     measurements: Measurements,
     T: FloatArray,
     nuisance: NuisanceParameters | None = None,
     joints: Mapping[str, FloatArray] | None = None,
 ) -> FloatArray:
-    """Return values of the nuisance parameters that fit the measurements at given poses.
+    """Return values (U,) of the nuisance parameters that fit the measurements at given poses.
 
     Parameters
     ----------
-    measurements : Measurements
-    T : (n, 4, 4)
-        T_base_platform of each pose, usually of the nominal robot at the readings.
-    nuisance : NuisanceParameters, optional
-        With priors and fixed values, if any; default: `measurements.nuisance_parameters`.
-    joints : name -> (1, n), optional
-        Values of joints that kinds sense.
-
-    Returns
-    -------
-    values : (U,)
+    T : (n, 4, 4) T_base_platform of each pose, usually of the nominal robot at the readings.
+    nuisance : with priors and fixed values; default: `measurements.nuisance_parameters`.
+    joints : name -> (1, n) of joints that kinds sense.
 
     Raises
     ------
@@ -202,26 +165,21 @@ def guess_nuisance_values_batch(
     most: int | None = None,
     steps: int = STEPS,
 ) -> FloatArray:
-    """Return values of the nuisance parameters for several sets of measured values, kind by kind.
+    """Return values (t, U) of the nuisance parameters for several sets of measured values, kind by
+    kind.
 
     Parameters
     ----------
-    measurements : to which the rows belong.
     measured : (t, r, c) of each kind; those of targets on the base last.
     T : (t | 1, n, 4, 4) T_base_platform.
-    nuisance : see `guess_nuisance_values`.
     most : number of candidates of each set to refine, those with the lowest cost; default all.
     steps : of the descent.
-
-    Returns
-    -------
-    values : (t, U)
 
     Raises
     ------
     DataError
-        See `guess_nuisance_values`. Of several sets, one without candidates keeps the nominal
-        values instead.
+        As `guess_nuisance_values`. Of several sets, one without candidates keeps the nominal values
+        instead.
     """
     known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
     observations = measurements.all_observations
@@ -263,8 +221,9 @@ def _list_groups(
         if not rows.kind.nuisance_parameters or rows.kind.sensed_joints:
             continue
         counts = (rows.weight > 0.0) & rows.present.any(axis=1)
-        for members, indices in _group_rows(nuisance.indices[i]):
-            counted = members[counts[members]]
+        sets, member = np.unique(nuisance.indices[i], axis=0, return_inverse=True)
+        for k, indices in enumerate(sets):
+            counted = np.flatnonzero((member.ravel() == k) & counts)
             if len(counted):
                 groups.append((i, counted, indices))
     return sorted(
@@ -276,12 +235,6 @@ def _rank_kind(kind: Kind) -> tuple[int, type[Kind]]:
     """Return when the rows of a kind are used, and its class."""
     is_first = isinstance(kind, Position) and kind.locates_frame
     return (0 if is_first else 2 if kind.is_of_base else 1), type(kind)
-
-
-def _group_rows(indices: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Return groups of rows that use the same parameters: their row indices and the parameters."""
-    sets, member = np.unique(indices, axis=0, return_inverse=True)
-    return [(np.flatnonzero(member.ravel() == k), sets[k]) for k in range(len(sets))]
 
 
 def _refine_best_candidate(
@@ -328,7 +281,10 @@ def _collect_candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> 
     offered = []
     for j, of_set in enumerate(measured):
         try:
-            guesses = _guess_values(kind, poses[j if len(poses) > 1 else 0], of_set)
+            own = kind.without_shared_errors() if kind.shared_errors else kind
+            guesses = own.guess_values(poses[j if len(poses) > 1 else 0], of_set)
+            shared = len(kind.nominal_values) - guesses.shape[1]  # a bias or drift begins at zero
+            guesses = np.pad(guesses, ((0, 0), (0, shared)))
         except DataError:
             if len(measured) == 1:
                 raise
@@ -336,15 +292,6 @@ def _collect_candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> 
         offered.append(np.concatenate([guesses, kind.nominal_values[None]]))
     k = max(len(guesses) for guesses in offered)
     return np.stack([np.concatenate([g, np.repeat(g[-1:], k - len(g), axis=0)]) for g in offered])
-
-
-def _guess_values(kind: Kind, T: FloatArray, measured: FloatArray) -> FloatArray:
-    """Return candidates (k, u) of a kind, without a bias or drift."""
-    if not kind.shared_errors:
-        return kind.guess_values(T, measured)
-    own = kind.without_shared_errors().guess_values(T, measured)
-    shared = np.zeros((len(own), len(kind.nuisance_parameters) - own.shape[1]))
-    return np.concatenate([own, shared], axis=1)
 
 
 def _refine_together(

@@ -9,14 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
+from loopcal.measure.array_checks import (
+    check_array,
+    check_seed,
+    check_type,
+    describe,
+    refuse_first,
+    set_fields,
+)
 from loopcal.measure.kinds.kind import Kind, measure_progress
 from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
-
-# --- noise
 
 
 class Noise(ABC):
@@ -34,11 +39,12 @@ class Noise(ABC):
 
 def _check_positive(value: ArrayLike, what: str) -> FloatArray:
     array = check_array(value, what, (None,))
-    wrong = array[~is_sd(array)]
-    if len(wrong):
-        raise DataError(
-            f"{what} contains {wrong[0]:.6g}; give a number above 0 for each column, {SD_RANGE}"
-        )
+    refuse_first(
+        ~is_sd(array),
+        lambda i: (
+            f"{what} contains {array[i]:.6g}; give a number above 0 for each column, {SD_RANGE}"
+        ),
+    )
     return array
 
 
@@ -114,29 +120,16 @@ def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Ge
 
     Parameters
     ----------
-    seed : int or BlockStream
-        Of the study, or of a block of its trials.
-    trial : int
-        Counted from 0. A trial gets the same numbers for any number of trials.
-    purpose : int
-        Separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3 effects, 4
-        errors of the readings of held-out poses.
-
-    Returns
-    -------
-    generator : numpy.random.Generator
+    seed : of the study, or of a block of its trials.
+    trial : counted from 0. A trial gets the same numbers for any number of trials.
+    purpose : separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3
+        effects, 4 errors of the readings of held-out poses.
     """
     if isinstance(seed, BlockStream):
         counter = np.array([0, purpose, trial, seed.block], dtype=np.uint64)
         return np.random.Generator(np.random.Philox(key=seed.key, counter=counter))
     check_seed(seed)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(trial, purpose)))
-
-
-# --- sensors and instruments
-
-BASE_ROWS = 2
-"""How often a sensor measures targets on the base unless it states its rows."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -184,7 +177,7 @@ class Sensor:
         """Return the sensor with explicit rows, sessions and groups for n poses; DataError where a
         pose does not exist.
         """
-        rows = self._rows(n_poses)
+        rows = self._list_rows(n_poses)
         if rows.size and (rows.min() < 0 or rows.max() >= n_poses):
             raise DataError(
                 f"the rows of kind {self.kind.name!r} refer to pose {int(rows.max())}, but the "
@@ -208,9 +201,10 @@ class Sensor:
             raise DataError("the sensor has no rows yet; use sensor.assign_rows(n_poses)")
         return self.rows
 
-    def _rows(self, n: int) -> IntArray:
+    def _list_rows(self, n: int) -> IntArray:
+        """Return the poses of the rows for n poses."""
         if self.kind.is_of_base:
-            return np.zeros(BASE_ROWS if self.rows is None else len(self.rows), dtype=np.intp)
+            return np.zeros(2 if self.rows is None else len(self.rows), dtype=np.intp)
         if self.rows is not None:
             return check_rows(self.rows, self.kind)
         if self.kind.poses_per_row == 1:
@@ -226,17 +220,7 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Instrument:
-    """The sensors that measure every pose.
-
-    Parameters
-    ----------
-    sensors : tuple of Sensor
-
-    Raises
-    ------
-    DataError
-        If it has no sensor.
-    """
+    """The sensors, at least one, that measure every pose."""
 
     sensors: tuple[Sensor, ...]
 

@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
+from loopcal.measure.array_checks import (
+    check_array,
+    check_seed,
+    check_type,
+    describe,
+    refuse_first,
+    set_fields,
+)
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -22,17 +29,10 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- Rows of targets that are fixed to the base: monuments, by which an instrument finds its
-# frame.
-
 
 def check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observations]) -> None:
-    """Refuse rows of the base among those of poses, the reverse, and a target on two bodies.
-
-    Raises
-    ------
-    DataError
-        Also `data.target-on-two-bodies`.
+    """Raise a DataError for rows of the base among those of poses, the reverse, and a target on two
+    bodies.
     """
     for rows in of_poses:
         if rows.kind.is_of_base:
@@ -46,19 +46,9 @@ def check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observation
                 f"rows of kind {rows.kind.name!r} measure poses; pass them as `observations`, or "
                 'give their kind `of="base"`'
             )
-    check_targets([rows.kind for rows in (*of_poses, *of_base)])
-
-
-def check_targets(kinds: Sequence[Kind]) -> None:
-    """Refuse kinds that have a target on the base and on a platform.
-
-    Raises
-    ------
-    DataError
-        `data.target-on-two-bodies`.
-    """
-    for kind in (kind for kind in kinds if kind.is_of_base):
-        if shared := list_moving_targets(kind, kinds):
+    kinds = [rows.kind for rows in (*of_poses, *of_base)]
+    for kind in kinds:
+        if kind.is_of_base and (shared := list_moving_targets(kind, kinds)):
             raise DataError(report_finding("data.target-on-two-bodies", targets=shared))
 
 
@@ -168,11 +158,16 @@ class Measurements(TableResult):
                 rows, Observations, "observations", "such as loopcal.Observations.from_sigma(...)"
             )
             _check_poses(rows, n)
-        set_fields(self, readings=readings, block=block, labels=labels)
-        set_fields(self, observations=tuple(self.observations))
-        set_fields(self, base_observations=tuple(self.base_observations))
+        set_fields(
+            self,
+            readings=readings,
+            block=block,
+            labels=labels,
+            observations=tuple(self.observations),
+            base_observations=tuple(self.base_observations),
+            is_held_out=_check_held_out(self.is_held_out, block, labels),
+        )
         check_bodies(self.observations, self.base_observations)
-        set_fields(self, is_held_out=_check_held_out(self.is_held_out, block, labels))
         if self.reading_sigma is not None:
             sigma = check_reading_sigma(self.reading_sigma, readings, labels)
             set_fields(self, reading_sigma=sigma)
@@ -251,16 +246,9 @@ class Measurements(TableResult):
         return self.take(~self.is_held_out) if self.is_held_out.any() else self
 
     def take(self, poses: ArrayLike) -> Self:
-        """Return the measurements of these poses, in this order, without rows of any other pose.
+        """Return the measurements of these poses (k,), in their order, or of a mask (n,).
 
-        Parameters
-        ----------
-        poses : (k,) int, or (n,) bool
-
-        Returns
-        -------
-        measurements : Measurements
-            With all rows of targets on the base.
+        Rows of other poses are left out; those of targets on the base stay.
 
         Raises
         ------
@@ -288,10 +276,15 @@ class Measurements(TableResult):
             )
         place = np.full(self.n_poses, -1)
         place[chosen] = np.arange(len(chosen))
+        observations = []
+        for rows in self.observations:
+            target = place[rows.rows]
+            kept = np.all(target.reshape(len(rows), rows.kind.poses_per_row) >= 0, axis=1)
+            observations.append(replace(rows.take(kept), rows=target[kept]))
         return replace(
             self,
             readings=self.readings[chosen],
-            observations=tuple(_renumber_poses(rows, place) for rows in self.observations),
+            observations=tuple(observations),
             block=self.block[chosen],
             labels=tuple(self.labels[i] for i in chosen),
             reading_sigma=None if self.reading_sigma is None else self.reading_sigma[chosen],
@@ -401,20 +394,11 @@ def _check_readings(readings: ArrayLike, uncertain: bool) -> FloatArray:
 
 
 def _check_poses(rows: Observations, n: int) -> None:
-    absent = (rows.rows < 0) | (rows.rows >= n)
-    if np.any(absent):
-        place = int(np.argwhere(absent)[0][0])
-        index = int(rows.rows[absent][0])
-        raise DataError(
-            f"row {place + 1} of kind {rows.kind.name!r} refers to pose {index}, but the {n} poses "
-            f"are 0 to {n - 1}; correct the row, or add the readings of the pose"
-        )
-
-
-def _renumber_poses(rows: Observations, place: IntArray) -> Observations:
-    """Return the rows whose poses are all kept, with their new indices; `place` (n,) is -1 for
-    poses that are dropped.
-    """
-    target = place[rows.rows]
-    kept = np.all(target.reshape(len(rows), rows.kind.poses_per_row) >= 0, axis=1)
-    return replace(rows.take(kept), rows=target[kept])
+    poses = rows.rows.reshape(len(rows), rows.kind.poses_per_row)
+    refuse_first(
+        (poses < 0) | (poses >= n),
+        lambda i, j: (
+            f"row {i + 1} of kind {rows.kind.name!r} refers to pose {int(poses[i, j])}, but the "
+            f"{n} poses are 0 to {n - 1}; correct the row, or add the readings of the pose"
+        ),
+    )

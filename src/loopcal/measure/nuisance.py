@@ -133,18 +133,16 @@ class NuisanceParameters:
     def with_nominal(self, values: FloatArray) -> Self:
         """Return a copy with other nominal values (U,)."""
         pairs = zip(self.table.entries, np.asarray(values).tolist(), strict=True)
-        return replace(
-            self, table=ParameterTable(tuple(replace(p, nominal=value) for p, value in pairs))
-        )
+        entries = tuple(replace(p, nominal=value) for p, value in pairs)
+        return replace(self, table=ParameterTable(entries))
 
     def _changed(self, pattern: str, **change: float | bool) -> Self:
         matches = [fnmatchcase(name, pattern) for name in self.table.names]
         if not any(matches):
             self._index(pattern)
-        entries = zip(self.table.entries, matches, strict=True)
-        return replace(
-            self, table=ParameterTable(tuple(replace(p, **change) if m else p for p, m in entries))
-        )
+        pairs = zip(self.table.entries, matches, strict=True)
+        entries = tuple(replace(p, **change) if matching else p for p, matching in pairs)
+        return replace(self, table=ParameterTable(entries))
 
     def _index(self, name: str) -> int:
         if name not in self.table.names:
@@ -161,18 +159,13 @@ def collect_nuisance_parameters(
     labels: tuple[str, ...],
     stated_values: Iterable[StatedValue] = (),
 ) -> NuisanceParameters:
-    """Collect the nuisance parameters of measurements.
+    """Return the nuisance parameters of measurements.
 
     Parameters
     ----------
     observations : of `Measurements`, or sensors with explicit rows (`Sensor.assign_rows`).
     labels : names of the poses.
-    stated_values : priors and fixed values, usually `Measurements.stated_values`; those of names
-        that do not occur are ignored.
-
-    Returns
-    -------
-    NuisanceParameters
+    stated_values : priors and fixed values; those of names that do not occur are ignored.
 
     Raises
     ------
@@ -184,9 +177,11 @@ def collect_nuisance_parameters(
     indices, factors = [], []
     for rows in observations:
         kind = rows.kind
-        factors.append(_take_parts(rows) if kind.is_drift.any() else None)
-        _check_references(references, kind)
-        _check_names(kind)
+        takes_parts = kind.is_drift.any()
+        factors.append(
+            np.where(kind.is_drift, rows.drift_part[:, None], 1.0) if takes_parts else None
+        )
+        _check_names(kind, references)
         owners = {
             scope: _list_owners(rows, scope, labels)
             for scope in {p.scope for p in kind.nuisance_parameters}
@@ -199,22 +194,14 @@ def collect_nuisance_parameters(
                 _enter(entries, p, owner[p.scope], kind) for p in kind.nuisance_parameters
             ]
         order = {name: i for i, name in enumerate(entries)}
-        used = {key: [order[name] for name in of_key] for key, of_key in names.items()}
-        indices.append(
-            np.array([used[key] for key in keys], dtype=np.intp).reshape(
-                len(keys), len(kind.nuisance_parameters)
-            )
-        )
+        used = [[order[name] for name in names[key]] for key in keys]
+        shape = (len(keys), len(kind.nuisance_parameters))
+        indices.append(np.array(used, dtype=np.intp).reshape(shape))
     for stated in stated_values:
         if stated.name in entries:
             entries[stated.name] = stated.apply_to(entries[stated.name])
     table = ParameterTable(tuple(entries.values()))
     return NuisanceParameters(table, tuple(indices), tuple(factors))
-
-
-def _take_parts(rows: Observations | Sensor) -> FloatArray:
-    """Return the parts (r, u) of their parameters that rows take: of a drift, their progress."""
-    return np.where(rows.kind.is_drift, rows.drift_part[:, None], 1.0)
 
 
 def _list_owners(rows: Observations | Sensor, scope: str, labels: tuple[str, ...]) -> list[str]:
@@ -246,7 +233,8 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
     return name
 
 
-def _check_names(kind: Kind) -> None:
+def _check_names(kind: Kind, references: dict[str, FloatArray]) -> None:
+    """Refuse two parameters of one name, and another reference than the kinds before; enter it."""
     names = [p.name for p in kind.nuisance_parameters]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
@@ -254,9 +242,6 @@ def _check_names(kind: Kind) -> None:
             f"the kind {kind.name!r} has two parameters called {repeated!r}; give frames, targets "
             "and surfaces different names"
         )
-
-
-def _check_references(references: dict[str, FloatArray], kind: Kind) -> None:
     for name, value in kind.references.items():
         if not np.array_equal(references.setdefault(name, value), value):
             raise DataError(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from typing import Any, Self
@@ -13,24 +14,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
-from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
+from loopcal.measure.array_checks import (
+    broadcast_array,
+    check_array,
+    check_type,
+    describe,
+    refuse_first,
+    set_fields,
+)
 from loopcal.measure.kinds.kind import Evaluation, Kind, measure_progress
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
 
-# --- Whiteners: matrices that give residuals unit variance, with zero rows for absent components.
-
 _SMALLEST_PIVOT = 1e-7
-"""Smallest pivot [1] of a correlation matrix. Below it a component equals a combination of
-the others to seven digits, and the inverse has fewer digits than a measurement.
+"""Smallest pivot of a correlation matrix. Below it a component equals a combination of the others
+to seven digits, and the inverse has fewer digits than a measurement.
 """
 
 
 def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatArray) -> FloatArray:
-    """Return matrices W with `W C W' = weight` on the present components.
-
-    Rows and columns of absent components are zero.
+    """Return matrices W (r, m, m) with `W C W' = weight` on the present components, zero elsewhere.
 
     W is the inverse lower Cholesky factor. Without a component, a Gaussian loses its row and column
     of C. Here they are replaced by those of the identity, which keeps the shape and gives the same
@@ -42,15 +46,8 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
 
     Parameters
     ----------
-    covariance : (r, m, m) [SI]
-        Entries of absent components are ignored.
-    present : (r, m) bool
-    weight : (r,)
-        Factor of the squared residuals, not negative; 0 excludes a row.
-
-    Returns
-    -------
-    W : (r, m, m)
+    covariance : (r, m, m) [SI], any numbers where a component is absent. present : (r, m) bool
+    weight : (r,) factor of the squared residuals, not negative; 0 excludes a row.
 
     Raises
     ------
@@ -71,42 +68,34 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
     _refuse(~np.all(np.isfinite(correlation), axis=(1, 2)), "is not positive definite")
     asymmetric = np.abs(correlation - np.swapaxes(correlation, 1, 2)) > 1e-9
     _refuse(np.any(asymmetric, axis=(1, 2)), "is not symmetric")
-    W = _invert_factor(correlation) / sd[:, None, :]
-    return np.where(both, W, 0.0) * np.sqrt(weight)[:, None, None]
-
-
-def _invert_factor(correlation: FloatArray) -> FloatArray:
-    """Return the inverse lower Cholesky factors (r, m, m) of correlation matrices."""
-    diagonal = np.eye(correlation.shape[1], dtype=bool)
-    if not np.any(correlation[:, ~diagonal]):  # most files: nothing to factor
+    if np.any(correlation[:, ~diagonal]):
+        try:
+            L = np.linalg.cholesky(correlation)
+        except np.linalg.LinAlgError:
+            smallest = np.linalg.eigvalsh(correlation)[:, 0]
+            _refuse(smallest <= max(float(np.min(smallest)), 0.0), "is not positive definite")
+            raise
+        pivots = np.min(np.einsum("rii->ri", L), axis=1)
+        _refuse(pivots < _SMALLEST_PIVOT, "is not positive definite to rounding")
+        inverse = np.asarray(np.tril(np.linalg.inv(L)), dtype=np.float64)
+    else:  # as in most files
         root = np.sqrt(np.where(diagonal, correlation, 1.0))
-        return np.where(diagonal, 1.0 / root, 0.0)
-    try:
-        L = np.linalg.cholesky(correlation)
-    except np.linalg.LinAlgError:
-        smallest = np.linalg.eigvalsh(correlation)[:, 0]
-        _refuse(smallest <= max(float(np.min(smallest)), 0.0), "is not positive definite")
-        raise
-    _refuse(
-        np.min(np.einsum("rii->ri", L), axis=1) < _SMALLEST_PIVOT,
-        "is not positive definite to rounding",
-    )
-    return np.asarray(np.tril(np.linalg.inv(L)), dtype=np.float64)
+        inverse = np.where(diagonal, 1.0 / root, 0.0)
+    return np.where(both, inverse / sd[:, None, :], 0.0) * np.sqrt(weight)[:, None, None]
 
 
 def _refuse(wrong: BoolArray, what: str) -> None:
-    if np.any(wrong):
-        row = int(np.flatnonzero(wrong)[0]) + 1
-        raise DataError(
-            f"the covariance of row {row} {what}; give each component a standard deviation above 0 "
-            "and correlations between -1 and 1 that are consistent"
-        )
+    refuse_first(
+        wrong,
+        lambda i: (
+            f"the covariance of row {i + 1} {what}; give each component a standard deviation above "
+            "0 and correlations between -1 and 1 that are consistent"
+        ),
+    )
 
-
-# --- Which instrument measured, and how its values are traceable: certificate, laboratory, dates.
 
 DATES = ("calibrated", "due", "measured")
-"""Fields that hold a date."""
+"""Fields of an instrument that hold a date."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +128,11 @@ class InstrumentRecord:
 
     def __post_init__(self) -> None:
         for key in DATES:
-            _parse_date(key, getattr(self, key))
+            text = getattr(self, key)
+            with suppress(ValueError):
+                if not text or date.fromisoformat(text).isoformat() == text:
+                    continue
+            raise DataError(f"{key} is {text!r}; write a date as 2026-05-31")
         if self.due and self.calibrated and self.due < self.calibrated:
             raise DataError(
                 f"due is {self.due}, which is before calibrated, {self.calibrated}; correct one"
@@ -192,18 +185,6 @@ def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
                 report_finding("data.instrument-calibrated-later", instrument=str(record), **dates)
             )
     return findings
-
-
-def _parse_date(key: str, text: str) -> None:
-    """Refuse a text that is no date of the form 2026-05-31."""
-    if not text:
-        return
-    try:
-        is_date = date.fromisoformat(text).isoformat() == text
-    except ValueError:
-        is_date = False
-    if not is_date:
-        raise DataError(f"{key} is {text!r}; write a date as 2026-05-31")
 
 
 TextArray = NDArray[np.str_]
@@ -289,24 +270,26 @@ class Observations:
         measured = check_array(
             self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True
         )
-        weights = _broadcast(self.weight, (r,), "the weight", f"one number for each of {r} rows")
+        wanted = f"one number for each of {r} rows"
+        weights = broadcast_array(self.weight, (r,), "the weight", wanted)
         weight = check_array(weights, "the weight", (r,))
-        if np.any(weight < 0.0):
-            i = int(np.flatnonzero(weight < 0.0)[0])
-            raise DataError(
+        refuse_first(
+            weight < 0.0,
+            lambda i: (
                 f"the weight of row {i + 1} is {weight[i]:.6g}; give a positive number, or 0 to "
                 "exclude the row"
-            )
+            ),
+        )
         for i, problem in kind.find_invalid_rows(measured):
             raise DataError(f"row {i + 1} of kind {kind.name!r} {problem}")
         present = kind.detect_present(measured)
-        covariance = _broadcast(
+        covariance = broadcast_array(
             self.covariance, (r, m, m), "covariance", f"({r}, {m}, {m}) or ({m}, {m})"
         )
         W = compute_whitener(covariance, present, weight)
         for array in (rows, covariance, present, W):
             array.setflags(write=False)
-        session, group = (check_labels(getattr(self, s), r, s) for s in ("session", "group"))
+        labels = {name: check_labels(getattr(self, name), r, name) for name in ("session", "group")}
         context = {
             name: check_array(v, f"the context {name!r}", (r,), allow_nan=True)
             for name, v in self.context.items()
@@ -315,8 +298,7 @@ class Observations:
             progress = check_array(self.progress, "the progress of the rows", (r,))
             set_fields(self, progress=progress)
         set_fields(self, rows=rows, measured=measured, covariance=covariance, weight=weight)
-        set_fields(self, session=session, group=group, context=context)
-        set_fields(self, present=present, whitener=W)
+        set_fields(self, context=context, present=present, whitener=W, **labels)
 
     @classmethod
     def from_sigma(
@@ -341,10 +323,6 @@ class Observations:
             Standard deviations.
         session, group : text or (r,) text
 
-        Returns
-        -------
-        observations : Observations
-
         Raises
         ------
         DataError
@@ -367,7 +345,7 @@ class Observations:
                 f"{len(kind.columns)}): {columns}"
             )
         shape = (len(values), len(kind.noise_columns))
-        sd = _broadcast(sigma, shape, "sigma", f"one number, or one for each of {names}")
+        sd = broadcast_array(sigma, shape, "sigma", f"one number, or one for each of {names}")
         wrong = sd[~(is_sd(sd) | np.isnan(sd) | (sd == 0.0))]
         if len(wrong):
             raise DataError(f"sigma contains {wrong[0]:.6g}; give numbers above 0, {SD_RANGE}")
@@ -410,18 +388,8 @@ class Observations:
     def evaluate(
         self, T: FloatArray, nuisance: FloatArray | None = None, joints: FloatArray | None = None
     ) -> Evaluation:
-        """Return residuals and derivatives of all rows at the poses of all n readings.
-
-        Parameters
-        ----------
-        T : (t, n, 4, 4)
-            T_base_platform of each pose.
-        nuisance : (t or 1, r or 1, u), optional
-        joints : (t, r, j), optional
-
-        Returns
-        -------
-        Evaluation
+        """Return residuals and derivatives of all rows at the poses T (t, n, 4, 4) of all n
+        readings; the rest as for `Kind.evaluate`.
         """
         return self.kind.evaluate(T[:, self.rows], self.measured[None], nuisance, joints)
 
@@ -452,12 +420,13 @@ def check_rows(rows: ArrayLike, kind: Kind) -> IntArray:
             f"whole numbers of shape {shape}: the index of the pose of each row"
         )
     if wanted == 2:
-        same = np.flatnonzero(given[:, 0] == given[:, 1])
-        if len(same):
-            raise DataError(
-                f"row {int(same[0]) + 1} of kind {kind.name!r} compares pose "
-                f"{int(given[same[0], 0])} with itself; give two different poses"
-            )
+        refuse_first(
+            given[:, 0] == given[:, 1],
+            lambda i: (
+                f"row {i + 1} of kind {kind.name!r} compares pose {int(given[i, 0])} with itself; "
+                "give two different poses"
+            ),
+        )
     return given.astype(np.intp)
 
 
@@ -472,15 +441,3 @@ def check_labels(value: ArrayLike, r: int, what: str) -> TextArray:
     labels = np.array(np.broadcast_to(given, (r,)))
     labels.setflags(write=False)
     return labels
-
-
-def _broadcast(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> FloatArray:
-    """Return a copy of an array, broadcast to a shape; DataError where it does not fit."""
-    try:
-        given = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise DataError(f"{what}: got {describe(value)}; give {wanted}") from None
-    try:
-        return np.array(np.broadcast_to(given, shape))
-    except ValueError:
-        raise DataError(f"{what} has shape {given.shape}; give {wanted}") from None

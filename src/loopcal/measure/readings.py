@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,18 +12,17 @@ from numpy.typing import ArrayLike
 
 from loopcal.engine import State
 from loopcal.errors import DataError, suggest_names
+from loopcal.measure.array_checks import broadcast_array, refuse_first
 from loopcal.measure.kinds.kind import Kind
 from loopcal.mechanism.chains import select_platform_entries
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import FloatArray
 from loopcal.units import SMALLEST_SD, Dimension
 
 if TYPE_CHECKING:
     from loopcal.measure.kinds.joints import ActuatorReadings
     from loopcal.measure.measurements import Measurements
-
-# --- commanded poses
 
 
 def solve_commanded_poses(
@@ -36,11 +35,9 @@ def solve_commanded_poses(
 
     Parameters
     ----------
-    controller : Mechanism
-        The geometry that the controller uses, usually the nominal robot.
+    controller : the geometry that the controller uses, usually the nominal robot.
     commanded : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
-    labels, places : sequence of str, optional
-        Names of the poses, and their places such as `poses.csv:12`, for messages; see `name_pose`.
+    labels, places : names of the poses, and their places such as `poses.csv:12`, for messages.
 
     Raises
     ------
@@ -68,9 +65,6 @@ def name_pose(index: int, labels: Sequence[str] = (), places: Sequence[str] = ()
     return f"{label} at {places[index]}" if places else label
 
 
-# --- values of joints
-
-
 def list_sensed_joints(kinds: Iterable[Kind]) -> tuple[str, ...]:
     """Return the names of all joints that kinds sense, each once."""
     return tuple(dict.fromkeys(name for kind in kinds for name in kind.sensed_joints))
@@ -79,26 +73,23 @@ def list_sensed_joints(kinds: Iterable[Kind]) -> tuple[str, ...]:
 def select_joint_values(
     robot: Mechanism, names: Iterable[str], readings: FloatArray, state: State
 ) -> dict[str, FloatArray]:
-    """Return values of joints by name.
+    """Return values (t or 1, n) [SI] of joints by name; DataError if the robot does not have one.
 
     Parameters
     ----------
-    robot : Mechanism
     names : of actuators, whose value is their reading, or of passive joints as `limb.joint`.
-    readings : (t or 1, n, a) [SI]
-    state : of t trials and n poses
-
-    Returns
-    -------
-    values : name -> (t or 1, n) [SI]
-
-    Raises
-    ------
-    DataError
-        If the robot does not have a joint.
+    readings : (t or 1, n, a) [SI]. state : of t trials and n poses.
     """
     actuators = [actuator.name for actuator in robot.actuators]
-    passive = _index_passive_joints(robot)
+    limbs = robot.assembly.limbs
+    places = {
+        f"{limbs[limb].name}.{joint.name}": (g, k, j)
+        for g, group in enumerate(robot.program.groups)
+        for k, limb in enumerate(group.limbs)
+        for j, joint in enumerate(limbs[limb].joints)
+    }
+    passive = {f"{limb.name}.{joint.name}" for limb, joint in robot.assembly.passive_joints}
+    passive = {name: place for name, place in places.items() if name in passive}
     entries = select_platform_entries(robot, state) if robot.stages else {}
     values = {}
     for name in names:
@@ -124,33 +115,15 @@ def select_joint_values(
     return values
 
 
-def _index_passive_joints(robot: Mechanism) -> dict[str, tuple[int, int, int]]:
-    """Return the indices of passive joints by name: group, limb in the group, joint in the limb."""
-    limbs = robot.assembly.limbs
-    passive = {f"{limb.name}.{joint.name}" for limb, joint in robot.assembly.passive_joints}
-    places = {
-        f"{limbs[limb].name}.{joint.name}": (g, k, j)
-        for g, group in enumerate(robot.program.groups)
-        for k, limb in enumerate(group.limbs)
-        for j, joint in enumerate(limbs[limb].joints)
-    }
-    return {name: place for name, place in places.items() if name in passive}
-
-
 def make_readings_kind(robot: Mechanism) -> ActuatorReadings:
-    """Return the kind of a robot's readings.
-
-    An uncertain reading is a measurement of the true one, by this kind.
-    """
+    """Return the kind of a robot's readings, by which an uncertain one measures the true one."""
     from loopcal.measure.kinds.joints import ActuatorReadings
 
     return ActuatorReadings({actuator.name: actuator.dimension for actuator in robot.actuators})
 
 
-# --- Standard deviations (n, a) [SI] of actuator readings: 0 is exact, infinity is missing.
-
 LARGEST_SIGMA = 1e6
-"""Largest finite sigma of a reading, in sizes of the robot or radians."""
+"""Largest finite standard deviation of a reading, in sizes of the robot or radians."""
 
 NOT_A_SIGMA = (
     "is not a standard deviation; give 0 (exact), a positive number from "
@@ -171,36 +144,20 @@ def weight_reading_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatA
 
 
 def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArray:
-    """Return standard deviations (n, a) of readings (n, a) from what broadcasts to them; DataError
-    where it does not fit.
-    """
-    try:
-        if np.iscomplexobj(sigma):
-            raise TypeError
-        given = np.asarray(sigma, dtype=float)
-    except (TypeError, ValueError):
-        raise DataError(
-            f"reading_sigma is {sigma!r}; give numbers, in meters and radians"
-        ) from None
-    try:
-        return np.array(np.broadcast_to(given, readings.shape))
-    except ValueError:
-        raise DataError(
-            f"reading_sigma has shape {given.shape}; give one number, or one for each of the "
-            f"{readings.shape[1]} actuators, or one for each of the {readings.shape[0]} x "
-            f"{readings.shape[1]} readings"
-        ) from None
+    """Return standard deviations (n, a) of readings (n, a) from what broadcasts to them."""
+    n, a = readings.shape
+    wanted = (
+        f"numbers, in meters and radians: one, or one for each of the {a} actuators, or one for "
+        f"each of the {n} x {a} readings"
+    )
+    return broadcast_array(sigma, readings.shape, "reading_sigma", wanted)
 
 
 def check_reading_sigma(
     sigma: ArrayLike, readings: FloatArray, labels: tuple[str, ...]
 ) -> FloatArray:
-    """Return checked, read-only standard deviations of readings (n, a).
-
-    Raises
-    ------
-    DataError
-        If one is negative or not a number, or a reading is missing although its sigma is finite.
+    """Return checked, read-only standard deviations of readings (n, a); DataError if one is
+    negative or not a number, or a reading is missing although its sigma is finite.
     """
     checked = broadcast_reading_sigma(sigma, readings)
 
@@ -208,9 +165,13 @@ def check_reading_sigma(
         value = f"{checked[pose, column]:.6g}"
         return f"pose {labels[pose]!r}: the sigma {value} [m or rad] of reading {column + 1}"
 
-    _refuse(~((checked == 0.0) | (checked >= SMALLEST_SD)), name, NOT_A_SIGMA)
-    is_missing = np.isnan(readings) & np.isfinite(checked)
-    _refuse(is_missing, name, "belongs to a missing reading; give the reading, or infinity")
+    refuse_first(
+        ~((checked == 0.0) | (checked >= SMALLEST_SD)), lambda i, j: f"{name(i, j)} {NOT_A_SIGMA}"
+    )
+    refuse_first(
+        np.isnan(readings) & np.isfinite(checked),
+        lambda i, j: f"{name(i, j)} belongs to a missing reading; give the reading, or infinity",
+    )
     checked.setflags(write=False)
     return checked
 
@@ -236,7 +197,25 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
         if not robot.stated_sigma.any():
             return None
         given = np.tile(robot.stated_sigma, (n, 1))
-    _check_size(robot, given)
+    is_length = [actuator.dimension is Dimension.LENGTH for actuator in robot.actuators]
+    size = np.where(is_length, robot.size, 1.0)
+
+    def name(pose: int, column: int) -> str:
+        actuator = robot.actuators[column]
+        shown = robot.get_unit(actuator.dimension)
+        value = f"{given[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"
+        return f"the sigma {value} of the reading of {actuator.name} in row {pose + 1}"
+
+    refuse_first(
+        ~((given == 0.0) | (given >= SMALLEST_SD)), lambda i, j: f"{name(i, j)} {NOT_A_SIGMA}"
+    )
+    refuse_first(
+        np.isfinite(given) & (given / size > LARGEST_SIGMA),
+        lambda i, j: (
+            f"{name(i, j)} is larger than any possible error of a reading; give inf (missing) "
+            "instead"
+        ),
+    )
     if robot.program.sigma is not None and np.any(given == 0.0):
         name = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
@@ -257,28 +236,3 @@ def fill_in_reading_sigma(robot: Mechanism, data: Measurements) -> Measurements:
     return (
         data if sigma is None or sigma is data.reading_sigma else replace(data, reading_sigma=sigma)
     )
-
-
-def _check_size(robot: Mechanism, sigma: FloatArray) -> None:
-    """Refuse standard deviations that are negative or too large, naming the actuator."""
-    is_length = [actuator.dimension is Dimension.LENGTH for actuator in robot.actuators]
-    size = np.where(is_length, robot.size, 1.0)
-
-    def name(pose: int, column: int) -> str:
-        actuator = robot.actuators[column]
-        shown = robot.get_unit(actuator.dimension)
-        value = f"{sigma[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"
-        return f"the sigma {value} of the reading of {actuator.name} in row {pose + 1}"
-
-    _refuse(~((sigma == 0.0) | (sigma >= SMALLEST_SD)), name, NOT_A_SIGMA)
-    is_huge = np.isfinite(sigma) & (sigma / size > LARGEST_SIGMA)
-    _refuse(
-        is_huge, name, "is larger than any possible error of a reading; give inf (missing) instead"
-    )
-
-
-def _refuse(wrong: BoolArray, name: Callable[[int, int], str], what: str) -> None:
-    """Raise a DataError that names the first wrong entry (pose, column), if there is one."""
-    if np.any(wrong):
-        pose, column = (int(i) for i in np.argwhere(wrong)[0])
-        raise DataError(f"{name(pose, column)} {what}")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -20,7 +19,7 @@ from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
 from loopcal.measure.data_checks import check_closure, check_redundancy
 from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements
-from loopcal.measure.instrument import Distribution, Instrument, Seed, Sensor, make_random_stream
+from loopcal.measure.instrument import Distribution, Instrument, Seed, make_random_stream
 from loopcal.measure.kinds.surfaces import Line, Plane
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
@@ -42,8 +41,6 @@ from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
-
-# --- Errors of simulated machines that no fit knows of, and the true poses under them.
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +83,8 @@ def reach_poses(
 
     Parameters
     ----------
-    robot : structure of the machines. values : (t, p) [SI] of each of them.
-    readings : (n, a) [SI] of the controller. start : (1, n) state of the commanded poses.
+    values : (t, p) [SI] of each machine. readings : (n, a) [SI] of the controller.
+    start : (1, n) state of the commanded poses.
     """
     true = readings[None]
     if disturbance.readings is not None:
@@ -103,19 +100,19 @@ def reach_poses(
     # of the reached pose. Where they contradict each other so widely that they lead to none, the
     # machine is moved to the commanded pose, with all but the needed actuators following it.
     if robot.program.sigma is not None:
-        lost = (state.status != Status.CONVERGED)[..., None, None]
-        begin = replace(state, T=np.where(lost, start.T, state.T))
+        lost = state.status != Status.CONVERGED
+
+        def select(placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
+            mask = lost.reshape(*lost.shape, *[1] * (reached.ndim - 2))
+            return np.where(mask, placed, reached)
+
+        begin = replace(state, T=select(start.T, state.T))
         placed, closed = solve_at_pose(robot, values, begin.T, begin)
-        state = map_arrays(partial(_select_lost, lost[..., 0, 0]), placed, state)
+        state = map_arrays(select, placed, state)
         true = np.where(np.isfinite(closed), closed, true)
     if disturbance.values is not None:
         true, state = true.reshape(*shape, -1), _reshape_state(state, (len(values), 1), shape)
     return true, state
-
-
-def _select_lost(lost: BoolArray, placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
-    """Return the arrays of poses (t, n, ..), those of lost ones (t, n) as they are placed."""
-    return np.where(lost.reshape(*lost.shape, *[1] * (reached.ndim - 2)), placed, reached)
 
 
 def _reshape_state(state: State, shape: tuple[int, int], wanted: tuple[int, int]) -> State:
@@ -205,14 +202,10 @@ def sample_truth(
 
     Parameters
     ----------
-    robot : Mechanism
-        Parameters that are fixed or have no tolerance stay nominal.
-    n_trials : int
-    seed : int or BlockStream
-        Trial i gets the same values for any number of trials.
-    distribution : "normal" or "uniform"
-        Of the errors. The tolerances are their standard deviations in both: uniform errors lie
-        within sqrt(3) of them.
+    robot : parameters that are fixed or have no tolerance stay nominal.
+    n_trials : trial i gets the same values for any number of trials.
+    distribution : of the errors, "normal" or "uniform". The tolerances are their standard
+        deviations in both: uniform errors lie within sqrt(3) of them.
 
     Returns
     -------
@@ -291,7 +284,9 @@ def simulate_trials(
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
     kinds = [sensor.kind for sensor in instrument.sensors]
     check_redundancy(robot, kinds)
-    values = _check_truth(robot, truth)
+    values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, len(robot.parameters)))
+    if not len(values):
+        raise DataError("truth has no row; give the parameter values of at least one machine")
     geometry = robot.nominal if controller is None else controller
     commanded = solve_commanded_poses(geometry, poses, *pose_names)
     readings, n = commanded.q, len(commanded.q)
@@ -308,15 +303,31 @@ def simulate_trials(
     joints = select_joint_values(
         robot, list_sensed_joints(s.kind for s in assigned.sensors), true, state
     )
-    noise = [_draw_noise(assigned, make_random_stream(seed, i, NOISE)) for i in range(len(values))]
-    measured = tuple(
-        _measure_sensor(k, sensor, disturbance.displace(T), reached, joints, noise, nuisance)
-        for k, sensor in enumerate(assigned.sensors)
-    )
+    streams = [make_random_stream(seed, trial, NOISE) for trial in range(len(values))]
+    seen = np.where(reached[..., None, None], disturbance.displace(T), np.eye(4))
+    measured = []
+    for k, sensor in enumerate(assigned.sensors):
+        kind, rows = sensor.kind, sensor.assigned_rows
+        noise = np.stack([sensor.noise.draw(stream, len(rows)) for stream in streams])
+        setup = nuisance.select(k, nuisance.table.nominal[None])
+        columns = kind.measure(seen[:, rows], noise, setup, kind.stack_joints(joints, rows))
+        if not kind.is_of_base:
+            complete = np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1)
+            columns = np.where(complete[..., None], columns, np.nan)
+        measured.append(columns)
     shown = true if disturbance.readings is None else true - disturbance.readings
     recorded, sigma = record_readings(robot, shown, reading_sigma, len(values), seed)
     return Trials(
-        assigned, robot.name, readings, measured, values, T, reached, nuisance, recorded, sigma
+        assigned,
+        robot.name,
+        readings,
+        tuple(measured),
+        values,
+        T,
+        reached,
+        nuisance,
+        recorded,
+        sigma,
     )
 
 
@@ -330,18 +341,7 @@ def simulate(
     reading_sigma: ArrayLike | None = None,
     pose_names: tuple[Sequence[str], Sequence[str]] = ((), ()),
 ) -> Measurements:
-    """Measure commanded poses on one machine: trial 0 of `simulate_trials`.
-
-    Parameters
-    ----------
-    robot : Mechanism
-        The true machine, at its true values.
-    poses, instrument, seed, controller, nuisance_values, reading_sigma, pose_names
-        As for `simulate_trials`.
-
-    Returns
-    -------
-    measurements : Measurements
+    """Measure commanded poses on one machine, at its true values: trial 0 of `simulate_trials`.
 
     Raises
     ------
@@ -350,10 +350,9 @@ def simulate(
         of the controller.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
-    truth = robot.values[None]
     trials = simulate_trials(
         robot,
-        truth,
+        robot.values[None],
         poses,
         instrument,
         seed,
@@ -381,14 +380,9 @@ def replace_measured_values(
 
     Parameters
     ----------
-    robot : Mechanism
-        The true machine, at its values.
-    data : Measurements
-        Poses and rows; their measured values are ignored.
-    instrument : Instrument
-        A sensor with its noise for each of `data.all_observations`, in their order.
-    seed : int
-        Of the noise.
+    robot : the true machine, at its values.
+    instrument : a sensor with its noise for each of `data.all_observations`, in their order.
+    seed : of the noise.
 
     Raises
     ------
@@ -418,35 +412,6 @@ def replace_measured_values(
     return replace(filled, readings=measured.readings, reading_sigma=measured.reading_sigma)
 
 
-def _check_truth(robot: Mechanism, truth: ArrayLike) -> FloatArray:
-    """Return true parameter values (t, p) of at least one machine, checked."""
-    values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, len(robot.parameters)))
-    if not len(values):
-        raise DataError("truth has no row; give the parameter values of at least one machine")
-    return values
-
-
-def _measure_sensor(
-    k: int,
-    sensor: Sensor,
-    T: FloatArray,
-    reached: BoolArray,
-    joints: Mapping[str, FloatArray],
-    noise: list[list[FloatArray]],
-    nuisance: NuisanceParameters,
-) -> FloatArray:
-    """Return columns (t, r, c) of sensor k at true poses; NaN where these were not reached."""
-    kind, rows = sensor.kind, sensor.assigned_rows
-    safe = np.where(reached[..., None, None], T, np.eye(4))
-    values = nuisance.select(k, nuisance.table.nominal[None])
-    drawn = np.stack([of_trial[k] for of_trial in noise])
-    measured = kind.measure(safe[:, rows], drawn, values, kind.stack_joints(joints, rows))
-    if kind.is_of_base:
-        return measured
-    complete = np.asarray(np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1))
-    return np.where(complete[..., None], measured, np.nan)
-
-
 def record_readings(
     robot: Mechanism, true: FloatArray, sigma: ArrayLike | None, trials: int, seed: Seed
 ) -> tuple[FloatArray | None, FloatArray | None]:
@@ -463,16 +428,6 @@ def record_readings(
     noise = np.where(present, resolved, 0.0) * draws
     return np.where(present, true + noise, np.nan), resolved
 
-
-def _draw_noise(instrument: Instrument, generator: np.random.Generator) -> list[FloatArray]:
-    """Return noise (r, m) of each sensor, in order from one stream."""
-    return [
-        sensor.noise.draw(generator, len(sensor.assigned_rows)) for sensor in instrument.sensors
-    ]
-
-
-# --- Simulated measurements by contact: the operator moves a machine until its points touch
-# surfaces.
 
 STEPS = 20
 """Corrections of a commanded position: each leaves the share by which the geometry is wrong."""
@@ -500,8 +455,23 @@ def simulate_contacts(
         Another kind of rows, a machine that cannot move in x, y and z, or points that it cannot
         bring to their surfaces.
     """
-    _check_sheet(robot, sheet)
-    sheet = _fill_gaps(sheet)
+    other = [o.kind.name for o in sheet.observations if not isinstance(o.kind, Plane | Line)]
+    if other:
+        raise DataError(
+            f"rows of the kind {other[0]!r} state no readings; only points on planes and lines are "
+            "simulated without readings"
+        )
+    missing = [name for name in POSITION if name not in robot.controlled]
+    if missing:
+        raise DataError(
+            f"{robot.name} does not control {', '.join(missing)}, so that its points cannot be "
+            "moved to planes and lines"
+        )
+    filled = tuple(
+        replace(o, measured=np.nan_to_num(np.where(o.present, o.measured, 0.0)))
+        for o in sheet.observations
+    )
+    sheet = replace(sheet, observations=filled)
     generator = make_random_stream(seed, 0)
     noise = [
         sensor.noise.draw(generator, len(rows))
@@ -518,38 +488,15 @@ def simulate_contacts(
         rows = evaluate_measurements(sheet, T[None], values[None])
         shift, largest = _correct_positions(sheet, rows, noise)
         if largest <= limit:
-            return _record(robot, sheet, q, seed)
+            recorded, sigma = record_readings(robot, q[None], sheet.reading_sigma, 1, seed)
+            readings = q if recorded is None else recorded[0]
+            return replace(sheet, readings=readings, reading_sigma=sigma)
         commanded[:, places] += shift
         q, T = _command(robot, commanded, sheet)
     raise DataError(
         f"{robot.name} does not bring all points to their surfaces: a gap of {largest:.3g} m is "
         f"left after {STEPS} corrections; simulate smaller errors"
     )
-
-
-def _check_sheet(robot: Mechanism, sheet: Measurements) -> None:
-    """Refuse rows other than planes and lines, and a machine that does not move in x, y and z."""
-    other = [o.kind.name for o in sheet.observations if not isinstance(o.kind, Plane | Line)]
-    if other:
-        raise DataError(
-            f"rows of the kind {other[0]!r} state no readings; only points on planes and lines are "
-            "simulated without readings"
-        )
-    missing = [name for name in POSITION if name not in robot.controlled]
-    if missing:
-        raise DataError(
-            f"{robot.name} does not control {', '.join(missing)}, so that its points cannot be "
-            "moved to planes and lines"
-        )
-
-
-def _fill_gaps(sheet: Measurements) -> Measurements:
-    """Return the sheet with a gap of zero where none is stated."""
-    filled = tuple(
-        replace(o, measured=np.nan_to_num(np.where(o.present, o.measured, 0.0)))
-        for o in sheet.observations
-    )
-    return replace(sheet, observations=filled)
 
 
 def _command(
@@ -606,10 +553,3 @@ def _correct_positions(
         is_of_pose = poses == pose
         shift[pose] = np.linalg.lstsq(along[is_of_pose], -gap[is_of_pose], rcond=None)[0]
     return shift, float(np.abs(gap).max(initial=0.0))
-
-
-def _record(robot: Mechanism, sheet: Measurements, q: FloatArray, seed: int) -> Measurements:
-    """Return the sheet with recorded readings."""
-    recorded, sigma = record_readings(robot, q[None], sheet.reading_sigma, 1, seed)
-    readings = q if recorded is None else recorded[0]
-    return replace(sheet, readings=readings, reading_sigma=sigma)

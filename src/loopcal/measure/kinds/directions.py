@@ -153,7 +153,7 @@ class AxisKind(DirectionKind):
 class Direction(AxisKind):
     """Direction of an axis as a unit vector, such as the normal of a probed face.
 
-    Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to the measured direction m.
+    Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to the measured m.
 
     The residual is twice the tangent of half the angle between the predicted direction d and m,
     along the two vectors B. It equals the angle where that is small, and is unbounded where d is
