@@ -40,21 +40,15 @@ RELATIONS: Mapping[str, Callable[[Any, Any], Any]] = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement of one claim.
-
-    Attributes
-    ----------
-    claim, where, name : the statement, its place in the paper or OWN_CHECK, its name in text.yaml.
-    agrees : whether the numbers support it; None if they cannot decide, or if draws differ.
-    why : the evidence in a sentence or two, with the numbers of this run.
-    draws : whether each repeated draw of a random study supports the claim (None: cannot decide).
-    """
+    """The judgement of one claim."""
 
     claim: str
+    # whether the numbers support it; None if they cannot decide, or if draws differ
     agrees: bool | None
-    why: str
-    where: str
-    name: str = ""
+    why: str  # the evidence in a sentence or two, with the numbers of this run
+    where: str  # place in the paper, or OWN_CHECK
+    name: str = ""  # in text.yaml
+    # whether each repeated draw of a random study supports the claim (None: cannot decide)
     draws: tuple[bool | None, ...] = ()
 
     @property

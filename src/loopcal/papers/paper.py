@@ -35,18 +35,12 @@ ANY_ERRORS = "errors: [1]  # normal errors, in tolerances of the robot file"
 
 @dataclass(frozen=True)
 class Paper:
-    """A published study that can be repeated.
+    """A published study that can be repeated."""
 
-    Attributes
-    ----------
-    name : on the command line. title, source : what it is and where it is published.
-    studies : robot -> its study file in the folder of the paper; that of the first one is adapted
-        to other robots.
-    """
-
-    name: str
+    name: str  # on the command line
     title: str
     source: str
+    # robot -> its study file in the folder; that of the first robot is adapted to other robots
     studies: Mapping[str, str]
 
     @property
@@ -148,20 +142,14 @@ def find_paper(name: str) -> Paper:
 
 @dataclass(frozen=True)
 class PaperStudyFile:
-    """A study file to write.
+    """A study file to write."""
 
-    Attributes
-    ----------
-    path, text : of the study file. poses, poses_text : of the file of poses beside it; None and ""
-        without one. robot : that the study names. replaced : keys of the study that belonged to the
-        robot of the paper and were replaced, too.
-    """
-
-    path: Path
+    path: Path  # of the study file
     text: str
-    poses: Path | None
+    poses: Path | None  # of the file of poses beside it
     poses_text: str
-    robot: str
+    robot: str  # that the study names
+    # keys of the study that belonged to the robot of the paper and were replaced, too
     replaced: tuple[str, ...]
 
     @property

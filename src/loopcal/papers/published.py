@@ -35,12 +35,8 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text and numbers.
-
-    Attributes
-    ----------
-    name : of its file. title, note : what it shows. columns : their names, with units.
-    formats : of each column on a page ("" for text). shown : rows on a page, None for all.
+    """Rows of text and numbers; name : of its file. formats : of the columns on a page ("" for
+    text). shown : rows on a page, None for all.
     """
 
     name: str
@@ -68,6 +64,35 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Series:
+    """A line of a figure: points x, y. A label that begins with _ is not in the legend."""
+
+    label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+
+    @classmethod
+    def of(cls, label: str, x: Sequence[Any] | FloatArray, y: Sequence[Any] | FloatArray) -> Series:
+        """Return a line of numbers."""
+        return cls(label, tuple(map(float, x)), tuple(map(float, y)))
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure as data, with units on the axes and the number of cases in the caption."""
+
+    name: str  # of its file
+    title: str
+    x_label: str
+    y_label: str
+    caption: str
+    series: tuple[Series, ...]
+    levels: Mapping[str, float] = field(default_factory=dict)  # horizontal lines by label
+    log: str = "y"  # logarithmic axes: "", "x", "y" or "xy"
+    joined: bool = True  # whether lines join points; not if the order along x means nothing
+
+
+@dataclass(frozen=True)
 class Printed:
     """A block of printed numbers: a row of texts under each label."""
 
@@ -86,23 +111,18 @@ class Printed:
     @cached_property
     def values(self) -> FloatArray:
         """(r, c) the numbers, in the units they are printed in."""
-        return np.array([[float(cell) for cell in row] for row in self.rows.values()])
+        return np.array([list(map(float, row)) for row in self.rows.values()])
 
     @cached_property
     def unit(self) -> FloatArray:
         """(r, c) one unit of the last digit."""
-        return np.array([[last_digit(cell) for cell in row] for row in self.rows.values()])
+        return np.array([list(map(last_digit, row)) for row in self.rows.values()])
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A published table beside computed numbers.
-
-    Attributes
-    ----------
-    name : of its file. title, note : what is compared. columns : of the printed block, with units.
-    published : as printed. computed : (r, c). yardstick : (r, c) difference within which numbers
-        agree; default: one unit of the last printed digit.
+    """A published table beside computed numbers (r, c), which agree within a yardstick (r, c); by
+    default it is one unit of the last printed digit.
     """
 
     name: str
@@ -154,12 +174,12 @@ class Comparison:
 
     def table(self) -> Table:
         """One row for each number."""
+        numbers = (self.computed, self.difference, self.step, self.within)
         rows = [
-            (label, column, printed, *(a[i, j].item() for a in
-             (self.computed, self.difference, self.step, self.within)))
+            (label, column, printed, *(array[i, j].item() for array in numbers))
             for i, (label, texts) in enumerate(self.published.rows.items())
             for j, (column, printed) in enumerate(zip(self.columns, texts, strict=True))
-        ]  # fmt: skip
+        ]
         columns = ("row", "column", "published", "computed", "difference",
                    "unit of the last digit", "within one unit")  # fmt: skip
         formats = ("", "", "", ".9g", ".2g", ".0e", "")
@@ -171,8 +191,8 @@ class Comparison:
         """
         lines: list[tuple[Cell, ...]] = []
         for i, (label, texts) in enumerate(self.published.rows.items()):
-            computed = (_like(*pair) for pair in zip(self.computed[i], texts, strict=True))
-            shown = [f"{d:.1e}" if d else "0" for d in self.difference[i]]
+            computed = map(_write_like, self.computed[i], texts)
+            shown = (f"{d:.1e}" if d else "0" for d in self.difference[i])
             marked = (d if ok else f"**{d}**" for d, ok in zip(shown, self.within[i], strict=True))
             lines += [(label, "published", *texts), ("", "computed", *computed)]
             lines.append(("", "difference", *marked))
@@ -181,68 +201,14 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Series:
-    """A line of a figure: points x, y. A label that begins with _ is not in the legend."""
-
-    label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-
-    @classmethod
-    def of(cls, label: str, x: Sequence[Any] | FloatArray, y: Sequence[Any] | FloatArray) -> Series:
-        """Return a line of numbers."""
-        return cls(label, tuple(map(float, x)), tuple(map(float, y)))
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A figure as data.
-
-    Attributes
-    ----------
-    name : of its file. title, x_label, y_label, caption : texts, with units on the axes and the
-        number of cases in the caption.
-    series : the lines. levels : horizontal lines by label. log : logarithmic axes: "", "y" or "xy".
-    joined : whether lines join the points of a series; not if the order along x means nothing.
-    """
-
-    name: str
-    title: str
-    x_label: str
-    y_label: str
-    caption: str
-    series: tuple[Series, ...]
-    levels: Mapping[str, float] = field(default_factory=dict)
-    log: str = "y"
-    joined: bool = True
-
-
-@dataclass(frozen=True)
-class _File:
-    """A data file beside a module of a paper (its `__file__`), read when it is needed."""
+class Published:
+    """The published.yaml beside a module of a paper (its `__file__`): texts by keys."""
 
     module: str
 
-    @cached_property
-    def content(self) -> Mapping[str, Any]:
-        """What the file says."""
-        return _read_content(Path(self.module).with_name(self.file_name))
-
-    @property
-    def file_name(self) -> str:
-        """Name of the file."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class Published(_File):
-    """The printed numbers of a paper, as text."""
-
-    file_name = "published.yaml"
-
     def find(self, *keys: str) -> Any:
         """Return the text or mapping at these keys."""
-        found = self.content
+        found = _read_file(self.module, "published.yaml")
         for key in keys:
             found = found[key]
         return found
@@ -257,10 +223,15 @@ class Published(_File):
 
 
 @dataclass(frozen=True)
-class PaperText(_File):
-    """The words of a paper, filled with numbers."""
+class PaperText:
+    """The text.yaml beside a module of a paper (its `__file__`), filled with numbers `data`."""
 
-    file_name = "text.yaml"
+    module: str
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """What the file says."""
+        return _read_file(self.module, "text.yaml")
 
     def about(self, **data: Any) -> tuple[str, ...]:
         """Return the paragraphs at the beginning of the page."""
@@ -274,25 +245,17 @@ class PaperText(_File):
         self, name: str, rows: Iterable[Sequence[Any]], file_name: str = "",
         more: Sequence[tuple[str, str]] = (), /, **data: Any,
     ) -> Table:  # fmt: skip
-        """Return a table of computed rows.
-
-        Parameters
-        ----------
-        name : in text.yaml. rows : of cells. file_name : of the written table; default `name`.
-        more : titles and formats of further columns. data : numbers in title, columns and note.
-        """
+        """Return a table of computed rows; more : titles and formats of further columns."""
         text = self.content["tables"][name]
-        titles = (*text["columns"], *(title for title, _ in more))
+        titles = (text["title"], text.get("note", ""), *text["columns"], *(t for t, _ in more))
+        title, note, *columns = (fill_template(part, **data) for part in titles)
         formats = (*text["formats"], *(spec for _, spec in more))
-        cells = tuple(
+        cells = (
             tuple(cell.item() if isinstance(cell, np.generic) else cell for cell in row)
             for row in rows
         )
-        title, note, *columns = (
-            fill_template(part, **data) for part in (text["title"], text.get("note", ""), *titles)
-        )
-        shown = text.get("shown")
-        return Table(file_name or name, title, tuple(columns), cells, formats, note, shown)
+        name, shown = file_name or name, text.get("shown")
+        return Table(name, title, tuple(columns), tuple(cells), formats, note, shown)
 
     def compare(
         self, name: str, published: Printed, computed: FloatArray,
@@ -307,13 +270,7 @@ class PaperText(_File):
         self, name: str, series: Iterable[Series], levels: Mapping[str, float] | None = None,
         file_name: str = "", log: str | None = None, /, *, joined: bool = True, **data: Any,
     ) -> Figure:  # fmt: skip
-        """Return a figure.
-
-        Parameters
-        ----------
-        name : in text.yaml. series, levels, log, joined : see `Figure`; default of log: that of
-            text.yaml. file_name : of the written figure; default `name`. data : numbers in texts.
-        """
+        """Return a figure; log : default that of text.yaml."""
         text = self.content["figures"][name]
         words = (fill_template(text[key], **data) for key in ("title", "x", "y", "caption"))
         log = text.get("log", "y") if log is None else log
@@ -331,7 +288,7 @@ def last_digit(text: str) -> float:
     return float(Decimal(1).scaleb(int(Decimal(text).as_tuple().exponent)))
 
 
-def _like(value: float, printed: str) -> str:
+def _write_like(value: float, printed: str) -> str:
     """Write a number as the printed one is, with one digit more."""
     if "E" in printed.upper():
         return f"{value:.3e}"
@@ -339,7 +296,7 @@ def _like(value: float, printed: str) -> str:
 
 
 @cache
-def _read_content(path: Path) -> dict[str, Any]:
+def _read_file(module: str, name: str) -> dict[str, Any]:
     from loopcal.io.core.yaml_file import read_yaml
 
-    return read_yaml(path, "file of a paper", has_names=False).content
+    return read_yaml(Path(module).with_name(name), "file of a paper", has_names=False).content

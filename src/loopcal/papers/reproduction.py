@@ -47,20 +47,14 @@ class Content(NamedTuple):
 
 @dataclass(frozen=True)
 class Reproduction:
-    """A repeated paper.
-
-    Attributes
-    ----------
-    paper, title, source : which one. about : paragraphs on what was done.
-    settings : seed and sizes of this run. content : its results.
-    """
+    """A repeated paper."""
 
     paper: str
     title: str
     source: str
-    about: tuple[str, ...]
-    settings: Mapping[str, Any]
-    content: Content
+    about: tuple[str, ...]  # paragraphs on what was done
+    settings: Mapping[str, Any]  # seed and sizes of this run
+    content: Content  # its results
 
     @property
     def verdict_groups(self) -> dict[str, tuple[tuple[int, Verdict], ...]]:

@@ -16,7 +16,6 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     ALIGNED,
     AT_NOMINAL,
     BEFORE,
-    FRAMES,
     LS,
     METHODS,
     MM,
@@ -24,16 +23,7 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     PRINTED,
     PRIOR,
     SET,
-    Arrangement,
-    Candidate,
-    Cell,
     Draw,
-    FiftyPoints,
-    Forms,
-    GroupRank,
-    Stated,
-    Study,
-    compute_draw,
 )
 from loopcal.papers.published import Comparison, Figure, PaperText, Printed, Series, Table
 from loopcal.papers.reproduction import Content
@@ -59,30 +49,22 @@ MOTIONS = (
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All computed numbers, before they are judged.
+    """All computed numbers, before they are judged."""
 
-    Attributes
-    ----------
-    study : the ten groups. draws : tables and figures show the first.
-    arrangements : TEN, ONE and ANY. candidates : interpretations. forms : surfaces as unknowns.
-    ranks : of random groups. pair : points of a group and rank of the equations of all its pairs.
-    gauge_effects : (9,) of the directions of GAUGE_NAMES on the rows.
-    table_4, conclusion : factors as printed.
-    """
-
-    study: Study
-    draws: tuple[Draw, ...]
-    arrangements: tuple[Arrangement, Arrangement, Arrangement]
-    candidates: tuple[Candidate, ...]
-    forms: Forms
-    ranks: tuple[GroupRank, ...]
-    pair: tuple[int, int]
-    gauge_effects: FloatArray
-    table_4: Mapping[str, Stated]
-    conclusion: Mapping[str, str]
+    study: steps.Study  # the ten groups
+    draws: tuple[Draw, ...]  # tables and figures show the first
+    arrangements: tuple[steps.Arrangement, steps.Arrangement, steps.Arrangement]  # TEN, ONE and ANY
+    candidates: tuple[steps.Candidate, ...]  # interpretations
+    forms: tuple[steps.FormRow, ...]  # surfaces as unknowns, the hardest first
+    covariance: float  # largest relative difference of a variance of both forms
+    ranks: tuple[steps.GroupRank, ...]  # of random groups
+    pair: tuple[int, int]  # points of a group and rank of the equations of all its pairs
+    gauge_effects: FloatArray  # (9,) of the directions of GAUGE_NAMES on the rows
+    table_4: Mapping[str, steps.Stated]  # factors as printed
+    conclusion: Mapping[str, str]  # of root mean squares, as printed
 
     @property
-    def cells(self) -> Mapping[tuple[str, str], Cell]:
+    def cells(self) -> Mapping[tuple[str, str], steps.Cell]:
         """Table 3 of the first draw."""
         return self.draws[0].cells
 
@@ -105,7 +87,7 @@ def compute(
     """
     progress("coordinate exchange, ten planes")
     study = steps.plan_points(seed=seed, sweeps=sweeps[0])
-    drawn = [compute_draw(study, seed, trials, progress)]
+    drawn = [steps.compute_draw(study, seed, trials, progress)]
     progress("one plane and one line")
     one = steps.plan_points(1, steps.GROUPS * steps.POINTS, seed=seed, sweeps=sweeps[1])
     progress("planes of any axis")
@@ -122,17 +104,20 @@ def compute(
         other = seed + SEED_STEP * i
         points = steps.plan_points(seed=other, sweeps=sweeps[0])
         label = f"draw {i + 1} of {draws}"
-        drawn.append(compute_draw(points, other, trials, lambda s, n=label: progress(f"{n}: {s}")))
+        drawn.append(
+            steps.compute_draw(points, other, trials, lambda s, n=label: progress(f"{n}: {s}"))
+        )
     return Results(
         study=study,
         draws=tuple(drawn),
         arrangements=(drawn[0].ten, one_plane, any_axis),
         candidates=candidates,
         forms=forms,
+        covariance=steps.compare_covariances(study.layout, min(steps.NOISES)),
         ranks=steps.compute_ranks(study, seed),
         pair=steps.compute_pair_rank(study),
         gauge_effects=steps.compute_gauge_effects(study),
-        table_4={name: Stated(**given) for name, given in PRINTED.find("table_4").items()},
+        table_4={name: steps.Stated(**given) for name, given in PRINTED.find("table_4").items()},
         conclusion=PRINTED.find("conclusion"),
     )
 
@@ -187,9 +172,8 @@ def make_tables(results: Results) -> tuple[Table, ...]:
     forms = [
         (row.noise / MM, row.method, f"{row.converged} of {row.machines}", row.iterations,
          ", ".join(map(str, row.ranks)), row.median, row.largest)
-        for row in results.forms.rows
+        for row in results.forms
     ]  # fmt: skip
-    covariance = results.forms.covariance
     measures = (POSITION_ALIGNED, "orientation, aligned [deg]", NO_GAUGE)
     absolute = ("position [mm]", "orientation [deg]", "parameters [mm]",
                 "position, gauge at nominal [mm]")  # fmt: skip
@@ -203,12 +187,12 @@ def make_tables(results: Results) -> tuple[Table, ...]:
         TEXT.table("arrangements", arrangements, trials=results.trials),
         TEXT.table("weights", weights),
         _list_fifty(results),
-        TEXT.table("forms", forms, errors=steps.ERRORS / MM, covariance=covariance),
+        TEXT.table("forms", forms, errors=steps.ERRORS / MM, covariance=results.covariance),
         _list_arithmetic(results),
     )
 
 
-def _list_given(study: Study) -> Table:
+def _list_given(study: steps.Study) -> Table:
     rows = [("robot", f"{steps.ROBOT}, 42 parameters, nominal geometry of Nategh and Agheli 2009")]
     for name, (low, high) in study.robot.assembly.workspace.items():
         scale, unit = (np.pi / 180.0, "deg") if name in {"roll", "pitch", "yaw"} else (MM, "mm")
@@ -254,7 +238,7 @@ def _list_arithmetic(results: Results) -> Table:
         follows = given.excess == 0.0
         rows.append((f"Table 4, {name}", *numbers, f"{low:.2f} to {high:.2f}", follows))
     for name in ("position", "orientation"):
-        given = Stated(**PRINTED.find("figure_5", name))
+        given = steps.Stated(**PRINTED.find("figure_5", name))
         follows = abs(given.reduction - float(given.stated)) <= 0.5
         numbers = (given.before, given.after, given.stated, given.reduction)
         rows.append((f"Figure 5, {name} [%]", *numbers, None, follows))
@@ -277,10 +261,10 @@ def _draw_figure_4(results: Results) -> Figure:
 
 def _draw_figure_5(results: Results) -> Figure:
     """Return position errors of single poses of the first machine, before and after."""
-    study, made = results.study, results.cells[f"{SET:g}", f"{NOISE:g}"].machines
+    study, made = results.study, results.cells[f"{SET:g}", f"{NOISE:g}"]
     true, sizes = study.held_out.solve(made.truth[:1]), {}
     for name in (BEFORE, *METHODS):
-        T = study.held_out.solve(made.estimates.get(name, study.robot.parameters.nominal[None])[:1])
+        T = study.held_out.solve(made.values.get(name, study.robot.parameters.nominal[None])[:1])
         for frame in (ABSOLUTE, ALIGNED):
             twists = study.held_out.compute_twists(T, true, frame)[0]
             label = name if frame == ABSOLUTE else f"{name}, {frame}"
@@ -318,7 +302,7 @@ def judge_claims(results: Results) -> tuple[Verdict, ...]:
         *_judge_points(results),
         *_judge_arithmetic(results),
         *_judge_methods(results),
-        *_judge_forms(results.forms),
+        *_judge_forms(results),
     )
 
 
@@ -418,7 +402,7 @@ def _judge_points(results: Results) -> tuple[Verdict, ...]:
     }
     falls = [
         bool((fifty.compute_factors(method, frame) > 1.0).all())
-        for fifty in fifties for frame in FRAMES for method in METHODS
+        for fifty in fifties for frame in steps.FRAMES for method in METHODS
     ]  # fmt: skip
     factors = ", ".join(f"{f:.1f}" for f in five_planes.compute_factors(PRIOR, ABSOLUTE))
     within = [draw.fifties[0].within_five for draw in results.draws]
@@ -441,7 +425,7 @@ def _judge_points(results: Results) -> tuple[Verdict, ...]:
     )  # fmt: skip
 
 
-def _format_change(fifty: FiftyPoints, frame: str, method: str) -> str:
+def _format_change(fifty: steps.FiftyPoints, frame: str, method: str) -> str:
     """Return the mean position error before and after, as text."""
     before, after = (fifty.compute_median(m, frame)[0] for m in (BEFORE, method))
     return f"{before:.2g} to {after:.2g} mm"
@@ -500,26 +484,26 @@ def _compare_weights(draw: Draw) -> dict[str, Any]:
     }
 
 
-def _judge_forms(forms: Forms) -> tuple[Verdict, Verdict]:
+def _judge_forms(results: Results) -> tuple[Verdict, Verdict]:
     """Judge the two forms of the equations."""
-    noises = [row.noise / MM for row in forms.rows]
+    forms, (hardest, *others) = results.forms, results.forms
+    noises = [row.noise / MM for row in forms]
     loud, calm = (
-        max(row.median for row in forms.rows if row.noise / MM == noise)
+        max(row.median for row in forms if row.noise / MM == noise)
         for noise in (max(noises), min(noises))
     )
     return (
         TEXT.claim("forms").judge(
-            covariance=forms.covariance, compared=sum(row.converged for row in forms.rows),
-            largest=max((row.largest for row in forms.rows if row.converged), default=np.nan),
-            fits=sum(row.machines for row in forms.rows), noise=max(noises), least=min(noises),
+            covariance=results.covariance, compared=sum(row.converged for row in forms),
+            largest=max((row.largest for row in forms if row.converged), default=np.nan),
+            fits=sum(row.machines for row in forms), noise=max(noises), least=min(noises),
             loud=loud, calm=calm,
         ),
         TEXT.claim("converged").judge(
-            hardest=forms.hardest, noise=forms.hardest.noise / MM,
-            converged=sum(row.converged for row in forms.others),
-            fits=sum(row.machines for row in forms.others),
-            most=max(row.iterations for row in forms.rows),
-            ranks=sorted({rank for row in forms.rows for rank in row.ranks}),
+            hardest=hardest, noise=hardest.noise / MM,
+            converged=sum(row.converged for row in others),
+            fits=sum(row.machines for row in others), most=max(row.iterations for row in forms),
+            ranks=sorted({rank for row in forms for rank in row.ranks}),
             noises=[f"{noise:g}" for noise in sorted(set(noises))],
         ),
     )  # fmt: skip

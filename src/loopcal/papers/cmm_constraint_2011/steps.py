@@ -121,15 +121,10 @@ The first six move all points as one body, which changes no distance and no angl
 
 @dataclass(frozen=True, eq=False)
 class HeldOutPoses:
-    """Poses that were not measured, at which identified machines are compared with true ones.
+    """Poses that were not measured, at which identified machines are compared with true ones."""
 
-    Attributes
-    ----------
-    robot : as designed. solution : 100 random poses of its workspace, as it is commanded to them.
-    """
-
-    robot: Mechanism
-    solution: Solution
+    robot: Mechanism  # as designed
+    solution: Solution  # 100 random poses of its workspace, as it is commanded to them
 
     def solve(self, values: FloatArray) -> FloatArray:
         """Return the poses (t, n, 4, 4) of machines (t, p) at the readings."""
@@ -162,19 +157,13 @@ class HeldOutPoses:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """The robot, the points it is sent to, and the poses at which it is judged.
-
-    Attributes
-    ----------
-    planned : how groups are written as designs. first, optimized : before and after coordinate
-        exchange. seed : of both.
-    """
+    """The robot, the points it is sent to, and the poses at which it is judged."""
 
     robot: Mechanism
-    planned: PlaneLineGroups
-    first: FloatArray
-    optimized: MovedDesign
-    seed: int
+    planned: PlaneLineGroups  # how groups are written as designs
+    first: FloatArray  # design before coordinate exchange
+    optimized: MovedDesign  # design after it
+    seed: int  # of both
 
     @cached_property
     def layout(self) -> Layout:
@@ -325,6 +314,10 @@ def compute_pair_rank(study: Study) -> tuple[int, int]:
 # --- calibrations -------------------------------------------------------------------------------
 
 
+Identified = tuple[Mapping[str, FloatArray], IntArray, Mapping[str, BoolArray]]
+"""Values (t, p) [m] by LS and MAP, iterations (t,) of LS, and which descents (t,) converged."""
+
+
 def compute_median(errors: FloatArray, converged: BoolArray | None = None) -> FloatArray:
     """Return medians (k,) of errors (t, k) of the converged machines (t,); NaN without any."""
     kept = errors if converged is None else errors[converged]
@@ -332,44 +325,29 @@ def compute_median(errors: FloatArray, converged: BoolArray | None = None) -> Fl
 
 
 @dataclass(frozen=True, eq=False)
-class Machines:
-    """True values (t, p) [m] of t machines, and their estimates by method."""
-
-    truth: FloatArray
-    estimates: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True, eq=False)
 class Cell:
-    """t machines with errors of one size, calibrated from points with noise of one size.
+    """t machines with errors of one size, calibrated from points with noise of one size."""
 
-    Attributes
-    ----------
-    sd, noise : standard deviations [m].
-    errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. converged : by LS,
-        MAP, (t,). machines : the true ones, and those that LS and MAP identified.
-    """
-
-    sd: float
-    noise: float
-    errors: Mapping[str, FloatArray]
-    iterations: IntArray
-    converged: Mapping[str, BoolArray]
-    machines: Machines
+    sd: float  # of the parameters [m]
+    noise: float  # standard deviation of a held coordinate [m]
+    errors: Mapping[str, FloatArray]  # by BEFORE, LS, MAP, (t, 7) see MEASURES
+    iterations: IntArray  # (t,) of LS
+    converged: Mapping[str, BoolArray]  # by LS, MAP, (t,)
+    truth: FloatArray  # (t, p) true values [m]
+    values: Mapping[str, FloatArray]  # by LS, MAP, (t, p) identified values [m]
 
     @classmethod
     def judge(
-        cls, study: Study, sd: float, noise: float, machines: Machines, iterations: IntArray,
-        converged: Mapping[str, BoolArray],
-    ) -> Cell:  # fmt: skip
-        """Return calibrated machines with their errors at the held-out poses."""
-        truth, nominal = machines.truth, study.robot.parameters.nominal[None]
-        true = study.held_out.solve(truth)
+        cls, study: Study, sd: float, noise: float, truth: FloatArray, identified: Identified
+    ) -> Cell:
+        """Return identified machines with their errors at the held-out poses."""
+        true, nominal = study.held_out.solve(truth), study.robot.parameters.nominal[None]
+        values, iterations, converged = identified
         errors = {
-            name: study.held_out.compute_errors(values, truth, true)
-            for name, values in {BEFORE: nominal, **machines.estimates}.items()
+            name: study.held_out.compute_errors(v, truth, true)
+            for name, v in {BEFORE: nominal, **values}.items()
         }
-        return cls(sd, noise, errors, iterations, converged, machines)
+        return cls(sd, noise, errors, iterations, converged, truth, values)
 
     @property
     def failed(self) -> int:
@@ -404,19 +382,21 @@ def calibrate_cell(
 ) -> Cell:  # fmt: skip
     """Draw machines, hold their coordinates with noise, identify, compare at held-out poses.
 
-    Parameters
-    ----------
     sd, noise : standard deviations [m], of a parameter and of a coordinate of a point. The prior of
-        MAP has this sd.
+    MAP has this sd.
     """
     truth = draw_true_machines(study.robot, sd, trials, seed, gauge_free)
     q = study.layout.solve_readings(truth, noise, seed)
-    problem = PaperRows(study.layout, q, sd, noise, weights)
+    identified = identify_machines(PaperRows(study.layout, q, sd, noise, weights))
+    return Cell.judge(study, sd, noise, truth, identified)
+
+
+def identify_machines(problem: PaperRows) -> Identified:
+    """Identify machines by LS and MAP."""
     descents = {name: identify_from_rows(problem, method) for name, method in METHODS.items()}
     values = {name: problem.values(descent.deviation) for name, descent in descents.items()}
-    converged = {n: descent.status == DescentStatus.CONVERGED for n, descent in descents.items()}
-    iterations = descents[LS].iterations
-    return Cell.judge(study, sd, noise, Machines(truth, values), iterations, converged)
+    converged = {name: d.status == DescentStatus.CONVERGED for name, d in descents.items()}
+    return values, descents[LS].iterations, converged
 
 
 def calibrate_grid(
@@ -435,11 +415,11 @@ def calibrate_grid(
         for noise in PRINTED.find("noises").split():
             numbers = find_cells(grid, errors=f"set {given}", instrument=f"{noise} mm")
             made = {cell.levels["method"]: cell for cell in calibrate_cells(grid, numbers)}
-            machines = Machines(made[LS].truth, {name: cell.values for name, cell in made.items()})
-            cells[given, noise] = Cell.judge(
-                study, float(given) * MM, float(noise) * MM, machines, made[LS].iterations,
-                {name: cell.is_converged for name, cell in made.items()},
-            )  # fmt: skip
+            values = {name: cell.values for name, cell in made.items()}
+            converged = {name: cell.is_converged for name, cell in made.items()}
+            identified, sizes = (values, made[LS].iterations, converged), (given, noise)
+            sd, sigma = (float(size) * MM for size in sizes)
+            cells[sizes] = Cell.judge(study, sd, sigma, made[LS].truth, identified)
     return cells
 
 
@@ -455,17 +435,12 @@ def compute_rank_correlation(cells: Iterable[Cell], method: str) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FiftyPoints:
-    """t machines calibrated from fifty points.
+    """t machines calibrated from fifty points."""
 
-    Attributes
-    ----------
-    groups : planes. iterations : (t,) of least squares. converged : by LS, MAP, (t,).
-    statistics : by method and frame (see FRAMES), (t, 4) see STATISTICS, over held-out poses.
-    """
-
-    groups: int
-    iterations: IntArray
-    converged: Mapping[str, BoolArray]
+    groups: int  # planes
+    iterations: IntArray  # (t,) of least squares
+    converged: Mapping[str, BoolArray]  # by LS, MAP, (t,)
+    # by method and frame (see FRAMES), (t, 4) see STATISTICS, over held-out poses
     statistics: dict[tuple[str, str], FloatArray]
 
     @property
@@ -494,12 +469,10 @@ def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyP
     layout = plan_points(groups, points, seed=seed + 2, sweeps=0).layout
     truth = draw_true_machines(study.robot, FIFTY_SD, trials, seed)
     problem = PaperRows(layout, layout.solve_readings(truth, noise, seed), FIFTY_SD, noise)
-    descents = {name: identify_from_rows(problem, method) for name, method in METHODS.items()}
-    machines = {BEFORE: study.robot.parameters.nominal[None]}
-    machines |= {name: problem.values(descent.deviation) for name, descent in descents.items()}
+    values, iterations, converged = identify_machines(problem)
     statistics, true = {}, study.held_out.solve(truth)
-    for name, values in machines.items():
-        T = study.held_out.solve(values)
+    for name, v in {BEFORE: study.robot.parameters.nominal[None], **values}.items():
+        T = study.held_out.solve(v)
         for frame in FRAMES:
             twists = study.held_out.compute_twists(T, true, frame)
             position = np.linalg.norm(twists[:, :, 3:], axis=2) / MM
@@ -508,8 +481,7 @@ def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyP
                 [part(e, axis=1) for e in (position, rotation) for part in (np.mean, np.std)],
                 axis=1,
             )
-    converged = {n: descent.status == DescentStatus.CONVERGED for n, descent in descents.items()}
-    return FiftyPoints(groups, descents[LS].iterations, converged, statistics)
+    return FiftyPoints(groups, iterations, converged, statistics)
 
 
 # --- open questions: number of planes, meaning of variances, gauge of errors, weights ------------
@@ -517,19 +489,13 @@ def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyP
 
 @dataclass(frozen=True, eq=False)
 class Arrangement:
-    """A way to place 100 points.
+    """A way to place 100 points."""
 
-    Attributes
-    ----------
-    name : TEN, ONE or ANY. drawn, optimized : see `Study.spreads`. study : the points.
-    cell : set 3 with noise 0.01 mm, as standard deviations.
-    """
-
-    name: str
-    drawn: float
+    name: str  # TEN, ONE or ANY
+    drawn: float  # see `Study.spreads`
     optimized: float
-    cell: Cell
-    study: Study
+    cell: Cell  # set 3 with noise 0.01 mm, as standard deviations
+    study: Study  # the points
 
     @property
     def gain(self) -> float:
@@ -547,17 +513,12 @@ def evaluate_arrangement(name: str, study: Study, seed: int, trials: int) -> Arr
 class Draw:
     """One draw of points, machines and noise. A statement that holds in some draws only is labelled
     so.
-
-    Attributes
-    ----------
-    ten : the ten planes. cells : Table 3, by (set, noise) as printed. weights : the cell of figure
-        5 by weights of the rows. fifties : fifty points on each number of planes in LINES.
     """
 
-    ten: Arrangement
-    cells: Mapping[tuple[str, str], Cell]
-    weights: Mapping[str, Cell]
-    fifties: tuple[FiftyPoints, ...]
+    ten: Arrangement  # the ten planes
+    cells: Mapping[tuple[str, str], Cell]  # Table 3, by (set, noise) as printed
+    weights: Mapping[str, Cell]  # the cell of figure 5 by weights of the rows
+    fifties: tuple[FiftyPoints, ...]  # fifty points on each number of planes in LINES
 
 
 def compute_draw(study: Study, seed: int, trials: int, progress: Callable[[str], None]) -> Draw:
@@ -583,19 +544,13 @@ def compare_weights(ten: Arrangement, seed: int, trials: int) -> dict[str, Cell]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One interpretation of the paper, and the figure 5 that follows from it.
+    """One interpretation of the paper, and the figure 5 that follows from it."""
 
-    Attributes
-    ----------
-    name, reading, truth, frame : how. reductions : (3,) of parameters, position, orientation by
-        least squares [%].
-    """
-
-    name: str
+    name: str  # of the arrangement
     reading: str
     truth: str
     frame: str
-    reductions: FloatArray
+    reductions: FloatArray  # (3,) of parameters, position, orientation by least squares [%]
 
     @property
     def distance(self) -> float:
@@ -633,18 +588,12 @@ def rank_candidates(
 
 @dataclass(frozen=True)
 class Stated:
-    """A number before and after, and its stated improvement.
+    """A number before and after, and its stated improvement."""
 
-    Attributes
-    ----------
-    before, after : as printed, or "". stated : percentage or factor, as printed. unit : of
-        before and after.
-    """
-
-    stated: str
-    before: str = ""
+    stated: str  # percentage or factor, as printed
+    before: str = ""  # as printed
     after: str = ""
-    unit: str = ""
+    unit: str = ""  # of before and after
 
     @property
     def reduction(self) -> float:
@@ -688,45 +637,17 @@ def compute_excess(stated: str, possible: tuple[float, float]) -> float:
 
 @dataclass(frozen=True)
 class FormRow:
-    """How the two forms differ over many machines, with one noise and one method.
+    """How the two forms differ over many machines, with one noise and one method."""
 
-    Attributes
-    ----------
-    noise : [m]. method : its name. machines : their number. converged : on how many both forms
-        converged; the differences are of these.
-    iterations : largest number with surfaces as unknowns. ranks : that occur there.
-    median, largest : over the machines, of the largest difference of the estimates along an
-        identifiable direction [sd].
-    """
-
-    noise: float
-    method: str
-    machines: int
-    converged: int
-    iterations: int
-    ranks: tuple[int, ...]
+    noise: float  # [m]
+    method: str  # its name
+    machines: int  # their number
+    converged: int  # on how many both forms converged; the differences are of these
+    iterations: int  # largest number with surfaces as unknowns
+    ranks: tuple[int, ...]  # that occur there
+    # over the machines, of the largest difference of estimates along an identifiable direction [sd]
     median: float
     largest: float
-
-
-@dataclass(frozen=True)
-class Forms:
-    """How the two forms differ.
-
-    Attributes
-    ----------
-    hardest : all machines, with HARDEST. others : a part of them, with other noises and methods.
-    covariance : largest relative difference of a variance.
-    """
-
-    hardest: FormRow
-    others: tuple[FormRow, ...]
-    covariance: float
-
-    @property
-    def rows(self) -> tuple[FormRow, ...]:
-        """All rows, the hardest first."""
-        return (self.hardest, *self.others)
 
 
 def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
@@ -756,8 +677,10 @@ def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measureme
     return Measurements(layout.robot.name, q, observations)
 
 
-def compare_forms(study: Study, seed: int, trials: int) -> Forms:
-    """Identify machines in both forms, at several noises and by both methods."""
+def compare_forms(study: Study, seed: int, trials: int) -> tuple[FormRow, ...]:
+    """Identify machines in both forms, at several noises and by both methods, HARDEST first: all
+    machines, and a part of them with the others.
+    """
     truth = draw_true_machines(study.robot, ERRORS, trials, seed)
     rows = {}
     for noise in NOISES:
@@ -765,8 +688,7 @@ def compare_forms(study: Study, seed: int, trials: int) -> Forms:
         for name in METHODS:
             count = trials if (noise, name) == HARDEST else max(trials // SHARE, 2)
             rows[noise, name] = compare_estimates(study.layout, q[:count], noise, name)
-    hardest = rows.pop(HARDEST)
-    return Forms(hardest, tuple(rows.values()), compare_covariances(study.layout, NOISES[0]))
+    return (rows.pop(HARDEST), *rows.values())
 
 
 def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) -> FormRow:

@@ -19,15 +19,8 @@ from loopcal.papers.hexapod_42.steps import (
     PRINTED,
     STATED,
     TO_PRINTED,
-    Iterations,
-    Level,
-    MethodResult,
-    Order,
-    Outliers,
     Setup,
-    compute_rms,
     to_table,
-    write_rotation,
 )
 from loopcal.papers.published import Cell, Comparison, Figure, PaperText, Printed, Series, Table
 from loopcal.papers.reproduction import Content
@@ -41,31 +34,21 @@ TEXT = PaperText(__file__)
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All computed numbers, before they are judged.
+    """All computed numbers, before they are judged."""
 
-    Attributes
-    ----------
-    setup : the machine of Tables 2 and 3.
-    runs : the ten steps without noise ("exact"), the same with one matrix throughout ("frozen"),
-        and with two levels of noise ("presumed", "stated").
-    levels, methods, poses : with other noises, methods and poses. orders, outliers, rounding : what
-        Table 4 shows. comparisons : by name of the table.
-    sizes : (4,) of Tables 5 and 6, see `Level`. explained : (6,) and noise : (n, 6) [m, rad], what
-        both tables imply.
-    """
-
-    setup: Setup
-    runs: Mapping[str, Iterations]
-    levels: Mapping[tuple[float, float], Level]
-    methods: Mapping[str, MethodResult]
+    setup: Setup  # the machine of Tables 2 and 3
+    # "exact": without noise; "frozen": the same with one matrix; "presumed", "stated": with noise
+    runs: Mapping[str, steps.Iterations]
+    levels: Mapping[tuple[float, float], steps.Level]  # by limits of the noise
+    methods: Mapping[str, steps.MethodResult]
     poses: list[tuple[Cell, ...]]
-    orders: tuple[Order, ...]
-    outliers: Outliers
+    orders: tuple[steps.Order, ...]  # the best first
+    outliers: steps.Outliers
     rounding: Mapping[str, tuple[int | None, float]]
-    comparisons: Mapping[str, Comparison]
-    sizes: FloatArray
-    explained: FloatArray
-    noise: FloatArray
+    comparisons: Mapping[str, Comparison]  # by name of the table
+    sizes: FloatArray  # (4,) of Tables 5 and 6, see `Level`
+    explained: FloatArray  # (6,) share of the residuals of Table 6 that parameters explain
+    noise: FloatArray  # (n, 6) [m, rad] that Tables 5 and 6 imply
 
 
 def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
@@ -123,7 +106,9 @@ def present(results: Results) -> Content:
 # --- tables and figures -------------------------------------------------------------------------
 
 
-def compare_tables(setup: Setup, exact: Iterations, noisy: Iterations) -> tuple[Comparison, ...]:
+def compare_tables(
+    setup: Setup, exact: steps.Iterations, noisy: steps.Iterations
+) -> tuple[Comparison, ...]:
     """Return Tables 2 to 6, printed beside computed."""
     used = find_rule()[1]
     robot, measured = setup.robot, PRINTED.table("table_4", "PP")
@@ -184,7 +169,7 @@ def make_tables(results: Results) -> tuple[Table, ...]:
     runs, trials = results.runs.values(), len(results.levels[STATED].needed)
     figure_4 = [(str(k), *(run.integrated[k] for run in runs)) for k in range(ITERATIONS + 1)]
     needed = ("iterations needed", *(run.count_needed(threshold) for run in runs))
-    stated = write_rotation(PRINTED.find("rotation", "order"))
+    stated = steps.write_rotation(PRINTED.find("rotation", "order"))
     low, high = steps.RANGES[steps.WIDE]
     outliers = [
         (o.label, o.chi_square, o.degrees, o.p_value, o.drop, o.label in results.outliers.labels)
@@ -200,7 +185,7 @@ def make_tables(results: Results) -> tuple[Table, ...]:
                                     for i, o in enumerate(results.orders, 1)]),
         TEXT.table("outliers", outliers, largest=max(fit.drop for fit in results.outliers.last)),
         TEXT.table("rounding", [(name, *row) for name, row in results.rounding.items()],
-                   rotation=write_rotation(steps.ORDER)),
+                   rotation=steps.write_rotation(steps.ORDER)),
         TEXT.table("noise", _list_levels(results), iterations=used),
         TEXT.table("methods", methods, limits=STATED, trials=trials, unmeasured=steps.UNMEASURED),
         TEXT.table("poses", results.poses, trials=trials, low=low, high=high,
@@ -222,7 +207,7 @@ def _list_levels(results: Results) -> list[tuple[Cell, ...]]:
 
 def _compute_initial_error(results: Results) -> float:
     """Return the rms parameter error [mm] of the machine as designed."""
-    return compute_rms((results.setup.robot.values - results.setup.truth.values) / MM)
+    return steps.compute_rms((results.setup.robot.values - results.setup.truth.values) / MM)
 
 
 def _describe_noise(limits: tuple[float, float]) -> str:
@@ -279,7 +264,7 @@ def judge_claims(results: Results) -> tuple[Verdict, ...]:
 
 def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
     best, second = results.orders[:2]
-    printed = write_rotation(PRINTED.find("rotation", "order"))
+    printed = steps.write_rotation(PRINTED.find("rotation", "order"))
     stated = next(order for order in results.orders if order.formula == printed)
     fourth = results.comparisons["table_4"]
     labels = fourth.published.labels

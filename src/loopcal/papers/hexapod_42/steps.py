@@ -92,16 +92,11 @@ PRINTED = Published(__file__)
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Step 1.
+    """Step 1."""
 
-    Attributes
-    ----------
-    robot : the machine as designed. truth : with its errors. poses : (n, 6) nominal [m, rad].
-    """
-
-    robot: Mechanism
-    truth: Mechanism
-    poses: FloatArray
+    robot: Mechanism  # the machine as designed
+    truth: Mechanism  # with its errors
+    poses: FloatArray  # (n, 6) nominal [m, rad]
 
     @cached_property
     def commanded(self) -> Solution:
@@ -200,20 +195,12 @@ def compute_rms(values: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Iterations:
-    """Result of steps 4 to 10. Index k is the state after k iterations, 0 the nominal machine.
+    """Result of steps 4 to 10. Index k is the state after k iterations, 0 the nominal machine."""
 
-    Attributes
-    ----------
-    machines : (k + 1) corrected machines.
-    pose_errors : (k + 1, n, 6) measured minus corrected [m, rad].
-    integrated : (k + 1,) max dQint [mm + rad].
-    conditions : (6,) condition number of each leg's matrix in the first iteration.
-    """
-
-    machines: tuple[Mechanism, ...]
-    pose_errors: FloatArray
-    integrated: FloatArray
-    conditions: FloatArray
+    machines: tuple[Mechanism, ...]  # (k + 1) corrected machines
+    pose_errors: FloatArray  # (k + 1, n, 6) measured minus corrected [m, rad]
+    integrated: FloatArray  # (k + 1,) max dQint [mm + rad]
+    conditions: FloatArray  # (6,) condition number of each leg's matrix in the first iteration
 
     def count_needed(self, threshold: float) -> int | None:
         """Return the iterations until max dQint is at most the threshold; None if it never is."""
@@ -288,16 +275,11 @@ def integrate_errors(errors: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Results with one level of noise.
+    """Results with one level of noise."""
 
-    Attributes
-    ----------
-    sizes : (t, 4) after calibration: pose residual rms [mm] and [rad], parameter error rms [mm],
-        max dQint [mm + rad]. needed : (t,) iterations, infinite for never.
-    """
-
+    # (t, 4): rms of pose residuals [mm], [rad] and of parameter errors [mm], max dQint [mm + rad]
     sizes: FloatArray
-    needed: FloatArray
+    needed: FloatArray  # (t,) iterations, infinite for never
 
     @property
     def median(self) -> FloatArray:
@@ -469,15 +451,10 @@ class ReducedFit:
 
 @dataclass(frozen=True)
 class Outliers:
-    """The search for outliers.
+    """The search for outliers."""
 
-    Attributes
-    ----------
-    labels : of the outliers, in the order in which they were removed.
-    first, last : fits without each pose, before the first removal and after the last.
-    """
-
-    labels: tuple[str, ...]
+    labels: tuple[str, ...]  # of the outliers, in the order in which they were removed
+    # fits without each pose, before the first removal and after the last
     first: tuple[ReducedFit, ...]
     last: tuple[ReducedFit, ...]
 

@@ -26,10 +26,8 @@ from loopcal.papers.tsvd_2016.steps import (
     CROSS,
     GAIN,
     HINDSIGHT,
-    LIMITS,
     LS,
     NARROW,
-    PRINTED,
     PRIOR,
     PRIOR_FIVE,
     RANKED,
@@ -38,16 +36,12 @@ from loopcal.papers.tsvd_2016.steps import (
     RAW_RE,
     RAW_TSVD,
     RE,
-    TRUE,
     TSVD,
     WHITENED,
     WIDE,
     Case,
     Draws,
     Situation,
-    Study,
-    Sweep,
-    compute_rise,
 )
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -85,19 +79,13 @@ SETTING, LOG = {RE: "lambda", TSVD: "k"}, {RE: "xy", TSVD: "y"}
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All computed numbers, before they are judged.
+    """All computed numbers, before they are judged."""
 
-    Attributes
-    ----------
-    cases : both manipulators, each with 6- and 5-DOF measurement. draws : of both manipulators.
-    ridge_steps : best lambda and errors of RE after RIDGE_STEPS, 3-PRS with 6-DOF measurement.
-    noise : Appendix 1 as printed.
-    """
-
-    cases: Mapping[tuple[str, int], Case]
-    draws: tuple[Draws, ...]
+    cases: Mapping[tuple[str, int], Case]  # both manipulators, each with 6- and 5-DOF measurement
+    draws: tuple[Draws, ...]  # of both manipulators
+    # best lambda and errors of RE after RIDGE_STEPS, 3-PRS with 6-DOF measurement
     ridge_steps: list[tuple[int | str, float, FloatArray]]
-    noise: Printed
+    noise: Printed  # Appendix 1 as printed
 
 
 def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
@@ -110,7 +98,7 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
     progress("ridge steps")
     ridge_steps = steps.follow_ridge(cases["3-PRS", 6].study, RIDGE_STEPS)
     draws = tuple(steps.draw_machines(name, seed, trials, progress) for name in steps.ROBOTS)
-    return Results(cases, draws, ridge_steps, PRINTED.table("appendix_1"))
+    return Results(cases, draws, ridge_steps, steps.PRINTED.table("appendix_1"))
 
 
 def present(results: Results) -> Content:
@@ -134,7 +122,7 @@ def write_file_name(name: str) -> str:
     return name.lower().replace("-", "_")
 
 
-def _name_file(study: Study | Situation) -> str:
+def _name_file(study: steps.Study | Situation) -> str:
     return f"{write_file_name(study.name)}_{study.freedoms}"
 
 
@@ -145,7 +133,7 @@ def _compare_counts(results: Results) -> Comparison:
     numbers = (results.cases["RU-PUS-PRS", 6].rank, tripod.rank, chain,
                len(tripod.study.trials.readings))  # fmt: skip
     computed = np.array(numbers, dtype=np.float64)[:, None]
-    return TEXT.compare("counts", PRINTED.table("counts"), computed)
+    return TEXT.compare("counts", steps.PRINTED.table("counts"), computed)
 
 
 def make_tables(results: Results) -> tuple[Table, ...]:
@@ -180,7 +168,7 @@ def _list_machine(name: str) -> list[tuple[str, str, str]]:
 
 
 def _list_noise(noise: Printed) -> Table:
-    limits = np.array([*LIMITS[:3] * 1e3, *LIMITS[3:]])
+    limits = np.array([*steps.LIMITS[:3] * 1e3, *steps.LIMITS[3:]])
     largest, rms = np.abs(noise.values).max(axis=0), np.sqrt(np.mean(noise.values**2, axis=0))
     columns = (NOISE_COLUMNS, largest, limits, rms, limits / np.sqrt(3.0))
     return TEXT.table("noise", zip(*columns, strict=True))
@@ -201,7 +189,7 @@ def _list_outputs(name: str, results: Results) -> Table:
     study = results.cases[name, 6].study
     rows: list[tuple[Any, ...]] = []
     for method, values in ((BEFORE, study.robot.parameters.nominal[None]),
-                           (TRUE, study.trials.truth)):  # fmt: skip
+                           (steps.TRUE, study.trials.truth)):  # fmt: skip
         commanded = study.compute_commanded_errors(values)[0]
         errors = study.compute_output_errors(values)[0, :4]
         rows.append(("", method, None, *errors, *commanded, None, None))
@@ -320,7 +308,7 @@ def to_document(draws: Draws, seed: int) -> dict[str, Any]:
     def describe(situation: Situation, algorithm: str, measure: int) -> dict[str, Any]:
         median = situation.compute_median(algorithm)[:, measure]
         is_higher = situation.compute_rises(algorithm, measure) > GAIN
-        return {"median": compute_rise(median) > GAIN, "machines": int(is_higher.sum())}
+        return {"median": steps.compute_rise(median) > GAIN, "machines": int(is_higher.sum())}
 
     inside = {
         str(situation.freedoms): {
@@ -357,12 +345,12 @@ def collect_history(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
     return done[:end], to_paper_units(case.study, history[:end])
 
 
-def _find_run(case: Case, algorithm: str) -> tuple[Sweep, int]:
+def _find_run(case: Case, algorithm: str) -> tuple[steps.Sweep, int]:
     sweep = case.sweeps[RE if algorithm == RE else TSVD]
     return sweep, 0 if algorithm == LS else sweep.best
 
 
-def to_paper_units(measured: Study, values: FloatArray) -> FloatArray:
+def to_paper_units(measured: steps.Study, values: FloatArray) -> FloatArray:
     """Return deviations from nominal [mm, rad] of values (.., p)."""
     return (values - measured.robot.parameters.nominal) / steps.list_scales(measured.robot)
 
@@ -474,41 +462,64 @@ def _draw_steps(results: Results) -> Figure:
 # --- verdicts -----------------------------------------------------------------------------------
 
 
+Numbers = Mapping[str, FloatArray]
+"""Quantity -> (t,) its number in each draw."""
+
+
 def judge_claims(results: Results) -> tuple[Verdict, ...]:
     """Return a verdict for each claim."""
     draws = results.draws
-    situations = [situation for draw in draws for situation in draw.situations]
+    situations = {s.label: s for draw in draws for s in draw.situations}
+    six, five = ({draw.situations[i].label: draw for draw in draws} for i in (0, 1))
+    before = {s.label: (draw, s) for draw in draws for s in draw.situations}
+    trials, judge = len(draws[0]), _judge_places
     with np.errstate(divide="ignore", invalid="ignore"):
         return (
-            *map(_judge_curve, situations),
-            _judge_availability(draws),
-            _judge_gain(draws),
-            _judge_best(situations),
-            _judge_failure(draws),
-            _judge_existence(draws),
-            _judge_parameters(draws),
-            _judge_deviation(draws),
-            _judge_speed(situations),
+            *map(_judge_curve, situations.values()),
+            judge("ls_stable", six, _find_diverged, limit=LINEARIZATIONS),
+            judge("ls_not_best", six, _compare_unseen),
+            judge("tsvd_best", situations, _compare_best, trials=trials),
+            judge("ls_fails", five, _compare_five),
+            judge("no_solution", five, _compare_exact),
+            judge("six_better", {draw.name: draw for draw in draws}, _compare_parameters),
+            judge("deviate", before, _compare_deviations),
+            judge("faster", situations, _compare_speed),
             _judge_lambda(results),
             _judge_ratio(draws, "no_rule", CROSS, RAW_RE),
-            _judge_k(situations),
+            judge("k_near_j", situations, _find_best_k),
             _judge_noise(results.noise),
             *_judge_own_checks(draws),
         )
 
 
+def _judge_places(
+    claim: str, places: Mapping[str, Any], compare: Callable[[Any], tuple[Numbers, dict[str, Any]]],
+    **data: Any,
+) -> Verdict:  # fmt: skip
+    """Judge a claim that holds in a draw if it holds in all places; `compare` returns the numbers
+    of a place, and those that the evidence shows.
+    """
+    numbers, rows = {}, []
+    for label, place in places.items():
+        numbers[label], row = compare(place)
+        rows.append({"name": label, **row})
+    return TEXT.claim(claim).judge_everywhere(numbers, rows=rows, **data)
+
+
 def _judge_curve(situation: Situation) -> Verdict:
     """Judge the curves over lambda and k of one figure: position and angle, each machine."""
-    places, curves = {}, []
     rises = {a: [situation.compute_rises(a, i) for i in (0, 1)] for a in (RE, TSVD)}
-    for i, error in enumerate(("position", "angle")):
-        places[error] = {"least_ridge": rises[RE][i], "least_tsvd": rises[TSVD][i]}
-    for algorithm, of_measures in rises.items():
-        for i, error in enumerate(places):
-            numbers = {"count": int((of_measures[i] > GAIN).sum()), "of": len(situation)}
-            words = {"letter": SETTING[algorithm], "error": error}
-            curves.append({**words, **numbers, **_describe_curve(situation, algorithm, i)})
-    short = [sum(compute_rise(curve) > GAIN for curve in situation.short[:, :, i]) for i in (0, 1)]
+    errors = ("position", "angle")
+    places = {error: {"least_ridge": rises[RE][i], "least_tsvd": rises[TSVD][i]}
+              for i, error in enumerate(errors)}  # fmt: skip
+    curves = [
+        {"letter": SETTING[algorithm], "error": error, "count": int((rise[i] > GAIN).sum()),
+         "of": len(situation), **_describe_curve(situation, algorithm, i)}
+        for algorithm, rise in rises.items() for i, error in enumerate(errors)
+    ]  # fmt: skip
+    short = [
+        sum(steps.compute_rise(curve) > GAIN for curve in situation.short[:, :, i]) for i in (0, 1)
+    ]
     return TEXT.claim("u_shape").judge_everywhere(
         places, name=situation.label, curves=curves, iterations=steps.SHORT,
         number=FIGURES[situation.name, situation.freedoms], short=short,
@@ -527,57 +538,41 @@ def _describe_curve(situation: Situation, algorithm: str, i: int) -> dict[str, s
     }
 
 
-def _judge_availability(draws: Sequence[Draws]) -> Verdict:
-    places, lost = {}, []
-    for draw in draws:
-        chosen = draw.six.chosen[LS]
-        diverged, count = np.isinf(chosen.errors[:, 0]), chosen.iterations
-        places[draw.six.label] = {"most_diverged": diverged, "most_iterations": count}
-        slow = int((count >= LINEARIZATIONS).sum())
-        lost.append({"name": draw.six.label, "diverged": int(diverged.sum()), "slow": slow})
-    return TEXT.claim("ls_stable").judge_everywhere(places, lost=lost, limit=LINEARIZATIONS)
+def _find_diverged(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+    """Return where LS diverges, and its iterations, with 6-DOF measurement."""
+    lost, count = np.isinf(draw.six.chosen[LS].errors[:, 0]), draw.six.chosen[LS].iterations
+    row = {"diverged": int(lost.sum()), "slow": int((count >= LINEARIZATIONS).sum())}
+    return {"most_diverged": lost, "most_iterations": count}, row
 
 
-def _judge_gain(draws: Sequence[Draws]) -> Verdict:
-    """Judge RE and TSVD against LS with settings that were best on other machines."""
-    places, gains = {}, []
-    for draw in draws:
-        ridge, tsvd = (draw.six.compare_unseen(algorithm) for algorithm in (RE, TSVD))
-        places[draw.six.label] = {"most_ridge": ridge.max(axis=1), "most_tsvd": tsvd.max(axis=1)}
-        middle = {key: format_pair(np.median(of, axis=0))
-                  for key, of in (("ridge", ridge), ("tsvd", tsvd))}  # fmt: skip
-        gains.append({"name": draw.six.label, **middle})
-    return TEXT.claim("ls_not_best").judge_everywhere(places, gains=gains)
+def _compare_unseen(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+    """Compare RE and TSVD with LS at settings that were best on other machines."""
+    ratios = {key: draw.six.compare_unseen(a) for key, a in (("ridge", RE), ("tsvd", TSVD))}
+    row = {key: format_pair(np.median(ratio, axis=0)) for key, ratio in ratios.items()}
+    return {f"most_{key}": ratio.max(axis=1) for key, ratio in ratios.items()}, row
 
 
-def _judge_best(situations: Sequence[Situation]) -> Verdict:
-    """Judge TSVD against LS and RE, each of the three at the bottom of its curve."""
-    places, rows = {}, []
-    for situation in situations:
-        ls, ridge, tsvd = (situation.chosen[a] for a in (LS, RE, TSVD))
-        places[situation.label] = {
-            name: (tsvd.errors[:, :2] / other.errors[:, :2]).max(axis=1)
-            for name, other in (("most_ridge", ridge), ("most_ls", ls))
-        }
-        medians = {key: np.median(of.errors, axis=0)
-                   for key, of in (("tsvd", tsvd), ("ridge", ridge), ("ls", ls))}  # fmt: skip
-        commanded = int(((tsvd.commanded / ridge.commanded).max(axis=1) <= 1.0).sum())
-        rows.append({"name": situation.label, "commanded": commanded, **format_all(**medians)})
-    claim, trials = TEXT.claim("tsvd_best"), len(situations[0])
-    return claim.judge_everywhere(places, rows=rows, trials=trials)
+def _compare_best(situation: Situation) -> tuple[Numbers, dict[str, Any]]:
+    """Compare TSVD with LS and RE, each of the three at the bottom of its curve."""
+    chosen = {key: situation.chosen[a] for key, a in (("ls", LS), ("ridge", RE), ("tsvd", TSVD))}
+    tsvd, ridge = chosen["tsvd"], chosen["ridge"]
+    numbers = {
+        f"most_{key}": (tsvd.errors[:, :2] / chosen[key].errors[:, :2]).max(axis=1)
+        for key in ("ridge", "ls")
+    }
+    medians = {key: np.median(of.errors, axis=0) for key, of in chosen.items()}
+    commanded = int(((tsvd.commanded / ridge.commanded).max(axis=1) <= 1.0).sum())
+    return numbers, {"commanded": commanded, **format_all(**medians)}
 
 
-def _judge_failure(draws: Sequence[Draws]) -> Verdict:
-    """Judge 5-DOF measurement: LS diverges, RE and TSVD improve the machine."""
-    places, rows = {}, []
-    for draw in draws:
-        chosen, label = draw.five.chosen, draw.five.label
-        ridge, tsvd = (_compare_with_before(draw, chosen[a].errors) for a in (RE, TSVD))
-        lost = np.isinf(chosen[LS].errors[:, 0])
-        places[label] = {"least_diverged": lost, "most_ridge": ridge, "most_tsvd": tsvd}
-        medians = {"ridge": float(np.median(ridge)), "tsvd": float(np.median(tsvd))}
-        rows.append({"name": label, "diverged": int(lost.sum()), "of": len(lost), **medians})
-    return TEXT.claim("ls_fails").judge_everywhere(places, rows=rows)
+def _compare_five(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+    """Return where LS diverges with 5-DOF measurement, and by how much RE and TSVD improve."""
+    chosen = draw.five.chosen
+    ridge, tsvd = (_compare_with_before(draw, chosen[a].errors) for a in (RE, TSVD))
+    lost = np.isinf(chosen[LS].errors[:, 0])
+    row = {"diverged": int(lost.sum()), "of": len(lost), "ridge": float(np.median(ridge)),
+           "tsvd": float(np.median(tsvd))}  # fmt: skip
+    return {"least_diverged": lost, "most_ridge": ridge, "most_tsvd": tsvd}, row
 
 
 def _compare_with_before(draw: Draws, errors: FloatArray) -> FloatArray:
@@ -585,56 +580,51 @@ def _compare_with_before(draw: Draws, errors: FloatArray) -> FloatArray:
     return (errors[:, :2] / draw.errors[BEFORE][:, :2]).max(axis=1)
 
 
-def _judge_existence(draws: Sequence[Draws]) -> Verdict:
-    """Judge whether exact 5-DOF measurements leave an error of the poses."""
-    places, rows = {}, []
-    for draw in draws:
-        exact, label = draw.five.exact, draw.five.label
-        places[label] = {"least_left": _compare_with_before(draw, exact)}
-        left = "{:.0e} mm / {:.0e} deg".format(*exact.max(axis=0)[:2])
-        rows.append({"name": label, "left": left, "parameters": float(np.median(exact[:, 3]))})
-    return TEXT.claim("no_solution").judge_everywhere(places, rows=rows)
+def _compare_exact(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+    """Return the error of the poses that exact 5-DOF measurements leave."""
+    exact = draw.five.exact
+    left = "{:.0e} mm / {:.0e} deg".format(*exact.max(axis=0)[:2])
+    row = {"left": left, "parameters": float(np.median(exact[:, 3]))}
+    return {"least_left": _compare_with_before(draw, exact)}, row
 
 
-def _judge_parameters(draws: Sequence[Draws]) -> Verdict:
-    """Judge the parameter errors of the paper's RE and TSVD with 5- against 6-DOF measurement."""
-    places, rows = {}, []
-    for draw in draws:
-        row: dict[str, Any] = {"name": draw.name}
-        places[draw.name] = ratios = {}
-        for key, algorithm in (("ridge", RE), ("tsvd", TSVD)):
-            six, five = (s.chosen[algorithm].errors[:, 3] for s in draw.situations)
-            ratios[f"least_{key}"] = five / six
-            row |= {f"{key}_six": float(np.median(six)), f"{key}_five": float(np.median(five))}
-        row |= {"six": draw.compute_median(PRIOR)[3], "five": draw.compute_median(PRIOR_FIVE)[3]}
-        rows.append(row)
-    return TEXT.claim("six_better").judge_everywhere(places, rows=rows)
+def _compare_parameters(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+    """Compare the parameter errors of the paper's RE and TSVD with 5- and 6-DOF measurement."""
+    numbers, row = {}, {}
+    for key, algorithm in (("ridge", RE), ("tsvd", TSVD)):
+        six, five = (s.chosen[algorithm].errors[:, 3] for s in draw.situations)
+        numbers[f"least_{key}"] = five / six
+        row |= {f"{key}_six": float(np.median(six)), f"{key}_five": float(np.median(five))}
+    prior = {"six": draw.compute_median(PRIOR)[3], "five": draw.compute_median(PRIOR_FIVE)[3]}
+    return numbers, {**row, **prior}
 
 
-def _judge_deviation(draws: Sequence[Draws]) -> Verdict:
-    """Judge both halves: parameters farther from the truth than nominal, and better poses."""
-    places, rows = {}, []
-    for draw in draws:
-        for situation in draw.situations:
-            used = [situation.chosen[a].errors for a in (RANKED, RE, TSVD)]
-            worse = np.array([errors[:, 4] for errors in used])
-            left = np.array([_compare_with_before(draw, errors) for errors in used])
-            numbers = {"least_worse": worse.min(axis=0), "most_left": left.max(axis=0)}
-            places[situation.label] = numbers
-            shares = dict(zip(("ls", "ridge", "tsvd"), np.median(worse, axis=1), strict=True))
-            rows.append({"name": situation.label, **shares, "left": np.median(left)})
-    return TEXT.claim("deviate").judge_everywhere(places, rows=rows)
+def _compare_deviations(place: tuple[Draws, Situation]) -> tuple[Numbers, dict[str, Any]]:
+    """Return both halves: parameters farther from the truth than nominal, and better poses."""
+    draw, situation = place
+    used = [situation.chosen[a].errors for a in (RANKED, RE, TSVD)]
+    worse = np.array([errors[:, 4] for errors in used])
+    left = np.array([_compare_with_before(draw, errors) for errors in used])
+    shares = dict(zip(("ls", "ridge", "tsvd"), np.median(worse, axis=1), strict=True))
+    numbers = {"least_worse": worse.min(axis=0), "most_left": left.max(axis=0)}
+    return numbers, {**shares, "left": np.median(left)}
 
 
-def _judge_speed(situations: Sequence[Situation]) -> Verdict:
-    places, rows = {}, []
-    for situation in situations:
-        ls, ridge, tsvd = (situation.chosen[a].iterations for a in (RANKED, RE, TSVD))
-        places[situation.label] = {"most_ls": tsvd / ls, "most_ridge": tsvd / ridge}
-        middle = {key: f"{np.median(count):,.0f}"
-                  for key, count in (("ls", ls), ("ridge", ridge), ("tsvd", tsvd))}  # fmt: skip
-        rows.append({"name": situation.label, **middle})
-    return TEXT.claim("faster").judge_everywhere(places, rows=rows)
+def _compare_speed(situation: Situation) -> tuple[Numbers, dict[str, Any]]:
+    chosen = {"ls": RANKED, "ridge": RE, "tsvd": TSVD}
+    counts = {key: situation.chosen[a].iterations for key, a in chosen.items()}
+    numbers = {f"most_{key}": counts["tsvd"] / counts[key] for key in ("ls", "ridge")}
+    return numbers, {key: f"{np.median(count):,.0f}" for key, count in counts.items()}
+
+
+def _find_best_k(situation: Situation) -> tuple[Numbers, dict[str, Any]]:
+    """Return the best k, all parameters included, by its distance from their number."""
+    ks = situation.settings[TSVD].astype(int)
+    best = np.array([ks[steps.find_bottom(curve)] for curve in situation.curves[TSVD]])
+    distance = (ks[0] - best) / ks[0]
+    row = {"low": int(best.min()), "high": int(best.max()), "middle": float(np.median(best)),
+           "of": int(ks[0])}  # fmt: skip
+    return {"most_distance": distance, "least_distance": distance}, row
 
 
 def _judge_lambda(results: Results) -> Verdict:
@@ -654,21 +644,8 @@ def _judge_lambda(results: Results) -> Verdict:
     return claim.judge_everywhere({"": numbers}, rows=rows, by_steps=by_steps, low=low, high=high)
 
 
-def _judge_k(situations: Sequence[Situation]) -> Verdict:
-    """Judge the best k, all parameters included, by its distance from their number."""
-    places, rows = {}, []
-    for situation in situations:
-        ks = situation.settings[TSVD].astype(int)
-        best = np.array([ks[steps.find_bottom(curve)] for curve in situation.curves[TSVD]])
-        distance = (ks[0] - best) / ks[0]
-        places[situation.label] = {"most_distance": distance, "least_distance": distance}
-        rows.append({"name": situation.label, "low": int(best.min()), "high": int(best.max()),
-                     "middle": float(np.median(best)), "of": int(ks[0])})  # fmt: skip
-    return TEXT.claim("k_near_j").judge_everywhere(places, rows=rows)
-
-
 def _judge_noise(noise: Printed) -> Verdict:
-    shares = noise.values * np.array([steps.MM] * 3 + [1.0] * 3) / LIMITS
+    shares = noise.values * np.array([steps.MM] * 3 + [1.0] * 3) / steps.LIMITS
     largest, rms = np.abs(noise.values).max(axis=0), float(np.sqrt(np.mean(shares**2)))
     # three standard deviations of the rms of that many uniform numbers
     spread = 3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))

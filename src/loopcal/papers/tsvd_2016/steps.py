@@ -128,17 +128,11 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """t machines of one structure, measured.
+    """t machines of one structure, measured."""
 
-    Attributes
-    ----------
-    name : of the structure in the paper. robot : as designed.
-    trials : true machines and their measurements.
-    """
-
-    name: str
-    robot: Mechanism
-    trials: Trials
+    name: str  # of the structure in the paper
+    robot: Mechanism  # as designed
+    trials: Trials  # true machines and their measurements
 
     @property
     def kind(self) -> Component:
@@ -369,18 +363,12 @@ def find_bottom(errors: FloatArray) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Result of one method.
+    """Result of one method."""
 
-    Attributes
-    ----------
-    setting : lambda or k. values : (p,) [SI], NaN if diverged. errors : (5,), see MEASURES.
-    commanded : (2,), see `Study.compute_commanded_errors`.
-    """
-
-    setting: str
-    values: FloatArray
-    errors: FloatArray
-    commanded: FloatArray
+    setting: str  # lambda or k
+    values: FloatArray  # (p,) [SI], NaN if diverged
+    errors: FloatArray  # (5,), see MEASURES
+    commanded: FloatArray  # (2,), see `Study.compute_commanded_errors`
     iterations: int
     is_converged: bool
 
@@ -392,43 +380,27 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """One algorithm over its setting.
+    """One algorithm over its setting."""
 
-    Attributes
-    ----------
-    settings : (s,) lambda or k. runs : of all settings. errors : (s, 5), see MEASURES.
-    best : place of the bottom of the curve.
-    """
-
-    settings: FloatArray
-    runs: Iterations
-    errors: FloatArray
-    best: int
+    settings: FloatArray  # (s,) lambda or k
+    runs: Iterations  # of all settings
+    errors: FloatArray  # (s, 5), see MEASURES
+    best: int  # place of the bottom of the curve
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One manipulator and one number of measured coordinates.
+    """One manipulator and one number of measured coordinates."""
 
-    Attributes
-    ----------
-    study : one machine. singular_values : (p,) of the raw identification matrix at nominal
-        parameters. rank : of them. known : identifiability of the same measurements.
-    is_equal : (s,) which lambdas are at equal intervals. sweeps : by RE and TSVD, which begins with
-        all k: LS. answers : by method.
-    bracket : smallest and largest lambda of those tried that does not diverge.
-    normal_equations : largest component [mm, rad] of the first step if (H'H)^-1 H'D is computed as
-        printed.
-    """
-
-    study: Study
-    singular_values: FloatArray
-    rank: int
-    known: Identifiability
-    is_equal: BoolArray
-    sweeps: Mapping[str, Sweep]
-    answers: dict[str, Answer]
-    bracket: tuple[float, float]
+    study: Study  # one machine
+    singular_values: FloatArray  # (p,) of the raw identification matrix at nominal parameters
+    rank: int  # of them
+    known: Identifiability  # identifiability of the same measurements
+    is_equal: BoolArray  # (s,) which lambdas are at equal intervals
+    sweeps: Mapping[str, Sweep]  # by RE and TSVD, which begins with all k: LS
+    answers: dict[str, Answer]  # by method
+    bracket: tuple[float, float]  # smallest and largest lambda of those tried that does not diverge
+    # largest component [mm, rad] of the first step if (H'H)^-1 H'D is computed as printed
     normal_equations: float
 
 
@@ -542,42 +514,29 @@ def follow_ridge(
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """One algorithm with one setting for each of t machines.
+    """One algorithm with one setting for each of t machines."""
 
-    Attributes
-    ----------
-    settings : (t,) lambda or k. iterations : (t,). errors : (t, 5), see MEASURES, and commanded :
-        (t, 2), see `Study.compute_commanded_errors`; infinite if diverged.
-    """
-
-    settings: FloatArray
-    iterations: IntArray
-    errors: FloatArray
-    commanded: FloatArray
+    settings: FloatArray  # (t,) lambda or k
+    iterations: IntArray  # (t,)
+    errors: FloatArray  # (t, 5), see MEASURES, infinite if diverged
+    commanded: FloatArray  # (t, 2), see `Study.compute_commanded_errors`, infinite if diverged
 
 
 @dataclass(frozen=True, eq=False)
 class Situation:
-    """One structure, t drawn machines, and the paper's methods.
+    """One structure, t drawn machines, and the paper's methods."""
 
-    Attributes
-    ----------
-    name : of the structure. freedoms : measured coordinates, 6 or 5.
-    settings : (s,) of RE (lambda, rising) and TSVD (k, falling); the first one of both is LS:
-        lambda = 0, and k the number of parameters.
-    curves : (t, s, 5) errors at them, see MEASURES, infinite if diverged.
-    short : (t, s - 1, 5) errors of RE after `SHORT` iterations, infinite if diverged before.
-    chosen : by algorithm; RE and TSVD at the bottom of their curves, without LS.
-    exact : (t, 5) errors of LS with rank detection, measured without noise.
-    """
-
-    name: str
-    freedoms: int
+    name: str  # of the structure
+    freedoms: int  # measured coordinates, 6 or 5
+    # (s,) of RE (lambda, rising) and TSVD (k, falling); the first one of both is LS: lambda = 0,
+    # and k the number of parameters
     settings: Mapping[str, FloatArray]
-    curves: Mapping[str, FloatArray]
+    curves: Mapping[str, FloatArray]  # (t, s, 5) errors at them, see MEASURES, infinite if diverged
+    # (t, s - 1, 5) errors of RE after `SHORT` iterations, infinite if diverged before
     short: FloatArray
+    # by algorithm; RE and TSVD at the bottom of their curves, without LS
     chosen: Mapping[str, Chosen]
-    exact: FloatArray
+    exact: FloatArray  # (t, 5) errors of LS with rank detection, measured without noise
 
     def __len__(self) -> int:
         return len(self.exact)
@@ -682,19 +641,13 @@ class Draws:
 
     The paper's methods take the setting that is best for the true machine. The library's methods
     choose theirs from the data; MAP is given the true spread of the errors as its tolerances.
-
-    Attributes
-    ----------
-    name : of the structure. six, five : the paper's methods with 6- and 5-DOF measurement.
-    errors : method -> (t, 5), see MEASURES, infinite if diverged.
-    commanded : method -> (t, 2), see `Chosen`; without HINDSIGHT, which takes another lambda for
-        each measure.
     """
 
-    name: str
-    six: Situation
+    name: str  # of the structure
+    six: Situation  # the paper's methods with 6- and 5-DOF measurement
     five: Situation
-    errors: Mapping[str, FloatArray]
+    errors: Mapping[str, FloatArray]  # method -> (t, 5), see MEASURES, infinite if diverged
+    # method -> (t, 2), see `Chosen`; without HINDSIGHT, which takes another lambda for each measure
     commanded: Mapping[str, FloatArray]
 
     def __len__(self) -> int:
