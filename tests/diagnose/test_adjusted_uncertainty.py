@@ -65,7 +65,7 @@ def cover_positions(robot, fit, truth):
 @pytest.mark.parametrize(("correlation", "before"), [(0.6, 0.93), (0.9, 0.82)])
 def test_poses_are_covered_where_errors_are_correlated(correlation, before):
     robot, inside, adjusted, named = ROBOTS["linear-delta"], [], [], []
-    for seed in range(50):
+    for seed in range(25):
         errors = draw_errors(20, 3, seed, correlation)
         truth, fit, result = fit_and_adjust("linear-delta", "component", errors, seed)
         inside.append(cover_positions(robot, fit, truth))
@@ -144,12 +144,12 @@ def test_slow_errors_that_no_test_shows_are_allowed_for_where_residuals_are_smal
 @pytest.mark.slow
 def test_clean_data_change_nothing():
     changed = 0
-    for seed in range(60):
+    for seed in range(30):
         errors = draw_errors(12, 3, seed)
         _, fit, result = fit_and_adjust("linear-delta", "component", errors, seed)
         changed += len(result.posterior.parts) > len(fit.posterior.parts)
     # all tests together, slow errors of the poses among them
-    assert changed <= binom.isf(1e-3, 60, FALSE_ALARMS)
+    assert changed <= binom.isf(1e-3, 30, FALSE_ALARMS)
 
 
 def test_correlated_residuals_do_not_mean_that_sigma_is_too_large():

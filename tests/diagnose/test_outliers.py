@@ -151,12 +151,12 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
 
 @pytest.mark.slow
 def test_false_alarm_rate_of_clean_data_sets_is_the_stated_one():
-    robot, t, alarms = hexapod(), 200, 0
+    robot, t, alarms = hexapod(), 100, 0
     measured = simulate_trials(robot, sample_truth(robot, t, 8), hexapod_poses(14), tracker(), 8)
     for i in range(t):
         data = measured.trial(i)
         alarms += bool(find_outliers(identify(robot, data, LeastSquares()), data).outliers)
-    # 5 % of 200 is 10; outside the central 99.9 % of binomial(200, 0.05) the level is wrong
+    # 5 % of 100 is 5; outside the central 99.9 % of binomial(100, 0.05) the level is wrong
     assert binom.ppf(0.0005, t, 0.05) <= alarms <= binom.ppf(0.9995, t, 0.05)
 
 
