@@ -9,7 +9,7 @@ import pytest
 
 from loopcal.apply.validation import validate
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
-from loopcal.diagnose.row_errors import compute_noise_floor, compute_row_errors
+from loopcal.diagnose.row_errors import METRICS, Metric, compute_noise_floor, compute_row_errors
 from loopcal.errors import DataError
 from loopcal.estimate.identification import identify
 from loopcal.io.core.json_text import to_json
@@ -22,6 +22,7 @@ from loopcal.measure.kinds.position import Position
 from loopcal.measure.observations import Observations
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.workspace import sample_workspace
+from loopcal.report.validation_view import view_error_statistics
 from tests import zoo
 from tests.estimate.problems import (
     UM,
@@ -96,6 +97,18 @@ def test_position_errors_are_those_of_each_target():
     noise = np.random.default_rng(0).normal(size=(20000, 6, 3)) * 2 * UM
     largest = np.linalg.norm(noise, axis=2).max(axis=1)
     assert floor.max["position"] == pytest.approx(np.median(largest), rel=0.01)
+
+
+def test_one_entry_adds_a_metric_to_results_json_and_tables(validation, monkeypatch):
+    def compute_percentile(sizes):
+        return float(np.quantile(sizes, 0.95))
+
+    monkeypatch.setitem(METRICS, "p95", Metric("95 %", compute_percentile))
+    expected = pytest.approx(np.quantile(validation.after.position, 0.95))
+    assert validation.after.statistics("position").p95 == expected
+    assert json.loads(to_json(validation))["after"]["position"]["p95"] == expected
+    titles = [column.title for column in view_error_statistics(validation)[0].columns]
+    assert titles[-3:-1] == ["sd", "95 %"]
 
 
 @pytest.mark.parametrize("kind_class", KINDS.values(), ids=list(KINDS))

@@ -31,7 +31,7 @@ from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit, linearize_rows_of
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES, CovariancePart
+from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.estimate.source_rows import fold_sources
@@ -123,7 +123,10 @@ def split_covariance(
         key = setup if source.kind == SETUP and setup is not None else source
         merged.setdefault(key, []).append(root)
     for part in (part for part in fit.posterior.parts if part.is_added):
-        name = _name_discrepancy(fit, part) if part.source == DISCREPANCY else ""
+        name, slow = "", fit.posterior.discrepancy
+        if part.source == DISCREPANCY and slow is not None:
+            of_position = slow.root[:, slow.root.shape[1] // 2 :]
+            name = "position" if np.array_equal(part.root, of_position) else "orientation"
         key = Source(part.source, name, "A", part.degrees)
         merged.setdefault(key, []).append(part.root / fit.tolerance[:, None])
     roots = tuple(
@@ -197,14 +200,6 @@ def _evaluate_tolerances(fit: Identification) -> tuple[str, float]:
 def _find_degrees(fit: Identification, source: str) -> float:
     """Return the degrees of freedom of what a source contributes; infinite where it is known."""
     return next((part.degrees for part in fit.posterior.parts if part.source == source), np.inf)
-
-
-def _name_discrepancy(fit: Identification, part: CovariancePart) -> str:
-    """Return whether a part comes from slow errors of the position or of the orientation."""
-    own = fit.posterior.discrepancy
-    assert own is not None
-    half = own.root.shape[1] // 2
-    return "position" if np.array_equal(part.root, own.root[:, half:]) else "orientation"
 
 
 def _name(rows: Observations, session: str, data: Measurements) -> str:

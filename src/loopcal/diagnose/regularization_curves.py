@@ -24,14 +24,7 @@ from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.penalties import (
-    GCV,
-    MarginalLikelihood,
-    Method,
-    Ridge,
-    TruncatedSVD,
-    TruncationGCV,
-)
+from loopcal.estimate.penalties import GCV, MarginalLikelihood, Ridge, TruncatedSVD, TruncationGCV
 from loopcal.estimate.problem import problem_of
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
@@ -169,7 +162,14 @@ def compute_regularization_curves(
         score, error, left_out = result.score, result.standard_error, result.blocks
     else:
         scheme, left_out = "folds", folds
-        score, error = _score_folds(robot, data, methods, options, folds, seed, progress)
+        score, error = np.zeros(len(methods)), np.full(len(methods), np.nan)
+        for i, method in enumerate(methods):
+            progress(i, len(methods), "cross-validating")
+            chosen = replace(options, method=method)
+            validation = cross_validate(robot, data, options=chosen, count=folds, seed=seed)
+            score[i] = validation.score
+            if np.isfinite(score[i]):
+                error[i] = validation.standard_error
     n = len(lam)
     ridge = _mark("lam", lam, score[:n], error[:n], rules_lam)
     truncation = _mark("k", k.astype(float), score[n:], error[n:], rules_k)
@@ -203,26 +203,6 @@ def _apply_rules(
 ) -> list[ChosenValue]:
     """Return what rules choose from a decomposition."""
     return [ChosenValue(name, float(rule(d)[0])) for name, rule in rules.items()]
-
-
-def _score_folds(
-    robot: Mechanism,
-    data: Measurements,
-    methods: Sequence[Method],
-    options: FitOptions,
-    folds: int,
-    seed: int,
-    progress: Progress,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the scores of methods by folds that are fitted again, and their standard errors."""
-    score, error = [], []
-    for done, method in enumerate(methods):
-        progress(done, len(methods), "cross-validating")
-        chosen = replace(options, method=method)
-        result = cross_validate(robot, data, options=chosen, count=folds, seed=seed)
-        score.append(result.score)
-        error.append(result.standard_error if np.isfinite(result.score) else np.nan)
-    return np.array(score), np.array(error)
 
 
 def _mark(

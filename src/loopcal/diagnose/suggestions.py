@@ -36,7 +36,6 @@ from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.presentation import HtmlResult
-from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 POSES = 24  # number of poses of a further measurement
@@ -138,7 +137,11 @@ def suggest_measurements(
             ]
         except DataError:
             continue  # this kind has nothing to measure on this robot
-        determined = _find_determined(X, B, floor)
+        # combinations that the rows X separate from all others
+        _, s, vt = np.linalg.svd(X @ B.T)
+        largest = max(float(np.linalg.norm(X, ord=2)), floor)
+        undetermined = vt[s <= OBSERVED * largest] if largest > 0.0 else vt
+        determined = np.asarray(np.linalg.norm(undetermined, axis=0) <= np.sqrt(OBSERVED))
         if determined.any():
             left = compute_remaining_sd(np.concatenate([factor, X]), root)
             better = determined & (left[leading] < IMPROVEMENT * present[leading])
@@ -231,14 +234,3 @@ def _measure_at(scene: ObservedPoses, kind: Kind, sigma: dict[Dimension, float])
         mounted, rows, measured, noise.sigma, sensor.session, sensor.group
     )
     return Measurements(robot.name, scene.readings, (observations,))
-
-
-def _find_determined(X: FloatArray, B: FloatArray, floor: float) -> BoolArray:
-    """Return which combinations (d,) the rows X (p, p) separate from all others.
-
-    `floor` is the size of the existing rows.
-    """
-    _, s, vt = np.linalg.svd(X @ B.T)
-    largest = max(float(np.linalg.norm(X, ord=2)), floor)
-    undetermined = vt[s <= OBSERVED * largest] if largest > 0.0 else vt
-    return np.asarray(np.linalg.norm(undetermined, axis=0) <= np.sqrt(OBSERVED))

@@ -205,8 +205,9 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     fitted = compute_fitted_misfit(robot, thinned) if np.isinf(misfit) else np.inf
     if not fitted > ALLOWED:
         return ConventionCheck(fitted)
-    has_errors = not is_redundant(free) and _has_uncertain_readings(data)
-    return compare_interpretations(free, thinned, has_errors)
+    sigma = data.reading_sigma
+    has_errors = sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
+    return compare_interpretations(free, thinned, has_errors and not is_redundant(free))
 
 
 def _select_known_readings(data: Measurements, redundant: bool) -> Measurements | None:
@@ -221,12 +222,6 @@ def _select_known_readings(data: Measurements, redundant: bool) -> Measurements 
         return None
     poses = data.take(known)
     return poses if redundant else replace(poses, reading_sigma=None)
-
-
-def _has_uncertain_readings(data: Measurements) -> bool:
-    """Return whether readings have errors, which may explain a misfit of exact ones."""
-    sigma = data.reading_sigma
-    return sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
 
 
 # Check setup parameters (frames, targets, surfaces): stated values, and values kept from a
@@ -387,7 +382,11 @@ def compare_interpretations(
     if against is not None and against.misfit <= ALLOWED:
         return _contradict(misfit, against)
     search = search_interpretations(free, thinned, stated, misfit, misfit > IMPLAUSIBLE)
-    equations = _count_equations(stated, search)
+    # those beyond unknown frames: of the data as written or as read, whichever has fewer
+    chosen = None if search.selection is None else search.selection.comparison
+    linear = [c.linearization for c in (stated, chosen) if c is not None]
+    counts = (int(each.equations[0]) for each in linear if each is not None)
+    equations = min(counts, default=FEWEST_TO_REFUSE)
     if search.selection is not None and equations >= FEWEST_TO_REFUSE:
         return _refuse(description, misfit, search.selection)
     if against is not None:
@@ -416,16 +415,6 @@ def _report_unexplained(
         "conventions.unexplained", **description, tried=search.tried, pairs=search.pairs
     )
     return ConventionCheck(misfit, finding=finding)
-
-
-def _count_equations(stated: Comparison | None, search: Search) -> int:
-    """Return the number of equations beyond those of unknown frames: of the data as written or of
-    the interpretation, whichever has fewer.
-    """
-    chosen = None if search.selection is None else search.selection.comparison
-    compared = [c.linearization for c in (stated, chosen) if c is not None]
-    counts = [int(linear.equations[0]) for linear in compared if linear is not None]
-    return min(counts, default=FEWEST_TO_REFUSE)
 
 
 def thin_out(data: Measurements) -> Measurements:

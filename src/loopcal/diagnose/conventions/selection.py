@@ -100,7 +100,11 @@ def find_zero_interpretations(
         zeros = [zeros[i] for i in best]
         constants = np.array([grids[i][np.argmin(sizes[i])] for i in best])
         if scan < SCANS - 1:
-            zeros = [_narrow(*pair) for pair in zip(zeros, constants.tolist(), strict=True)]
+            halves = [0.5 * (zero.high - zero.low) / NARROWER for zero in zeros]
+            zeros = [
+                zero._replace(low=constant - half, high=constant + half)
+                for zero, constant, half in zip(zeros, constants.tolist(), halves, strict=True)
+            ]
     result = []
     for zero, constant in zip(zeros, constants.tolist(), strict=True):
         total = zero.base + constant
@@ -147,12 +151,6 @@ def _list_zeros(free: FreeParameters, data: Measurements) -> Iterator[_Zero]:
             most = float((high[chosen] - ends_of[1]).min())
             if least < most:
                 yield _Zero(columns, sign, base, least, most)
-
-
-def _narrow(zero: _Zero, constant: float) -> _Zero:
-    """Return the hypothesis with narrower limits around a constant."""
-    half = 0.5 * (zero.high - zero.low) / NARROWER
-    return zero._replace(low=constant - half, high=constant + half)
 
 
 def _compute_sizes(
