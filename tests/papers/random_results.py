@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Results of a study with random numbers in place of the computed ones, and their verdicts.
 
 A verdict that follows from numbers answers "does not agree" for some of them, and "agrees" for

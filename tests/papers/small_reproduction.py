@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A reproduction with one comparison, table, figure and verdict."""
 
 import numpy as np

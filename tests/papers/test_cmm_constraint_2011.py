@@ -1,7 +1,9 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration from planes and perpendicular lines: equations, claims of the paper, many machines.
 
 The small version below draws 6 machines, uses fewer sweeps of the exchange, and has wide bounds.
 The tests marked `evidence` use 200 machines.
+Page: docs/papers/cmm-constraint-2011.md.
 """
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What all repeated papers share: printed numbers, claims, pages, folders, the command."""
 
 import csv

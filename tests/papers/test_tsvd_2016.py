@@ -1,6 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
 """LS, RE and TSVD on two parallel manipulators: steps, claims of the paper, many machines.
 
 The small version below draws 4 machines; the tests marked `evidence` check the bounds at full size.
+Page: docs/papers/tsvd-2016.md.
 """
 
 import json
