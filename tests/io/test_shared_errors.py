@@ -175,3 +175,24 @@ def test_a_bias_and_an_unknown_frame_together_begin_from_the_frame(tmp_path):
     assert fit.converged
     assert abs(value - 30.0 * LENGTH) < 4.0 * sd
     assert sd < 10.0 * LENGTH
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["unknown: [offset]", "unknowns: {wire.offset: {sd: 0.2 mm}}"],
+        ["unknown: [offset]", "unknowns: {distance.offset: {sd: 0.2 mm}}"],
+        ["unknown: [bias]", "unknowns: {wire.bias.distance: {sd: 0.2 mm}}"],
+        ["session_bias: {distance: 0.2 mm}"],
+    ],
+)
+def test_offset_and_bias_of_a_distance_are_one_unknown_under_old_names_too(tmp_path, lines):
+    settings = ["kind: distance", "anchor: [0 mm, 0 mm, 900 mm]", "anchor_name: wire"]
+    settings += ["noise: {distance: 10 um}", *lines]
+    head = "\n".join(f"# {line}" for line in settings)
+    columns = "pose,q1 [mm],q2 [mm],q3 [mm],distance [mm]"
+    rows = "\n".join(f"{i},{200 + i},{200 - i},205,{700 + i}" for i in range(4))
+    path = tmp_path / "a.csv"
+    path.write_text(f"{head}\n{columns}\n{rows}\n")
+    (value,) = load_measurements(path, DELTA).stated_values
+    assert (value.name, value.sd) == ("wire.offset", 2e-4)

@@ -10,8 +10,9 @@ from numpy.testing import assert_allclose
 from loopcal.errors import DataError
 from loopcal.measure.instrument import Gaussian, Sensor
 from loopcal.measure.kinds import KINDS
-from loopcal.measure.kinds.distance import Distance
-from loopcal.measure.kinds.kind import measure_progress
+from loopcal.measure.kinds.bearing import Bearing
+from loopcal.measure.kinds.distance import Distance, Separation
+from loopcal.measure.kinds.kind import measure_progress, update_setup_name
 from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.nuisance import collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -39,7 +40,9 @@ def test_what_is_measured_with_a_bias_has_no_residual_and_right_derivatives(kind
     u = len(kind.nuisance_parameters)
     shared = u - len(kind.without_shared_errors().nuisance_parameters)
     assert shared > 0
-    assert kind.is_drift[-shared:].sum() * 2 == shared
+    # the bias of a length is its offset, which is no error that all kinds have
+    own = 2 if kind.bias_item == "bias" else 1
+    assert kind.is_drift[-shared:].sum() * own == shared
     values = np.tile(kind.nominal_values, (1, 3, 1))
     values[..., -shared:] += 1e-5 * np.random.default_rng(1).standard_normal((1, 3, shared))
     measured = kind.measure(T, np.zeros((1, 3, len(kind.noise_columns))), values, joints)
@@ -88,9 +91,23 @@ def test_rows_take_their_part_of_a_drift():
 
 
 def test_two_instruments_have_errors_of_their_own():
-    wires = [
-        Distance(anchor=np.ones(3), anchor_name=name, unknown=("bias",))
-        for name in ("wire1", "wire2")
+    cameras = [
+        Bearing(frame=name, unknown=("bias",), T_base_frame=np.eye(4)) for name in ("left", "right")
     ]
-    names = [p.name for kind in wires for p in kind.nuisance_parameters]
-    assert names == ["wire1.bias.distance", "wire2.bias.distance"]
+    names = [p.name for kind in cameras for p in kind.nuisance_parameters]
+    assert len(set(names)) == len(names)
+    assert all(name.startswith(("left.bias.", "right.bias.")) for name in names)
+
+
+def test_the_bias_of_a_length_is_its_offset():
+    wires = [
+        Distance(anchor=np.ones(3), anchor_name=name, unknown=unknown)
+        for name in ("wire1", "wire2")
+        for unknown in (("bias",), ("offset",), ("offset", "bias"))
+    ]
+    names = [[p.name for p in kind.nuisance_parameters] for kind in wires]
+    assert names == [["wire1.offset"]] * 3 + [["wire2.offset"]] * 3
+    (name,) = Separation(unknown=("bias",)).nuisance_parameters
+    assert name.name == "separation.offset"
+    assert update_setup_name("monday.wire1.bias.distance") == "monday.wire1.offset"
+    assert update_setup_name("tracker.bias.x") == "tracker.bias.x"

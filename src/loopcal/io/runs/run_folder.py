@@ -50,6 +50,7 @@ from loopcal.io.runs.run_result import (
     refuse_other_parameters,
     report_damage,
 )
+from loopcal.measure.kinds.kind import update_setup_name
 from loopcal.mechanism.model import Mechanism
 from loopcal.presentation import HtmlResult
 from loopcal.typing import report_no_progress
@@ -447,7 +448,7 @@ def load_run(path: str | Path) -> Run:
     before = arrays.get("initial", robot.parameters.nominal)
     refuse_other_parameters(result, len(before), robot, _find_robot_file(path))
     initial = robot.with_values(before)
-    names = [row["name"] for row in result["fit"].get("local", ())]
+    names = [update_setup_name(row["name"]) for row in result["fit"].get("local", ())]
     values, initial_values = (
         dict(zip(names, arrays[key].tolist(), strict=True)) if key in arrays else {}
         for key in ("local_estimate", "local_start")

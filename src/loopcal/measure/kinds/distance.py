@@ -16,7 +16,15 @@ from loopcal.errors import DataError
 from loopcal.geometry import FLATNESS, solve_trilateration
 from loopcal.measure.array_checks import check_point
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, checked, list_rows
+from loopcal.measure.kinds.kind import (
+    BIAS,
+    Column,
+    Evaluation,
+    InvalidRows,
+    checked,
+    list_rows,
+    name_shared_error,
+)
 from loopcal.measure.kinds.points import Prediction, TargetKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
@@ -25,12 +33,17 @@ from loopcal.units import Dimension
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class LengthKind(TargetKind):
-    """A kind that measures one length above 0 for each target, with a common offset."""
+    """A kind that measures one length above 0 for each target, with a common offset: the bias of a
+    session.
+    """
+
+    bias_item: ClassVar[str] = "offset"
 
     @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Also the offset of all readings."""
-        offset = Parameter(f"{self.name}.offset", Dimension.LENGTH, 0.0, scope="session")
+        name = name_shared_error(self, BIAS, "")
+        offset = Parameter(name, Dimension.LENGTH, 0.0, scope="session")
         return {**super().possible_setup, "offset": setup.SetupItem((offset,))}
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
@@ -63,7 +76,7 @@ class Distance(LengthKind):
     |x - c|`.
 
     Setup parameters [m]: `anchor.x` to `anchor.z`, `target.x` to `target.z` of each target, and
-    `distance.offset`.
+    `distance.offset`, which is called after `frame` or `anchor_name` where these are stated.
 
     Parameters
     ----------

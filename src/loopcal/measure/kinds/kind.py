@@ -19,6 +19,7 @@ m residuals (often c), u nuisance parameters of the kind, j joints that it sense
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
@@ -179,7 +180,16 @@ def name_shared_error(kind: Kind, item: str, component: str) -> str:
         value = getattr(kind, setting, "")
         if value and value != getattr(type(kind), setting):
             owner = value
+    if item == BIAS and kind.bias_item != BIAS:
+        return f"{owner}.{kind.bias_item}"
     return f"{owner}.{item}.{component}"
+
+
+def update_setup_name(name: str) -> str:
+    """Return the present name of a setup parameter: the bias of a length was another unknown than
+    its offset before.
+    """
+    return re.sub(r"\.bias\.(distance|separation)$", ".offset", name)
 
 
 def measure_progress(session: np.ndarray, time: FloatArray | None) -> FloatArray:
@@ -224,8 +234,10 @@ class Kind(ABC):
         What its residuals are errors of, by dimension, such as "position"; see `list_error_groups`.
     allowed_unknown : tuple of str
         Setup items that `unknown` may list.
+    bias_item : str
+        Setup item that the bias of a session is; the one that all kinds have, or one of its own.
     unknown : tuple of str
-        Setup items that are unknown.
+        Setup items that are unknown; "bias" stands for `bias_item`.
     measures_points : bool
         Whether it measures targets, which may be fixed to the base (`of: base`).
     of : str
@@ -243,12 +255,14 @@ class Kind(ABC):
     length_error: ClassVar[str] = "length"
     angle_error: ClassVar[str] = "angle"
     allowed_unknown: ClassVar[tuple[str, ...]] = ()
+    bias_item: ClassVar[str] = BIAS
     unknown: tuple[str, ...] = ()
     of: str = ""
 
     def __post_init__(self) -> None:
-        names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
-        allowed = (*self.allowed_unknown, *SHARED_ERRORS)
+        stated = (self.unknown,) if isinstance(self.unknown, str) else self.unknown
+        names = tuple(dict.fromkeys(self.bias_item if n == BIAS else n for n in stated))
+        allowed = tuple(dict.fromkeys((*self.allowed_unknown, self.bias_item, DRIFT)))
         for name in (name for name in names if name not in allowed):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
