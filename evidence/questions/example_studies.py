@@ -12,7 +12,7 @@ from typing import Any
 
 import loopcal
 from loopcal.report.pictures import render_figure
-from loopcal.report.tables import Table
+from loopcal.results.tables import Table
 from loopcal.studies.results.questions import (
     FRAMES,
     AnsweredQuestion,

@@ -8,6 +8,16 @@ purpose.
 
 import lazy_loader
 
+from loopcal.results.presenters import name_presenters
+
 __version__ = "0.1.0.dev0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+name_presenters(
+    page=["loopcal.report.pages"],
+    figure=[
+        f"loopcal.report.figures.{module}"
+        for module in ("fit_figures", "plan_figures", "result_figures", "robot_figure")
+    ],
+)

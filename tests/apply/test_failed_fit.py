@@ -23,7 +23,7 @@ from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.report.calibration_view import view_calibration, view_fit
-from loopcal.report.tables import render_text
+from loopcal.results.tables import render_text
 from tests.estimate.problems import hexapod, hexapod_data
 
 

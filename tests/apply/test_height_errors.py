@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal.apply.height_errors import (
+    PREFIX,
     HeightErrors,
     map_height_errors,
     measures_only_heights,
     restore_heights,
-    store_heights,
 )
 from loopcal.estimate.identification import identify
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
@@ -30,7 +30,8 @@ from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.calibration_view import build_height_map, build_height_summary, view_heights
 from loopcal.report.figures.result_figures import draw_height_errors
-from loopcal.report.tables import Table
+from loopcal.results.storage import store_arrays
+from loopcal.results.tables import Table
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def test_places_are_those_of_the_calibrated_geometry(report, heights) -> None:
 
 
 def test_heights_come_back_from_the_arrays_of_a_run(report, heights) -> None:
-    again = restore_heights(store_heights(heights), report.robot)
+    again = restore_heights(store_arrays(heights, PREFIX), report.robot)
     assert again is not None
     assert str(again) == str(heights)
     assert again.to_dict().keys() == report.to_dict()["height_errors"].keys()
@@ -157,7 +158,7 @@ def test_heights_of_a_platform_that_rotates_are_no_map(heights) -> None:
         data = simulate(robot, poses, Instrument((sensor,)), 1)
         fit = identify(robot, data)
         assert map_height_errors(fit, data, None) is None
-    assert restore_heights(store_heights(heights), robot) is None
+    assert restore_heights(store_arrays(heights, PREFIX), robot) is None
     assert "bed" not in str(heights)
 
 

@@ -17,7 +17,7 @@ from loopcal.diagnose.residual_patterns import ResidualRows
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.findings import Severity
-from loopcal.serialization import to_json
+from loopcal.results.serialization import to_json
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
 CODE = "residuals.heavy-tailed"

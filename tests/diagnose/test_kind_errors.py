@@ -73,7 +73,7 @@ def test_improvement_weights_each_instrument_by_its_sigma():
     ((name, times),) = result.improvements().items()
     assert name == "weighted"
     assert times == pytest.approx(np.sqrt(10 * 5.0**2 / (30 * 0.1**2)), rel=1e-6)
-    assert [k["kind"] for k in result.to_dict()["kinds"]] == ["component", "position", "all"]
+    assert [k.kind for k in result.to_dict()["kinds"]] == ["component", "position", "all"]
 
 
 def test_validation_counts_rows_of_each_quantity_and_reports_too_few():

@@ -21,8 +21,8 @@ from loopcal.report.document.calibration_document import SECTIONS, build_calibra
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
 from loopcal.report.scene.scene import load_script
-from loopcal.report.tables import Table
 from loopcal.report.validation_view import READING_NOISE, view_errors
+from loopcal.results.tables import Table
 
 pytestmark = pytest.mark.slow
 

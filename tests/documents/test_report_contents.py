@@ -20,7 +20,7 @@ from loopcal.report.document.elements import (
     describe_call,
     list_options,
 )
-from loopcal.report.tables import Table
+from loopcal.results.tables import Table
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 
 pytestmark = pytest.mark.slow

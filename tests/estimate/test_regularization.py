@@ -20,6 +20,7 @@ from loopcal.estimate.penalties import (
     TruncatedSVD,
     TruncationGCV,
 )
+from loopcal.results.serialization import to_json
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +101,7 @@ def test_every_rule_is_reported(data, method, parameter, value, rule):
     assert value is None or chosen.value == value
     assert (chosen.score is None) == (rule == "fixed")
     assert chosen.finding.code in [finding.code for finding in fit.findings]
-    document = fit.to_dict()["regularization"].to_dict()
+    document = to_json(fit.to_dict()["regularization"])
     assert document["value"] == chosen.value
     assert document["rule"] == rule
 

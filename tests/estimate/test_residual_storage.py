@@ -12,7 +12,7 @@ import loopcal as lc
 from loopcal.apply.validation import restore_validation
 from loopcal.estimate.result import residuals_from_arrays
 from loopcal.report.validation_view import describe_improvements, view_errors
-from loopcal.serialization import restore_numbers
+from loopcal.results.serialization import restore_numbers
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"
 

@@ -17,7 +17,7 @@ import loopcal
 from loopcal.errors import EstimationError
 from loopcal.findings import Quantity, Severity, report_finding
 from loopcal.findings.catalog import FILES, find_entry, load_catalog, phrases, read_document
-from loopcal.serialization import to_json
+from loopcal.results.serialization import to_json
 from tools import findings_reference
 
 SOURCE = Path(loopcal.__file__).parent

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.height_errors import HeightErrors, store_heights
+from loopcal.apply.height_errors import PREFIX, HeightErrors
 from loopcal.cli.entry_point import main
 from loopcal.errors import FileError, LoopcalError
 from loopcal.estimate.smooth_errors import describe_smooth_errors
@@ -33,6 +33,7 @@ from loopcal.io.runs.run_result import (
     read_result,
 )
 from loopcal.report.calibration_view import view_budget
+from loopcal.results.storage import store_arrays
 from loopcal.units import find_unit
 from tests.io.changed_documents import change_value, list_places
 
@@ -211,7 +212,7 @@ def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
     heights = HeightErrors(
         ("1", "2"), np.ones((2, 2)), np.ones(2), np.ones(2), np.ones(2, dtype=bool), find_unit("mm")
     )
-    arrays |= store_heights(heights)
+    arrays |= store_arrays(heights, PREFIX)
     assert set(RULES) <= set(arrays)
     assert set(DISCREPANCY) == set(own)
     assert find_problem(arrays) is None

@@ -12,8 +12,8 @@ from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.calibration_view import view_calibration
-from loopcal.report.tables import render_text
 from loopcal.report.validation_view import describe_commanded
+from loopcal.results.tables import render_text
 from tests.estimate.problems import UM, URAD, noise
 
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
 
 import loopcal as lc
-from loopcal.presentation import HtmlResult, TableResult
+from loopcal.results.result import Result, TableResult
 
 NAMES = """
     CalibrationOptions Constraints FitOptions GCV Gaussian Huber InflatedTolerances Instrument
@@ -75,7 +75,7 @@ def list_result_classes() -> list[type]:
 
 @pytest.mark.parametrize("result_class", list_result_classes(), ids=lambda c: c.__name__)
 def test_every_public_result_has_a_page_for_notebooks(result_class) -> None:
-    advice = "give it a base class of loopcal.presentation, or list it in SETTINGS above"
+    advice = "give it a base class of loopcal.results.result, or list it in SETTINGS above"
     assert callable(getattr(result_class, "_repr_html_", None)), advice
 
 
@@ -98,7 +98,7 @@ def list_returned_classes() -> set[type]:
     ids=lambda c: c.__name__,
 )
 def test_what_public_functions_return_has_a_page_for_notebooks(result_class) -> None:
-    assert result_class.__name__ in SETTINGS or issubclass(result_class, HtmlResult)
+    assert result_class.__name__ in SETTINGS or issubclass(result_class, Result)
 
 
 @pytest.fixture(scope="module")
@@ -252,5 +252,5 @@ def test_results_draw_themselves(results, five_bar) -> None:
 
 def test_only_results_with_numbers_have_tables(results) -> None:
     for result in results.values():
-        assert isinstance(result, HtmlResult)
+        assert isinstance(result, Result | lc.Finding)
         assert hasattr(result, "to_frame") == isinstance(result, TableResult)

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import binom
 
 from loopcal.errors import DataError
-from loopcal.report.tables import render_text
+from loopcal.results.tables import render_text
 from loopcal.studies.files.study_folder import StudySource, open_study
 from loopcal.studies.results.questions import AnsweredQuestion, decide, say_answer, view_answers
 from loopcal.studies.results.study_result import StudyResult

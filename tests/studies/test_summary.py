@@ -14,7 +14,7 @@ from scipy.stats import beta, binom
 
 from loopcal.errors import DataError
 from loopcal.report.pictures import render_figure
-from loopcal.report.tables import render_text
+from loopcal.results.tables import render_text
 from loopcal.studies.files.store import read_store
 from loopcal.studies.results.questions import list_shown, view_summary, write_summary
 from loopcal.studies.results.study_result import (

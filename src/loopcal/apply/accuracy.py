@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,18 +48,21 @@ from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.assembly import TWIST_UNITS
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import resolve_poses
 from loopcal.numerics.statistics import compute_f_quantile
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, fields, label_axes, within
+from loopcal.results.result import DrawnResult, TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from loopcal.results.tables import Block
 
 # Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
 # table G.2).
@@ -103,6 +106,16 @@ class PoseUncertainty(TableResult):
     covariance: FloatArray
     reference: Finding
     degrees: PoseDegrees
+
+    FIELDS = (
+        *fields("frame", "coverage_factor", "degrees", components=lambda _: COMPONENTS),
+        Field("position", axes="pose", unit="m", key="position_rms"),
+        Field("orientation", axes="pose", unit="rad", key="orientation_rms"),
+        Field("sd", axes="pose component", unit=TWIST_UNITS),
+        Field("expanded", axes="pose component", unit=TWIST_UNITS, key="expanded"),
+        *fields(position_95="expanded_position", orientation_95="expanded_orientation"),
+    )
+    LABELS = label_axes(component=COMPONENTS)
 
     @property
     def frame(self) -> str:
@@ -156,20 +169,6 @@ class PoseUncertainty(TableResult):
     def orientation(self) -> FloatArray:
         """(n,) root mean square of the rotation of the platform [rad]."""
         return np.sqrt((self.sd[:, :3] ** 2).sum(axis=1))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return frame, factors, degrees and expanded uncertainties for JSON, SI."""
-        return {
-            "frame": self.frame,
-            "coverage_factor": self.coverage_factor,
-            "degrees": self.degrees,
-            "components": list(COMPONENTS),
-            "expanded": self.expanded,
-            "position_rms": self.position,
-            "orientation_rms": self.orientation,
-            "position_95": self.expanded_position,
-            "orientation_95": self.expanded_orientation,
-        }
 
 
 def pose_uncertainty(
@@ -356,7 +355,7 @@ def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> Floa
 
 
 @dataclass(frozen=True, eq=False)
-class AccuracyMap(TableResult):
+class AccuracyMap(DrawnResult):
     """Uncertainty over the workspace, and at the measured poses.
 
     Attributes
@@ -369,6 +368,23 @@ class AccuracyMap(TableResult):
     coordinates: FloatArray
     uncertainty: PoseUncertainty
     measured: PoseUncertainty
+
+    FIELDS = (
+        Field("names"),
+        Field(
+            "commanded",
+            "coordinates",
+            "pose coordinate",
+            units=lambda accuracy: list_dimensions(accuracy.names),
+        ),
+        Field("coordinates"),
+        Field("extrapolated", axes="pose"),
+        *within("uncertainty", PoseUncertainty.FIELDS),
+        *fields("position_ratio", "orientation_ratio"),
+        *fields(extrapolated=lambda accuracy: int(accuracy.extrapolated.sum())),
+    )
+    LABELS = label_axes(component=COMPONENTS, coordinate="names")
+    CAPTION = "Poses of the map"
 
     @property
     def position_ratio(self) -> FloatArray:
@@ -387,10 +403,6 @@ class AccuracyMap(TableResult):
     def extrapolated(self) -> BoolArray:
         """(n,) poses that are less certain than every measured pose."""
         return (self.position_ratio > 1.0) | (self.orientation_ratio > 1.0)
-
-    def plot(self) -> Figure:
-        """Draw the uncertainty in slices of the workspace, beside the measured poses."""
-        return draw("result_figures.draw_accuracy_map", self)
 
     def __str__(self) -> str:
         """Return medians and maxima, and how many poses are extrapolated."""
@@ -412,17 +424,6 @@ class AccuracyMap(TableResult):
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the map by name for JSON, SI."""
-        return {
-            "names": list(self.names),
-            "coordinates": self.coordinates,
-            **self.uncertainty.to_dict(),
-            "position_ratio": self.position_ratio,
-            "orientation_ratio": self.orientation_ratio,
-            "extrapolated": int(self.extrapolated.sum()),
-        }
 
 
 def accuracy_map(
@@ -489,6 +490,18 @@ class AccuracySimulation(TableResult):
     observed: FloatArray
     trials: int
     failed: int
+
+    FIELDS = (
+        Field("predicted", "predicted.sd", "pose component", TWIST_UNITS),
+        Field("observed", axes="pose component", unit=TWIST_UNITS),
+        Field("ratio", axes="pose component", unit="1"),
+    )
+    LABELS = label_axes(component=COMPONENTS)
+
+    def page(self) -> list[Block]:
+        """Return predicted and observed errors."""
+        counts = f"{self.trials} trials, {self.failed} did not converge"
+        return [f"{counts}; {self.predicted.frame}", self.main_table()]
 
     @property
     def ratio(self) -> FloatArray:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.apply import height_errors
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit
-from loopcal.apply.height_errors import store_heights
 from loopcal.apply.validation import store_differences
 from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict, recommend_values
 from loopcal.engine import collect_versions
@@ -20,8 +20,10 @@ from loopcal.findings import Finding, Severity
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import InstrumentRecord, list_instruments
 from loopcal.mechanism.model import Mechanism
-from loopcal.presentation import TableResult
-from loopcal.serialization import to_json
+from loopcal.results.description import Field, Records, fields
+from loopcal.results.result import TableResult
+from loopcal.results.serialization import json_fields, to_json
+from loopcal.results.storage import store_arrays
 
 if TYPE_CHECKING:
     from loopcal.apply.error_budget import ErrorBudget
@@ -47,10 +49,6 @@ class Provenance:
     versions: Mapping[str, str]  # of loopcal, numpy, scipy and python, and the engine that computed
     seeds: Mapping[str, int]  # by name
     options: Mapping[str, Any]  # as plain data
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes by name for JSON."""
-        return dict(vars(self))
 
 
 def describe_provenance(options: CalibrationOptions) -> Provenance:
@@ -116,6 +114,29 @@ class CalibrationReport(TableResult):
     change: Change | None
     comparison: ValueComparison | None
     provenance: Provenance
+
+    FIELDS = (
+        *fields("verdict", "headline", "states_expected_error", "findings", "recommendation"),
+        *fields("next_step", passed=lambda report: not report.failures),
+        *fields(reasons=lambda report: list(map(str, report.failures)), fit="identification"),
+        *fields(
+            start="", split=lambda report: report.split.to_dict(), instruments="", validation=""
+        ),
+        *(
+            Field(name, of, is_optional=True)
+            for name, of in (
+                ("change", "change"),
+                ("expected_error", "budget"),
+                ("comparison", "comparison"),
+                ("model_choice", "model_choice"),
+                ("examination", "examination"),
+                ("remedies", "suggestions"),
+                ("reading_errors", "reading_errors"),
+                ("height_errors", "height_errors"),
+            )
+        ),
+        *fields(options="provenance.options"),
+    )
 
     @property
     def robot(self) -> Mechanism:
@@ -216,42 +237,16 @@ class CalibrationReport(TableResult):
             "initial": fit.initial.values,
             "poses": np.array(self.split.fitted.labels, str),
             **({} if errors is None else store_differences(errors)),
-            **({} if heights is None else store_heights(heights)),
+            **({} if heights is None else store_arrays(heights, height_errors.PREFIX)),
         }
+
+    def records(self) -> Records:
+        """Return the numbers of the fit."""
+        return self.identification.records()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON values by name, SI: dictionaries, lists, numbers and text.
 
         A number that is not finite becomes None.
         """
-        return to_json(self.contents())
-
-    def contents(self) -> dict[str, Any]:
-        """Return the results by name, as objects; `to_dict` turns them into JSON values."""
-        optional = {
-            "change": self.change,
-            "expected_error": self.budget,
-            "comparison": self.comparison,
-            "model_choice": self.model_choice,
-            "examination": self.examination,
-            "remedies": self.suggestions,
-            "reading_errors": self.reading_errors,
-            "height_errors": self.height_errors,
-        }
-        return {
-            "verdict": self.verdict,
-            "headline": self.headline,
-            "states_expected_error": self.states_expected_error,
-            "findings": self.findings,
-            "recommendation": self.recommendation,
-            "next_step": self.next_step,
-            "passed": not self.failures,
-            "reasons": [str(finding) for finding in self.failures],
-            "fit": self.identification,
-            "start": self.start,
-            "split": self.split.to_dict(),
-            "instruments": self.instruments,
-            "validation": self.validation,
-            **{name: part for name, part in optional.items() if part is not None},
-            "options": self.provenance.options,
-        }
+        return to_json(json_fields(self))

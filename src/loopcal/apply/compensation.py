@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,12 +25,14 @@ from loopcal.errors import DataError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.platform_coordinates import list_dimensions, read_coordinates
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import check_limits
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, StepCounter, report_no_progress
 from loopcal.units import Dimension
 
@@ -110,6 +112,31 @@ class Compensation(TableResult):
     uncertainty: PoseUncertainty | None
     findings: tuple[Finding, ...]
 
+    FIELDS = (
+        *fields(robot="robot.name", mode="", labels="", actuators="robot.actuators.name"),
+        Field("status", lambda result: [reach.value for reach in result.reach], "pose"),
+        Field(
+            "command",
+            "commands",
+            "pose coordinate",
+            units=lambda result: list_dimensions(result.robot.controlled),
+        ),
+        Field("reading", "readings", "pose actuator", units="robot.actuators.dimension"),
+        *fields(readings="", coordinates="robot.controlled", commands=""),
+        Field("before", axes="pose component", unit=TWIST_UNITS, key="before"),
+        Field("remaining", axes="pose component", unit=TWIST_UNITS, key="remaining"),
+        *fields("not_compensable", "residual_position", "residual_orientation"),
+        *fields(uncertainty=lambda result: result.uncertainty and result.uncertainty.to_dict()),
+        *fields(reach=lambda result: [reach.value for reach in result.reach]),
+        *fields(sentences=lambda result: list(map(str, result.findings)), findings=""),
+    )
+    LABELS = label_axes(
+        pose="labels",
+        actuator="robot.actuators.name",
+        coordinate="robot.controlled",
+        component=AXES,
+    )
+
     @property
     def reach(self) -> tuple[Reach, ...]:
         """(n,) whether each target is reached."""
@@ -137,27 +164,6 @@ class Compensation(TableResult):
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result by name for JSON, SI."""
-        return {
-            "robot": self.robot.name,
-            "mode": self.mode,
-            "labels": self.labels,
-            "actuators": [a.name for a in self.robot.actuators],
-            "readings": self.readings,
-            "coordinates": self.robot.controlled,
-            "commands": self.commands,
-            "before": self.before,
-            "remaining": self.remaining,
-            "not_compensable": self.not_compensable,
-            "residual_position": self.residual_position,
-            "residual_orientation": self.residual_orientation,
-            "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
-            "reach": [r.value for r in self.reach],
-            "sentences": [str(finding) for finding in self.findings],
-            "findings": self.findings,
-        }
 
 
 def compensate(

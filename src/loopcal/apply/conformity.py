@@ -26,7 +26,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,9 +36,13 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.observations import Observations
 from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
-from loopcal.presentation import HtmlResult
+from loopcal.results.description import fields
+from loopcal.results.result import Result
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
+
+if TYPE_CHECKING:
+    from loopcal.results.tables import Block
 
 LEVEL = 0.95  # probability that conformity and nonconformity need: the default of ISO 14253-1:2017
 # Probabilities of the bounds of an interval, and of the estimate between them.
@@ -60,7 +64,7 @@ class Decision(Enum):
 
 
 @dataclass(frozen=True)
-class Conformity(HtmlResult):
+class Conformity(Result):
     """An error with its uncertainty against a limit.
 
     Attributes
@@ -80,6 +84,19 @@ class Conformity(HtmlResult):
     probability: float
     level: float = LEVEL
     count: int = 1
+
+    FIELDS = fields(
+        *("limit", "estimate", "low", "high", "expanded", "probability", "level"),
+        *("guard_band", "acceptance_limit", "count"),
+        decision="decision.value",
+        rule=lambda _: "ISO 14253-1, JCGM 106",
+    )
+
+    def page(self) -> list[Block]:
+        """Return the decision with its probability; numbers are in m or rad."""
+        error = f"error {self.estimate:.4g} (95 %: {self.low:.4g} to {self.high:.4g})"
+        decision = f"{self.decision.value} with a probability of {100.0 * self.probability:.3g} %"
+        return [f"{error} against a limit of {self.limit:.4g}, all in m or rad: {decision}"]
 
     @property
     def expanded(self) -> float:
@@ -102,13 +119,6 @@ class Conformity(HtmlResult):
         if self.probability >= self.level:
             return Decision.CONFORMS
         return Decision.FAILS if self.probability <= 1.0 - self.level else Decision.UNDECIDED
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return numbers, rule and decision by name for JSON, SI."""
-        names = ("limit", "estimate", "low", "high", "expanded", "probability", "level")
-        more = ("guard_band", "acceptance_limit", "count")
-        values = {name: getattr(self, name) for name in (*names, *more)}
-        return {**values, "decision": self.decision.value, "rule": "ISO 14253-1, JCGM 106"}
 
 
 def judge_estimate(

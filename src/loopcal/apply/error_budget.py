@@ -43,12 +43,13 @@ from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import are_nonzero, substitute_backward
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import OTHER, Field, fields, label_axes
+from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # Split the covariance of a fit by the sources of its errors, and compute it for other sigmas.
@@ -56,6 +57,25 @@ if TYPE_CHECKING:
 INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
 # Kinds of sources; others are the codes of the findings with which a covariance was added.
 EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
+
+
+SOURCE_WORDS = {
+    "instrument": "instrument: {name}",
+    "readings": "actuator readings",
+    "setup": "setup parameters",
+    "tolerances": "tolerances",
+    "earlier calibration": "earlier calibration",
+    "repeatability": "repeatability in use",
+    "residuals.model-discrepancy": "model discrepancy: {name}",
+    "residuals.correlated": "correlated errors",
+    "residuals.drift": "drift",
+    "residuals.trend": "trend",
+    "residuals.sessions-differ": "differences of sessions",
+    "residuals.depend-on-temperature": "temperature",
+    "residuals.depend-on-reading": "dependence on a reading",
+    "prior.inflation": "factor on the tolerances",
+}
+"""Kind of a source -> words; others are codes of findings that added a covariance."""
 
 
 class Source(NamedTuple):
@@ -70,6 +90,11 @@ class Source(NamedTuple):
     # corrected by statistics
     evaluation: str
     degrees: float  # degrees of freedom; infinite where the size counts as known
+
+    @property
+    def words(self) -> str:
+        """What people read."""
+        return SOURCE_WORDS.get(self.kind, self.kind).format(name=self.name)
 
 
 class CovarianceSplit(NamedTuple):
@@ -364,7 +389,7 @@ class HalvedErrors(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorBudget(TableResult):
+class ErrorBudget(DrawnResult):
     """The uncertainty of the parameters and of poses over the workspace, by source.
 
     position, orientation : variances of the tool's place and of the rotation, by kind of source.
@@ -386,9 +411,32 @@ class ErrorBudget(TableResult):
     is_workspace: bool
     finding: Finding
 
-    def plot(self) -> Figure:
-        """Draw the part of each source in the expected error, and what half its sigma leaves."""
-        return draw("result_figures.draw_budget", self)
+    FIELDS = (
+        *fields(
+            position=lambda b: {"rms": b.position.rms, "variances": b.position._asdict()},
+            orientation=lambda b: {"rms": b.orientation.rms, "variances": b.orientation._asdict()},
+            parameters=lambda b: dict(zip(b.names, b.sd.tolist(), strict=True)),
+            worst_parameter="worst",
+            sources=lambda b: [b._list_line(line) for line in b.lines],
+            poses="poses",
+            over=lambda b: "workspace" if b.is_workspace else "measured poses",
+            frame="finding.data.frame",
+            finding="finding",
+        ),
+        Field("type", "lines.source.evaluation", "source"),
+        Field("degrees", "lines.source.degrees", "source", "1"),
+        Field("position", lambda b: np.sqrt([x.position for x in b.lines]), "source", "m"),
+        Field("orientation", lambda b: np.sqrt([x.orientation for x in b.lines]), "source", "rad"),
+        Field("position_if_halved", "lines.halved.position", "source", "m"),
+        Field("orientation_if_halved", "lines.halved.orientation", "source", "rad"),
+        Field(
+            "parameter_variance",
+            lambda b: np.reshape([line.parameters for line in b.lines], (-1, len(b.names))),
+            f"source {OTHER}",
+            "square of the SI unit",
+        ),
+    )
+    LABELS = label_axes(source="lines.source.words", other="names")
 
     def __str__(self) -> str:
         return str(self.finding)
@@ -400,27 +448,6 @@ class ErrorBudget(TableResult):
             f"<ErrorBudget: {len(self.lines)} sources; position {round_to_digits(position)} mm, "
             f"orientation {round_to_digits(orientation)} mrad>"
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return root mean squares and variances by source for JSON, SI.
-
-        `sources` has one entry for each source, with the variance of every parameter by name.
-        """
-        errors = {}
-        for name in ("position", "orientation"):
-            sources: ErrorSources = getattr(self, name)
-            errors[name] = {"rms": sources.rms, "variances": sources._asdict()}
-        place = "workspace" if self.is_workspace else "measured poses"
-        return {
-            **errors,
-            "parameters": dict(zip(self.names, self.sd.tolist(), strict=True)),
-            "worst_parameter": self.worst,
-            "sources": [self._list_line(line) for line in self.lines],
-            "poses": self.poses,
-            "over": place,
-            "frame": self.finding.data["frame"],
-            "finding": self.finding,
-        }
 
     def _list_line(self, line: SourceBudget) -> dict[str, Any]:
         """Return a source by name for JSON."""

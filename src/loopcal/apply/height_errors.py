@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,13 +34,13 @@ from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.assembly import AXES
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, fields
+from loopcal.results.result import DrawnResult
+from loopcal.results.storage import restore_arrays
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, Unit
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from loopcal.mechanism.model import Mechanism
 
 PREFIX = "heights_"  # beginning of the names of the stored arrays
@@ -52,7 +52,7 @@ UPRIGHT = 0.95  # least cosine of the angle between the z axes of the measured f
 
 
 @dataclass(frozen=True, eq=False)
-class HeightErrors(TableResult):
+class HeightErrors(DrawnResult):
     """Errors of n measured heights, prediction minus measurement, at their places x, y.
 
     Attributes
@@ -69,6 +69,18 @@ class HeightErrors(TableResult):
     is_held_out: BoolArray
     unit: Unit
 
+    FIELDS = (
+        Field("poses", is_stored=True),
+        Field("points", is_stored=True),
+        Field("pose", "poses", "row"),
+        Field("x", lambda heights: heights.points[:, 0], "row", "m"),
+        Field("y", lambda heights: heights.points[:, 1], "row", "m"),
+        Field("before", axes="row", unit="m", key="before", is_stored=True),
+        Field("after", axes="row", unit="m", key="after", is_stored=True),
+        Field("held_out", "is_held_out", "row", key="held_out", is_stored=True),
+        *fields(statistics=lambda heights: heights.list_statistics()),
+    )
+
     def statistics(self, errors: str, held_out: bool) -> Statistics:
         """Return the statistics of the sizes of "before" or "after", of the held-out or of the
         fitted heights [m].
@@ -81,9 +93,12 @@ class HeightErrors(TableResult):
             if (self.is_held_out == is_held_out).any():
                 yield name, is_held_out
 
-    def plot(self) -> Figure:
-        """Draw the errors over x and y before and after calibration, with one scale of colors."""
-        return draw("result_figures.draw_height_errors", self)
+    def list_statistics(self) -> dict[str, dict[str, Statistics]]:
+        """Return the statistics of the errors before and after, of the fitted and the held-out."""
+        return {
+            name: {e: self.statistics(e, is_held_out) for e in ("before", "after")}
+            for name, is_held_out in self.list_sets()
+        }
 
     def __str__(self) -> str:
         """Return one line for the fitted and one for the held-out heights."""
@@ -96,17 +111,6 @@ class HeightErrors(TableResult):
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return points, errors and their statistics by name for JSON, SI."""
-        return {
-            **{name: getattr(self, name) for name in ("poses", "points", "before", "after")},
-            "held_out": self.is_held_out,
-            "statistics": {
-                name: {e: self.statistics(e, is_held_out) for e in ("before", "after")}
-                for name, is_held_out in self.list_sets()
-            },
-        }
 
 
 def map_height_errors(
@@ -150,25 +154,11 @@ def has_height_map(robot: Mechanism) -> bool:
     return robot.program.freedoms == TRANSLATIONS
 
 
-def store_heights(heights: HeightErrors) -> dict[str, np.ndarray]:
-    """Return the errors as arrays by name [SI]."""
-    arrays = {name: getattr(heights, name) for name in ("points", "before", "after")}
-    arrays |= {"poses": np.array(heights.poses, str), "held_out": heights.is_held_out}
-    return {f"{PREFIX}{name}": array for name, array in arrays.items()}
-
-
 def restore_heights(arrays: Mapping[str, np.ndarray], robot: Mechanism) -> HeightErrors | None:
-    """Return stored errors; None where a run has none, or its robot has no map of heights.
-
-    arrays : of the run. robot : for the unit.
-    """
-    if f"{PREFIX}poses" not in arrays or not has_height_map(robot):
+    """Return stored errors; None where a run has none, or its robot has no map of heights."""
+    if not has_height_map(robot):
         return None
-    points, before, after, held_out = (
-        arrays[f"{PREFIX}{name}"] for name in ("points", "before", "after", "held_out")
-    )
-    labels = tuple(arrays[f"{PREFIX}poses"].tolist())
-    return HeightErrors(labels, points, before, after, held_out, robot.get_unit(Dimension.LENGTH))
+    return restore_arrays(HeightErrors, arrays, PREFIX, unit=robot.get_unit(Dimension.LENGTH))
 
 
 def measures_only_heights(data: Measurements) -> bool:

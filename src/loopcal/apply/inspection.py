@@ -28,7 +28,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import evaluate_limits
 from loopcal.numerics.decomposition import RANK_TOLERANCE
-from loopcal.serialization import json_fields
+from loopcal.results.serialization import json_fields
 from loopcal.typing import FloatArray
 
 FEW = 3  # combinations that change poses and that a summary lists one by one

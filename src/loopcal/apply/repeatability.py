@@ -41,12 +41,13 @@ from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_quantile
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, fields
+from loopcal.results.result import DrawnResult
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import DISPLAY_UNITS, Dimension
+from loopcal.units import DISPLAY_UNITS, SI_SYMBOLS, Dimension
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # The result of `assess_repeatability`: what each visited pose shows.
@@ -109,8 +110,12 @@ class VisitedPose:
         return {**{name: getattr(self, name) for name in names}, **whole, **listed}
 
 
+NUMBERS = ("AP", "AP_low", "AP_high", "RP", "RP_low", "RP_high", "visits")
+"""Columns of numbers of the data frame."""
+
+
 @dataclass(frozen=True, eq=False)
-class Repeatability(TableResult):
+class Repeatability(DrawnResult):
     """Pose accuracy and repeatability of a machine.
 
     Attributes
@@ -127,9 +132,45 @@ class Repeatability(TableResult):
     variations: Mapping[tuple[str, str], float]
     findings: tuple[Finding, ...]
 
-    def plot(self) -> Figure:
-        """Draw pose accuracy and repeatability of each pose, with intervals of 95 %."""
-        return draw("result_figures.draw_repeatability", self)
+    FIELDS = (
+        *fields(standard=lambda _: "ISO 9283:1998", frame=""),
+        *(
+            Field(name, lambda result, name=name: result.poses.get(name), is_optional=True)
+            for name in ("position", "orientation")
+        ),
+        *fields(variations=lambda result: result.list_variations(), findings=""),
+        *(
+            Field(name, lambda result, i=i: [row[i] for row in result.list_rows()], "row")
+            for i, name in enumerate(
+                ("pose", "target", "direction", "quantity", "component", "unit", *NUMBERS)
+            )
+        ),
+    )
+
+    def list_variations(self) -> list[dict[str, Any]]:
+        """Return the variations by name."""
+        return [
+            {"pose": pose, "target": target, "vAP_p": value}
+            for (pose, target), value in self.variations.items()
+        ]
+
+    def list_rows(self) -> list[tuple[Any, ...]]:
+        """Return AP and RP with their intervals, one row for each pose and component [SI]."""
+        listed = []
+        for quantity, poses in self.poses.items():
+            unit = SI_SYMBOLS[DIMENSIONS[quantity]]
+            for pose in poses:
+                rows = list(
+                    zip(pose.components, pose.accuracies, pose.repeatabilities, strict=True)
+                )
+                if pose.accuracy is not None and pose.repeatability is not None:
+                    rows.insert(0, ("all", pose.accuracy, pose.repeatability))
+                named = (pose.pose, pose.target, pose.direction, quantity)
+                listed += [
+                    (*named, component, unit, *accuracy, *repeatability, pose.visits)
+                    for component, accuracy, repeatability in rows
+                ]
+        return listed
 
     def __repr__(self) -> str:
         counts = (f"{name} of {len(poses)} visited poses" for name, poses in self.poses.items())
@@ -142,19 +183,6 @@ class Repeatability(TableResult):
             for name, poses in self.poses.items()
         ]
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content by name for JSON, SI."""
-        return {
-            "standard": "ISO 9283:1998",
-            "frame": self.frame,
-            **{name: [pose.to_dict() for pose in poses] for name, poses in self.poses.items()},
-            "variations": [
-                {"pose": pose, "target": target, "vAP_p": value}
-                for (pose, target), value in self.variations.items()
-            ],
-            "findings": self.findings,
-        }
 
 
 def describe_largest(poses: tuple[VisitedPose, ...], quantity: str) -> str:

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -28,12 +29,13 @@ from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_single_level
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import UNITS, Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # What a comparison needs of a calibration, as `loopcal.Run` has it.
@@ -301,25 +303,6 @@ COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a 
 class PairComparison:
     """A run against the first one."""
 
-    JSON_FIELDS: ClassVar[tuple[str, ...]] = (
-        "first",
-        "second",
-        "data",
-        "shared",
-        "names",
-        "shift",
-        "shift_sd",
-        "significant",
-        "chi_square",
-        "degrees",
-        "p_value",
-        "moved",
-        "cause",
-        "cause_shift",
-        "cause_sd",
-        "finding",
-    )
-
     # first, second: names of the runs
     first: str
     second: str
@@ -346,8 +329,31 @@ class PairComparison:
     cause_sd: FloatArray
     finding: Finding  # the result with its code
 
+    FIELDS = fields(
+        *("first", "second", "data", "shared", "names", "shift", "shift_sd", "significant"),
+        *(
+            "chi_square",
+            "degrees",
+            "p_value",
+            "moved",
+            "cause",
+            "cause_shift",
+            "cause_sd",
+            "finding",
+        ),
+    )
+
     def __repr__(self) -> str:
         return f"<PairComparison: {self.finding}>"
+
+    def find_shift(self, name: str) -> tuple[float, float, bool]:
+        """Return the shift of a parameter, its standard deviation [SI], and whether it is
+        significant; NaN where it is not tested.
+        """
+        if name not in self.names:
+            return math.nan, math.nan, False
+        i = self.names.index(name)
+        return float(self.shift[i]), float(self.shift_sd[i]), bool(self.significant[i])
 
 
 @dataclass(frozen=True)
@@ -523,7 +529,7 @@ class RunSummary:
 
 
 @dataclass(frozen=True, eq=False)
-class RunComparison(TableResult):
+class RunComparison(DrawnResult):
     """Calibrations side by side; the first one is the reference of all others.
 
     Attributes
@@ -543,15 +549,35 @@ class RunComparison(TableResult):
     common_poses: int
     findings: tuple[Finding, ...]
 
+    FIELDS = (
+        *fields(runs="", parameters="", units="units.symbol", pairs="", errors=""),
+        *fields("common_poses", "moved", "findings"),
+        Field("unit", "units.symbol", "parameter"),
+    )
+    LABELS = label_axes(parameter="parameters")
+
+    def list_fields(self) -> Iterator[Field]:
+        """Yield the fields, among them the estimates and the shifts of each run in shown units."""
+        yield from self.FIELDS
+        factor = [unit.factor_to_si for unit in self.units]
+
+        def show(name: str, values: Iterable[float | None]) -> Field:
+            return Field(name, lambda _: np.array(list(values), float) / factor, "parameter")
+
+        for run in self.runs:
+            yield show(f"{run.name} estimate", map(run.estimates.get, self.parameters))
+            yield show(f"{run.name} plus_minus", map(run.plus_minus.get, self.parameters))
+        for pair in self.pairs:
+            shift, sd, significant = zip(*map(pair.find_shift, self.parameters), strict=True)
+            yield show(f"{pair.second} shift", shift)
+            yield show(f"{pair.second} shift_sd", sd)
+            yield Field(f"{pair.second} significant", lambda _, s=significant: s, "parameter")
+
     @property
     def moved(self) -> bool | None:
         """Whether any machine differs from that of the first run; None where nothing was tested."""
         answers = [pair.moved for pair in self.pairs if pair.moved is not None]
         return any(answers) if answers else None
-
-    def plot(self) -> Figure:
-        """Draw the tested shift of each parameter from the first run, in standard deviations."""
-        return draw("result_figures.draw_run_shifts", self)
 
     def __str__(self) -> str:
         """Return the findings, one on each line."""
@@ -560,19 +586,6 @@ class RunComparison(TableResult):
         return "\n".join([f"Comparison of {names}:", *lines])
 
     __repr__ = __str__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result by name for JSON, SI; `units` are those in which people see it."""
-        return {
-            "runs": self.runs,
-            "parameters": self.parameters,
-            "units": [unit.symbol for unit in self.units],
-            "pairs": self.pairs,
-            "errors": self.errors,
-            "common_poses": self.common_poses,
-            "moved": self.moved,
-            "findings": self.findings,
-        }
 
 
 def compare_runs(runs: Sequence[StoredRun], data: Measurements | None = None) -> RunComparison:

@@ -49,12 +49,14 @@ from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_quantile, find_distinct
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, fields
+from loopcal.results.result import DrawnResult
+from loopcal.results.storage import restore
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension, Unit
+from loopcal.units import SI_SYMBOLS, Dimension, Unit
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # Findings of a validation: limits, setup parameters that moved, and poses that were left out.
@@ -321,7 +323,7 @@ def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[
 
 
 @dataclass(frozen=True, eq=False)
-class Validation(TableResult):
+class Validation(DrawnResult):
     """Errors on measured poses before and after calibration, over the r rows of all kinds.
 
     Positions are compared target by target in the frame of their instrument, see `frame`.
@@ -371,6 +373,22 @@ class Validation(TableResult):
     blunders: tuple[Blunder, ...] = ()
     without_blunders: Validation | None = None
     conformity: Mapping[str, Conformity] = field(default_factory=dict)
+
+    FIELDS = (
+        *fields("poses", "before", "after", "commanded_before", "commanded_after"),
+        *fields("not_compensable", "noise_floor", failed="unreachable"),
+        *fields("limit_position", "limit_angle", "conformity", "passed"),
+        *fields(
+            reasons=lambda v: list(map(str, v.failures)),
+            notes=lambda v: [str(f) for f in v.findings if f.severity is not Severity.FAILURE],
+        ),
+        *fields("findings", "blunders", without_blunders=lambda v: v._without_blunders()),
+        *fields("frame", "alignment", "kinds", "setup_count", "absorbed", "judged"),
+        *(
+            Field(name, lambda v, i=i: [row[i] for row in v.list_sizes()], "row")
+            for i, name in enumerate(("pose", "target", "quantity", "unit", "before", "after"))
+        ),
+    )
 
     @property
     def failures(self) -> tuple[Finding, ...]:
@@ -447,9 +465,17 @@ class Validation(TableResult):
             "not compensable": self.not_compensable,
         }
 
-    def plot(self) -> Figure:
-        """Draw the errors by pose before and after calibration, with the noise floor and limits."""
-        return draw("result_figures.draw_validation", self)
+    def list_sizes(self) -> list[tuple[str, str, str, str, float, float]]:
+        """Return pose, target, quantity, unit, and sizes before and after [SI] of every error."""
+        rows = []
+        for quantity in self.quantities:
+            before, after = self.before[quantity].size, self.after[quantity]
+            symbol = SI_SYMBOLS[after.dimension]
+            for i, target, *sizes in zip(
+                after.rows, after.targets, before.tolist(), after.size.tolist(), strict=True
+            ):
+                rows.append((self.poses[i], target, quantity, symbol, *sizes))
+        return rows
 
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""
@@ -477,31 +503,6 @@ class Validation(TableResult):
         return lines
 
     __repr__ = __str__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result by name for JSON, SI."""
-        named = ("before", "after", "commanded_before", "commanded_after", "not_compensable")
-        return {
-            "poses": self.poses,
-            **{name: getattr(self, name) for name in named},
-            "noise_floor": self.noise_floor,
-            "failed": self.unreachable,
-            "limit_position": self.limit_position,
-            "limit_angle": self.limit_angle,
-            "conformity": dict(self.conformity),
-            "passed": self.passed,
-            "reasons": [str(finding) for finding in self.failures],
-            "notes": [str(f) for f in self.findings if f.severity is not Severity.FAILURE],
-            "findings": self.findings,
-            "blunders": self.blunders,
-            "without_blunders": self._without_blunders(),
-            "frame": self.frame,
-            "alignment": self.alignment,
-            "kinds": [vars(kind) for kind in self.kinds],
-            "setup_count": self.setup_count,
-            "absorbed": self.absorbed,
-            "judged": self.judged,
-        }
 
     def _without_blunders(self) -> dict[str, Any] | None:
         """Return the errors without blunders for JSON; None without any."""
@@ -705,25 +706,18 @@ def restore_validation(
         name: _restore_errors(content[name], arrays, f"{PREFIX}_{name}")
         for name in ("before", "after", "commanded_before", "commanded_after", "not_compensable")
     }
-    after = errors["after"]
-    return Validation(
-        poses=tuple(content["poses"]),
-        before=errors["before"],
-        after=after,
-        commanded_before=errors["commanded_before"],
-        commanded_after=errors["commanded_after"],
-        not_compensable=errors["not_compensable"],
-        noise_floor=_restore_floor(content["noise_floor"]),
-        unreachable=tuple(content["failed"]),
-        limit_position=content["limit_position"],
-        limit_angle=content["limit_angle"],
-        units={name: robot.get_unit(e.dimension) for name, e in after.quantities.items()},
-        alignment={key: tuple(names) for key, names in content["alignment"].items()},
-        kinds=_restore_kinds(content["kinds"]),
-        setup_count=content["setup_count"],
-        absorbed=content["absorbed"],
-        judged=content["judged"],
-        blunders=tuple(_restore_blunder(blunder) for blunder in content["blunders"]),
+    return restore(
+        Validation,
+        content,
+        **errors,
+        units={name: robot.get_unit(e.dimension) for name, e in errors["after"].quantities.items()},
+        noise_floor=restore(NoiseFloor, {"metrics": content["noise_floor"]}),
+        findings=(),
+        conformity={},
+        blunders=tuple(
+            restore(Blunder, blunder, explanation=Explanation("none"))
+            for blunder in content["blunders"]
+        ),
         without_blunders=_restore_rest(content["without_blunders"], content, robot),
     )
 
@@ -757,38 +751,3 @@ def _restore_errors(
             tuple(stored["components"]),
         )
     return PoseErrors(quantities)
-
-
-def _restore_floor(content: Mapping[str, Any]) -> NoiseFloor:
-    """Return the noise floor."""
-    return NoiseFloor(
-        {
-            metric: {quantity: _number(value) for quantity, value in values.items()}
-            for metric, values in content.items()
-        }
-    )
-
-
-def _restore_kinds(content: list[Mapping[str, Any]]) -> tuple[KindErrors, ...]:
-    """Return the whitened errors of each kind."""
-    keys = ("before", "after", "noise_floor")
-    return tuple(
-        KindErrors(
-            kind["kind"],
-            kind["count"],
-            *(_number(kind[key]) for key in keys),
-            change=_number(kind.get("change")),
-        )
-        for kind in content
-    )
-
-
-def _restore_blunder(content: Mapping[str, Any]) -> Blunder:
-    """Return a pose that does not fit, without its explanation."""
-    numbers = (_number(content["times"]), _number(content["p_value"]))
-    return Blunder(tuple(content["poses"]), *numbers, Explanation("none"))
-
-
-def _number(value: float | None) -> float:
-    """Return a number of a file, in which null is not finite."""
-    return float("nan") if value is None else float(value)

@@ -22,7 +22,7 @@ from loopcal.plain_text import escape
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
-    from loopcal.report.tables import Block
+    from loopcal.results.tables import Block
 
 WIDEST = 120
 """Characters of the longest line of prose, on wide terminals."""
@@ -41,7 +41,7 @@ def width() -> int:
 
 def print_page(blocks: Iterable[Block]) -> None:
     """Print paragraphs and tables, wrapped to the terminal."""
-    from loopcal.report.tables import render_text
+    from loopcal.results.tables import render_text
 
     print_text(render_text(blocks, width()) + "\n")
 

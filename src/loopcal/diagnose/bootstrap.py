@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -56,7 +56,8 @@ from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_single_level
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 # Whitened rows of a fit in the order of its kinds, with columns for everything that they
@@ -434,6 +435,14 @@ class Bootstrap(TableResult):
     failed: int
     scatter: BlockScatter
 
+    FIELDS = (
+        *fields(robot="fit.robot.name", scheme="", seed="", unit="blocks.unit"),
+        *fields(blocks="blocks.count", resamples=lambda boot: len(boot.draws), failed=""),
+        *fields(degrees="scatter.degrees", findings=""),
+        Field("estimate", "draws", "draw parameter", units="fit.free_parameters.dimensions"),
+    )
+    LABELS = label_axes(parameter="fit.names")
+
     def __repr__(self) -> str:
         """Return scheme, blocks and number of resamples."""
         blocks = f"{self.blocks.count} {self.blocks.unit}s"
@@ -504,20 +513,6 @@ class Bootstrap(TableResult):
         stated = np.where(self.is_known, self.fit.standard_deviations, np.nan)
         ratio = self.standard_deviations / stated
         return (*findings, self.scatter.report(self.fit.names, ratio, self.blocks))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what was drawn and what was found, for JSON."""
-        return {
-            "robot": self.fit.robot.name,
-            "scheme": self.scheme,
-            "seed": self.seed,
-            "unit": self.blocks.unit,
-            "blocks": self.blocks.count,
-            "resamples": len(self.draws),
-            "failed": self.failed,
-            "degrees": self.scatter.degrees,
-            "findings": self.findings,
-        }
 
     def _ends(
         self, kind: IntervalKind, level: float, quantile: FloatArray

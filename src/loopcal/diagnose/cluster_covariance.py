@@ -40,6 +40,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.elimination import find_connected_groups, fold_at
 from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.results.description import fields
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Divide poses into the units that may share an error: days, sessions, blocks or single poses.
@@ -156,17 +157,11 @@ class ClusterCheck:
     parameter: tuple[str, float]
     finding: Finding  # the result
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result by name for JSON."""
-        ratios = {name: getattr(self, name)._asdict() for name in ("position", "orientation")}
-        name, ratio = self.parameter
-        return {
-            "unit": self.unit,
-            "clusters": self.clusters,
-            **ratios,
-            "parameter": {"name": name, "ratio": ratio},
-            "finding": self.finding,
-        }
+    FIELDS = fields(
+        *("unit", "clusters", "position", "orientation"),
+        parameter=lambda check: dict(zip(("name", "ratio"), check.parameter, strict=True)),
+        finding="finding",
+    )
 
 
 def check_clusters(

@@ -16,7 +16,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -42,9 +42,13 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import are_nonzero, decompose
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, each, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from loopcal.results.tables import Block
 
 # Determinant of 1 - leverage of a block below which the other blocks do not determine its rows.
 NOTHING_LEFT = 1e-12
@@ -70,6 +74,18 @@ class CrossValidation(TableResult):
     before_fold: FloatArray
     converged: bool
 
+    FIELDS = (
+        *fields("*", "score", "standard_error"),
+        Field("mean_square_before", "before_fold", "fold", "sigma^2"),
+        Field("mean_square", "fold", "fold", "sigma^2"),
+    )
+
+    def page(self) -> list[Block]:
+        """Return the score and the folds."""
+        text = f"Held-out score {self.score:.4g} +/- {self.standard_error:.2g} sigma^2"
+        poses = f"{len(self.poses)} rows in {len(self.fold)} folds"
+        return [f"{text}, {poses}; 1 is noise alone.", self.main_table()]
+
     @property
     def score(self) -> float:
         """Mean over folds of the held-out mean square."""
@@ -89,10 +105,6 @@ class CrossValidation(TableResult):
         error = round_to_digits(self.standard_error, 2)
         score = f"score {round_to_digits(self.score, 4)} +/- {error}"
         return f"<CrossValidation: {len(self.fold)} folds, {len(self.poses)} rows, {score}>"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes, the score and its standard error for JSON, SI."""
-        return {**vars(self), "score": self.score, "standard_error": self.standard_error}
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,6 +332,15 @@ class Candidate:
     validation: CrossValidation | None
     conditioning: Conditioning  # by all data, at the values before calibration
 
+    FIELDS = (
+        Field("name", title="free"),
+        Field("parameters", show=lambda names: str(len(names))),
+        Field("score", unit="sigma^2", digits=4),
+        Field("standard_error", unit="sigma^2", title="+/-", digits=2),
+        Field("rank", "conditioning.rank", unit="1"),
+        Field("condition", "conditioning.condition", unit="1", digits=3),
+    )
+
     @property
     def score(self) -> float:
         """Mean square error on held-out poses [sigma^2]; infinite where it is not known."""
@@ -329,15 +350,6 @@ class Candidate:
     def standard_error(self) -> float:
         """Standard error of the score; NaN where it is not known."""
         return np.nan if self.validation is None else self.validation.standard_error
-
-    JSON_FIELDS: ClassVar[Mapping[str, str]] = {
-        "name": "name",
-        "parameters": "parameters",
-        "score": "score",
-        "standard_error": "standard_error",
-        "rank": "conditioning.rank",
-        "condition": "conditioning.condition",
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,6 +366,18 @@ class ModelChoice(TableResult):
     chosen: Candidate
     best: Candidate
     robot: Mechanism
+
+    FIELDS = (
+        *fields(candidates="", chosen="chosen.name", best="best.name", finding=""),
+        Field(
+            "parameters", lambda choice: [len(c.parameters) for c in choice.candidates], "set", "1"
+        ),
+        *each(
+            "candidates", "set", Candidate.FIELDS, "rank", "condition", "score", "standard_error"
+        ),
+        Field("chosen", lambda choice: [c is choice.chosen for c in choice.candidates], "set"),
+    )
+    LABELS = label_axes(set="candidates.name")
 
     @property
     def finding(self) -> Finding:
@@ -384,15 +408,6 @@ class ModelChoice(TableResult):
                 f"{c.score:>14.4g} {c.standard_error:>9.2g}"
             )
         return "\n".join([*lines, str(self.finding)])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return scores, conditions, choice and finding for JSON."""
-        return {
-            "candidates": self.candidates,
-            "chosen": self.chosen.name,
-            "best": self.best.name,
-            "finding": self.finding,
-        }
 
 
 def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:

@@ -6,7 +6,7 @@ expected gain.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,9 +29,14 @@ from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import transmit_readings
 from loopcal.numerics.statistics import find_distinct
-from loopcal.presentation import HtmlResult
+from loopcal.results.description import fields
+from loopcal.results.result import Result
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from loopcal.results.tables import Block
+
 
 # Find parameters whose estimates are strongly correlated.
 
@@ -49,14 +54,12 @@ class CorrelatedGroup:
     pair: tuple[str, str]
     correlation: float
 
+    FIELDS = fields("*", "finding")
+
     @property
     def finding(self) -> Finding:
         """The group as a finding."""
         return report_finding("residuals.correlated-parameters", **vars(self))
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the attributes and the finding for JSON."""
-        return {**vars(self), "finding": self.finding}
 
 
 def find_correlated_groups(
@@ -105,11 +108,10 @@ class CalibrationGain:
     is_worthwhile: bool | None  # whether either becomes smaller; None where it cannot be predicted
     finding: Finding  # the expected errors, or the reason why there are none
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes for JSON; `is_worthwhile` is called `calibrate` there."""
-        content = dict(vars(self))
-        content["calibrate"] = content.pop("is_worthwhile")
-        return content
+    FIELDS = fields(
+        *("position_before", "position_after", "angle_before", "angle_after", "finding"),
+        calibrate="is_worthwhile",
+    )
 
 
 def estimate_calibration_gain(
@@ -179,7 +181,7 @@ def _quantities(
 
 
 @dataclass(frozen=True, eq=False)
-class FitExamination(HtmlResult):
+class FitExamination(Result):
     """The results of all examinations of a fit by its own data.
 
     Attributes
@@ -197,15 +199,17 @@ class FitExamination(HtmlResult):
     gain: CalibrationGain
     tails: HeavyTails
 
-    JSON_FIELDS = {  # noqa: RUF012
-        "outliers": "outliers",
-        "lack_of_fit": "lack_of_fit",
-        "clusters": "clusters",
-        "correlated": "correlated",
-        "worth": "gain",
-        "heavy_tails": "tails",
-        "findings": "findings",
-    }
+    FIELDS = fields(
+        *("outliers", "lack_of_fit", "clusters", "correlated"),
+        worth="gain",
+        heavy_tails="tails",
+        findings="findings",
+    )
+
+    def page(self) -> list[Block]:
+        """Return the findings."""
+        lines = (f"{f.severity.value}: {f}" for f in self.findings)
+        return ["\n".join(lines) or "no findings"]
 
     def __repr__(self) -> str:
         names = ", ".join(finding.code for finding in self.findings) or "none"

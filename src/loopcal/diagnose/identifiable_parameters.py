@@ -7,7 +7,7 @@ Singular values are those of whitened rows in units of tolerance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,12 +34,12 @@ from loopcal.numerics.decomposition import (
     are_nonzero,
     decompose,
 )
-from loopcal.presentation import TableResult, draw
-from loopcal.serialization import json_fields
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import DrawnResult
 from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from loopcal.results.tables import Block
 
 
 # The observability indices O1 to O5. Formulas and sources: docs/theory/observability.md.
@@ -125,6 +125,8 @@ class ParameterIdentifiability:
     # learned
     left: float
 
+    FIELDS = fields("*", "state")
+
     @property
     def state(self) -> str:
         """Return "determined", "together" or "not at all"."""
@@ -137,13 +139,9 @@ class ParameterIdentifiability:
         """The other parameters of its combinations."""
         return tuple(name for name in self.partners if name != self.name)
 
-    def to_dict(self) -> dict[str, object]:
-        """Return the attributes and the state for JSON."""
-        return {**vars(self), "state": self.state}
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identifiability(TableResult):
+class Identifiability(DrawnResult):
     """What measurements determine, in units of sigma (rows) and tolerance (columns).
 
     Attributes
@@ -163,10 +161,19 @@ class Identifiability(TableResult):
     indices: Observability
     parameters: tuple[ParameterIdentifiability, ...]
 
-    JSON_FIELDS: ClassVar[tuple[str, ...]] = (
-        *("n_parameters", "n_equations", "rank", "condition", "gap", "singular_values"),
-        *("tolerance", "improved", "unidentifiable", "weak", "indices", "parameters", "findings"),
+    FIELDS = (
+        *fields("n_parameters", "n_equations", "rank", "condition", "gap", "singular_values"),
+        *fields("tolerance", "improved", "unidentifiable", "weak", "indices", "parameters"),
+        *fields("findings", scaling=lambda _: SCALING),
+        Field("determined", "parameters.state", "parameter"),
+        Field("sd_over_tolerance", "parameters.left", "parameter", "1"),
+        Field("singular_value", "singular_values", "direction", "sigma per tolerance"),
     )
+    LABELS = label_axes(parameter="free_parameters.names")
+
+    def page(self) -> list[Block]:
+        """Return the findings and the parameters."""
+        return ["\n".join(map(str, self.findings)), self.main_table()]
 
     @property
     def n_parameters(self) -> int:
@@ -209,10 +216,6 @@ class Identifiability(TableResult):
     def improved(self) -> int:
         """Number of directions known better than their tolerance (singular value above 1)."""
         return int((self.singular_values[: self.rank] > 1.0).sum())
-
-    def plot(self) -> Figure:
-        """Draw the singular values with the gap, null vectors and weak directions."""
-        return draw("fit_figures.draw_identifiability", self)
 
     def __repr__(self) -> str:
         name, rank = self.free_parameters.robot.name, f"rank {self.rank} of {self.n_parameters}"
@@ -295,10 +298,6 @@ class Identifiability(TableResult):
     def null_space(self) -> FloatArray:
         """Return (p, d) orthonormal deviations in tolerances that change no measured value."""
         return self.decomposition.null_space()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what the data determine for JSON, without the matrices."""
-        return {**json_fields(self), "scaling": SCALING}
 
 
 def identifiability(

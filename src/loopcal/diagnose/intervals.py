@@ -21,7 +21,8 @@ import numpy as np
 
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.statistics import compute_single_level
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray
 
 # Statistics of weighted draws, and how well the draws determine them.
@@ -92,6 +93,9 @@ NAMED = 3  # parameters that a finding names, at most
 FALSE_ALARMS = 0.01
 
 
+ENDS = ("lower", "upper", "linear_lower", "linear_upper")
+
+
 @dataclass(frozen=True, eq=False)
 class Intervals(TableResult):
     """Intervals of parameters; arrays are (p,) [SI], NaN where the data determine none.
@@ -117,6 +121,13 @@ class Intervals(TableResult):
     shift: FloatArray
     shift_error: FloatArray
 
+    FIELDS = (
+        *fields("level", "source", parameters=lambda intervals: intervals._list_rows()),
+        *(Field(name, axes="parameter", unit="SI") for name in ("center", "sd", *ENDS)),
+        Field("linear_is_off", "is_off", "parameter"),
+    )
+    LABELS = label_axes(parameter="names")
+
     def __repr__(self) -> str:
         """Return the number of parameters, and how many linear intervals are off."""
         off = int(self.is_off.sum())
@@ -137,27 +148,14 @@ class Intervals(TableResult):
         """(p,) largest difference of an end, in linear half-widths."""
         return np.asarray(np.abs(np.nan_to_num(self.shift)).max(axis=0))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return one entry for each parameter, for JSON [SI]."""
-        return {
-            "level": self.level,
-            "source": self.source,
-            "parameters": [
-                {
-                    "name": name,
-                    "mean": self.center[i],
-                    "sd": self.sd[i],
-                    "lower": self.lower[i],
-                    "upper": self.upper[i],
-                    "linear_lower": self.linear_lower[i],
-                    "linear_upper": self.linear_upper[i],
-                    "shift": self.shift[:, i],
-                    "shift_error": self.shift_error[:, i],
-                    "linear_is_off": bool(self.is_off[i]),
-                }
-                for i, name in enumerate(self.names)
-            ],
-        }
+    def _list_rows(self) -> list[dict[str, Any]]:
+        """Return one entry for each parameter [SI]."""
+        columns = {name: getattr(self, name) for name in ENDS}
+        columns |= {"shift": self.shift.T, "shift_error": self.shift_error.T}
+        columns = {"name": self.names, "mean": self.center, "sd": self.sd, **columns}
+        columns["linear_is_off"] = self.is_off
+        rows = zip(*columns.values(), strict=True)
+        return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -33,7 +33,8 @@ from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.statistics import compute_f_quantile, compute_single_level
-from loopcal.presentation import TableResult
+from loopcal.results.description import OTHER, Field, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray, IntArray
 
 Rule = Literal["maximum", "sidak", "bonferroni", "scheffe"]  # how simultaneous intervals are made
@@ -60,6 +61,16 @@ class JointRegion(TableResult):
     level: float
     degrees: float
     square: float
+
+    FIELDS = (
+        *fields("*", "half_widths", "axes", "correlation"),
+        *(
+            Field(name, axes="quantity", unit="SI")
+            for name in ("center", "standard_deviations", "half_widths")
+        ),
+        Field("covariance", axes=f"quantity {OTHER}", unit="SI times SI"),
+    )
+    LABELS = label_axes(quantity="names", other="names")
 
     def __repr__(self) -> str:
         return f"<JointRegion of {', '.join(self.names)}: {round_to_digits(100 * self.level, 4)} %>"
@@ -114,11 +125,6 @@ class JointRegion(TableResult):
             return np.asarray(chdtrc(q, square))
         return np.asarray(fdtrc(q, self.degrees, square / q))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the region for JSON [SI]."""
-        own = vars(self) | {"half_widths": self.half_widths, "axes": self.axes}
-        return {**own, "correlation": self.correlation}
-
 
 @dataclass(frozen=True, eq=False)
 class SimultaneousIntervals(TableResult):
@@ -139,6 +145,12 @@ class SimultaneousIntervals(TableResult):
     factor: FloatArray
     single: FloatArray
 
+    FIELDS = (
+        *fields("*"),
+        *(Field(name, axes="quantity", unit="SI") for name in ("center", "half_widths", "single")),
+    )
+    LABELS = label_axes(quantity="names")
+
     def __repr__(self) -> str:
         names = f"{len(self.names)} quantities at {round_to_digits(100 * self.level, 4)} %"
         return f"<SimultaneousIntervals of {names} by {self.rule}>"
@@ -147,10 +159,6 @@ class SimultaneousIntervals(TableResult):
         """Return whether all of values (.., q) [SI] lie in their intervals."""
         off = np.abs(np.asarray(values) - self.center)
         return np.asarray((off <= self.half_widths).all(axis=-1))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the intervals for JSON [SI]."""
-        return dict(vars(self))
 
 
 def compute_joint_region(

@@ -46,7 +46,8 @@ from loopcal.numerics.statistics import (
     compute_f_tail,
     compute_single_level,
 )
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 # Search the observation blocks that a fit to all others does not explain.
@@ -383,10 +384,29 @@ class OutlierCheck(TableResult):
     scale: float
     summary: tuple[Finding, ...]
 
+    FIELDS = (
+        *fields("outliers", undecided="ambiguous", settled="is_converged", level="level"),
+        *fields("blocks", "scale", mean_leverage="mean_leverage", findings="findings"),
+        Field("state", lambda check: list(map(check.judge, check.poses)), "poses"),
+    )
+    LABELS = label_axes(poses=lambda check: [", ".join(poses) for poses in check.poses])
+
     @property
     def names(self) -> tuple[str, ...]:
         """Labels of all poses of the outliers."""
         return tuple(label for outlier in self.outliers for label in outlier.poses)
+
+    @property
+    def mean_leverage(self) -> float:
+        """Share of the residuals that the parameters take up."""
+        residuals = max(int(self.influence.residuals.sum()), 1)
+        return float(self.influence.leverage.sum() / residuals)
+
+    def judge(self, poses: tuple[str, ...]) -> str:
+        """Return whether a block of poses fits the others, in words."""
+        if set(poses) <= set(self.names):
+            return "outlier"
+        return "contradicts others" if set(poses) <= set(self.suspects) else "fits"
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -411,20 +431,6 @@ class OutlierCheck(TableResult):
 
     def __str__(self) -> str:
         return "\n".join(str(finding) for finding in self.findings)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result by name for JSON."""
-        mean = self.influence.leverage.sum() / max(int(self.influence.residuals.sum()), 1)
-        return {
-            "outliers": self.outliers,
-            "undecided": self.ambiguous,
-            "settled": self.is_converged,
-            "level": self.level,
-            "blocks": self.blocks,
-            "scale": self.scale,
-            "mean_leverage": float(mean),
-            "findings": self.findings,
-        }
 
 
 def find_outliers(

@@ -26,7 +26,8 @@ from loopcal.measure.array_checks import check_type
 from loopcal.mechanism.assembly import LinearMap
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import NULL_COMPONENT
-from loopcal.presentation import HtmlResult
+from loopcal.results.description import fields
+from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -46,6 +47,8 @@ class MergedParameter:
     changes: FloatArray  # (k,) of each for one `unit` of it, to first order
     units: tuple[str, ...]  # (k,) symbols
 
+    FIELDS = fields("*", "finding")
+
     @property
     def finding(self) -> Finding:
         """The parameter and its replacement."""
@@ -59,13 +62,9 @@ class MergedParameter:
     def __str__(self) -> str:
         return str(self.finding)
 
-    def to_dict(self) -> dict[str, object]:
-        """Return the attributes and the finding for JSON."""
-        return {**vars(self), "finding": self.finding}
-
 
 @dataclass(frozen=True, eq=False)
-class IdentifiableSubset(HtmlResult):
+class IdentifiableSubset(Result):
     """A set of free parameters that carries all information of the measurements.
 
     kept : names of the parameters that stay free. dropped : those to fix, and their replacements.
@@ -77,6 +76,8 @@ class IdentifiableSubset(HtmlResult):
     dropped: tuple[MergedParameter, ...]
     condition: float
     robot: Mechanism
+
+    FIELDS = fields("kept", "dropped", "condition")
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -92,10 +93,6 @@ class IdentifiableSubset(HtmlResult):
 
     def __str__(self) -> str:
         return "\n".join(str(finding) for finding in self.findings)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return names, replacements and the condition for JSON."""
-        return {"kept": self.kept, "dropped": self.dropped, "condition": self.condition}
 
 
 def choose_identifiable_subset(identifiability: Identifiability) -> IdentifiableSubset:
@@ -186,9 +183,9 @@ class AccurateCombination:
     # data do not determine it
     sd: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON."""
-        return {**vars(self), "sd": self.sd if np.isfinite(self.sd) else None}
+    FIELDS = fields(
+        "names", "coefficients", sd=lambda known: known.sd if np.isfinite(known.sd) else None
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ See docs/theory/resampling.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -37,7 +36,8 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 # The exact posterior of a fit, and its linear approximation, at drawn parameters.
@@ -192,6 +192,14 @@ class PosteriorSample(TableResult):
     degrees: float
     tail_shape: float
 
+    FIELDS = (
+        *fields(robot="fit.robot.name", seed="", draws=lambda sample: len(sample.draws)),
+        *fields("effective_size", "tail_shape", "rounds", "findings"),
+        Field("weight", axes="draw", unit="1"),
+        Field("estimate", "draws", "draw parameter", units="fit.free_parameters.dimensions"),
+    )
+    LABELS = label_axes(parameter="fit.names")
+
     @property
     def effective_size(self) -> float:
         """Number of independent draws that are worth as much."""
@@ -246,18 +254,6 @@ class PosteriorSample(TableResult):
         if ratio <= 1.0 + OFF:
             return []
         return [report_finding("sampling.stated-wider", ratio=float(ratio))]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what was drawn and what was found, for JSON."""
-        return {
-            "robot": self.fit.robot.name,
-            "seed": self.seed,
-            "draws": len(self.draws),
-            "effective_size": self.effective_size,
-            "tail_shape": self.tail_shape,
-            "rounds": self.rounds,
-            "findings": self.findings,
-        }
 
 
 def sample_posterior(

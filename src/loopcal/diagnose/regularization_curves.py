@@ -30,11 +30,12 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, fields
+from loopcal.results.result import DrawnResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 PER_DECADE = 4  # values of lam per factor of ten where no fit is repeated
 # Values of lam, and of k, that are fitted again for each fold, beside those of rules.
@@ -78,7 +79,7 @@ class RegularizationCurve:
 
 
 @dataclass(frozen=True, eq=False)
-class RegularizationCurves(TableResult):
+class RegularizationCurves(DrawnResult):
     """How the error at held-out poses depends on regularization.
 
     Attributes
@@ -98,19 +99,27 @@ class RegularizationCurves(TableResult):
     truncation: RegularizationCurve
     nominal: tuple[float, float]
 
+    FIELDS = (
+        *fields("*"),
+        Field("regularization", lambda curves: curves.join("name"), "point"),
+        Field("value", lambda curves: curves.join("values"), "point", "1"),
+        Field("score", lambda curves: curves.join("score"), "point", "sigma^2"),
+        Field("standard_error", lambda curves: curves.join("standard_error"), "point", "sigma^2"),
+    )
+
+    def join(self, name: str) -> list[Any]:
+        """Return an attribute of both curves, one entry for each of their points."""
+        joined = []
+        for curve in (self.ridge, self.truncation):
+            value = getattr(curve, name)
+            joined += [value] * len(curve.values) if isinstance(value, str) else list(value)
+        return joined
+
     def __repr__(self) -> str:
         return (
             f"<RegularizationCurves of {self.robot}: {len(self.ridge.values)} values of lam, "
             f"{len(self.truncation.values)} of k, {self.scheme}>"
         )
-
-    def plot(self) -> Figure:
-        """Draw the held-out error against lam and against k, with what rules choose."""
-        return draw("fit_figures.draw_regularization", self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes for JSON."""
-        return dict(vars(self))
 
 
 def compute_regularization_curves(

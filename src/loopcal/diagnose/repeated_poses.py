@@ -14,7 +14,6 @@ Regression Analysis.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
+from loopcal.results.description import fields
 from loopcal.typing import IntArray
 
 # Singular values of the whiteners of repeats below this share of the largest belong to components
@@ -53,11 +53,11 @@ class LackOfFit:
     # the result of the test, and the repeatability where it contradicts the stated sigma
     findings: tuple[Finding, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes for JSON; `is_explained` is called `explained` there."""
-        content = dict(vars(self))
-        content["explained"] = content.pop("is_explained")
-        return content
+    FIELDS = fields(
+        *("groups", "pure", "pure_degrees", "lack", "lack_degrees", "sigma_scale", "p_value"),
+        *("findings",),
+        explained="is_explained",
+    )
 
 
 def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:

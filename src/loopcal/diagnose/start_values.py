@@ -32,6 +32,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.results.description import fields
 
 # Share of the start's cost below which a gain is rounding: the last digits of a file.
 NO_GAIN = 1e-3
@@ -63,9 +64,7 @@ class StartCheck:
     p_value: float
     finding: Finding  # the result
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes by name for JSON."""
-        return {**vars(self), "verdict": self.verdict.value}
+    FIELDS = fields(verdict="verdict.value", before="", after="", p_value="", finding="")
 
 
 @dataclass(frozen=True)

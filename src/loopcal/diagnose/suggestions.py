@@ -35,7 +35,8 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.presentation import HtmlResult
+from loopcal.results.description import fields
+from loopcal.results.result import Result
 from loopcal.units import Dimension
 
 POSES = 24  # number of poses of a further measurement
@@ -66,11 +67,13 @@ class FurtherMeasurement:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasurementSuggestion(HtmlResult):
+class MeasurementSuggestion(Result):
     """An unidentifiable combination, and the measurements that determine it, simplest first."""
 
     combination: Combination
     measurements: tuple[FurtherMeasurement, ...]
+
+    FIELDS = fields(names="combination.names", cures="measurements", finding="finding")
 
     @property
     def finding(self) -> Finding:
@@ -85,14 +88,6 @@ class MeasurementSuggestion(HtmlResult):
 
     def __str__(self) -> str:
         return str(self.finding)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return names, measurements and the finding for JSON."""
-        return {
-            "names": self.combination.names,
-            "cures": self.measurements,
-            "finding": self.finding,
-        }
 
 
 def suggest_measurements(

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,9 +43,14 @@ from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from loopcal.results.tables import Block
+
 
 # Measure by how much second-order effects of a change of parameters exceed the noise.
 
@@ -140,6 +146,19 @@ class ValueComparison(TableResult):
     sigma: float
     direction: tuple[str, ...]
 
+    FIELDS = (
+        *fields("*", "rms", "agrees", finding="outcome"),
+        Field("estimate_minus_given", "raw", "parameter", "SI"),
+        Field("determined_part", "error", "parameter", "SI"),
+        Field("determined_part_in_tolerances", "tolerances", "parameter", "tolerance"),
+    )
+    LABELS = label_axes(parameter="names")
+    CAPTION = "Estimate minus given value"
+
+    def page(self) -> list[Block]:
+        """Return the outcome of the test and the differences."""
+        return [str(self.outcome), self.main_table()]
+
     @property
     def rms(self) -> float:
         """Root mean square of the error in tolerances over the compared directions; NaN without
@@ -196,10 +215,6 @@ class ValueComparison(TableResult):
             f"chi-square {round_to_digits(self.chi_square, 4)} "
             f"(p = {round_to_digits(self.p_value, 2)}), rms {round_to_digits(self.rms)} tolerances>"
         )
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the attributes, the root mean square, the answer and the finding, SI."""
-        return {**vars(self), "rms": self.rms, "agrees": self.agrees, "finding": self.outcome}
 
 
 def compare_with_truth(fit: Identification, truth: ArrayLike) -> ValueComparison:

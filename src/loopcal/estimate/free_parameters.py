@@ -64,6 +64,11 @@ class FreeParameters:
         """The free parameters in order."""
         return tuple(self.robot.parameters.entries[i] for i in self.places)
 
+    @property
+    def dimensions(self) -> tuple[Dimension, ...]:
+        """Dimensions in order."""
+        return tuple(parameter.dimension for parameter in self.parameters)
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names in order."""

@@ -24,7 +24,8 @@ from loopcal.measure.kinds.setup_parameters import ROTATION_AXES
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.parameters import Parameter, ParameterTable
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -63,6 +64,18 @@ class NuisanceEstimate(TableResult):
     is_unobservable: BoolArray
     display: tuple[tuple[float, str], ...]
     is_harmless: bool = False
+
+    FIELDS = (
+        Field("unit", lambda setup: [symbol for _, symbol in setup.display], "parameter"),
+        Field("nominal", lambda setup: setup.list_shown(setup.table.nominal), "parameter"),
+        Field("estimate", lambda setup: setup.list_shown(setup.estimate), "parameter"),
+        Field("sd", lambda setup: setup.list_shown(setup.sd), "parameter"),
+    )
+    LABELS = label_axes(parameter="names")
+
+    def list_shown(self, values: FloatArray) -> FloatArray:
+        """Return values (U,) [SI] in the units in which they are shown."""
+        return values / [factor for factor, _ in self.display]
 
     def __len__(self) -> int:
         return len(self.table)

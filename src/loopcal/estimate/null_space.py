@@ -9,13 +9,13 @@ robot's file.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
-from loopcal.presentation import HtmlResult
+from loopcal.results.description import fields
+from loopcal.results.result import Result
 from loopcal.typing import FloatArray, IntArray
 
 NEGLIGIBLE = 1e-6
@@ -32,7 +32,7 @@ by rounding, 1e-13 in practice, which is another one for every engine and proces
 
 
 @dataclass(frozen=True, eq=False)
-class Combination(HtmlResult):
+class Combination(Result):
     """A combined change of parameters that changes no measured value, or hardly any.
 
     Attributes
@@ -55,6 +55,13 @@ class Combination(HtmlResult):
     nuisance: tuple[str, ...] = ()
     direction: FloatArray = field(default_factory=lambda: np.zeros(0))
 
+    FIELDS = fields(
+        *("names", "changes", "units", "weights", "singular_value"),
+        meaning=lambda combination: str(combination.meaning),
+        nuisance="nuisance",
+        sentence=str,
+    )
+
     @property
     def finding(self) -> Finding:
         """That the data do not determine this combination, or hardly."""
@@ -73,19 +80,6 @@ class Combination(HtmlResult):
     def __str__(self) -> str:
         """Return the text of the finding."""
         return str(self.finding)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON, with the sentence."""
-        return {
-            "names": self.names,
-            "changes": self.changes,
-            "units": self.units,
-            "weights": self.weights,
-            "singular_value": self.singular_value,
-            "meaning": str(self.meaning),
-            "nuisance": self.nuisance,
-            "sentence": str(self),
-        }
 
 
 def describe_null_space(free: FreeParameters, null_space: FloatArray) -> tuple[Combination, ...]:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -552,10 +552,6 @@ class Regularization:
         """The parameter with rule and score."""
         code = "fit.regularization-at-limit" if self.is_at_limit else "fit.regularization"
         return report_finding(code, **vars(self))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes by name for JSON."""
-        return dict(vars(self))
 
 
 def describe_regularization(

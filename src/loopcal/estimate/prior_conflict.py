@@ -19,9 +19,7 @@ for the noise. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +28,7 @@ from loopcal.estimate.tolerance_components import ToleranceComponent, are_penali
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import compute_any_probability, compute_chi_square_tail
+from loopcal.results.description import fields
 from loopcal.typing import BoolArray, FloatArray
 
 LEVEL = 0.01
@@ -79,20 +78,6 @@ class PriorConflict:
     farthest : names of the parameters farthest from nominal, and their deviations in tolerances.
     """
 
-    JSON_FIELDS: ClassVar[Mapping[str, str]] = {
-        "statistic": "statistic",
-        "degrees": "degrees",
-        "p_value": "p_value",
-        "worst_direction": "direction",
-        "worst_parameter": "parameter",
-        "joint_p_value": "joint_p_value",
-        "inflation": "inflation",
-        "components": "component_rows",
-        "conflict": "conflict",
-        "farthest": "farthest",
-        "sentence": "sentence",
-    }
-
     statistic: float
     degrees: float
     p_value: float
@@ -103,6 +88,18 @@ class PriorConflict:
     farthest: tuple[tuple[str, float], ...]
     components: tuple[ToleranceComponent, ...]
     component_rows: tuple[dict[str, object], ...]
+
+    FIELDS = fields(
+        *("statistic", "degrees", "p_value"),
+        worst_direction="direction",
+        worst_parameter="parameter",
+        joint_p_value="joint_p_value",
+        inflation="inflation",
+        components="component_rows",
+        conflict="conflict",
+        farthest="farthest",
+        sentence="sentence",
+    )
 
     @property
     def conflict(self) -> bool:

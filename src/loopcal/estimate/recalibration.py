@@ -13,9 +13,8 @@ of that noise. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +32,8 @@ from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_averaged_tail
-from loopcal.presentation import HtmlResult
+from loopcal.results.description import fields
+from loopcal.results.result import Result
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 MOST_TRIED = 60
@@ -52,7 +52,7 @@ EXPLAINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Change(HtmlResult):
+class Change(Result):
     """Whether parameters have changed between two calibrations.
 
     Attributes
@@ -67,17 +67,6 @@ class Change(HtmlResult):
     finding : the result with its code.
     """
 
-    JSON_FIELDS: ClassVar[Mapping[str, str]] = {
-        "subject": "subject",
-        "names": "names",
-        "change": "change",
-        "chi_square": "chi_square",
-        "degrees": "degrees",
-        "p_value": "p_value",
-        "moved": "moved",
-        "sentence": "sentence",
-    }
-
     subject: str
     names: tuple[str, ...]
     change: FloatArray
@@ -87,9 +76,12 @@ class Change(HtmlResult):
     moved: bool | None
     finding: Finding
 
-    @property
-    def sentence(self) -> str:
-        """The text of the finding."""
+    FIELDS = fields(
+        *("subject", "names", "change", "chi_square", "degrees", "p_value", "moved"),
+        sentence=lambda change: str(change.finding),
+    )
+
+    def __str__(self) -> str:
         return str(self.finding)
 
 

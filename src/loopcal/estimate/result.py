@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -24,11 +24,15 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.presentation import FitFigures, TableResult
+from loopcal.results.description import OTHER, Field, Source, fields, label_axes
+from loopcal.results.presenters import draw
+from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
+from loopcal.units import SI_SYMBOLS, Dimension
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from loopcal.estimate.observation_rows import ObservationRows, Residuals
     from loopcal.estimate.pose_estimate import EstimatedPoses
     from loopcal.estimate.problem import Problem
@@ -362,6 +366,43 @@ class Identification(TableResult):
     poses: EstimatedPoses | None
     findings: tuple[Finding, ...]
 
+    FIELDS = (
+        *fields(robot="robot.name", method=lambda fit: repr(fit.method)),
+        *fields(parameters=lambda fit: fit.list_parameters()),
+        *fields(interval_note=lambda fit: fit.interval_note and str(fit.interval_note)),
+        *fields(local=lambda fit: fit.list_nuisance()),
+        Field("rank", lambda fit: fit.rank if fit.converged else None),
+        Field("condition", lambda fit: fit.spectrum.condition if fit.converged else None),
+        *fields(singular_values="spectrum.singular_values", rank_tolerance="spectrum.tolerance"),
+        *fields("regularization", "unidentifiable", dof="residual_test.dof"),
+        *fields("chi_square", degrees="residual_test.degrees", p_value="residual_test.p_value"),
+        *fields(noise="residual_test.noise", sigma_uncertainty="options.sigma_uncertainty"),
+        Field("sigma_scale", lambda fit: fit.residual_test.sigma_scale if fit.converged else None),
+        Field(
+            "noise_degrees", lambda fit: fit.residual_test.noise_degrees if fit.converged else None
+        ),
+        *fields("prior_conflict", dropped="excluded_poses", readings="poses"),
+        *fields(status=lambda fit: fit.status.name.lower(), iterations="history.iterations"),
+        *fields(cost_history="history.cost", notes=lambda fit: list(map(str, fit.findings))),
+        *fields("findings"),
+        Field("unit", lambda fit: fit.free_parameters.display()[1], "parameter"),
+        *(
+            Field(
+                name,
+                lambda fit, name=name: [row[name] for row in fit.list_parameters()],
+                "parameter",
+            )
+            for name in ("nominal", "estimate", "sd", "plus_minus", "degrees", "tolerance")
+        ),
+        Field(
+            "covariance",
+            lambda fit: fit.covariance / np.multiply.outer(*2 * [fit.free_parameters.display()[0]]),
+            f"parameter {OTHER}",
+            "unit times unit of other",
+        ),
+    )
+    LABELS = label_axes(parameter="names", other="names")
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters."""
@@ -477,11 +518,6 @@ class Identification(TableResult):
         law = "normal" if np.isinf(nu).all() else f"Student's t, at least {nu.min():.3g} degrees"
         return f"95 % intervals: {factor} standard uncertainties ({law})."
 
-    @property
-    def plot(self) -> FitFigures:
-        """The figures of the fit, such as `fit.plot.residuals()`."""
-        return FitFigures(self)
-
     def __repr__(self) -> str:
         """Return a summary on one screen; `print` shows the parameters."""
         codes = ", ".join(dict.fromkeys(finding.code for finding in self.findings))
@@ -505,7 +541,7 @@ class Identification(TableResult):
     def _list_values(self) -> list[str]:
         """Return the lines of the table of parameters; last values are no estimates."""
         width = max(len(name) for name in (*self.names, *self.nuisance.names))
-        rows = (*self._parameter_rows(), *self._nuisance_rows())
+        rows = (*self.list_parameters(), *self.list_nuisance())
         if not self.converged:
             lines = [f"{'parameter':<{width}} {'nominal':>14} {'last value':>14} unit"]
             for entry in rows:
@@ -522,17 +558,39 @@ class Identification(TableResult):
             )
         return lines
 
+    def list_fields(self) -> Iterator[Field]:
+        """Yield the fields, among them the residuals of each kind (predicted - measured)."""
+        yield from self.FIELDS
+        for i, r in enumerate(self.residuals, 1):
+            axes, named = f"row_{i} component_{i}", f"{i}_{r.kind}"
+            symbols = tuple(SI_SYMBOLS[dimension] for dimension in r.dimensions)
+            yield Field(f"residual_{named}", lambda _, r=r: r.raw, axes, symbols)
+            yield Field(f"whitened_{named}", lambda _, r=r: r.whitened, axes, "sigma")
+        yield Field("sum_of_squares", "history.cost", "step", "1")
+
+    def list_labels(self) -> Mapping[str, Source | Sequence[Any]]:
+        """Return the names along the axes, among them poses and components of the residuals."""
+        named = {"step": range(len(self.history.cost))}
+        for i, r in enumerate(self.residuals, 1):
+            named |= {f"row_{i}": r.poses, f"component_{i}": r.components}
+        return {**self.LABELS, **named}
+
+    @property
+    def plot(self) -> FitFigures:
+        """The figures of the fit, such as `fit.plot.residuals()`."""
+        return FitFigures(self)
+
     @property
     def _further_findings(self) -> list[Finding]:
         """The findings but the status."""
         return [f for f in self.findings if f.code != self.history.finding.code]
 
-    def _nuisance_rows(self) -> list[dict[str, Any]]:
+    def list_nuisance(self) -> list[dict[str, Any]]:
         """Return one row for each nuisance parameter, with 95 % intervals."""
         degrees = self.nuisance.count_degrees(self.posterior.parts, self.tolerance)
         return self.nuisance.rows(coverage_factor(degrees), degrees)
 
-    def _parameter_rows(self) -> list[dict[str, Any]]:
+    def list_parameters(self) -> list[dict[str, Any]]:
         """Return one row for each parameter, in the units of the robot's file."""
         factor, symbols = self.free_parameters.display()
         half = self.interval()
@@ -550,43 +608,6 @@ class Identification(TableResult):
             }
             for i, parameter in enumerate(self.free_parameters.parameters)
         ]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON; parameters in the units of the robot's file, the rest SI.
-
-        Rank, condition and the numbers of the residual test are None where the iteration did not
-        converge.
-        """
-        test = self.residual_test
-        return {
-            "robot": self.robot.name,
-            "method": repr(self.method),
-            "parameters": self._parameter_rows(),
-            "interval_note": None if self.interval_note is None else str(self.interval_note),
-            "local": self._nuisance_rows(),
-            "rank": self.rank if self.converged else None,
-            "condition": self.spectrum.condition if self.converged else None,
-            "singular_values": self.spectrum.singular_values,
-            "rank_tolerance": self.spectrum.tolerance,
-            "regularization": self.regularization,
-            "unidentifiable": self.unidentifiable,
-            "dof": test.dof,
-            "chi_square": test.chi_square,
-            "degrees": test.degrees,
-            "p_value": test.p_value,
-            "noise": test.noise,
-            "sigma_uncertainty": self.options.sigma_uncertainty,
-            "sigma_scale": test.sigma_scale if self.converged else None,
-            "noise_degrees": test.noise_degrees if self.converged else None,
-            "prior_conflict": self.prior_conflict,
-            "dropped": self.excluded_poses,
-            "readings": self.poses,
-            "status": self.status.name.lower(),
-            "iterations": self.history.iterations,
-            "cost_history": self.history.cost,
-            "notes": [str(finding) for finding in self.findings],
-            "findings": self.findings,
-        }
 
     def arrays(self) -> dict[str, FloatArray]:
         """Return the arrays of the run folder by name [SI]."""
@@ -608,3 +629,31 @@ class Identification(TableResult):
             **({} if self.poses is None else self.poses.arrays()),
             **store_residuals(self.residuals),
         }
+
+
+class FitFigures:
+    """The figures of a fit."""
+
+    def __init__(self, fit: Identification) -> None:
+        self._fit = fit
+
+    def __repr__(self) -> str:
+        return "<FitFigures: residuals(), parameters(), correlation(), convergence()>"
+
+    def residuals(self) -> Figure:
+        """Draw the residuals by pose and component, as histogram and normal plot, and against
+        actuator readings, time and temperatures.
+        """
+        return draw(self._fit, "figure residuals")
+
+    def parameters(self) -> Figure:
+        """Draw the shift of each parameter in tolerances with its 95 % interval."""
+        return draw(self._fit, "figure parameters")
+
+    def correlation(self) -> Figure:
+        """Draw the correlations of the parameters as a matrix of colors."""
+        return draw(self._fit, "figure correlation")
+
+    def convergence(self) -> Figure:
+        """Draw the sum of squares and the parameters by step of the iteration."""
+        return draw(self._fit, "figure convergence")

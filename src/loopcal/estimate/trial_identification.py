@@ -33,7 +33,8 @@ from loopcal.measure.simulation import Trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, solve_regular
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # --- The result of identifying many machines at once.
@@ -58,6 +59,19 @@ class IdentifiedTrials(TableResult):
     free_parameters: FreeParameters
     linear_models: tuple[LinearModel, ...]
     method: Method
+
+    FIELDS = (
+        Field("converged", axes="trial"),
+        Field("iterations", axes="trial", unit="1"),
+        Field("sum_of_squares", "cost", "trial", "1"),
+        Field(
+            "estimate",
+            lambda trials: trials.values[:, trials.free_parameters.places],
+            "trial parameter",
+            units="free_parameters.dimensions",
+        ),
+    )
+    LABELS = label_axes(parameter="free_parameters.names")
 
     def __repr__(self) -> str:
         """Return the number of trials and how many converged."""

@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Any
 
 from loopcal.findings.wording import Quantity as Quantity
-from loopcal.presentation import HtmlResult
+from loopcal.plain_text import escape
 
 
 class Severity(StrEnum):
@@ -32,7 +32,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding(HtmlResult):
+class Finding:
     """What loopcal noticed, in a form that programs can read.
 
     Build findings with `loopcal.findings.report_finding`, which takes the severity from the catalog
@@ -56,8 +56,14 @@ class Finding(HtmlResult):
 
         return find_entry(self.code).word(self.data)
 
+    def _repr_html_(self) -> str:
+        """Return the sentence for notebooks."""
+        from html import escape as escape_html
+
+        return f'<div class="loopcal"><pre>{escape_html(escape(str(self), chr(10)))}</pre></div>'
+
     def to_dict(self) -> dict[str, Any]:
-        """Return code, severity, data and text, for `loopcal.serialization.to_json`."""
+        """Return code, severity, data and text, for `loopcal.results.serialization.to_json`."""
         return {
             "code": self.code,
             "severity": self.severity.value,

@@ -26,8 +26,10 @@ from loopcal.measure.observations import Observations
 from loopcal.measure.readings import check_reading_sigma, weight_reading_sigma
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import find_distinct
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import SI_SYMBOLS
 
 
 def check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observations]) -> None:
@@ -134,6 +136,16 @@ class Measurements(TableResult):
     is_held_out: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
     base_observations: tuple[Observations, ...] = ()
 
+    FIELDS = (
+        *(
+            Field(name, lambda data, i=i: [row[i] for row in data.list_values()], "number")
+            for i, name in enumerate(("kind", "pose", "component", "unit", "value"))
+        ),
+        Field("reading", "readings", "measured_pose actuator", "m or rad"),
+        Field("held_out", "is_held_out", "measured_pose"),
+    )
+    LABELS = label_axes(measured_pose="labels")
+
     def __post_init__(self) -> None:
         readings = _check_readings(self.readings, self.reading_sigma is not None)
         n = len(readings)
@@ -182,6 +194,20 @@ class Measurements(TableResult):
         if self.reading_sigma is not None:
             lines.append("  with uncertain readings")
         return "\n".join(lines)
+
+    def list_values(self) -> list[tuple[str, str, str, str, float]]:
+        """Return kind, pose, component, unit and value [SI] of every measured number."""
+        rows = []
+        for o in self.observations:
+            for members, values in zip(
+                o.rows.reshape(len(o), -1), o.measured.tolist(), strict=True
+            ):
+                pose = "/".join(self.labels[i] for i in members)
+                rows += [
+                    (o.kind.name, pose, column.name, SI_SYMBOLS[column.dimension], value)
+                    for column, value in zip(o.kind.columns, values, strict=True)
+                ]
+        return rows
 
     @property
     def n_poses(self) -> int:

@@ -19,6 +19,7 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 AXES = ("rx", "ry", "rz", "x", "y", "z")
+TWIST_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 """Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too."""
 
 BASE = "base"

@@ -25,12 +25,13 @@ from loopcal.mechanism.transmission import (
     term_derivatives,
 )
 from loopcal.parameters import ParameterTable
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, label_axes
+from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # --- The parameters by which poses are differentiated, and how they move displacements and joints.
@@ -282,7 +283,7 @@ class Stage:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Mechanism(TableResult):
+class Mechanism(DrawnResult):
     """A robot with closed loops, ready to compute.
 
     Attributes
@@ -312,9 +313,18 @@ class Mechanism(TableResult):
     record: Any = None
     stages: tuple[Stage, ...] = ()
 
-    def plot(self) -> Figure:
-        """Draw the robot at home: in the plane where it is planar, else in two views."""
-        return draw("robot_figure.draw_robot", self)
+    FIELDS = (
+        Field("value", lambda robot: robot.list_shown(robot.values), "parameter"),
+        Field("nominal", lambda robot: robot.list_shown(robot.parameters.nominal), "parameter"),
+        Field("tolerance", lambda robot: robot.list_shown(robot.parameters.tolerance), "parameter"),
+        Field("unit", lambda r: [r.units[d] for d in r.parameters.dimensions], "parameter"),
+        Field("free", "parameters.free", "parameter"),
+    )
+    LABELS = label_axes(parameter="parameters.names")
+
+    def list_shown(self, values: FloatArray) -> FloatArray:
+        """Return values (p,) [SI] in the units of the robot's file."""
+        return values / [self.get_unit(d).factor_to_si for d in self.parameters.dimensions]
 
     def __repr__(self) -> str:
         """Return name, family, actuators, freedoms and counts, on a few lines."""

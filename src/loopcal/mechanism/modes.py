@@ -25,7 +25,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
 from loopcal.mechanism.transmission import evaluate_sums, joints_from_readings, select_weights
-from loopcal.presentation import HtmlResult
+from loopcal.results.result import Result
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -38,7 +38,7 @@ SCALES = (0.1, 1.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Modes(HtmlResult):
+class Modes(Result):
     """Solutions found from random starts.
 
     Attributes

@@ -15,11 +15,17 @@ from loopcal import geometry
 from loopcal.engine import Target
 from loopcal.errors import MechanismError
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
 
 POSITION = ("x", "y", "z")
 TILT = ("phi", "theta", "psi")
 EULER = ("roll", "pitch", "yaw")
 COORDINATES = (*POSITION, *EULER, *TILT)
+
+
+def list_dimensions(names: tuple[str, ...]) -> tuple[Dimension, ...]:
+    """Return the dimensions of coordinates."""
+    return tuple(Dimension.LENGTH if name in POSITION else Dimension.ANGLE for name in names)
 
 
 def check_coordinates(names: tuple[str, ...]) -> None:

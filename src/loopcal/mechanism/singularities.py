@@ -37,7 +37,7 @@ from loopcal.mechanism.solutions import Solution, forward, inverse, make_solutio
 from loopcal.mechanism.states import driven_values, join_states
 from loopcal.mechanism.transmission import invert_weights, select_weights
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.presentation import HtmlResult
+from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -48,7 +48,7 @@ SAMPLE_SIZE = 400
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Singularity(HtmlResult):
+class Singularity(Result):
     """Distance of n poses from singularities.
 
     Attributes

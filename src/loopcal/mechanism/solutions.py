@@ -19,7 +19,7 @@ from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.chains import judge_stage_modes
 from loopcal.mechanism.kinematics import (
     clear_sign,
@@ -34,6 +34,7 @@ from loopcal.mechanism.kinematics import (
 from loopcal.mechanism.limb_rows import name_passive_joints, stack_platform_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
+    POSITION,
     compare_coordinates,
     read_coordinates,
     state_target,
@@ -49,7 +50,8 @@ from loopcal.mechanism.states import (
 )
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.trial_batch import map_arrays
-from loopcal.presentation import TableResult
+from loopcal.results.description import Field, label_axes
+from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
 
@@ -475,6 +477,18 @@ class Solution(TableResult):
     iterations: IntArray
     state: State
 
+    FIELDS = (
+        Field(
+            "status", lambda s: [Status(k).name.lower().replace("_", " ") for k in s.status], "pose"
+        ),
+        Field("platform", lambda solution: solution.T[:, :3, 3], "pose axis", "m"),
+        Field("reading", "q", "pose actuator", "m or rad"),
+        Field("residual", axes="pose", unit="m"),
+        Field("passive", axes="pose joint", unit="m or rad"),
+        Field("T_base_platform", "T", "pose row column", "m"),
+    )
+    LABELS = label_axes(axis=POSITION, joint="passive_names")
+
     def __len__(self) -> int:
         return len(self.q)
 
@@ -639,6 +653,25 @@ class Jacobian(TableResult):
     reading_names: tuple[str, ...]
     reading_units: tuple[str, ...]
     solution: Solution
+
+    FIELDS = (
+        Field("pose", lambda j: np.repeat(range(1, len(j.parameters) + 1), len(AXES)), "row"),
+        Field("component", lambda j: AXES * len(j.parameters), "row"),
+        Field("unit", lambda j: TWIST_UNITS * len(j.parameters), "row"),
+        Field(
+            "by",
+            lambda j: j.parameters.reshape(-1, len(j.parameter_names)),
+            "row parameter",
+            units=lambda j: [f"unit per {unit}" for unit in j.parameter_units],
+        ),
+        Field(
+            "by_reading",
+            lambda j: j.readings.reshape(-1, len(j.reading_names)),
+            "row actuator",
+            units=lambda j: [f"unit per {unit}" for unit in j.reading_units],
+        ),
+    )
+    LABELS = label_axes(parameter="parameter_names", actuator="reading_names")
 
     components = AXES
 

@@ -17,7 +17,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
-from loopcal.presentation import HtmlResult
+from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -119,7 +119,7 @@ def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[
 
 
 @dataclass(frozen=True, eq=False)
-class WorkspaceSample(HtmlResult):
+class WorkspaceSample(Result):
     """Positions drawn at random from a workspace.
 
     Attributes

@@ -16,12 +16,12 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from loopcal import serialization
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.result_folder import FolderKind, write_result_folder
 from loopcal.papers.claims import Verdict
 from loopcal.papers.published import Comparison, Figure, Table
 from loopcal.report.pictures import render_figure
+from loopcal.results import serialization
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

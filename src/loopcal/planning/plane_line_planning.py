@@ -32,12 +32,12 @@ from loopcal.planning.constraints import ConstraintChecker, Constraints, build_c
 from loopcal.planning.design_space import D, PriorInformation, find_observable_space, is_allowed
 from loopcal.planning.exchange import MovedDesign, coordinate_exchange
 from loopcal.planning.path import check_paths, locate_home
-from loopcal.planning.result import PlannedPoses
-from loopcal.presentation import TableResult, draw
+from loopcal.planning.result import Plan, PlannedPoses
+from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # Groups of poses whose points lie on a plane and on a line perpendicular to it, as candidates.
@@ -343,7 +343,7 @@ class SurfaceOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfacePlan(TableResult):
+class SurfacePlan(DrawnResult):
     """Points to bring onto planes and lines.
 
     Attributes
@@ -371,6 +371,9 @@ class SurfacePlan(TableResult):
     sd_first: float
     sd_last: float
     is_converged: bool = True
+
+    FIELDS = Plan.FIELDS
+    LABELS = Plan.LABELS
 
     def list_roles(self) -> tuple[str, ...]:
         """Return the role of each point of a group: on both, on the line, in the plane."""
@@ -427,10 +430,6 @@ class SurfacePlan(TableResult):
             rank=self.possible,
             needed=-(-self.possible // (k - SPENT)),
         )
-
-    def plot(self) -> Figure:
-        """Draw where the tool is at the points of each group, in three views."""
-        return draw("plan_figures.draw_surface_plan", self)
 
     def __repr__(self) -> str:
         u, k = self.poses.groups.shape

@@ -14,16 +14,19 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.kinds.kind import Kind
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import inverse
 from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import ExpectedErrors
 from loopcal.planning.problem import ErrorCurve, name_groups
-from loopcal.presentation import TableResult, draw
+from loopcal.results.description import Field, fields, label_axes
+from loopcal.results.result import DrawnResult
+from loopcal.results.serialization import to_json
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 WEAK = 0.5  # efficiency below which the certificate guarantees little
 
@@ -53,13 +56,23 @@ class PlannedPoses:
     def __repr__(self) -> str:
         return f"PlannedPoses({len(self)} poses, {int(self.held_out.sum())} held out)"
 
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """(m,) "fit" or "held-out"."""
+        return tuple("held-out" if is_held_out else "fit" for is_held_out in self.held_out)
+
+    def list_compared(self) -> list[list[str]]:
+        """Return the labels of the poses that are measured together; none for single poses."""
+        is_grouped = self.groups.shape[1] > 1
+        return [[self.labels[i] for i in group] for group in self.groups] if is_grouped else []
+
     def to_dicts(self, robot: Mechanism) -> list[dict[str, Any]]:
         """Return for each pose its name, use, command and readings, SI."""
         actuators = [actuator.name for actuator in robot.actuators]
         return [
             {
                 "name": label,
-                "use": "held-out" if self.held_out[i] else "fit",
+                "use": self.uses[i],
                 "via_home": bool(self.via_home[i]),
                 "commanded": dict(zip(robot.controlled, self.coordinates[i].tolist(), strict=True)),
                 "readings": dict(zip(actuators, self.readings[i].tolist(), strict=True)),
@@ -101,9 +114,11 @@ class ErrorForecast:
     after: ExpectedErrors  # with the planned poses
     frame: Finding  # point, axes and frame of these errors
 
+    FIELDS = fields(before="", evenly_drawn="random", after="")
+
 
 @dataclass(frozen=True, eq=False)
-class Plan(TableResult):
+class Plan(DrawnResult):
     """Poses to measure.
 
     Attributes
@@ -124,6 +139,29 @@ class Plan(TableResult):
     errors: ErrorForecast
     notes: tuple[Finding, ...] = ()
     curve: ErrorCurve | None = None
+
+    FIELDS = (
+        *fields(robot="robot.name", kinds="instrument.sensors.kind.name", n_poses=""),
+        *fields(criterion="options.criterion", target="options.target", figures="quality.figures"),
+        *fields(efficiency="quality.efficiency", n_candidates="quality.n_candidates"),
+        *fields(frame=lambda plan: str(plan.errors.frame)),
+        *fields(expected=lambda plan: to_json(plan.errors)),
+        *fields(path_length="poses.path_length", seed="options.seed"),
+        *fields(poses=lambda plan: plan.poses.to_dicts(plan.robot)),
+        *fields(compared=lambda plan: plan.poses.list_compared(), curve=""),
+        *fields(notes=lambda plan: list(map(str, plan.notes)), findings=""),
+        Field("use", "poses.uses", "pose"),
+        Field(
+            "commanded",
+            "poses.coordinates",
+            "pose coordinate",
+            units=lambda plan: list_dimensions(plan.robot.controlled),
+        ),
+        Field("reading", "poses.readings", "pose actuator", units="robot.actuators.dimension"),
+    )
+    LABELS = label_axes(
+        pose="poses.labels", coordinate="robot.controlled", actuator="robot.actuators.name"
+    )
 
     @property
     def n_poses(self) -> int:
@@ -149,10 +187,6 @@ class Plan(TableResult):
             *curve,
             *self.notes,
         )
-
-    def plot(self) -> Figure:
-        """Draw the poses, numbered in their order, with the path between them."""
-        return draw("plan_figures.draw_plan", self)
 
     def __repr__(self) -> str:
         return (
@@ -212,32 +246,6 @@ class Plan(TableResult):
             reduction=share,
             **self.errors.frame.data,
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything by name for JSON, SI."""
-        errors, poses = self.errors, self.poses
-        forecast = {"before": errors.before, "evenly_drawn": errors.random, "after": errors.after}
-        return {
-            "robot": self.robot.name,
-            "kinds": [sensor.kind.name for sensor in self.instrument.sensors],
-            "n_poses": self.n_poses,
-            "criterion": self.options.criterion,
-            "target": self.options.target,
-            "figures": dict(self.quality.figures),
-            "efficiency": self.quality.efficiency,
-            "n_candidates": self.quality.n_candidates,
-            "frame": str(self.errors.frame),
-            "expected": {k: None if e is None else dict(vars(e)) for k, e in forecast.items()},
-            "path_length": poses.path_length,
-            "seed": self.options.seed,
-            "poses": poses.to_dicts(self.robot),
-            "compared": [[poses.labels[i] for i in group] for group in poses.groups]
-            if poses.groups.shape[1] > 1
-            else [],
-            "curve": None if self.curve is None else self.curve.to_dict(),
-            "notes": [str(note) for note in self.notes],
-            "findings": self.findings,
-        }
 
 
 def list_stops(plan: Plan) -> tuple[Stop, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.apply.compensation import ROUNDING, Compensation
+from loopcal.apply.error_budget import Source
 from loopcal.apply.height_errors import HeightErrors
 from loopcal.apply.inspection import IdentifiabilityReport
 from loopcal.diagnose.parameter_subset import UsefulAccuracy
@@ -19,7 +20,13 @@ from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import count_decimals, list_names
 from loopcal.mechanism.model import Mechanism
-from loopcal.report.tables import (
+from loopcal.report.validation_view import (
+    READING_NOISE,
+    describe_improvements,
+    view_error_statistics,
+    view_errors,
+)
+from loopcal.results.tables import (
     ABSENT,
     Block,
     Column,
@@ -33,12 +40,6 @@ from loopcal.report.tables import (
     format_with_uncertainty,
     units_of,
     word_column,
-)
-from loopcal.report.validation_view import (
-    READING_NOISE,
-    describe_improvements,
-    view_error_statistics,
-    view_errors,
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
@@ -357,24 +358,6 @@ def _describe_iteration(fit: Identification) -> str:
 
 # --- The uncertainty budget of a calibration on one screen.
 
-WORDS = {
-    "instrument": "instrument: {name}",
-    "readings": "actuator readings",
-    "setup": "setup parameters",
-    "tolerances": "tolerances",
-    "earlier calibration": "earlier calibration",
-    "repeatability": "repeatability in use",
-    "residuals.model-discrepancy": "model discrepancy: {name}",
-    "residuals.correlated": "correlated errors",
-    "residuals.drift": "drift",
-    "residuals.trend": "trend",
-    "residuals.sessions-differ": "differences of sessions",
-    "residuals.depend-on-temperature": "temperature",
-    "residuals.depend-on-reading": "dependence on a reading",
-    "prior.inflation": "factor on the tolerances",
-}
-"""Kind of a source -> words; others are codes of findings that added a covariance."""
-
 MEANING = (
     "Standard uncertainties (k = 1): root mean square over {poses} {over}, tool point, and the "
     "parameter that is known worst in tolerances. Their squares add up. Setup parameters: what not "
@@ -445,13 +428,8 @@ def _show_share(variance: float | None, total: float) -> str:
     return "below 0.1" if 0.0 < share < 0.1 else f"{share:.1f}"
 
 
-def name_source(kind: str, name: str) -> str:
-    """Return the words for a source of this kind and name."""
-    return WORDS[kind].format(name=name) if kind in WORDS else kind
-
-
 def _name_source(line: Mapping[str, Any]) -> str:
-    return name_source(line["kind"], line["name"])
+    return Source(line["kind"], line["name"], "", 0.0).words
 
 
 def _add(budget: Mapping[str, Any]) -> dict[str, Any]:

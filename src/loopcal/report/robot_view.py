@@ -13,7 +13,7 @@ from loopcal.apply.inspection import RobotInspection
 from loopcal.findings.wording import name_count
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import TRIANGLE_TERMS, WEIGHT, compute_range
-from loopcal.report.tables import (
+from loopcal.results.tables import (
     ABSENT,
     Block,
     Column,

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
-from loopcal.apply.run_comparison import PairComparison, RunComparison, RunSummary
+from loopcal.apply.run_comparison import RunComparison, RunSummary
 from loopcal.apply.validation import FEW_ROWS, ErrorChange, Validation
 from loopcal.diagnose.bootstrap import Bootstrap
 from loopcal.diagnose.intervals import Intervals
@@ -22,7 +22,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, sort_by_importance
 from loopcal.findings.wording import list_names
 from loopcal.mechanism.model import Mechanism
-from loopcal.report.tables import (
+from loopcal.results.tables import (
     ABSENT,
     ROUNDING,
     Block,
@@ -372,7 +372,7 @@ def build_shifts(comparison: RunComparison) -> Table:
     for name, unit in zip(comparison.parameters, comparison.units, strict=True):
         cells = [name]
         for pair in comparison.pairs:
-            shift, sd, is_significant = find_shift(pair, name)
+            shift, sd, is_significant = pair.find_shift(name)
             if not math.isfinite(sd):
                 cells += [ABSENT, ABSENT]
                 continue
@@ -412,7 +412,8 @@ def tabulate_comparison(comparison: RunComparison) -> Table:
     for run in comparison.runs:
         pair = pairs.get(run.name)
         for name, unit in zip(comparison.parameters, comparison.units, strict=True):
-            shift, sd, is_significant = find_shift(pair, name)
+            nothing = (math.nan, math.nan, False)
+            shift, sd, is_significant = nothing if pair is None else pair.find_shift(name)
             numbers = (run.estimates.get(name), run.plus_minus.get(name), shift, sd)
             cells = (_write(value, unit) for value in numbers)
             is_tested = math.isfinite(sd)
@@ -431,17 +432,6 @@ def find_error_units(comparison: RunComparison) -> dict[str, Unit]:
     lengths = symbols.get(length.dimension, length)
     angles = symbols.get(angle.dimension, angle)
     return {"position": lengths, "length": lengths, "orientation": angles}
-
-
-def find_shift(pair: PairComparison | None, name: str) -> tuple[float, float, bool]:
-    """Return the shift of a parameter, its standard deviation [SI], and whether it is significant;
-    NaN where it is not tested.
-    """
-    if pair is None or name not in pair.names:
-        return math.nan, math.nan, False
-    place = pair.names.index(name)
-    values = pair.shift[place], pair.shift_sd[place]
-    return float(values[0]), float(values[1]), bool(pair.significant[place])
 
 
 def _format_estimate(value: float | None, half: float | None, unit: Unit) -> tuple[str, str]:

@@ -16,7 +16,7 @@ from typing import Any
 
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
-from loopcal.report.tables import Block
+from loopcal.results.tables import Block
 from loopcal.studies.execution.executors import MOST_LOSSES, Executor
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.questions import explain_failures

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from loopcal.findings import Finding
     from loopcal.io.formats.program_format import Format, Imported, ImportOptions
     from loopcal.mechanism.model import Mechanism
-    from loopcal.report.tables import Block
+    from loopcal.results.tables import Block
 
 
 # --- `loopcal gcode` and `loopcal fill`: from a plan to the machine, and from the export of an

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from loopcal.estimate.published_steps import PerLegEstimate
     from loopcal.papers.published import Table as PaperTable
     from loopcal.papers.reproduction import Reproduction
-    from loopcal.report.tables import Block, Table
+    from loopcal.results.tables import Block, Table
 
 HEADING = 18
 """Characters of a line of a heading."""
@@ -149,7 +149,7 @@ def per_leg(
 
 def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> list[Block]:
     """Return the parameters, the condition numbers of the legs and the last step."""
-    from loopcal.report.tables import Column, Table, word_column
+    from loopcal.results.tables import Column, Table, word_column
 
     columns = (word_column("parameter"), *map(Column, ("unit", "nominal", "estimate", "change")))
     rows = [
@@ -203,7 +203,7 @@ def _view_reproduction(result: Reproduction) -> list[Block]:
 
 def _make_table(printed: PaperTable) -> Table:
     """Return a table of a study; long headings are broken."""
-    from loopcal.report.tables import Column, Table, word_column
+    from loopcal.results.tables import Column, Table, word_column
 
     headings = ["\n".join(textwrap.wrap(column, HEADING)) for column in printed.columns]
     columns = (word_column(headings[0], wraps=True), *(Column(title) for title in headings[1:]))

@@ -200,7 +200,7 @@ def example(name: str | None, output: Path | None, as_json: bool) -> int:
       loopcal example delta-printer -o printer
     """  # noqa: D301
     from loopcal.io.example_folders import describe_example, list_examples, write_example
-    from loopcal.report.tables import Table, word_column
+    from loopcal.results.tables import Table, word_column
 
     if name is None:
         titles = {name: describe_example(folder) for name, folder in list_examples().items()}

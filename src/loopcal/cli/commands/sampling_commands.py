@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose.posterior_sample import PosteriorSample
     from loopcal.estimate.result import Identification
     from loopcal.measure.measurements import Measurements
-    from loopcal.report.tables import Block
+    from loopcal.results.tables import Block
     from loopcal.typing import FloatArray
 
 

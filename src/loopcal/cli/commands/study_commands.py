@@ -176,7 +176,7 @@ def _print_report(report: RunReport, folder: Path, as_json: bool) -> None:
 
 def _list_numbers(report: RunReport) -> dict[str, Any]:
     """Return a report for JSON."""
-    from loopcal.serialization import to_json
+    from loopcal.results.serialization import to_json
 
     return {**to_json(report), "is_complete": report.is_complete}
 

@@ -61,7 +61,8 @@ from loopcal.mechanism.over_constraint import fix_breaking_parameters
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
-from loopcal.presentation import HtmlResult
+from loopcal.results.description import fields
+from loopcal.results.result import Result
 
 if TYPE_CHECKING:
     from loopcal.diagnose.conventions.interpretations import Interpretation
@@ -75,7 +76,7 @@ IMPLAUSIBLE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class ConventionCheck(HtmlResult):
+class ConventionCheck(Result):
     """The stated conventions of measurements against the robot, and the best other interpretation.
 
     Attributes
@@ -95,6 +96,15 @@ class ConventionCheck(HtmlResult):
     alternatives: tuple[Interpretation, ...] = ()
     finding: Finding | None = None
 
+    FIELDS = fields(
+        "misfit",
+        interpretation="interpretation.finding",
+        other_misfit="other_misfit",
+        alternatives="alternatives.finding",
+        refused="is_refused",
+        finding="finding",
+    )
+
     @property
     def is_doubtful(self) -> bool:
         """Whether tolerances and noise do not explain the data as they are stated."""
@@ -111,18 +121,6 @@ class ConventionCheck(HtmlResult):
 
     def __str__(self) -> str:
         return repr(self) if self.finding is None else str(self.finding)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return misfits and findings for JSON."""
-        other = self.interpretation
-        return {
-            "misfit": self.misfit,
-            "interpretation": None if other is None else other.finding,
-            "other_misfit": self.other_misfit,
-            "alternatives": [interpretation.finding for interpretation in self.alternatives],
-            "refused": self.is_refused,
-            "finding": self.finding,
-        }
 
 
 def check_conventions(

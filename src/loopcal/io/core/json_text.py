@@ -13,11 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from loopcal import serialization
 from loopcal.errors import FileError
 from loopcal.io.core.limits import JSON_DEPTH, JSON_VALUES, PROGRAM_SIZE, FileLimit
 from loopcal.io.core.text_file import read_text
 from loopcal.plain_text import escape_json
+from loopcal.results import serialization
 
 SHOWN = 20
 """Characters of a number that a message shows."""

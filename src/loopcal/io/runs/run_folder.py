@@ -52,7 +52,8 @@ from loopcal.io.runs.run_result import (
 )
 from loopcal.measure.kinds.kind import update_setup_name
 from loopcal.mechanism.model import Mechanism
-from loopcal.presentation import HtmlResult
+from loopcal.results.result import Result
+from loopcal.results.serialization import json_fields
 from loopcal.typing import report_no_progress
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def find_file_failure(path: Path) -> Finding | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Run(HtmlResult):
+class Run(Result):
     """A calibration read from its run folder, or a robot file as if it were one.
 
     Parameters
@@ -432,7 +433,7 @@ def build_document(
     """Return the content of result.json; see `save_run`."""
     files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}
     provenance = collect_provenance(command, files, report.provenance.seeds)
-    return {"made_by": provenance, **report.contents()}
+    return {"made_by": provenance, **json_fields(report)}
 
 
 def load_run(path: str | Path) -> Run:

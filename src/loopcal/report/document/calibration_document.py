@@ -35,7 +35,6 @@ from loopcal.report.document.figures import (
     draw_scene_picture,
     draw_validation_picture,
 )
-from loopcal.report.tables import ABSENT, Table, format_number, word_column
 from loopcal.report.validation_view import (
     READING_NOISE,
     describe_commanded,
@@ -43,6 +42,7 @@ from loopcal.report.validation_view import (
     view_error_statistics,
     view_errors,
 )
+from loopcal.results.tables import ABSENT, Table, format_number, word_column
 
 # --- Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
 

@@ -27,8 +27,8 @@ from loopcal.estimate.result import KindResiduals, residuals_from_arrays
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import escape
 from loopcal.report.scene.scene import load_script
-from loopcal.report.tables import Table
-from loopcal.serialization import restore_numbers
+from loopcal.results.serialization import restore_numbers
+from loopcal.results.tables import Table
 
 if TYPE_CHECKING:
     from jinja2 import Template

@@ -40,8 +40,9 @@ from loopcal.report.figures.style import (
     show_names,
     start_figure,
 )
-from loopcal.report.tables import format_uncertainty, format_with_uncertainty
 from loopcal.report.validation_view import WORDS
+from loopcal.results.presenters import register
+from loopcal.results.tables import format_uncertainty, format_with_uncertainty
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit
 
@@ -175,6 +176,7 @@ COLUMNS = 3
 """Panels of quantities beside each other."""
 
 
+@register("figure residuals", Identification)
 def draw_residuals(fit: Identification) -> Figure:
     """Draw the residuals of a fit, see `draw_residual_rows`."""
     return draw_residual_rows(fit.robot, fit.residuals, fit.nuisance.names)
@@ -422,6 +424,7 @@ class FittedParameters(Protocol):
         ...
 
 
+@register("figure parameters", Identification)
 def draw_parameters(fit: FittedParameters) -> Figure:
     """Draw the shift of each parameter in tolerances with its 95 % interval, its uncertainty in
     tolerances, and both as numbers in the unit of the robot's file.
@@ -520,6 +523,7 @@ def _set_rows(axes: Axes, labels: list[str]) -> None:
     axes.set_ylim(len(labels) - 0.4, -0.6)
 
 
+@register("figure correlation", Identification)
 def draw_correlation(fit: FittedParameters) -> Figure:
     """Draw the correlations of all parameters as a matrix of colors.
 
@@ -580,6 +584,7 @@ SMALLEST = 1e-16
 """Change in tolerances below which a number is rounding and drawn at this value."""
 
 
+@register("figure convergence", Identification)
 def draw_convergence(fit: Identification) -> Figure:
     """Draw the sum of squares and the distance of each parameter from its last value by step."""
     figure = start_figure(9.0, 3.9)
@@ -657,6 +662,7 @@ COUNTED, CUT = COLORS[0], COLORS[1]
 """Colors of singular values that count and of those that count as zero."""
 
 
+@register("figure", Identifiability)
 def draw_identifiability(analysis: Identifiability) -> Figure:
     """Draw the singular values with the rank and the gap, and the null vectors and weak directions
     as weights of the parameters.
@@ -788,6 +794,7 @@ METHOD_MARKERS = {
 """Rule -> marker and color of the value that it chooses."""
 
 
+@register("figure", RegularizationCurves)
 def draw_regularization(curves: RegularizationCurves) -> Figure:
     """Draw the held-out error against lam and against k, with bands of one standard error, and mark
     what rules choose.

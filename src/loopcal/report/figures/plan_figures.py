@@ -32,7 +32,8 @@ from loopcal.report.figures.style import (
     label_logarithmic,
     start_figure,
 )
-from loopcal.report.tables import units_of
+from loopcal.results.presenters import register
+from loopcal.results.tables import units_of
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, Unit, find_unit
 
@@ -50,6 +51,7 @@ DISK, CLOSE = 9.5, 0.02
 """Size of the disk of a pose [pt], and distance of two overlapping ones as a share of an axis."""
 
 
+@register("figure", Plan)
 def draw_plan(plan: Plan) -> Figure:
     """Draw the poses of a plan in pairs of controlled coordinates, numbered in the order of
     visiting, with the path between them.
@@ -221,6 +223,7 @@ MOST_GROUPS = 8
 """Groups with a label of their own in the legend."""
 
 
+@register("figure", SurfacePlan)
 def draw_surface_plan(plan: SurfacePlan) -> Figure:
     """Draw where the tool is at the points of each group: the first two are on the line, and the
     first and all others in the plane. A number is that of a group at its first point.

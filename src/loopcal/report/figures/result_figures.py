@@ -16,7 +16,6 @@ from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import Validation
 from loopcal.findings.wording import count_decimals
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
-from loopcal.report.calibration_view import name_source
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
@@ -38,8 +37,8 @@ from loopcal.report.figures.style import (
     shorten,
     start_figure,
 )
-from loopcal.report.tables import format_number
-from loopcal.report.validation_view import find_shift
+from loopcal.results.presenters import register
+from loopcal.results.tables import format_number
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit
 
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@register("figure", Repeatability)
 def draw_repeatability(result: Repeatability) -> Figure:
     """Draw pose accuracy and repeatability of each visited pose, with intervals of 95 %."""
     n = len(result.poses)
@@ -104,6 +104,7 @@ def _name_visited(pose: VisitedPose) -> str:
     return " ".join(filter(None, (pose.pose, pose.target, pose.direction)))
 
 
+@register("figure", ErrorBudget)
 def draw_budget(budget: ErrorBudget) -> Figure:
     """Draw the part of each source in the expected error of poses as bars, and the error that half
     the sigma of a source would leave.
@@ -130,7 +131,7 @@ def draw_budget(budget: ErrorBudget) -> Figure:
         axes.set_xlim(0.0, 1.08 * max(total, rms_by_source.max(initial=0.0)))
         title = f"{kind}: {format_number(total, 3)} {unit.symbol} in all"
         label_axes(axes, f"{kind} [{unit.symbol}]", "", title)
-    names = [name_source(line.source.kind, line.source.name) for line in lines]
+    names = [line.source.words for line in lines]
     panels[0].set_yticks(y, [shorten(name, 34) for name in names])
     panels[0].set_ylim(len(lines) - 0.4, -0.6)
     handles = [
@@ -170,6 +171,7 @@ class Slice(NamedTuple):
     measured: BoolArray
 
 
+@register("figure", AccuracyMap)
 def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
     """Draw the rms uncertainty of position and orientation in slices of the workspace.
 
@@ -319,6 +321,7 @@ LOGARITHMIC = 8.0
 """Ratio of the largest errors before and after from which their axis is logarithmic."""
 
 
+@register("figure", Validation)
 def draw_validation(validation: Validation, with_before: bool = True) -> Figure:
     """Draw the errors of each quantity by pose, and those of all kinds over sigma.
 
@@ -539,6 +542,7 @@ def draw_run_errors(comparison: RunComparison, show_unit: Callable[[str], Unit])
     return finish_figure(figure, f"Errors after calibration at the {poses}")
 
 
+@register("figure", RunComparison)
 def draw_run_shifts(comparison: RunComparison) -> Figure:
     """Draw the shift of each parameter from the first run, in standard deviations, while all others
     may have changed, too; a significant shift is filled. What is not determined or not tested has
@@ -552,7 +556,7 @@ def draw_run_shifts(comparison: RunComparison) -> Figure:
     handles, y = [], np.arange(len(names))
     for k, pair in enumerate(comparison.pairs, 1):  # the first run has color and marker 0
         color, marker = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
-        shifts = [find_shift(pair, name) for name in names]
+        shifts = [pair.find_shift(name) for name in names]
         size = np.array([shift / sd if sd > 0.0 else np.nan for shift, sd, _ in shifts])
         significant = np.array([flag for _, _, flag in shifts])
         offset = 0.5 * k / (len(comparison.pairs) + 1) - 0.25
@@ -602,6 +606,7 @@ AREA, MARGIN = 110.0, 0.16
 """Area of a marker [pt^2], and margin around the points as a share of their range."""
 
 
+@register("figure", HeightErrors)
 def draw_height_errors(heights: HeightErrors) -> Figure:
     """Draw the errors of heights over x and y, before and after, with one scale of colors.
 

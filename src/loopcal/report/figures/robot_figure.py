@@ -33,6 +33,7 @@ from loopcal.report.figures.style import (
     start_figure,
 )
 from loopcal.report.scene.scene import Part, PoseErrors, Role, Scene, is_planar, list_parts
+from loopcal.results.presenters import register
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
@@ -57,6 +58,7 @@ class Stroke:
     style: dict[str, Any]
 
 
+@register("figure", Mechanism)
 def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Figure:
     """Draw a robot at home, or at a row of a solution, in the length unit of its file."""
     state = robot.home_state if solution is None else solution.take(np.array([row])).state

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
-from loopcal.presentation import TableResult
-from loopcal.report.tables import Block, Column, Table, word_column
+from loopcal.results.result import TableResult
+from loopcal.results.tables import Block, Column, Table, word_column
 from loopcal.studies.execution.executors import import_optional
 from loopcal.studies.files.store import StudyStore, is_driven, read_store
 from loopcal.studies.files.study_folder import load_specification, read_study
@@ -47,7 +47,7 @@ class StudyResult(TableResult):
 
     def _repr_html_(self) -> str:
         """Return the summary of all cells as HTML."""
-        from loopcal.report.notebook import render_html
+        from loopcal.results.notebook import render_html
         from loopcal.studies.results.questions import list_shown, view_summary
 
         summary = self.summarize()

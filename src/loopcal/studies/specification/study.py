@@ -17,7 +17,7 @@ from typing import Any
 
 import msgspec
 
-from loopcal.presentation import HtmlResult
+from loopcal.results.result import Result
 from loopcal.studies.specification.levels import (
     FACTORS,
     EffectsLevel,
@@ -127,7 +127,7 @@ BLOCK, REPLICATES = 50, 1000
 
 
 @dataclass(frozen=True)
-class Study(HtmlResult):
+class Study(Result):
     """The specification of a study; equal specifications give equal numbers.
 
     Parameters
@@ -157,7 +157,7 @@ class Study(HtmlResult):
 
     def _repr_html_(self) -> str:
         """Return title, size and factors as HTML."""
-        from loopcal.report.notebook import render_html
+        from loopcal.results.notebook import render_html
 
         levels = {n: dict.fromkeys(c.levels[n] for c in self.cells) for n in self.order}
         factors = [f"{name}: {', '.join(names)}" for name, names in levels.items()]

@@ -4,7 +4,7 @@
 import pytest
 
 from loopcal.report.calibration_view import build_parameter_table
-from loopcal.report.tables import (
+from loopcal.results.tables import (
     Column,
     Table,
     build_table,

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from loopcal.findings import Finding, Quantity, Severity
-from loopcal.serialization import INFINITE, UNDEFINED, json_fields, to_json
+from loopcal.results.description import fields
+from loopcal.results.serialization import INFINITE, UNDEFINED, json_fields, to_json
 from loopcal.units import Dimension
 
 
@@ -28,7 +29,7 @@ class Record:
 
 @dataclass(frozen=True)
 class WithTable:
-    JSON_FIELDS: ClassVar = {"rank": "inner.rank", "status": "status"}
+    FIELDS: ClassVar = fields(rank="inner.rank", status="")
     inner: Record = field(default_factory=Record)
     status: Status = Status.CONVERGED
 

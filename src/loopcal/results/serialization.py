@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turn results into JSON: one function for dataclasses, arrays, enums, findings and mappings.
 
-A class whose JSON is not simply its fields says so in one of two ways:
-
-* `JSON_FIELDS`, a class variable. A tuple names the attributes that are written, in order. A
-  mapping gives each key the path of an attribute, such as `{"rank": "spectrum.rank"}`.
-* a method `to_dict`, where a key has to be computed.
+A class whose JSON is not simply its fields states `FIELDS`, see `loopcal.results.description`, or
+has a method `to_dict`, where keys depend on its content.
 """
 
 from __future__ import annotations
@@ -14,9 +11,10 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from enum import Enum
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
+
+from loopcal.results.description import describe_json
 
 INFINITE = "infinite: these data do not determine it, or it is divided by zero"
 UNDEFINED = "undefined: there is nothing to compute it from"
@@ -92,16 +90,16 @@ def _restore(value: Any, nulls: Mapping[str, str], path: str) -> Any:
 
 
 def json_fields(value: Any) -> dict[str, Any]:
-    """Return the attributes of a dataclass that JSON shows, by key, as they are.
+    """Return what a class states for JSON, by key, as objects; of a dataclass that states nothing
+    its fields.
 
     For methods `to_dict` that add keys to the fields: `{**json_fields(self), "rms": self.rms}`.
     """
-    chosen = getattr(value, "JSON_FIELDS", None)
-    if chosen is None:
-        chosen = tuple(field.name for field in dataclasses.fields(value) if field.name[0] != "_")
-    if not isinstance(chosen, Mapping):
-        chosen = {name: name for name in chosen}
-    return {key: attrgetter(attribute)(value) for key, attribute in chosen.items()}
+    described = getattr(value, "FIELDS", ())
+    if any(field.json_key is not None for field in described):
+        return describe_json(value, described)
+    names = (field.name for field in dataclasses.fields(value) if field.name[0] != "_")
+    return {name: getattr(value, name) for name in names}
 
 
 def _content(value: Any) -> Any:

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages of results that are more than a text and the main table: those of the command line."""
+
+from __future__ import annotations
+
+from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.apply.compensation import Compensation
+from loopcal.apply.height_errors import HeightErrors
+from loopcal.apply.repeatability import Repeatability
+from loopcal.apply.run_comparison import RunComparison
+from loopcal.apply.validation import Validation
+from loopcal.diagnose.bootstrap import Bootstrap
+from loopcal.diagnose.cross_validation import ModelChoice
+from loopcal.diagnose.posterior_sample import PosteriorSample
+from loopcal.diagnose.regularization_curves import RegularizationCurves
+from loopcal.estimate.result import Identification
+from loopcal.report.calibration_view import (
+    build_model_table,
+    view_calibration,
+    view_compensation,
+    view_fit,
+    view_heights,
+)
+from loopcal.report.validation_view import (
+    find_error_units,
+    view_bootstrap,
+    view_comparison,
+    view_posterior,
+    view_regularization,
+    view_repeatability,
+    view_validation,
+)
+from loopcal.results.presenters import register
+from loopcal.results.tables import Block
+
+register("page", CalibrationReport)(view_calibration)
+register("page", RegularizationCurves)(view_regularization)
+register("page", Repeatability)(view_repeatability)
+
+
+@register("page", Identification)
+def write_fit(fit: Identification) -> list[Block]:
+    """Return the page of a fit, and its findings."""
+    return [*view_fit(fit), *(f"{f.severity.value}: {f}" for f in fit.findings)]
+
+
+@register("page", Validation)
+def write_validation(validation: Validation) -> list[Block]:
+    """Return errors before and after calibration."""
+    return view_validation(validation, with_before=True, verbose=False)
+
+
+@register("page", HeightErrors)
+def write_heights(heights: HeightErrors) -> list[Block]:
+    """Return the table of the heights."""
+    return view_heights(heights, verbose=False)
+
+
+@register("page", Compensation)
+def write_compensation(result: Compensation) -> list[Block]:
+    """Return the targets, and the findings of those that are not reached."""
+    return [str(result), *view_compensation(result)]
+
+
+@register("page", ModelChoice)
+def write_model_choice(choice: ModelChoice) -> list[Block]:
+    """Return the comparison of parameter sets and the choice."""
+    return [build_model_table(choice), str(choice.finding)]
+
+
+@register("page", Bootstrap)
+def write_bootstrap(result: Bootstrap) -> list[Block]:
+    """Return findings and intervals."""
+    return view_bootstrap(result, result.intervals())
+
+
+@register("page", PosteriorSample)
+def write_sample(sample: PosteriorSample) -> list[Block]:
+    """Return findings and intervals."""
+    return view_posterior(sample, sample.intervals())
+
+
+@register("page", RunComparison)
+def write_runs(comparison: RunComparison) -> list[Block]:
+    """Return the calibrations side by side."""
+    return view_comparison(comparison, find_error_units(comparison).__getitem__)

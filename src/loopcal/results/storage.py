@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results from stored content: from JSON by the types of their attributes, and from arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from enum import Enum
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from loopcal.results.description import Field
+
+Stored = TypeVar("Stored")
+
+
+def restore(of_class: type[Stored], content: Mapping[str, Any], **given: Any) -> Stored:
+    """Return an object from its content of JSON.
+
+    Keys are those of `FIELDS` of its class, or the names of its attributes. Where there is no key,
+    an attribute has its default. Null for a number is NaN.
+
+    Parameters
+    ----------
+    content : numbers that are not finite may be restored already, see `restore_numbers`.
+    given : attributes that are not in `content`, or are to be taken instead.
+    """
+    hints, values = get_type_hints(of_class), dict(given)
+    described: tuple[Field, ...] = getattr(of_class, "FIELDS", ())
+    keys = {f.of or f.name: f.json_key for f in described if f.json_key is not None}
+    for name in (field.name for field in dataclasses.fields(of_class)):  # type: ignore[arg-type]
+        key = keys.get(name, name)
+        if name not in given and key in content:
+            values[name] = _restore_value(hints[name], content[key])
+    return of_class(**values)
+
+
+def _restore_value(hint: Any, value: Any) -> Any:
+    """Return a value of JSON as one of a type."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        (other,) = (argument for argument in arguments if argument is not NoneType)
+        return None if value is None else _restore_value(other, value)
+    if hint is float:
+        return math.nan if value is None else float(value)
+    if origin is np.ndarray:
+        return np.array(value, dtype=get_args(arguments[1])[0])
+    if origin is tuple:
+        entries = arguments[:1] * len(value) if arguments[-1] is ... else arguments
+        return tuple(map(_restore_value, entries, value))
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return {key: _restore_value(arguments[1], entry) for key, entry in value.items()}
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return hint[value.upper()]
+    return restore(hint, value) if dataclasses.is_dataclass(hint) else value
+
+
+def store_arrays(result: Any, prefix: str) -> dict[str, np.ndarray]:
+    """Return the fields that a class marks as stored, by name after `prefix`."""
+    stored = (field for field in type(result).FIELDS if field.is_stored)
+    return {prefix + field.name: np.asarray(field.get(result)) for field in stored}
+
+
+def restore_arrays(
+    of_class: type[Stored], arrays: Mapping[str, np.ndarray], prefix: str, **given: Any
+) -> Stored | None:
+    """Return an object from what `store_arrays` returned; None where an array is missing.
+
+    Parameters
+    ----------
+    given : the attributes that are not stored.
+    """
+    stored: list[Field] = [field for field in getattr(of_class, "FIELDS", ()) if field.is_stored]
+    if any(prefix + field.name not in arrays for field in stored):
+        return None
+    hints = get_type_hints(of_class)
+    for field in stored:
+        attribute, array = str(field.of or field.name), arrays[prefix + field.name]
+        is_array = get_origin(hints[attribute]) is np.ndarray
+        given[attribute] = array if is_array else _restore_value(hints[attribute], array.tolist())
+    return of_class(**given)
