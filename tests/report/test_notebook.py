@@ -22,10 +22,10 @@ from loopcal.results.result import Result, TableResult
 
 NAMES = """
     CalibrationOptions Column Constraints FitOptions GCV Gaussian Huber InflatedTolerances
-    Instrument LeastSquares LineOfSight MAP MarginalLikelihood PlanOptions Prior Ridge Sensor StatedValue
-    StepControl SurfaceOptions TruncatedSVD TruncationGCV Tukey Uniform Dask Processes Ray Serial
-    Autocollimation Bearing Closure Component Direction Distance Inclination JointSensor Line Locked
-    Plane Pose Position Separation Sphere Observations Trials InstrumentRecord
+    Instrument LeastSquares LineOfSight MAP MarginalLikelihood PlanOptions Prior Ridge Sensor
+    StatedValue StepControl SurfaceOptions TruncatedSVD TruncationGCV Tukey Uniform Dask Processes
+    Ray Serial Autocollimation Bearing Closure Component Direction Distance Inclination JointSensor
+    Line Locked Plane Pose Position Separation Sphere Observations Trials InstrumentRecord
     Exported Format Imported TargetKind
 """
 SETTINGS = frozenset(NAMES.split())
