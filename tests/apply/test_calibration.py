@@ -17,8 +17,8 @@ from loopcal.apply.calibration_options import CalibrationOptions, split_data
 from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.observation_rows import BLOCK, EXACT_BLOCK
 from loopcal.estimate.penalties import MAP
+from loopcal.estimate.pose_blocks import BLOCK, EXACT_BLOCK
 from loopcal.findings import Quantity, Severity, report_finding
 from loopcal.io.core.json_text import to_json
 from loopcal.io.runs.run_folder import load_run, save_run

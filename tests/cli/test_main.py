@@ -74,8 +74,7 @@ UNUSED = {
     *("loopcal.diagnose.cross_validation", "loopcal.apply.run_comparison"),
     *("loopcal.mechanism.chains", "loopcal.mechanism.actuation"),
     *("loopcal.mechanism.open_closure", "loopcal.mechanism.compilation"),
-    *("loopcal.estimate.uncertain_poses", "loopcal.estimate.pose_estimate"),
-    *("loopcal.estimate.uncertain_poses", "loopcal.estimate.pose_start"),
+    *("loopcal.estimate.pose_estimate", "loopcal.estimate.pose_start"),
     *("loopcal.measure.instrument", "loopcal.measure.simulation", "loopcal.measure.initial_values"),
     *("loopcal.measure.kinds.position", "loopcal.measure.kinds.surfaces"),
 }

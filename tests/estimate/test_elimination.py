@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import loopcal.estimate.problem as problem_module
+import loopcal.estimate.pose_blocks as blocks_module
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.information import observe_poses, observe_rows
@@ -328,7 +328,7 @@ def test_planes_that_share_a_probe_give_the_joint_solution(held):
 def test_groups_split_over_row_blocks_give_the_same_factor(monkeypatch):
     data = simulate_probed_planes(7)
     whole = linearize_nominal(data)[0]
-    monkeypatch.setattr(problem_module, "EXACT_BLOCK", 5)
+    monkeypatch.setattr(blocks_module, "EXACT_BLOCK", 5)
     parts = linearize_nominal(data)[0]
     assert_allclose(
         parts.T @ parts, whole.T @ whole, rtol=0, atol=1e-10 * np.abs(whole.T @ whole).max()

@@ -14,9 +14,9 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.pose_estimate import report_doubtful_readings
 from loopcal.estimate.pose_linearization import PoseStates
+from loopcal.estimate.pose_rows import PoseRows
 from loopcal.estimate.pose_start import measure_poses
 from loopcal.estimate.problem import problem_of
-from loopcal.estimate.uncertain_poses import UncertainPoses
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.distance import Distance
@@ -73,7 +73,7 @@ def evaluation_counter(monkeypatch):
 
         monkeypatch.setattr(owner, attribute, wrapped)
 
-    counting(UncertainPoses, "_evaluate", "evaluations")
+    counting(PoseRows, "_evaluate", "evaluations")
     counting(trials_module, "follow_path", "followed")
     return count
 
@@ -211,7 +211,7 @@ def test_pose_search_from_random_starts_is_bounded_and_never_increases_cost(
     lost[:, 0] = True
     data = remove_readings(data, lost)
     problem = problem_of(select_free_parameters(robot), data)
-    assert isinstance(problem.poses, UncertainPoses)
+    assert problem.is_uncertain
     stroke = np.array([a.stroke for a in robot.actuators], dtype=float)
     rng, z = np.random.default_rng(3), np.zeros((1, problem.parameters))
     for _ in range(4):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import loopcal.estimate.problem as problem_module
+import loopcal.estimate.pose_blocks as blocks_module
 from loopcal.diagnose.start_values import check_start_values
 from loopcal.errors import EstimationError
 from loopcal.estimate import fit_descent as module
@@ -17,9 +17,9 @@ from loopcal.estimate.fit_descent import FEWEST_POSES, SHARE, select_part, sprea
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
-from loopcal.estimate.observation_rows import BLOCK
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, TruncatedSVD
+from loopcal.estimate.pose_blocks import BLOCK
 from loopcal.estimate.prior import prior_from
 from loopcal.estimate.problem import problem_of, problem_of_trials
 from loopcal.estimate.result import Identification
@@ -264,7 +264,7 @@ def test_parts_are_not_of_chains_of_stages_or_open_sums(monkeypatch, name):
     ("robot", "kind", "count"), [(DELTA, Position(), 6), (load_robot("hexapod-42"), Pose(), 0)]
 )
 def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot, kind, count):
-    monkeypatch.setattr(problem_module, "EXACT_BLOCK", BLOCK)  # two blocks of poses
+    monkeypatch.setattr(blocks_module, "EXACT_BLOCK", BLOCK)  # two blocks of poses
     poses = np.resize(sample_workspace(robot, 500, 1).coordinates, (3000, len(robot.controlled)))
     noise = Gaussian(np.full(len(kind.noise_columns), SIGMA))
     measured = simulate(robot, poses, Instrument((Sensor(kind, noise),)), 0)

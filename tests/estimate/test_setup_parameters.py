@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
-import loopcal.estimate.problem as problem_module
+import loopcal.estimate.pose_blocks as blocks_module
 from loopcal import geometry
 from loopcal.apply.validation import validate
 from loopcal.cli.entry_point import main
@@ -220,7 +220,7 @@ def test_a_target_that_is_never_measured_is_not_harmless():
 
 @pytest.mark.parametrize("block", [16, 512])
 def test_linked_poses_and_joint_sensors_are_fitted_with_any_block_size(monkeypatch, block):
-    monkeypatch.setattr(problem_module, "EXACT_BLOCK", block)
+    monkeypatch.setattr(blocks_module, "EXACT_BLOCK", block)
     robot, truth, poses = make_machine("3-prs", 40)
     passive = lc.inverse(robot, poses[:1]).passive_names[0]
     far = Sensor(
@@ -269,7 +269,7 @@ def test_each_session_has_its_own_frame_and_elimination_cluster():
 
 @pytest.mark.slow
 def test_memory_hardly_grows_with_the_number_of_sessions(monkeypatch):
-    monkeypatch.setattr(problem_module, "EXACT_BLOCK", 256)  # poses, those of 32 sessions
+    monkeypatch.setattr(blocks_module, "EXACT_BLOCK", 256)  # poses, those of 32 sessions
 
     def peak(sessions):
         day = np.repeat([f"day{i}" for i in range(sessions)], 8)

@@ -11,8 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 from scipy.stats import binom, chi2
 
-import loopcal.estimate.problem as problem_module
-import loopcal.estimate.uncertain_poses as components_module
+import loopcal.estimate.pose_blocks as blocks_module
 from loopcal.apply.validation import validate
 from loopcal.diagnose.cross_validation import cross_validate
 from loopcal.diagnose.fit_examination import examine_fit
@@ -457,7 +456,7 @@ def test_pose_blocks_do_not_change_a_fit_of_uncertain_readings(monkeypatch):
     )
     data = simulate_hexapod(12, 2 * UM, sensors=sensors)
     whole = identify(hexapod(), data, LeastSquares())
-    monkeypatch.setattr(problem_module, "BLOCK", 5)
+    monkeypatch.setattr(blocks_module, "BLOCK", 5)
     parts = identify(hexapod(), data, LeastSquares())
     assert parts.chi_square == pytest.approx(whole.chi_square, rel=1e-9)
     assert_allclose(
@@ -501,7 +500,7 @@ def test_too_few_readings_and_too_many_linked_poses_are_refused(cable, monkeypat
     alone = replace(simulate_hexapod(6, UM), observations=())
     with pytest.raises(EstimationError, match="No equation remains"):
         identify(hexapod(), alone, LeastSquares())
-    monkeypatch.setattr(components_module, "LARGEST", 30)
+    monkeypatch.setattr(blocks_module, "LARGEST", 30)
     data = simulate_hexapod(6, UM, sensors=(Sensor(Separation(), noise(UM)), *tracker().sensors))
     with pytest.raises(EstimationError, match="link 6 poses"):
         identify(hexapod(), data, LeastSquares())

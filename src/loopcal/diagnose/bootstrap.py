@@ -87,7 +87,7 @@ def list_observed_columns(
     root = None if estimate is None else estimate.elimination.joint_root()[0]
     width = 0 if root is None else len(root)
     kinds = [_make_empty(problem, rows, width) for rows in problem.rows]
-    for block, poses in problem.poses.iterate_linearized(solution, z, trials):
+    for block, poses in problem.poses.iterate_poses(solution, z):
         for kind, numbers, rows in zip(kinds, block.row_numbers, block.rows, strict=True):
             if not len(numbers):
                 continue

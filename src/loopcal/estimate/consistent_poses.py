@@ -13,19 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.pose_linearization import PoseSolution, PoseStates, spread_states
+from loopcal.estimate.pose_rows import PoseRows
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from loopcal.estimate.uncertain_poses import UncertainPoses
 
 CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9, stuck=1e-3)
 """Control of the iteration to consistent poses: until residuals are rounding, or out of reach."""
@@ -64,7 +62,7 @@ class ConsistentPoses(NamedTuple):
     readings : (T | 1, n, actuators) [SI] where exact readings begin.
     """
 
-    poses: UncertainPoses
+    poses: PoseRows
     readings: FloatArray
 
     def move(

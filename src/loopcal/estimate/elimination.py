@@ -11,7 +11,7 @@ nuisance parameter is one more row. See docs/theory/identification.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -31,7 +31,6 @@ from loopcal.numerics.elimination import (
     build_tree,
     eliminate_tree,
 )
-from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.parameters import ParameterTable
@@ -126,22 +125,6 @@ class NuisanceElimination:
         if len(self.prior_mean) == 1:
             return self
         return replace(self, prior_mean=self.prior_mean[trials])
-
-    def members(self, rows: ObservationRows) -> tuple[NodeMembers, ...]:
-        """Return the rows of a kind by the structure of the node that each belongs to."""
-        numbers = np.arange(len(rows.poses))
-        if not rows.nuisance.shape[1]:
-            return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
-        tree, node = self.tree, self.tree.node[rows.nuisance].max(axis=1)
-        structure = np.full(len(node), -1)
-        structure[node >= 0] = tree.structure[node[node >= 0]]
-        groups = []
-        for s in find_distinct(structure):
-            chosen = np.flatnonzero(structure == s)
-            nodes, used = node[chosen], rows.nuisance[chosen]
-            columns = np.zeros_like(used) if s < 0 else tree.columns(nodes, used)
-            groups.append(NodeMembers(int(s), chosen, nodes, columns))
-        return tuple(groups)
 
     def start_values(
         self, data: Measurements, T: FloatArray, joints: Mapping[str, FloatArray]
@@ -256,26 +239,46 @@ def plan_elimination(
 def list_members(
     nuisance: NuisanceElimination | None, rows: ObservationRows
 ) -> tuple[NodeMembers, ...]:
-    """Return the rows of a kind by nodes; all are of the machine without nuisance parameters."""
-    if nuisance is not None:
-        return nuisance.members(rows)
+    """Return the rows of a kind by the structure of the node that each belongs to.
+
+    All are of the machine where they use no nuisance parameter.
+    """
     numbers = np.arange(len(rows.poses))
-    return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
+    if nuisance is None or not rows.nuisance.shape[1]:
+        return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
+    tree, node = nuisance.tree, nuisance.tree.node[rows.nuisance].max(axis=1)
+    structure = np.full(len(node), -1)
+    structure[node >= 0] = tree.structure[node[node >= 0]]
+    groups = []
+    for s in find_distinct(structure):
+        chosen = np.flatnonzero(structure == s)
+        nodes, used = node[chosen], rows.nuisance[chosen]
+        columns = np.zeros_like(used) if s < 0 else tree.columns(nodes, used)
+        groups.append(NodeMembers(int(s), chosen, nodes, columns))
+    return tuple(groups)
 
 
 def divide_among_nodes(
-    kind: KindRows, members: Iterable[NodeMembers], tree: EliminationTree | None
+    kinds: Sequence[KindRows | None],
+    members: Sequence[tuple[NodeMembers, ...]],
+    tree: EliminationTree | None,
 ) -> list[NodeRows]:
-    """Return the rows of a kind by nodes, [nuisance | machine | residual]."""
-    rows = kind.machine
+    """Return the rows of every kind by nodes, [nuisance | machine | residual].
+
+    `members` are those of the kinds; none where the rows do not go to the nodes as they are.
+    """
     divided = []
-    for structure, numbers, nodes, columns in members:
-        chosen = rows if len(numbers) == rows.shape[1] else rows[:, numbers]
-        if structure >= 0 and kind.by_nuisance is not None and tree is not None:
-            width = tree.structures[structure].width
-            by_path = spread_columns(kind.by_nuisance[:, numbers], columns, width)
-            chosen = np.concatenate([by_path, chosen], axis=-1)
-        divided.append(NodeRows(structure, nodes, numbers, chosen))
+    for i, (kind, of_kind) in enumerate(zip(kinds, members, strict=False)):
+        if kind is None:
+            continue
+        rows = kind.machine
+        for structure, numbers, nodes, columns in of_kind:
+            chosen = rows if len(numbers) == rows.shape[1] else rows[:, numbers]
+            if structure >= 0 and kind.by_nuisance is not None and tree is not None:
+                width = tree.structures[structure].width
+                by_path = spread_columns(kind.by_nuisance[:, numbers], columns, width)
+                chosen = np.concatenate([by_path, chosen], axis=-1)
+            divided.append(NodeRows(structure, nodes, numbers, chosen, i))
     return divided
 
 
@@ -303,50 +306,6 @@ def fold_node_rows(
         rows = [_flat(part) for part in chosen]
         factors.add(structure, np.concatenate(rows, axis=1), np.concatenate(places))
     return factor
-
-
-class _NuisancePoint(NamedTuple):
-    """Values (a, U), the factors of rows [F | r] there, and their sums of squares (a,)."""
-
-    values: FloatArray
-    factors: NodeFactors
-    cost: FloatArray
-
-
-class _NuisanceStep(NamedTuple):
-    """A step (a, U), the squared change (a,) of the rows, and the share (a, 1) tried first."""
-
-    step: FloatArray
-    change: FloatArray
-    share: FloatArray
-
-
-def solve_for_nuisance(
-    nuisance: NuisanceElimination,
-    values: FloatArray,
-    fold_at: Callable[[FloatArray], NodeFactors],
-    control: Halving,
-) -> FloatArray:
-    """Return the values (a, U) next to given ones that fit rows at fixed poses best.
-
-    `fold_at` returns the factors of the rows [F | r] at values (a, U), without priors.
-    """
-
-    def evaluate(tried: FloatArray) -> _NuisancePoint:
-        factors = fold_at(tried)
-        nuisance.fold_priors(factors, tried)
-        return _NuisancePoint(tried, factors, factors.sum_of_squares())
-
-    def propose(point: _NuisancePoint) -> _NuisanceStep:
-        step = eliminate_tree(point.factors)[0].shift
-        change = point.factors.squared_change(step)
-        return _NuisanceStep(step, change, np.ones((len(step), 1)))
-
-    def move(point: _NuisancePoint, step: _NuisanceStep, share: FloatArray) -> _NuisancePoint:
-        return evaluate(point.values + share * step.step)
-
-    point, _ = minimize_by_halving(evaluate(values), propose, move, control)
-    return point.values
 
 
 def _flat(part: NodeRows) -> FloatArray:

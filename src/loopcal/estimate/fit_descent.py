@@ -20,12 +20,14 @@ from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, Method, Ridge
 from loopcal.estimate.pose_linearization import LinearizedPoses
 from loopcal.estimate.prior_inflation import ROUNDS, choose_methods
-from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem import Problem, make_exact_problem
 from loopcal.estimate.robust_descent import Run, descend_robustly
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 # --- A start for fits of very many poses: the estimate of a small part of them.
@@ -138,8 +140,10 @@ def take_poses(problem: Problem, poses: IntArray) -> Problem:
     place = np.full(problem.readings.shape[1], -1)
     place[poses] = np.arange(len(poses))
     chosen = [np.flatnonzero(place[rows.poses] >= 0) for rows in problem.rows]
-    rows = (r.take_rows(numbers, place) for r, numbers in zip(problem.rows, chosen, strict=True))
-    return replace(problem, readings=problem.readings[:, poses], rows=tuple(rows))
+    rows = [r.take_rows(numbers, place) for r, numbers in zip(problem.rows, chosen, strict=True)]
+    readings, trials = problem.readings[:, poses], len(problem)
+    nothing = NuisanceParameters(ParameterTable(()), ())
+    return make_exact_problem(problem.free, readings, tuple(rows), trials, nothing, problem.data)
 
 
 def _is_converged(fit: Descent) -> bool:
@@ -277,7 +281,7 @@ def descend_from_closure(
     if located is None:
         return deviation, None
     coarse = replace(control, relative=max(control.relative, RELATIVE))
-    fit = descend(replace(problem, located=located), deviation, method, coarse, tolerance)
+    fit = descend(problem.at_measured_poses(located), deviation, method, coarse, tolerance)
     good = fit.status == DescentStatus.CONVERGED
     return np.where(good[:, None], fit.deviation, deviation), fit
 

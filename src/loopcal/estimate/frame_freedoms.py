@@ -100,16 +100,18 @@ class FrameRows:
         evaluations: Sequence[Evaluation | None],
     ) -> None:
         """Add the rows of every kind at poses T (1, n, 4, 4) and joints name -> (1, n)."""
-        elimination, node_rows, trial = self._problem.nuisance, [], np.zeros(1, dtype=np.int64)
+        elimination, whitened, trial = self._problem.nuisance, [], np.zeros(1, dtype=np.int64)
         by_frames = frame_twists(T, self._problem.free.robot.size)
         poses = LinearizedPoses(T, np.ones(T.shape[:2], dtype=bool), by_frames, joints)
         tree = None if elimination is None else elimination.tree
-        for rows, evaluated in zip(kinds, evaluations, strict=True):
-            if len(rows.poses):
-                kind = linearize_rows(rows, poses, trial, self._nuisance, evaluated=evaluated)
-                length = float(np.linalg.norm(kind.by_parameters))
-                self._effect = float(np.hypot(self._effect, length))
-                node_rows += divide_among_nodes(kind, list_members(elimination, rows), tree)
+        observed = [pair for pair in zip(kinds, evaluations, strict=True) if len(pair[0].poses)]
+        for rows, evaluated in observed:
+            kind = linearize_rows(rows, poses, trial, self._nuisance, evaluated=evaluated)
+            length = float(np.linalg.norm(kind.by_parameters))
+            self._effect = float(np.hypot(self._effect, length))
+            whitened.append(kind)
+        members = [list_members(elimination, rows) for rows, _ in observed]
+        node_rows = divide_among_nodes(whitened, members, tree)
         self._factor = fold_node_rows(self._factor, self._factors, node_rows)
 
     def find_unfixed(self) -> FloatArray | None:

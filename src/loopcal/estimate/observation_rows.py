@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observed rows of every kind for a batch of trials, and the blocks of poses they are divided into.
-
-A block is a run of consecutive poses with the rows that observed these poses alone. Rows that link
-poses of different runs form blocks of their own, with the poses that they name, so that no block is
-larger than it must be.
-"""
+"""Observed rows of every kind for a batch of trials."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -18,18 +13,11 @@ import numpy as np
 from loopcal.measure.kinds.kind import Kind, MeasuredColumns
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.elimination import find_connected_groups
-from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-BLOCK = 2048
-"""Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few
-enough for the cache."""
-EXACT_BLOCK = 4096
-"""The same of poses that exact readings determine. All problems of the same poses have the same
-blocks, so that poses that one of them solved serve another one."""
 TRIAL_BLOCK = 16384
-"""The same for many trials whose rows the engine folds as it makes them, so that less of them is in
-memory: larger parts leave less time to Python, which runs in one thread at a time."""
+"""Poses of many trials together whose rows the engine folds as it makes them, so that less of them
+is in memory: larger parts leave less time to Python, which runs in one thread at a time."""
 
 
 def _no_nuisance() -> IntArray:
@@ -154,24 +142,6 @@ class Residuals(NamedTuple):
     whitened: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class PoseBlock:
-    """Some poses and the rows that observed them.
-
-    Attributes
-    ----------
-    poses : (b,) numbers of the poses. readings : (1, b, a) [SI].
-    row_numbers : of every kind, (k,). rows : of every kind, poses numbered within the block.
-    is_needed : (b,) poses that some row needs.
-    """
-
-    poses: IntArray
-    readings: FloatArray
-    row_numbers: tuple[IntArray, ...]
-    rows: tuple[ObservationRows, ...]
-    is_needed: BoolArray
-
-
 def linked_blocks(data: Measurements) -> IntArray:
     """Return the block (n,) of each pose, where rows that compare poses join their blocks."""
     numbers, member = np.unique(data.block, return_inverse=True)
@@ -195,67 +165,9 @@ def consecutive_pairs(poses: IntArray) -> IntArray:
     return np.column_stack([poses[:, :-1].ravel(), poses[:, 1:].ravel()])
 
 
-def divide_poses(
-    readings: FloatArray, rows: Sequence[ObservationRows], is_needed: BoolArray, size: int
-) -> tuple[PoseBlock, ...]:
-    """Divide n poses into blocks of `size` poses.
-
-    The first blocks cover every pose once, in order. Those of linked rows follow.
-    """
-    n = len(readings)
-    runs = [r.poses_by_link // size for r in rows]
-    inside = [
-        np.where(np.ptp(run, axis=1) == 0, run[:, 0], -1) if len(run) else run[:, 0] for run in runs
-    ]
-    blocks = []
-    for k in range(0, n, size):
-        poses = np.arange(k, min(k + size, n))
-        chosen = tuple(np.flatnonzero(run == k // size) for run in inside)
-        blocks.append(make_block(poses, readings, rows, chosen, is_needed))
-    nothing = np.zeros(0, dtype=np.int64)
-    for i, run in enumerate(inside):
-        for linking in _chunks(np.flatnonzero(run < 0), size // 2):
-            poses = find_distinct(rows[i].poses[linking])
-            chosen = tuple(linking if j == i else nothing for j in range(len(rows)))
-            blocks.append(make_block(poses, readings, rows, chosen, is_needed))
-    return tuple(blocks)
-
-
-def make_block(
-    poses: IntArray,
-    readings: FloatArray,
-    rows: Sequence[ObservationRows],
-    chosen: tuple[IntArray, ...],
-    is_needed: BoolArray,
-) -> PoseBlock:
-    """Return the block of poses (b,) with the chosen rows of every kind, whose poses lie in it."""
-    place = np.zeros(len(readings), dtype=np.int64)
-    place[poses] = np.arange(len(poses))
-    inside = tuple(r.take_rows(numbers, place) for r, numbers in zip(rows, chosen, strict=True))
-    return PoseBlock(poses, readings[None, poses], chosen, inside, is_needed[poses])
-
-
 def find_needed_poses(rows: Sequence[ObservationRows], n: int) -> BoolArray:
     """Return the poses (n,) that a row with a present residual needs."""
     needed = np.zeros(n, dtype=bool)
     for r in rows:
         needed[r.poses[r.is_present.any(axis=(0, 2))]] = True
     return needed
-
-
-def count_by_component(rows: Sequence[ObservationRows], member: IntArray) -> IntArray:
-    """Return the residuals (T | 1, components) that are present; member (n,) of each pose."""
-    components = int(member.max(initial=0)) + 1
-    total = np.zeros((1, components), dtype=np.int64)
-    for r in rows:
-        present = r.is_present.sum(axis=2)
-        of = member[r.first_poses]
-        total = total + np.stack([np.bincount(of, row, components) for row in present]).astype(
-            np.int64
-        )
-    return total
-
-
-def _chunks(rows: IntArray, size: int) -> Iterator[IntArray]:
-    for first in range(0, len(rows), size):
-        yield rows[first : first + size]

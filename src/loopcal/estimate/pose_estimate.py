@@ -264,8 +264,7 @@ def fit_poses(
     fitted = problem.solve(z, problem.start(z))
     estimates = fitted.estimates
     assert estimates is not None
-    assert problem.member is not None
-    states, member = estimates.states, problem.member
+    states, member = estimates.states, problem.poses.member
     assert data.reading_sigma is not None
     uncertain = (np.isfinite(data.reading_sigma) & (data.reading_sigma > 0.0)).sum(axis=1)
     first = np.unique(member, return_index=True)[1]
@@ -275,7 +274,7 @@ def fit_poses(
         make_solution(robot, states.state, states.q[0]),
         ~estimates.is_undetermined[0],
         absorbed,
-        (problem.component_count[0] - estimates.rank[0])[member],
+        (problem.poses.component_count[0] - estimates.rank[0])[member],
         problem.residuals(z, fitted)[-1].whitened[0],
     )
 

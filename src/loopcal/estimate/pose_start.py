@@ -15,8 +15,8 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.estimate.observation_rows import ObservationRows, whiten
+from loopcal.estimate.pose_coordinates import stroke_of
 from loopcal.estimate.pose_linearization import PoseStates, spread_states
-from loopcal.estimate.uncertain_poses import stroke_of
 from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates

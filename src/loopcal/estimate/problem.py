@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,16 +36,15 @@ from loopcal.estimate.elimination import (
     fold_node_rows,
     plan_elimination,
 )
-from loopcal.estimate.exact_poses import ExactPoses, divide_exact_poses, have_plain_rows
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import LeverageRows, Linearization, Start
-from loopcal.estimate.observation_rows import (
-    BLOCK,
-    EXACT_BLOCK,
-    TRIAL_BLOCK,
-    ObservationRows,
-    Residuals,
-    count_by_component,
+from loopcal.estimate.observation_rows import TRIAL_BLOCK, ObservationRows, Residuals
+from loopcal.estimate.pose_blocks import BLOCK, PoseBlock, find_components
+from loopcal.estimate.pose_coordinates import (
+    MeasuredPoses,
+    PoseCoordinates,
+    ReadingCoordinates,
+    TwistCoordinates,
 )
 from loopcal.estimate.pose_linearization import (
     LinearizedPoses,
@@ -53,6 +52,7 @@ from loopcal.estimate.pose_linearization import (
     PoseStates,
     evaluate_rows,
 )
+from loopcal.estimate.pose_rows import PoseRows
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
@@ -67,12 +67,9 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
-    from loopcal.estimate.uncertain_poses import PoseCoordinates, UncertainPoses
     from loopcal.measure.instrument import Sensor
     from loopcal.measure.simulation import Trials
 
-
-# --- Rows of a problem with columns for all nuisance parameters, poses eliminated (one trial).
 
 AtNodes = Callable[[IntArray], tuple[IntArray, FloatArray, FloatArray]]
 """From nodes (k,) of nuisance parameters to their paths (k, w), roots and slopes; see
@@ -81,38 +78,33 @@ AtNodes = Callable[[IntArray], tuple[IntArray, FloatArray, FloatArray]]
 
 
 def spread_rows(
-    poses: ExactPoses | UncertainPoses,
-    rows_of_blocks: Iterable[tuple[list[NodeRows], BoolArray]],
+    poses: PoseRows,
+    block: PoseBlock,
+    node_rows: Iterable[NodeRows],
     p: int,
-    nuisance: NuisanceElimination | None,
     at_nodes: AtNodes | None,
-) -> Iterator[list[LeverageRows]]:
-    """Give the rows block by block, with the machine's columns as the nuisance parameters follow.
+) -> Iterator[LeverageRows]:
+    """Give rows with columns for all nuisance parameters, poses eliminated (one trial).
+
+    The columns of the p free parameters are those by which the nuisance parameters follow.
 
     Parameters
     ----------
-    poses : of the problem. rows_of_blocks : their rows, see `ExactPoses.iterate_rows`.
-    p : number of free parameters. nuisance : of the problem. at_nodes : None without any.
+    poses : of the problem. block, node_rows : see `PoseRows.iterate_rows`.
+    at_nodes : None without nuisance parameters.
     """
-    wide = 0 if nuisance is None else len(nuisance)
-    for block, (node_rows, _) in zip(poses.blocks, rows_of_blocks, strict=True):
-        of_block = []
-        for part in node_rows:
-            whitened = part.rows[0]
-            w = whitened.shape[-1] - p - 1
-            rows = np.zeros((*whitened.shape[:2], wide + p + 1))
-            rows[..., -p - 1 :] = whitened[..., w:]
-            if at_nodes is not None and part.structure >= 0:
-                path, root, slope = at_nodes(part.nodes)
-                rows[..., -p - 1 : -1] += whitened[..., :w] @ slope
-                k, m = (
-                    np.arange(len(whitened))[:, None, None],
-                    np.arange(whitened.shape[1])[:, None],
-                )
-                rows[k, m, path[:, None, :]] = whitened[..., :w] @ root
-            first = poses.poses_of(block, part)
-            of_block.append(LeverageRows(first, rows, part.kind, part.numbers))
-        yield of_block
+    wide = 0 if poses.nuisance is None else len(poses.nuisance)
+    for part in node_rows:
+        whitened = part.rows[0]
+        w = whitened.shape[-1] - p - 1
+        rows = np.zeros((*whitened.shape[:2], wide + p + 1))
+        rows[..., -p - 1 :] = whitened[..., w:]
+        if at_nodes is not None and part.structure >= 0:
+            path, root, slope = at_nodes(part.nodes)
+            rows[..., -p - 1 : -1] += whitened[..., :w] @ slope
+            k, m = np.ogrid[: len(whitened), : whitened.shape[1]]
+            rows[k[..., None], m[..., None], path[:, None, :]] = whitened[..., :w] @ root
+        yield LeverageRows(poses.poses_of(block, part), rows, part.kind, part.numbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,56 +113,42 @@ class Problem:
 
     Attributes
     ----------
-    free : the free parameters and their units.
+    poses : the rows of every kind at the poses; uncertain readings are the last kind.
     readings : (T | 1, n, actuators) [SI] recorded ones, NaN where not taken.
-    rows : of every kind; uncertain readings are the last kind.
     trials : (t,) numbers of the problem's trials among the T trials of the arrays.
-    nuisance : nuisance parameters and their elimination tree; None without any.
     data : from the number of a trial to its measurements, from which nuisance parameters start.
     control : of the iteration to the best nuisance parameters and poses.
     sigma : (n, actuators) [SI] of the readings, 0 exact, infinite not taken or not believed; None
         where all readings are exact.
-    member : (n,) component of each pose where readings are uncertain.
-    coordinates : in which poses of uncertain readings move.
-    located : (T | 1, n, 4, 4) [m], optional; see `ExactPoses`.
     consistent : poses without residuals, at which rank is decided; None where all residuals are
         invariant under the motions that the rows do not determine.
-    residual_count : (T,) residuals that are present, those of uncertain readings included.
     """
 
-    free: FreeParameters
+    poses: PoseRows
     readings: FloatArray
-    rows: tuple[ObservationRows, ...]
     trials: IntArray
-    nuisance: NuisanceElimination | None
     data: Callable[[int], Measurements]
     control: Halving = Halving()  # noqa: RUF009
     sigma: FloatArray | None = None
-    member: IntArray | None = None
-    coordinates: PoseCoordinates | None = None
-    located: FloatArray | None = None
     consistent: ConsistentPoses | None = None
-
-    @cached_property
-    def poses(self) -> ExactPoses | UncertainPoses:
-        """Rows at the poses, which readings determine or which are estimated."""
-        observed = self.free, self.readings[0], self.rows, self.nuisance
-        if self.coordinates is None:
-            return divide_exact_poses(*observed, self.located, EXACT_BLOCK)
-        from loopcal.estimate.uncertain_poses import divide_uncertain_poses
-
-        assert self.member is not None
-        return divide_uncertain_poses(*observed, self.coordinates, self.member, BLOCK)
-
-    @cached_property
-    def component_count(self) -> IntArray:
-        """(T | 1, components) residuals that are present."""
-        n = self.readings.shape[1]
-        member = np.zeros(n, dtype=np.int64) if self.member is None else self.member
-        return count_by_component(self.rows, member)
 
     def __len__(self) -> int:
         return len(self.trials)
+
+    @property
+    def free(self) -> FreeParameters:
+        """The free parameters and their units."""
+        return self.poses.free
+
+    @property
+    def rows(self) -> tuple[ObservationRows, ...]:
+        """The rows of every kind."""
+        return self.poses.rows
+
+    @property
+    def nuisance(self) -> NuisanceElimination | None:
+        """The nuisance parameters and their elimination tree; None without any."""
+        return self.poses.nuisance
 
     @property
     def parameters(self) -> int:
@@ -180,12 +158,12 @@ class Problem:
     @property
     def is_uncertain(self) -> bool:
         """Whether readings are uncertain, so that poses are unknowns."""
-        return self.coordinates is not None
+        return self.poses.coordinates.count > 0
 
     @property
     def residual_count(self) -> IntArray:
-        """(t,) residuals that are present."""
-        return select_counts(self.component_count.sum(axis=1), self.trials)
+        """(t,) residuals that are present, those of uncertain readings included."""
+        return select_counts(self.poses.component_count.sum(axis=1), self.trials)
 
     @property
     def equations(self) -> IntArray:
@@ -193,26 +171,31 @@ class Problem:
 
         Nuisance parameters are not counted.
         """
-        count = self.component_count
-        if self.coordinates is not None and self.member is not None:
-            free = self.coordinates.is_free(np.arange(len(self.member))).sum(axis=1)
-            used = np.bincount(self.member, free, count.shape[1]).astype(np.int64)
-            count = np.maximum(count - used, 0)
-        return select_counts(count.sum(axis=1), self.trials)
-
-    def take(self, trials: IntArray) -> Problem:
-        """Return the problem of some trials; this object where these are all of them."""
-        if np.array_equal(trials, np.arange(len(self))):
-            return self
-        other = replace(self, trials=self.trials[trials])
-        vars(other).update(poses=self.poses, component_count=self.component_count)
-        return other
+        count, member = self.poses.component_count, self.poses.member
+        free = self.poses.coordinates.is_free(np.arange(len(member))).sum(axis=1)
+        used = np.bincount(member, free, count.shape[1]).astype(np.int64)
+        return select_counts(np.maximum(count - used, 0).sum(axis=1), self.trials)
 
     @property
     def part_size(self) -> int:
         """Number of trials whose rows are made together."""
         size = TRIAL_BLOCK if self.folds_plain_rows else BLOCK
-        return max(1, size // self.poses.block_size)
+        return max(1, size // max(len(block.poses) for block in self.poses.blocks))
+
+    @property
+    def folds_plain_rows(self) -> bool:
+        """Whether the engine makes the rows of exact poses as it folds them."""
+        return self.poses.are_plain and self.consistent is None
+
+    def take(self, trials: IntArray) -> Problem:
+        """Return the problem of some trials; this object where these are all of them."""
+        if np.array_equal(trials, np.arange(len(self))):
+            return self
+        return replace(self, trials=self.trials[trials])
+
+    def with_rows(self, rows: Iterable[ObservationRows]) -> Problem:
+        """Return the problem of other rows of the same kinds and poses."""
+        return replace(self, poses=replace(self.poses, rows=tuple(rows)))
 
     def weighted(self, weight: FloatArray) -> Problem:
         """Return the problem with a factor (n,) on each pose's squares, its readings included, or
@@ -220,7 +203,15 @@ class Problem:
 
         A weight of 0 makes the rows of a pose absent.
         """
-        return replace(self, rows=tuple(r.weighted(weight) for r in self.rows))
+        return self.with_rows(r.weighted(weight) for r in self.rows)
+
+    def at_measured_poses(self, T: FloatArray) -> Problem:
+        """Return the problem whose closure is linearized at poses (T | 1, n, 4, 4) [m] that were
+        measured in full, and not solved.
+        """
+        exact = self.poses.coordinates
+        coordinates = MeasuredPoses(self.free, exact.names, exact.readings, T)
+        return replace(self, poses=replace(self.poses, coordinates=coordinates))
 
     def start(self, deviation: FloatArray | None = None, seek: bool = True) -> Start:
         """Return the first start.
@@ -257,20 +248,17 @@ class Problem:
         Nuisance parameters and uncertain poses are those that fit best there; the iteration to them
         begins at `start`.
         """
-        t, shared, folds, poses = len(self), None, self.folds_plain_rows, self.poses
-        single = poses if isinstance(poses, ExactPoses) and poses.is_single_block else None
-        is_equal = t > 1 and bool((deviation == deviation[0]).all())
-        if single is not None and is_equal:
-            shared = single.solve_single_block(deviation[:1], self.trials, start, not folds)
+        t, known, poses, folds = len(self), None, self.poses, self.folds_plain_rows
+        are_shared = poses.is_kept and poses.coordinates.are_shared
+        if are_shared and t > 1 and (deviation == deviation[0]).all():
+            known = poses.solve_exact_poses(deviation[:1], start, not folds)
         batch, linearizations = self.part_size, []
         for first in range(0, t, batch):
             chosen = np.arange(first, min(first + batch, t))
             z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
-            if single is not None and (shared is not None or folds):
-                known = shared or single.solve_single_block(z, trials, begin, not folds)
-                solution = single.solve(z, trials, begin, self.control, shared=known)
-            else:
-                solution = self.poses.solve(z, trials, begin, self.control)
+            solution = poses.solve(
+                z, trials, begin, self.control, known=known, derivatives=not folds
+            )
             linearizations.append(self.take(chosen).linearize_at(z, begin, solution))
         return Linearization.join(linearizations)
 
@@ -278,10 +266,14 @@ class Problem:
         self, deviation: FloatArray, start: Start, solution: PoseSolution
     ) -> Linearization:
         """Linearize at deviations (t, p) and a solution there, see `solve`."""
-        linearization = self._eliminate(solution, deviation, self.trials, start)
-        if self.consistent is not None and self.located is None:
-            return self._drop_second_order(linearization, solution, self.trials, start)
-        return linearization
+        linearization = self._eliminate(solution, deviation, start)
+        if self.consistent is None:
+            return linearization
+        # directions that the rows do not determine at poses without residuals
+        states = self.consistent.move(solution, deviation, self.trials, start)
+        moved = replace(solution, states=states, linearized=None)
+        reference = self._eliminate(moved, deviation, start).factor
+        return replace(linearization, factor=remove_null_space(linearization.factor, reference))
 
     def solve(
         self,
@@ -295,8 +287,9 @@ class Problem:
 
         `nuisance` (t, U) is not solved for. `derivatives` : whether poses are linearized, too.
         """
+        trials, control = self.trials, self.control
         return self.poses.solve(
-            deviation, self.trials, start, self.control, nuisance, derivatives=derivatives
+            deviation, trials, start, control, nuisance, derivatives=derivatives
         )
 
     def residuals(
@@ -312,7 +305,7 @@ class Problem:
         """
         shapes = [(len(self), *r.whitener.shape[1:3]) for r in self.rows]
         kinds = [Residuals(np.full(shape, np.nan), np.full(shape, np.nan)) for shape in shapes]
-        for i, (block, poses) in enumerate(self.poses.iterate_poses(solution, deviation)):
+        for i, (block, poses) in enumerate(self.poses.iterate_poses(solution, deviation, False)):
             evaluations: list[Evaluation | None] = []
             for kind, numbers, rows in zip(kinds, block.row_numbers, block.rows, strict=True):
                 if not len(numbers):
@@ -343,9 +336,7 @@ class Problem:
             fixed = None if estimate is None else estimate.values
             solution = self.solve(z, linearization.next_start, fixed, derivatives=True)
         at_nodes = None if estimate is None else estimate.elimination.at_nodes
-        rows = self.poses.iterate_rows(solution, z, self.trials)
-        spread = spread_rows(self.poses, rows, self.parameters, self.nuisance, at_nodes)
-        yield from map(self._select_rows_of_poses, spread)
+        return self._spread_rows(solution, z, at_nodes)
 
     def rows_at(self, deviation: FloatArray, nuisance: FloatArray) -> Iterator[list[LeverageRows]]:
         """Give the rows like `leverage_rows`, but with nuisance parameters that are not eliminated:
@@ -355,30 +346,23 @@ class Problem:
         solution = self.poses.solve(deviation, self.trials, start, self.control, nuisance)
         unknowns, p = self.nuisance, self.parameters
         apart = None if unknowns is None else partial(unknowns.keep_apart, p)
-        rows = self.poses.iterate_rows(solution, deviation, self.trials)
-        spread = spread_rows(self.poses, rows, p, unknowns, apart)
-        yield from map(self._select_rows_of_poses, spread)
+        return self._spread_rows(solution, deviation, apart)
 
-    def _select_rows_of_poses(self, block: list[LeverageRows]) -> list[LeverageRows]:
-        """Return the rows of a block without those of targets on the base."""
-        return [r for r in block if r.kind < 0 or not self.rows[r.kind].kind.is_of_base]
+    def _spread_rows(
+        self, solution: PoseSolution, z: FloatArray, at_nodes: AtNodes | None
+    ) -> Iterator[list[LeverageRows]]:
+        """Give the rows of every block of poses, without those of targets on the base."""
+        of_base = {i for i, r in enumerate(self.rows) if r.kind.is_of_base}
+        for block, node_rows, _ in self.poses.iterate_rows(solution, z, self.trials):
+            of_poses = [part for part in node_rows if part.kind not in of_base]
+            yield list(spread_rows(self.poses, block, of_poses, self.parameters, at_nodes))
 
     def count_leverage_rows(self, member: IntArray, count: int) -> IntArray:
         """Return how many rows `leverage_rows` gives of each of `count` blocks of poses.
 
         `member` (n,) is the block of each pose.
         """
-        total = np.zeros(count, dtype=np.int64)
-        if not isinstance(self.poses, ExactPoses):
-            k, first = self.poses.coordinates.freedoms, self.poses.first_pose
-            for group in (group for groups in self.poses.groups for group in groups):
-                height = max(group.height, group.poses.shape[1] * k)
-                blocks = member[first[group.components]]
-                total += height * np.bincount(blocks, minlength=count)
-            return total
-        for r in (r for r in self.rows if not r.kind.is_of_base):
-            total += np.bincount(member[r.first_poses], minlength=count) * r.whitener.shape[-1]
-        return total
+        return self.poses.count_rows(member, count)
 
     def count_pose_directions(
         self, solution: PoseSolution, member: IntArray, count: int
@@ -387,7 +371,7 @@ class Problem:
 
         `member` (n,) is the block of each pose. Poses of exact readings take up none.
         """
-        if solution.estimates is None or isinstance(self.poses, ExactPoses):
+        if solution.estimates is None:
             return np.zeros(count, dtype=np.int64)
         blocks = member[self.poses.first_pose]
         return np.bincount(blocks, solution.estimates.rank[0], count).astype(np.int64)
@@ -396,31 +380,22 @@ class Problem:
         """Return the poses that a row needs and that are not reached at deviation (1, p)."""
         return self.poses.find_unreached(deviation, start)
 
-    @cached_property
-    def folds_plain_rows(self) -> bool:
-        """Whether the engine makes the rows of exact poses as it folds them."""
-        is_more = self.is_uncertain or self.consistent is not None or self.located is not None
-        return not is_more and have_plain_rows(self.free, self.rows, self.nuisance)
-
-    def _eliminate(
-        self, solution: PoseSolution, z: FloatArray, trials: IntArray, start: Start
-    ) -> Linearization:
+    def _eliminate(self, solution: PoseSolution, z: FloatArray, start: Start) -> Linearization:
         """Fold all rows at a solution and eliminate the nuisance parameters."""
-        a, p = len(trials), self.parameters
+        a, p, poses, trials = len(self), self.parameters, self.poses, self.trials
         nuisance = None if self.nuisance is None else self.nuisance.take(trials)
         factor, is_lost = empty_factor(a, p), np.zeros(a, dtype=bool)
         factors = None if nuisance is None else NodeFactors(nuisance.tree, a, p)
         if self.folds_plain_rows and not solution.has_derivatives:
-            assert isinstance(self.poses, ExactPoses)
-            factor, is_lost = self.poses.fold_rows(factor, solution, z, trials)
+            factor, is_lost = poses.fold_plain_rows(factor, solution, z, trials)
         else:
-            for node_rows, lost in self.poses.iterate_rows(solution, z, trials):
+            for _, node_rows, lost in poses.iterate_rows(solution, z, trials):
                 factor = fold_node_rows(factor, factors, node_rows)
                 is_lost |= lost
-        equations = select_counts(self.component_count.sum(axis=1), trials)
+        equations = self.residual_count
         if solution.estimates is not None:
             equations = equations - solution.estimates.rank.sum(axis=1)
-        states, is_near = self.poses.next_start(solution, start)
+        states, is_near = poses.next_start(solution, start)
         next_start = replace(start, deviation=z, poses=states, is_near=is_near)
         estimate = None
         if nuisance is not None and factors is not None and solution.nuisance is not None:
@@ -432,27 +407,13 @@ class Problem:
         cost = np.where(is_lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
         return Linearization(z, factor, cost, equations, next_start, estimate, solution.estimates)
 
-    def _drop_second_order(
-        self, linearization: Linearization, solution: PoseSolution, trials: IntArray, start: Start
-    ) -> Linearization:
-        """Remove directions that the rows do not determine at poses without residuals."""
-        assert self.consistent is not None
-        z = linearization.deviation
-        states = self.consistent.move(solution, z, trials, start)
-        if isinstance(self.poses, ExactPoses):
-            poses = self.poses.at_readings(states.q)
-            moved = poses.solve(z, trials, start, self.control, solution.nuisance)
-        else:
-            poses, moved = self.poses, replace(solution, states=states, linearized=None)
-        problem = replace(self)
-        vars(problem).update(poses=poses, component_count=self.component_count)
-        reference = problem._eliminate(moved, z, trials, start).factor
-        return replace(linearization, factor=remove_null_space(linearization.factor, reference))
-
     def _first_states(self) -> PoseStates | None:
-        """Return the states with which poses begin."""
-        if isinstance(self.poses, ExactPoses):
-            return self.poses.first_states(len(self))
+        """Return the states with which poses begin; None where they are not kept."""
+        coordinates = self.poses.coordinates
+        if not coordinates.count:
+            if coordinates.are_shared and not self.poses.is_kept:
+                return None
+            return coordinates.first_states(self.trials)
         from loopcal.estimate.pose_start import first_poses
 
         assert self.sigma is not None
@@ -562,51 +523,47 @@ def make_problem(
     `sigma` (n, actuators) [SI] of the readings; None where they are exact unless the robot states
     the sigma of its actuators.
     """
-    numbers, robot = np.arange(trials), free.robot
-    believed = resolve_reading_sigma(robot, sigma, recorded.shape[1])
-    consistent = _plan_consistent_poses(free, recorded, believed, rows, numbers, data)
+    believed = resolve_reading_sigma(free.robot, sigma, recorded.shape[1])
+    consistent = _plan_consistent_poses(free, recorded, believed, rows)
     if believed is None:
-        nuisance = plan_elimination(local, rows)
-        return Problem(free, recorded[:1], rows, numbers, nuisance, data, consistent=consistent)
-    uncertain = _make_uncertain(free, recorded, believed, rows, numbers, data)
-    nuisance = plan_elimination(local, rows, uncertain.member)
-    return replace(uncertain, nuisance=nuisance, consistent=consistent)
+        problem = make_exact_problem(free, recorded[:1], rows, trials, local, data)
+        return replace(problem, consistent=consistent)
+    poses = _make_uncertain_rows(free, recorded, believed, rows)
+    poses = replace(poses, nuisance=plan_elimination(local, rows, poses.member))
+    numbers = np.arange(trials)
+    return Problem(poses, recorded, numbers, data, POSE_CONTROL, believed, consistent)
 
 
-def _make_uncertain(
+def make_exact_problem(
     free: FreeParameters,
-    recorded: FloatArray,
-    sigma: FloatArray,
+    readings: FloatArray,
     rows: tuple[ObservationRows, ...],
-    numbers: IntArray,
+    trials: int,
+    local: NuisanceParameters,
     data: Callable[[int], Measurements],
 ) -> Problem:
-    """Return the problem with uncertain readings, before nuisance parameters are eliminated."""
-    from loopcal.estimate.uncertain_poses import (
-        ReadingCoordinates,
-        TwistCoordinates,
-        find_components,
-    )
+    """Return the problem of observed rows at exact readings (1, n, actuators) [SI], without poses
+    at which rank is decided.
+    """
+    coordinates = PoseCoordinates(free, list_sensed_joints(r.kind for r in rows), readings)
+    member = np.zeros(readings.shape[1], dtype=np.int64)
+    poses = PoseRows(free, rows, plan_elimination(local, rows), coordinates, member)
+    return Problem(poses, readings, np.arange(trials), data)
 
+
+def _make_uncertain_rows(
+    free: FreeParameters, recorded: FloatArray, sigma: FloatArray, rows: tuple[ObservationRows, ...]
+) -> PoseRows:
+    """Return the rows at uncertain readings, before nuisance parameters are eliminated."""
     all_rows, robot = (*rows, _reading_rows(free, recorded, sigma)), free.robot
     names = list_sensed_joints(r.kind for r in all_rows)
     if robot.program.sigma is None:
         scale = np.where(np.isinf(sigma), UNKNOWN_READING * _reading_units(robot), sigma)
-        coordinates: PoseCoordinates = ReadingCoordinates(free, scale, names)
+        coordinates: PoseCoordinates = ReadingCoordinates(free, names, scale)
     else:
         coordinates = TwistCoordinates(free, names)
-    return Problem(
-        free,
-        recorded,
-        all_rows,
-        numbers,
-        None,
-        data,
-        control=POSE_CONTROL,
-        sigma=sigma,
-        member=find_components(recorded.shape[1], all_rows, coordinates.freedoms),
-        coordinates=coordinates,
-    )
+    member = find_components(recorded.shape[1], all_rows, coordinates.count)
+    return PoseRows(free, all_rows, None, coordinates, member)
 
 
 def _plan_consistent_poses(
@@ -614,8 +571,6 @@ def _plan_consistent_poses(
     recorded: FloatArray,
     sigma: FloatArray | None,
     rows: tuple[ObservationRows, ...],
-    numbers: IntArray,
-    data: Callable[[int], Measurements],
 ) -> ConsistentPoses | None:
     """Return poses that follow the rows of kinds that mix their components; None without any."""
     mixing = select_mixing_rows(rows)
@@ -624,9 +579,7 @@ def _plan_consistent_poses(
     loose = np.broadcast_to(LOOSE * _reading_units(free.robot), recorded.shape[1:])
     if sigma is not None:
         loose = np.where(np.isinf(sigma), np.inf, loose)
-    problem = _make_uncertain(free, recorded, loose, mixing, numbers, data)
-    assert not isinstance(problem.poses, ExactPoses)
-    return ConsistentPoses(problem.poses, recorded)
+    return ConsistentPoses(_make_uncertain_rows(free, recorded, loose, mixing), recorded)
 
 
 def _reading_units(robot: Mechanism) -> FloatArray:

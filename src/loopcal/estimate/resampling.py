@@ -137,7 +137,8 @@ def resample_rows(
     nuisance = problem.nuisance
     if nuisance is not None:
         nuisance = replace(nuisance, prior_mean=prior_mean)
-    return replace(problem, rows=rows, nuisance=nuisance, trials=np.arange(len(prior_mean)))
+    poses = replace(problem.poses, rows=rows, nuisance=nuisance)
+    return replace(problem, poses=poses, trials=np.arange(len(prior_mean)))
 
 
 def fit_resamples(

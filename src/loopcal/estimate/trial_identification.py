@@ -18,7 +18,6 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.descent import Descent, LinearModel, descend
-from loopcal.estimate.exact_poses import ExactPoses
 from loopcal.estimate.fit_descent import descend_once, get_method, repeat_trials
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
@@ -166,9 +165,7 @@ def share_factor(
         method = replace(method, inflation=1.0)  # which only chooses where the exact descent begins
     fixed = fix_penalty(method, p)
     is_plain = problem.nuisance is None and problem.consistent is None
-    if fixed is None or not is_plain or not isinstance(poses, ExactPoses):
-        return None
-    if not poses.is_single_block:
+    if fixed is None or not (is_plain and poses.coordinates.are_shared and poses.is_kept):
         return None
     first = problem.take(np.array([0]))
     begin = first.start(deviation)
@@ -367,8 +364,9 @@ def _cut_problem(problem: Problem, trials: IntArray) -> Problem:
     if not problem.folds_plain_rows:
         return problem.take(trials)
     numbers, data, own = problem.trials[trials], problem.data, np.arange(len(trials))
-    rows = tuple(r.cut_trials(numbers) for r in problem.rows)
-    return replace(problem, rows=rows, trials=own, data=lambda i: data(int(numbers[i])))
+    rows = (r.cut_trials(numbers) for r in problem.rows)
+    cut = problem.with_rows(rows)
+    return replace(cut, trials=own, data=lambda i: data(int(numbers[i])))
 
 
 # --- The posterior of one of many simulated machines that were identified at once.

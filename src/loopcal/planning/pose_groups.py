@@ -29,8 +29,8 @@ from loopcal.errors import DataError
 from loopcal.estimate.frame_freedoms import unfixed_motions
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows
+from loopcal.estimate.pose_coordinates import TwistCoordinates
 from loopcal.estimate.pose_linearization import PoseStates
-from loopcal.estimate.uncertain_poses import TwistCoordinates
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
@@ -77,8 +77,9 @@ def observe_groups(
     values = free.robot.values[None]
     coordinates = TwistCoordinates(free, names)
     state = forward_trials(free.robot, values, readings[None])
-    closed = coordinates.close(values, PoseStates(state, readings[None]), follow=True)
-    poses = coordinates.linearize(values, closed, np.arange(len(readings)))
+    begin, numbers = PoseStates(state, readings[None]), np.arange(len(readings))
+    closed = coordinates.close(values, numbers, begin, follow=True)
+    poses = coordinates.linearize(values, closed, numbers)
     assert poses.by_coordinates is not None
     place = np.arange(len(readings)) % size
     slopes: Mapping[str, FloatArray] = {

@@ -18,12 +18,11 @@ import numpy as np
 from loopcal import engine
 from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.elimination import plan_elimination
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
-from loopcal.estimate.problem import Problem, make_problem, problem_of
+from loopcal.estimate.problem import Problem, make_exact_problem, make_problem, problem_of
 from loopcal.findings import Quantity
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.measurements import Measurements
@@ -177,17 +176,11 @@ def compare_with_robot(
         problem = make_problem(
             free, recorded, data.reading_sigma, tuple(rows), count, chosen, lambda _: data
         )
-        problem = replace(problem, control=effort.control)
     else:
-        problem = Problem(
-            free,
-            data.readings[None],
-            tuple(rows),
-            np.arange(count),
-            plan_elimination(chosen, rows),
-            lambda _: data,
-            control=effort.control,
+        problem = make_exact_problem(
+            free, data.readings[None], tuple(rows), count, chosen, lambda _: data
         )
+    problem = replace(problem, control=effort.control)
     return Comparison(data, problem, _linearize(problem, data, effort, start), effort)
 
 
@@ -217,7 +210,7 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
         excluded += ["/".join(data.labels[i] for i in poses) for poses in far]
         whitener = rows.take_trials(problem.trials)[1] * kept[..., None, None]
         kept_rows.append(replace(rows, whitener=whitener))
-    problem = replace(problem, rows=tuple(kept_rows))
+    problem = problem.with_rows(kept_rows)
     start = None if linearization.nuisance is None else linearization.nuisance.values
     if len(problem) == 1 and effort == THOROUGH:
         start = None  # far rows may have spoilt the guess

@@ -1,0 +1,539 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rows at the poses of a problem: solve for poses and nuisance parameters, give rows to nodes.
+
+Every pose has k >= 0 coordinates. Where readings are exact, k is 0: the kinematics determine the
+pose, and its rows go to the nodes of the nuisance parameters as they are. Where readings are
+uncertain (errors in variables), a reading of stated sigma is a row like any other,
+(true - recorded) / sigma, and closure ties pose and readings together. At given parameters of the
+machine every pose stands where all its rows, readings among them, fit best, together with the
+nuisance parameters. They are found by Gauss-Newton on many trials at once: every pose is closed by
+the kinematics, the rows of its component are stacked, the coordinates of the component's poses are
+eliminated by projection, and what is left determines the nuisance parameters; the best coordinates
+follow. A step is no longer than closure is about linear, and one that does not lower the sum of
+squares is halved. An exact reading has no coordinate: its row is not a heavy one, it does not
+exist. See docs/theory/uncertain-readings.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from loopcal.estimate.elimination import (
+    NodeRows,
+    NuisanceElimination,
+    divide_among_nodes,
+    fold_node_rows,
+)
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.linearization import Start
+from loopcal.estimate.observation_rows import ObservationRows, find_needed_poses
+from loopcal.estimate.pose_blocks import (
+    ComponentGroup,
+    PoseBlock,
+    divide_into_components,
+    divide_into_runs,
+    stack_rows,
+)
+from loopcal.estimate.pose_coordinates import PoseCoordinates
+from loopcal.estimate.pose_linearization import (
+    KindRows,
+    LinearizedPoses,
+    PoseEstimates,
+    PoseSolution,
+    PoseStates,
+    linearize_rows,
+    list_twist_rows,
+)
+from loopcal.mechanism.actuation import drive_joints
+from loopcal.mechanism.sensitivity import fold_pose_rows
+from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
+from loopcal.numerics.elimination import Elimination, NodeFactors, eliminate_columns, eliminate_tree
+from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.trial_batch import map_arrays
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What is solved for: deviations z (a, p) and numbers (a,) of the trials.
+
+    `solves_nuisance` tells whether nuisance parameters are; `located` are the poses of every block
+    where these have no coordinates.
+    """
+
+    z: FloatArray
+    trials: IntArray
+    solves_nuisance: bool
+    located: list[LinearizedPoses] | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """All rows at closed poses and nuisance parameters, and the parts of the next step.
+
+    Arrays are (a, ..): `squares` of the components, `gain` that the best coordinates promise.
+    """
+
+    states: PoseStates | None
+    nuisance: FloatArray | None
+    linearized: list[LinearizedPoses]
+    is_reached: BoolArray
+    cost: FloatArray
+    squares: FloatArray
+    gain: FloatArray
+    solutions: list[tuple[IntArray, ComponentGroup, FloatArray]]
+    factors: NodeFactors | None
+    rank: IntArray
+    is_unobservable: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Full step of the coordinates (a, n, k) and nuisance parameters (a, U)."""
+
+    u: FloatArray
+    nuisance: FloatArray | None
+    change: FloatArray
+    share: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRows:
+    """The rows at n poses, whose coordinates are eliminated before all other unknowns.
+
+    Attributes
+    ----------
+    free : the free parameters. rows : of every kind. nuisance : nuisance parameters, if any.
+    coordinates : of the poses. member : (n,) component of each pose; one of all poses where they
+        have no coordinates.
+    """
+
+    free: FreeParameters
+    rows: tuple[ObservationRows, ...]
+    nuisance: NuisanceElimination | None
+    coordinates: PoseCoordinates
+    member: IntArray
+
+    @cached_property
+    def blocks(self) -> tuple[PoseBlock, ...]:
+        """The poses in blocks whose rows are made together."""
+        count = len(self.rows) - self.coordinates.rows_of_readings
+        is_needed = find_needed_poses(self.rows[:count], len(self.member))
+        if self.coordinates.count:
+            return divide_into_components(self.rows, is_needed, self.nuisance, self.member)
+        return divide_into_runs(self.rows, is_needed, self.nuisance)
+
+    @cached_property
+    def first_pose(self) -> IntArray:
+        """First pose of each component."""
+        return np.unique(self.member, return_index=True)[1]
+
+    @cached_property
+    def component_count(self) -> IntArray:
+        """(T | 1, components) residuals that are present."""
+        components = int(self.member.max(initial=0)) + 1
+        total = np.zeros((1, components), dtype=np.int64)
+        for r in self.rows:
+            of, present = self.member[r.first_poses], r.is_present.sum(axis=2)
+            counts = np.stack([np.bincount(of, row, components) for row in present])
+            total = total + counts.astype(np.int64)
+        return total
+
+    @cached_property
+    def are_plain(self) -> bool:
+        """Whether the platform's twist by the parameters determines all rows of solved poses, so
+        that the engine folds them without writing its derivatives.
+        """
+        if not self.coordinates.are_shared or self.nuisance is not None:
+            return False
+        is_simple = all(r.kind.poses_per_row == 1 and not r.kind.sensed_joints for r in self.rows)
+        robot = self.free.robot
+        has_more = self.free.errors is not None or robot.stages or robot.has_open_sums
+        return is_simple and not has_more
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether solved poses are kept from start to start: those of one block."""
+        return len(self.blocks) == 1
+
+    def solve(
+        self,
+        z: FloatArray,
+        trials: IntArray,
+        start: Start,
+        control: Halving,
+        fixed: FloatArray | None = None,
+        known: PoseSolution | None = None,
+        derivatives: bool = True,
+    ) -> PoseSolution:
+        """Solve for poses and nuisance parameters where all rows fit best.
+
+        Parameters
+        ----------
+        z : (a, p) deviations. trials : (a,) numbers of the rows' trials. start : of the a trials.
+        fixed : (a, U), optional; nuisance parameters that are not solved for.
+        known : poses without coordinates, the same for all trials, where they are solved already.
+        derivatives : whether poses without coordinates are linearized, too.
+        """
+        solves_nuisance = self.nuisance is not None and fixed is None
+        nuisance = start.predict_nuisance(z) if solves_nuisance else fixed
+        if self.coordinates.count:
+            assert start.poses is not None
+            task = _Task(z, trials, solves_nuisance, None)
+            point, is_converged = self._minimize(task, start.poses, nuisance, control)
+            assert point.states is not None
+            is_free = self.coordinates.is_free(np.arange(len(self.member)))
+            estimates = PoseEstimates(
+                states=point.states,
+                is_reached=point.is_reached,
+                rank=point.rank,
+                is_undetermined=np.asarray((point.is_unobservable & is_free).any(axis=2)),
+                is_converged=is_converged,
+            )
+            linearized = point.linearized[0] if self.is_kept else None
+            return PoseSolution(point.nuisance, linearized, point.states, estimates)
+        if known is None:
+            known = self.solve_exact_poses(z, start, derivatives)
+        if solves_nuisance:
+            located = [known.linearized] if known.linearized else self._locate_blocks(z)
+            task = _Task(z, trials, solves_nuisance, located)
+            nuisance = self._minimize(task, None, nuisance, control)[0].nuisance
+        return PoseSolution(nuisance, known.linearized, known.states, driven=known.driven)
+
+    def solve_exact_poses(
+        self, z: FloatArray, start: Start, derivatives: bool = True
+    ) -> PoseSolution:
+        """Solve the poses of the only block, without coordinates, at deviations z (a | 1, p).
+
+        Poses of several blocks are solved again wherever they are needed. A pose that Newton's
+        method does not reach from a near start counts as not reached: the last step of a fit has
+        the same readings, and no path to follow. Where a step is too long for Newton's method, a
+        shorter one is tried.
+        """
+        if not self.is_kept:
+            return PoseSolution(None, states=start.poses)
+        begin = start.take(np.arange(len(z))) if len(z) < len(start) else start
+        values, poses, driven = self.free.values(z), self.blocks[0].poses, None
+        if self.are_plain and not derivatives:
+            driven = drive_joints(self.free.robot, values, self.coordinates.readings)
+        states = self.coordinates.close(values, poses, begin.poses, not begin.is_near, driven)
+        linearized = self.coordinates.linearize(values, states, poses, derivatives)
+        return PoseSolution(None, linearized, states, driven=driven)
+
+    def next_start(self, solution: PoseSolution, start: Start) -> tuple[PoseStates | None, bool]:
+        """Return the states for the next start, and whether they were solved at exact readings."""
+        linearized, states, old = solution.linearized, solution.states, start.poses
+        if self.coordinates.count:
+            return states, False
+        if linearized is None or states is None or old is None:
+            return old, start.is_near
+        a, ok = len(start), linearized.is_reached
+
+        def kept(new: np.ndarray, before: np.ndarray) -> np.ndarray:
+            if ok.all():
+                return np.broadcast_to(new, (a, *new.shape[1:]))
+            return np.where(ok.reshape(*ok.shape, *[1] * (new.ndim - 2)), new, before)
+
+        is_new = ok.all() and len(ok) == a
+        state = states.state if is_new else map_arrays(kept, states.state, old.state)
+        return PoseStates(state, old.q), True
+
+    def iterate_poses(
+        self, solution: PoseSolution, z: FloatArray, derivatives: bool = True
+    ) -> Iterator[tuple[PoseBlock, LinearizedPoses]]:
+        """Give every block with its poses; without derivatives where they are not asked for."""
+        values = self.free.values(z)
+        for block in self.blocks:
+            poses = solution.linearized
+            if poses is None:
+                poses = self._linearize_block(values, block, solution.states, derivatives)
+            yield block, poses
+
+    def iterate_rows(
+        self, solution: PoseSolution, z: FloatArray, trials: IntArray
+    ) -> Iterator[tuple[PoseBlock, list[NodeRows], BoolArray]]:
+        """Give every block with the rows of the nodes, what is left of them once coordinates are
+        eliminated, and which trials (a,) lack a needed pose.
+        """
+        tree = None if self.nuisance is None else self.nuisance.tree
+        for block, poses in self.iterate_poses(solution, z):
+            kinds = self.linearize_kinds(block, poses, trials, solution.nuisance)
+            node_rows = divide_among_nodes(kinds, block.members, tree)
+            for group in block.groups:
+                rest = self._eliminate(block, group, kinds)[0].rest
+                node_rows.append(NodeRows(group.structure, group.nodes, group.components, rest))
+            yield block, node_rows, poses.is_lost(block.is_needed)
+
+    def fold_plain_rows(
+        self, factor: FloatArray, solution: PoseSolution, z: FloatArray, trials: IntArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Fold the rows of all blocks; return also which trials (a,) lack a needed pose.
+
+        For rows that `are_plain`.
+        """
+        robot, is_lost = self.free.robot, np.zeros(len(z), dtype=bool)
+        for block in self.blocks:
+            states, poses = solution.states, solution.linearized
+            readings = self.coordinates.readings_at(block.poses)
+            if states is None or poses is None:
+                all_values = self.free.values(z)
+                states = self.coordinates.close(all_values, block.poses, None, True)
+                poses = self.coordinates.linearize(all_values, states, block.poses, False)
+            observed = [list_twist_rows(r, poses, trials) for r in block.rows if len(r.poses)]
+            values = self.free.values(z[: len(states.state.T)])  # one trial may stand for all
+            inputs = values, readings, states.state, self.free.columns, observed, factor
+            factor, is_finite = fold_pose_rows(robot, *inputs, solution.driven)
+            is_lost |= np.any(~(poses.is_reached & is_finite) & block.is_needed, axis=1)
+        return factor, is_lost
+
+    def linearize_kinds(
+        self,
+        block: PoseBlock,
+        poses: LinearizedPoses,
+        trials: IntArray,
+        nuisance: FloatArray | None,
+        by_parameters: bool = True,
+    ) -> list[KindRows | None]:
+        """Return the whitened rows of every kind at a block's poses; None without any.
+
+        Without derivatives by the parameters, rows that nothing else changes are left out.
+        """
+        return [
+            linearize_rows(rows, poses, trials, nuisance, by_parameters)
+            if len(rows.poses)
+            and (by_parameters or self.coordinates.count or rows.nuisance.shape[1])
+            else None
+            for rows in block.rows
+        ]
+
+    def poses_of(self, block: PoseBlock, part: NodeRows) -> IntArray:
+        """Return the first pose of each of the rows of a part, or of each of its components."""
+        if part.kind < 0:
+            return self.first_pose[part.numbers]
+        return block.poses[block.rows[part.kind].first_poses[part.numbers]]
+
+    def count_rows(self, block_of_pose: IntArray, count: int) -> IntArray:
+        """Return how many rows `iterate_rows` gives of each of `count` blocks of poses, without
+        those of targets on the base; `block_of_pose` (n,) is the block of each pose.
+        """
+        total, k = np.zeros(count, dtype=np.int64), self.coordinates.count
+        for block in self.blocks:
+            for rows in block.rows if block.members else ():
+                if not rows.kind.is_of_base:
+                    of = block_of_pose[block.poses[rows.first_poses]]
+                    total += np.bincount(of, minlength=count) * rows.whitener.shape[-1]
+            for group in block.groups:
+                height = max(group.height, group.poses.shape[1] * k)
+                of = block_of_pose[self.first_pose[group.components]]
+                total += height * np.bincount(of, minlength=count)
+        return total
+
+    def find_unreached(self, z: FloatArray, start: Start) -> IntArray:
+        """Return the poses that a row needs and that cannot be reached at deviation z (1, p)."""
+        located = zip(self.blocks, self._locate_blocks(z, start), strict=True)
+        lost = [block.poses[~poses.is_reached[0] & block.is_needed] for block, poses in located]
+        return find_distinct(np.concatenate(lost))
+
+    def locate(
+        self, z: FloatArray, start: Start
+    ) -> tuple[FloatArray, dict[str, FloatArray]] | None:
+        """Return poses (n, 4, 4) and joints name -> (1, n) of one trial; None if one is lost."""
+        located = self._locate_blocks(z, start)
+        pairs = zip(self.blocks, located, strict=True)
+        if any(poses.is_lost(block.is_needed)[0] for block, poses in pairs):
+            return None
+        joints = {}
+        for name in self.coordinates.names:
+            parts = [np.broadcast_to(p.joints[name], p.is_reached.shape) for p in located]
+            joints[name] = np.concatenate(parts, axis=1)[:, self._pose_order]
+        return np.concatenate([p.T[0] for p in located])[self._pose_order], joints
+
+    def _locate_blocks(self, z: FloatArray, start: Start | None = None) -> list[LinearizedPoses]:
+        """Return the closed poses of every block, from home or a start."""
+        states, values = None if start is None else start.poses, self.free.values(z)
+        closed = []
+        for block in self.blocks:
+            begin = None if states is None else states.take_poses(block.poses)
+            found = self.coordinates.close(values, block.poses, begin, True)
+            closed.append(self.coordinates.linearize(values, found, block.poses, False))
+        return closed
+
+    def _linearize_block(
+        self, values: FloatArray, block: PoseBlock, solved: PoseStates | None, derivatives: bool
+    ) -> LinearizedPoses:
+        """Return the poses of a block, closed as they are solved, or from home."""
+        if solved is None:
+            states = self.coordinates.close(values, block.poses, None, True)
+        else:
+            states = solved.take_poses(block.poses)
+        return self.coordinates.linearize(values, states, block.poses, derivatives)
+
+    @cached_property
+    def _pose_order(self) -> IntArray:
+        """First places (n,) of all poses among those of the blocks, one after the other."""
+        poses = np.concatenate([block.poses for block in self.blocks])
+        return np.unique(poses, return_index=True)[1]
+
+    def _minimize(
+        self, task: _Task, begin: PoseStates | None, nuisance: FloatArray | None, control: Halving
+    ) -> tuple[_Point, BoolArray]:
+        """Return the best poses and nuisance parameters, and which trials (a,) converged."""
+
+        def is_part_worse(point: _Point, candidate: _Point) -> BoolArray:
+            grew = ~(candidate.squares <= point.squares)[:, self.member]
+            return grew | ~candidate.is_reached
+
+        def propose(point: _Point) -> _Step:
+            return self._propose(task, point)
+
+        def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
+            return self._move(task, point, step, share)
+
+        first = self._evaluate(task, begin, nuisance)
+        alone = None if task.solves_nuisance else is_part_worse
+        return minimize_by_halving(first, propose, move, control, alone)
+
+    def _evaluate(
+        self,
+        task: _Task,
+        begin: PoseStates | None,
+        nuisance: FloatArray | None,
+        is_still: BoolArray | None = None,
+    ) -> _Point:
+        """Close all poses that have coordinates and compare their rows.
+
+        Where `is_still` (a, n) is given, these poses are closed already, and poses that Newton does
+        not close are not followed. Rows of located poses that no nuisance parameter changes are
+        left out.
+        """
+        values, k, a = self.free.values(task.z), self.coordinates.count, len(task.z)
+        n, components = len(self.member), len(self.first_pose)
+        tree, factors = None, None
+        if task.solves_nuisance and self.nuisance is not None:
+            tree = self.nuisance.tree
+            factors = NodeFactors(tree, a, 0)
+        squares, gain, cost = np.zeros((a, components)), np.zeros(a), np.zeros(a)
+        rank = np.zeros((a, components), dtype=np.int64)
+        is_unobservable = np.zeros((a, n, k), dtype=bool)
+        linearized, solutions, closed = [], [], []
+        is_reached, is_lost = np.zeros((a, n), dtype=bool), np.zeros(a, dtype=bool)
+        for i, block in enumerate(self.blocks):
+            if task.located is None:
+                assert begin is not None
+                states = begin.take_poses(block.poses)
+                solved = self.coordinates.close(values, block.poses, states, is_still is None)
+                if is_still is not None:
+                    solved = _keep_still(solved, states, is_still[:, block.poses])
+                closed.append(solved)
+                poses = self.coordinates.linearize(values, solved, block.poses)
+            else:
+                poses = task.located[i]
+            is_reached[:, block.poses] = poses.is_reached
+            is_lost |= poses.is_lost(block.is_needed)
+            linearized = [poses] if self.is_kept else []
+            kinds = self.linearize_kinds(block, poses, task.trials, nuisance, False)
+            node_rows = divide_among_nodes(kinds, block.members, tree)
+            node_rows = [part for part in node_rows if part.structure >= 0]
+            cost += sum((part.rows[..., -1] ** 2).sum(axis=(1, 2)) for part in node_rows)
+            for group in block.groups:
+                best, before = self._eliminate(block, group, kinds, task.solves_nuisance)
+                squares[:, group.components] = before
+                gain += best.explained.sum(axis=1)
+                rank[:, group.components] = best.rank
+                part = np.sqrt((best.unobservable**2).sum(axis=-2)) > NULL_COMPONENT
+                numbers = block.poses[group.poses]
+                is_unobservable[:, numbers] = part.reshape(a, *group.poses.shape, k)
+                solutions.append((numbers, group, best.solution))
+                if group.structure >= 0:
+                    own = group.structure, group.nodes, group.components, best.rest
+                    node_rows.append(NodeRows(*own))
+            if factors is not None:
+                fold_node_rows(empty_factor(0, 0), factors, node_rows)
+        cost = cost + squares.sum(axis=1)
+        if factors is not None and self.nuisance is not None and nuisance is not None:
+            unknowns = self.nuisance.take(task.trials)
+            cost = cost + unknowns.prior_cost(nuisance)
+            unknowns.fold_priors(factors, nuisance)
+        return _Point(
+            states=PoseStates.join_poses(closed, self._pose_order) if closed else None,
+            nuisance=nuisance,
+            linearized=linearized,
+            is_reached=is_reached,
+            cost=np.where(is_lost | ~np.isfinite(cost), np.inf, cost),
+            squares=squares,
+            gain=gain,
+            solutions=solutions,
+            factors=factors,
+            rank=rank,
+            is_unobservable=is_unobservable,
+        )
+
+    def _propose(self, task: _Task, point: _Point) -> _Step:
+        """Return the Gauss-Newton step of all poses and nuisance parameters.
+
+        The share of it that is tried first is one for all poses of a component, or of a trial where
+        nuisance parameters move, too.
+        """
+        a, nuisance, change = len(task.z), None, point.gain
+        u = np.zeros((a, len(self.member), self.coordinates.count))
+        if point.factors is not None:
+            nuisance = eliminate_tree(point.factors)[0].shift
+            change = change + point.factors.squared_change(nuisance)
+        for numbers, group, solution in point.solutions:
+            right = np.ones((a, len(numbers), 1))
+            if nuisance is not None and self.nuisance is not None and group.structure >= 0:
+                tree = self.nuisance.tree
+                path = tree.structures[group.structure].path[tree.place[group.nodes]]
+                right = np.concatenate([nuisance[:, path], right], axis=2)
+            best = -np.matmul(solution, right[..., None])[..., 0]
+            u[:, numbers] = best.reshape(a, *numbers.shape, -1)
+        each = self.coordinates.limit_step(u)
+        if task.solves_nuisance:
+            share = np.repeat(each.min(axis=1, keepdims=True), each.shape[1], axis=1)
+        else:
+            least = np.ones((a, len(self.first_pose)))
+            np.minimum.at(least.T, self.member, each.T)
+            share = least[:, self.member]
+        return _Step(u, nuisance, change, share)
+
+    def _move(self, task: _Task, point: _Point, step: _Step, share: FloatArray) -> _Point:
+        """Return the point to which shares (a, n) of a step lead."""
+        states, nuisance = point.states, point.nuisance
+        if states is not None:
+            states = self.coordinates.move(states, share[..., None] * step.u)
+        if step.nuisance is not None and nuisance is not None:
+            nuisance = nuisance + share[:, :1] * step.nuisance
+        return self._evaluate(task, states, nuisance, is_still=share == 0.0)
+
+    def _eliminate(
+        self,
+        block: PoseBlock,
+        group: ComponentGroup,
+        kinds: Sequence[KindRows | None],
+        with_nuisance: bool = True,
+    ) -> tuple[Elimination, FloatArray]:
+        """Eliminate the coordinates of a group's components from their stacked rows.
+
+        Return also the sums of squares (a, C) before.
+        """
+        tree = self.nuisance.tree if with_nuisance and self.nuisance is not None else None
+        k = self.coordinates.count
+        rows = stack_rows(block, group, kinds, k, tree)
+        squares = (rows[..., -1] ** 2).sum(axis=2)
+        return eliminate_columns(rows, group.poses.shape[1] * k), squares
+
+
+def _keep_still(solved: PoseStates, before: PoseStates, is_still: BoolArray) -> PoseStates:
+    """Return solved poses, those that did not move (a, n) as before.
+
+    Solved again, they could end on another branch.
+    """
+    rows, poses = np.nonzero(is_still)
+    if not len(rows):
+        return solved
+    return solved.put_poses(rows, poses, map_arrays(lambda array: array[rows, poses], before))
