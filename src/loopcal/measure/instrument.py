@@ -138,8 +138,6 @@ class Sensor:
 
     Parameters
     ----------
-    kind : Kind
-    noise : Noise
     rows : (r,) or (r, l) int, optional
         Poses of each row. Default: every pose once. Where a row compares poses: each pose with the
         next one, and the last with the first. Targets on the base are measured twice by default,

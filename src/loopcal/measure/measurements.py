@@ -94,7 +94,6 @@ class Measurements(TableResult):
 
     Parameters
     ----------
-    robot_name : str
     readings : (n, a) [SI]
         Actuator readings at each pose.
     observations : tuple of Observations
@@ -331,10 +330,6 @@ class Measurements(TableResult):
             is the same share.
         seed : int
             The same seed gives the same sets.
-
-        Returns
-        -------
-        fitted, held_out : Measurements
 
         Raises
         ------

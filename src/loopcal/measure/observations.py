@@ -316,7 +316,6 @@ class Observations:
 
         Parameters
         ----------
-        kind : Kind
         rows : (r,) int
         measured : (r, c) [SI]
         sigma : number, (m,) or (r, m) [SI]

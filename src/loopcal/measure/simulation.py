@@ -135,7 +135,6 @@ class Trials:
     ----------
     instrument : Instrument
         With the robot's tool, and with explicit rows of every sensor.
-    robot_name : str
     readings : (n, a) [SI]
         Of the controller, equal in all trials.
     measured : tuple of (t, r, c) [SI]
@@ -258,7 +257,6 @@ def simulate_trials(
         True parameter values of each machine, see `sample_truth`.
     poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
         As commanded.
-    instrument : Instrument
     seed : int or BlockStream
         Trial i draws the same noise for any number of trials.
     controller : Mechanism, optional

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +25,6 @@ from loopcal.mechanism.assembly import (
 )
 from loopcal.mechanism.chains import (
     ChainState,
-    PoseDerivative,
     differentiate_end,
     find_carrying_actuators,
     join_stage_states,
@@ -53,10 +52,8 @@ from loopcal.mechanism.transmission import (
     readings_from_joints,
 )
 from loopcal.parameters import ParameterTable
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, LARGEST, SI_SYMBOLS, Dimension
-
-# --- Values of parameters that a machine can have: one rule for every family.
 
 
 def find_impossible_values(
@@ -69,7 +66,14 @@ def find_impossible_values(
     findings = tuple(_find_single_values(robot, values))
     if findings:
         return findings
-    state = _close_with_values(robot, values[None])
+    if robot.program.sigma is not None:
+        # errors of the geometry make redundant readings contradict each other
+        target = read_coordinates(robot.home_state.T, robot.controlled)
+        state = inverse_trials(robot, values[None], target)
+    else:  # at the readings of the nominal home, where nominal values displace nothing
+        joints, slots = driven_values(robot.program, robot.home_state), robot.slots
+        q = readings_from_joints(joints, slots.terms[None], slots.frequency)
+        state = forward_trials(robot, values[None], q)
     if is_closed(state.status).all():
         return ()
     deviation = np.abs(values - robot.parameters.nominal)
@@ -88,31 +92,6 @@ def find_impossible_values(
     return ((None, finding),)
 
 
-def _close_with_values(robot: Mechanism, values: FloatArray) -> State:
-    """Return the state at the readings of the nominal home; of redundant actuators, at its pose.
-
-    Errors of the geometry make redundant readings contradict each other.
-    """
-    if robot.program.sigma is not None:
-        target = read_coordinates(robot.home_state.T, robot.controlled)
-        return inverse_trials(robot, values, target)
-    # nominal values displace nothing
-    joints, slots = driven_values(robot.program, robot.home_state), robot.slots
-    q = readings_from_joints(joints, slots.terms[None], slots.frequency)
-    return forward_trials(robot, values, q)
-
-
-def check_nominal_values(table: ParameterTable) -> None:
-    """Refuse nominal values that no machine has; raises MechanismError."""
-    for p in table.entries:
-        if not abs(p.nominal) <= LARGEST:
-            symbol = SI_SYMBOLS[p.dimension]
-            raise MechanismError(
-                f"the nominal value of {p.name} is {p.nominal:g} {symbol}; it must not be beyond "
-                f"{LARGEST:g} {symbol}"
-            )
-
-
 def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[str, Finding]]:
     """Yield parameters whose own value is impossible."""
     table = robot.parameters
@@ -122,18 +101,11 @@ def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[
         number = robot.to_quantity(value, p.dimension)
         if is_large[i]:
             limit = robot.to_quantity(LARGEST, p.dimension)
-            yield (
-                p.name,
-                report_finding("mechanism.value-too-large", name=p.name, value=number, limit=limit),
-            )
+            code, data = "mechanism.value-too-large", {"limit": limit}
         else:
             nominal = robot.to_quantity(p.nominal, p.dimension)
-            yield (
-                p.name,
-                report_finding(
-                    "mechanism.value-not-positive", name=p.name, value=number, nominal=nominal
-                ),
-            )
+            code, data = "mechanism.value-not-positive", {"nominal": nominal}
+        yield p.name, report_finding(code, name=p.name, value=number, **data)
 
 
 DEFAULT_SIZE = 1.0
@@ -152,10 +124,6 @@ def build(
     assembly : as returned by the `expand` method of a family.
     units : display units of the file. record : the family record, kept for writing the file.
 
-    Returns
-    -------
-    Mechanism at its nominal values.
-
     Raises
     ------
     MechanismError
@@ -164,14 +132,8 @@ def build(
     """
     check_assembly(assembly)
     if assembly.stages:
-        return build_chain(assembly, units or {}, record, _build_stage, differentiate_pose)
+        return _build_chain(assembly, units or {}, record)
     return _compile(assembly, units, record)
-
-
-def _build_stage(stage: AttachedStage) -> Mechanism:
-    """Compile a stage of a chain; raises MechanismError."""
-    check_assembly(stage.assembly, is_stage=True)
-    return _compile(stage.assembly)
 
 
 def _compile(
@@ -188,7 +150,13 @@ def _close_at_home(
 ) -> Mechanism:
     """Return a mechanism of one stage with its loops closed at home, and its mobility checked."""
     table = ParameterTable(assembly.parameters, assembly.common_errors)
-    check_nominal_values(table)
+    for p in table.entries:
+        if not abs(p.nominal) <= LARGEST:
+            symbol = SI_SYMBOLS[p.dimension]
+            raise MechanismError(
+                f"the nominal value of {p.name} is {p.nominal:g} {symbol}; it must not be beyond "
+                f"{LARGEST:g} {symbol}"
+            )
     slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size, a = compute_characteristic_length(assembly), len(assembly.driven_joints)
@@ -200,6 +168,18 @@ def _close_at_home(
         groups, places, count = _group_limbs(assembly, slots, idle)
         guess = _make_first_guess(assembly, groups)
     _check_sums(assembly, groups, freedoms)
+    findings = []
+    for limb, joint in ((assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]):
+        locked = limb.joints[joint]
+        findings.append(
+            report_finding(
+                "mechanism.locked-joint",
+                limb=limb.name,
+                joint=locked.name,
+                turns=locked.dimension is Dimension.ANGLE,
+                value=Quantity(locked.start, SI_SYMBOLS[locked.dimension]),
+            )
+        )
     weights = _weigh_actuators(assembly, groups, freedoms)
     robot = Mechanism(
         assembly,
@@ -210,11 +190,13 @@ def _close_at_home(
         size,
         guess,
         {d: unit.symbol for d, unit in DISPLAY_UNITS.items()} | dict(units or {}),
-        tuple(_report_locked(assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]),
+        tuple(findings),
         record,
     )
     if robot.is_serial and not robot.controlled:
-        return replace(robot, home_state=_place_at_start(robot))
+        e, _ = robot.slots(robot.values[None])
+        joints = driven_values(robot.program, robot.home_state)
+        return replace(robot, home_state=solve_serial(robot, e, joints))
     robot = replace(robot, home_state=_find_home(robot))
     check_mobility(robot)
     return robot
@@ -316,6 +298,7 @@ def _group_limbs(
     for i, limb in enumerate(assembly.limbs):
         structure = tuple((j.kind, bool(j.actuator)) for j in limb.joints), bool(limb.actuator)
         alike.setdefault((limb.ending, structure, locked.get(i, ())), []).append(i)
+    driven = {name: i for i, name in enumerate(assembly.driven_joints)}
     groups, places, count = [], {}, 0
     for members in alike.values():
         limbs, fixed = [assembly.limbs[i] for i in members], locked.get(members[0], ())
@@ -323,6 +306,10 @@ def _group_limbs(
         used = {slot for m in limbs for slot in slots_by_limb[m.name].values()}
         slots = tuple(sorted(used, key=lambda s: (s.element, s.axis)))
         column = {slot: i for i, slot in enumerate(slots)}
+        # columns of q (J + 1, k) of each joint and rod of the limbs, -1 for passive ones
+        names = [(*(j.actuator for j in m.joints), m.actuator) for m in limbs]
+        drives = [[driven[name] if name else -1 for name in of_limb] for of_limb in names]
+        actuators = np.array(drives, dtype=np.int64).T.reshape(len(kinds) + 1, len(limbs))
         first = count
         for m in limbs:
             places |= {a: count + column[slot] for a, slot in slots_by_limb[m.name].items()}
@@ -333,7 +320,7 @@ def _group_limbs(
             Group(
                 tuple(members),
                 kinds,
-                _number_actuators(assembly, limbs),
+                actuators,
                 tuple(j in fixed for j in range(len(kinds))),
                 ending,
                 select_rows(ending, assembly.freedoms),
@@ -345,16 +332,6 @@ def _group_limbs(
             )
         )
     return tuple(groups), places, count
-
-
-def _number_actuators(assembly: Assembly, limbs: list[Limb]) -> IntArray:
-    """Return the columns of q (J + 1, k) of each joint and rod of limbs, -1 for passive ones."""
-    column = {name: i for i, name in enumerate(assembly.driven_joints)}
-    drives = [
-        [column[name] if name else -1 for name in (*(j.actuator for j in m.joints), m.actuator)]
-        for m in limbs
-    ]
-    return np.array(drives, dtype=np.int64).T.reshape(len(limbs[0].joints) + 1, len(limbs))
 
 
 def _weigh_actuators(
@@ -413,16 +390,6 @@ def _refuse_other_limbs(
             )
 
 
-def _report_locked(limb: Limb, place: int) -> Finding:
-    """Return the finding of a joint that moves nothing but its limb."""
-    joint = limb.joints[place]
-    turns = joint.dimension is Dimension.ANGLE
-    value = Quantity(joint.start, SI_SYMBOLS[joint.dimension])
-    return report_finding(
-        "mechanism.locked-joint", limb=limb.name, joint=joint.name, turns=turns, value=value
-    )
-
-
 def _map_slots(
     assembly: Assembly, table: ParameterTable, places: dict[Address, int], count: int
 ) -> SlotMap:
@@ -453,12 +420,6 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
         for group in groups
     )
     return make_start(assembly.home[None, None], tuple(np.array([[rows]]) for rows in joints))
-
-
-def _place_at_start(robot: Mechanism) -> State:
-    """Return the state of a serial stage with every joint at its `start`."""
-    e, _ = robot.slots(robot.values[None])
-    return solve_serial(robot, e, driven_values(robot.program, robot.home_state))
 
 
 def _find_home(robot: Mechanism) -> State:
@@ -494,28 +455,17 @@ def _find_home(robot: Mechanism) -> State:
     return state
 
 
-# --- Compilation of a chain: its stages one by one, then their structures one after the other.
-
-"""Characteristic length [m] of a chain whose platforms all coincide."""
-
-
-def build_chain(
-    assembly: Assembly,
-    units: Mapping[Dimension, str],
-    record: Any,
-    build: Callable[[AttachedStage], Mechanism],
-    differentiate: PoseDerivative,
-) -> Mechanism:
-    """Return the mechanism of a chain; `build` compiles a stage, `differentiate` is that of one.
+def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any) -> Mechanism:
+    """Return the mechanism of a chain: its stages one by one, then their structures joined.
 
     Raises
     ------
     MechanismError
         A stage cannot be built (names it), or the actuators cannot set the controlled coordinates.
     """
-    stages = _build_stages(assembly.stages, build)
+    stages = _build_stages(assembly.stages)
     table = ParameterTable(assembly.parameters, assembly.common_errors)
-    size = compute_chain_size(stages)
+    size = _compute_chain_size(stages)
     program = _join_programs(stages, size)
     robot = Mechanism(
         assembly,
@@ -532,20 +482,19 @@ def build_chain(
     )
     home = join_stage_states(robot, [stage.robot.home_state for stage in stages])
     robot = replace(robot, home_state=home, assembly=replace(assembly, home=np.array(home.T[0, 0])))
-    _check_mobility(robot, home, differentiate)
+    _check_chain(robot, home)
     return robot
 
 
-def _build_stages(
-    attached: Sequence[AttachedStage], build: Callable[[AttachedStage], Mechanism]
-) -> tuple[Stage, ...]:
+def _build_stages(attached: Sequence[AttachedStage]) -> tuple[Stage, ...]:
     """Return the compiled stages; an error names its stage."""
     stages: list[Stage] = []
     places = {BASE: -1}
     p = a = g = 0
     for stage in attached:
         try:
-            robot = build(stage)
+            check_assembly(stage.assembly, is_stage=True)
+            robot = _compile(stage.assembly)
         except MechanismError as error:
             raise MechanismError(f"stage {stage.name!r}: {error}") from None
         if robot.program.sigma is not None:
@@ -569,7 +518,7 @@ def _build_stages(
     return tuple(stages)
 
 
-def compute_chain_size(stages: Sequence[Stage]) -> float:
+def _compute_chain_size(stages: Sequence[Stage]) -> float:
     """Return the characteristic length [m] of a chain.
 
     It is the root mean square distance of the end platform from the bases of the stages at home, or
@@ -639,7 +588,7 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
     return SlotMap(matrix, tuple(shared), nominal, displacements, terms, frequency)
 
 
-def _check_mobility(robot: Mechanism, home: ChainState, differentiate: PoseDerivative) -> None:
+def _check_chain(robot: Mechanism, home: ChainState) -> None:
     """Refuse a chain whose actuators do not set the controlled coordinates one by one.
 
     The freedoms of the end platform are the rank of its derivatives by the readings.
@@ -648,7 +597,7 @@ def _check_mobility(robot: Mechanism, home: ChainState, differentiate: PoseDeriv
     values = robot.values[None]
     _, tau = robot.slots(values)
     q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.frequency)
-    D = differentiate_end(robot, values, q, home, differentiate).readings[0, 0]
+    D = differentiate_end(robot, values, q, home, differentiate_pose).readings[0, 0]
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
     scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)
     freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))

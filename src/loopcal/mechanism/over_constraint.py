@@ -11,6 +11,7 @@ and no reading can close them again. Derivation: docs/theory/over-constraint.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -42,24 +43,6 @@ NEARBY, DISTANCE = 4, 0.03
 """Number of poses near home that are examined with it, and the change of their driven joints: a
 share of the robot's size, or this many radians. Home alone may be a special position.
 """
-
-
-class RepeatedDirection(NamedTuple):
-    """A direction that a limb constrains although other limbs do.
-
-    turns : whether it is a rotation about `axis`, else a translation along it. axis : (3,) in base
-    axes at home.
-    """
-
-    turns: bool
-    axis: tuple[float, float, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the direction for a finding; an axis of the base by its name."""
-        size = np.abs(self.axis)
-        name = "xyz"[int(size.argmax())] if size.max() > 1 - SAME else ""
-        vector = tuple(round(float(v), 3) + 0.0 for v in self.axis)
-        return {"turns": self.turns, "name": name, "vector": () if name else vector}
 
 
 class _Rows(NamedTuple):
@@ -167,7 +150,7 @@ def _list_repeated(robot: Mechanism, rows: _Rows) -> tuple[dict[str, Any], ...]:
         by_others: dict[tuple[str, ...], list[dict[str, Any]]] = {}
         for wrench, direction in _name_directions(wrenches, robot.program.freedoms):
             others = tuple(names[i] for i in _find_others(rows, last, wrench))
-            by_others.setdefault(others, []).append(direction.to_dict())
+            by_others.setdefault(others, []).append(direction)
         out += [
             {"limb": names[last], "others": others, "directions": tuple(directions)}
             for others, directions in by_others.items()
@@ -197,11 +180,12 @@ def _find_others(rows: _Rows, last: int, wrench: FloatArray) -> list[int]:
 
 def _name_directions(
     wrenches: FloatArray, freedoms: tuple[int, ...]
-) -> list[tuple[FloatArray, RepeatedDirection]]:
-    """Return a basis of the wrenches (r, m), each (m,) with the direction that it constrains.
+) -> list[tuple[FloatArray, dict[str, Any]]]:
+    """Return a basis of the wrenches (r, m), each (m,) with the direction that it constrains, as
+    the catalog words it.
 
     A wrench without force constrains a rotation, any other one the translation along its force.
-    Axes of the base are chosen where they can be.
+    Axes of the base are chosen where they can be, and have a name.
     """
     whole = np.zeros((len(wrenches), 6))
     whole[:, list(freedoms)] = wrenches
@@ -216,8 +200,10 @@ def _name_directions(
             weights = np.linalg.lstsq(basis[:, part].T, axis, rcond=None)[0]
             wrench = weights @ basis
             unit = wrench[list(freedoms)] / np.linalg.norm(wrench)
-            x, y, z = (float(v) for v in axis)
-            out.append((unit, RepeatedDirection(turns, (x, y, z))))
+            size = np.abs(axis)
+            name = "xyz"[int(size.argmax())] if size.max() > 1 - SAME else ""
+            vector = () if name else tuple(round(float(v), 3) + 0.0 for v in axis)
+            out.append((unit, {"turns": turns, "name": name, "vector": vector}))
     return out
 
 
@@ -254,22 +240,13 @@ def _find_sufficient_freedoms(
     for left_out in range(1, len(still) + 1):
         for dropped in combinations(still.tolist(), left_out):
             names = tuple(AXES[f] for i, f in enumerate(freedoms) if i not in dropped)
-            if _is_exact_with(robot, names, close_at_home):
-                return names
+            narrow = replace(robot.assembly, freedoms=names, closure="exact")
+            with suppress(MechanismError):
+                check_assembly(narrow)
+                flat = close_at_home(narrow)
+                if not _count_repeated(flat, _linearize(flat, flat.home_state)[0]):
+                    return names
     return ()
-
-
-def _is_exact_with(
-    robot: Mechanism, freedoms: tuple[str, ...], close_at_home: Callable[[Assembly], Mechanism]
-) -> bool:
-    """Return whether the robot can have these freedoms, and then no equation repeats another."""
-    narrow = replace(robot.assembly, freedoms=freedoms, closure="exact")
-    try:
-        check_assembly(narrow)
-        flat = close_at_home(narrow)
-    except MechanismError:
-        return False
-    return not _count_repeated(flat, _linearize(flat, flat.home_state)[0])
 
 
 def find_self_stress(robot: Mechanism) -> FloatArray:
@@ -307,24 +284,16 @@ def is_over_constrained(robot: Mechanism) -> bool:
 
 
 def refuse_free_breaking_parameters(robot: Mechanism) -> None:
-    """Refuse to vary free parameters that open the loops of an over-constrained robot.
-
-    Raises
-    ------
-    MechanismError
-        `mechanism.free-parameters-open-loops`.
+    """Raise the MechanismError `mechanism.free-parameters-open-loops` if free parameters open the
+    loops of an over-constrained robot.
     """
     if names := find_breaking_parameters(robot):
         raise MechanismError(_report_breaking("mechanism.free-parameters-open-loops", robot, names))
 
 
 def refuse_drawn_errors(robot: Mechanism) -> None:
-    """Refuse to draw errors of an over-constrained robot that open its loops.
-
-    Raises
-    ------
-    MechanismError
-        `mechanism.drawn-errors-open-loops`.
+    """Raise the MechanismError `mechanism.drawn-errors-open-loops` if parameters with a tolerance
+    open the loops of an over-constrained robot.
     """
     table = robot.parameters
     drawn = {p.name for p in table.entries if p.tolerance}

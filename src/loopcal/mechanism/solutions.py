@@ -55,8 +55,6 @@ from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
 
-# --- Tell whether a motion of the actuators leads from one state to another, by small steps.
-
 CONTRACTION = {1: 1 / 2, 3: 1 / 8}
 """Number of Newton steps -> largest distance that they leave, per distance of the start."""
 FIRST_STEP, GROWTH, SHORTEST = 0.25, 2.0, 1 / 500
@@ -78,10 +76,8 @@ Step = Callable[[IntArray, FloatArray, State], State]
 def connect_by_readings(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
     """Follow the straight paths of joint values from states `first` (1, k | 1) to `last` (1, k).
 
-    Returns
-    -------
-    state : (1, k) the last states, with the passive joints at the end of a path.
-    connected : (k,) rows that a single safe step or a path without a singularity leads to.
+    Return the last states, with the passive joints at the end of a path, and the rows (k,) that a
+    single safe step or a path without a singularity leads to.
     """
     return _connect(robot, first, last, contracts(robot, first, last), _move_readings)
 
@@ -105,10 +101,14 @@ def _connect(
     start = select_poses(repeat_poses(first, len(connected)), rows)
     goal = select_poses(last, rows)
     end, arrived = _follow_path(robot, start, path(robot, start, goal))
-    arrived &= _is_same_pose(robot, end, goal)
+    arrived &= _is_same_pose(robot, end, goal, SAME_JOINTS)
     connected = connected.copy()
     connected[rows] = arrived
-    return _take_joints(robot, last, rows[arrived], select_poses(end, arrived)), connected
+    differs = arrived & (measure_distance(robot, goal, end) > SAME_JOINTS)
+    rows, end = rows[differs], select_poses(end, differs)
+    new = replace(select_poses(last, rows), T=end.T, joints=end.joints)
+    last = replace_rows(last, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
+    return last, connected
 
 
 def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
@@ -196,23 +196,11 @@ def _follow_path(robot: Mechanism, first: State, step: Step) -> tuple[State, Boo
     return current, share >= 1.0
 
 
-def _take_joints(robot: Mechanism, state: State, rows: IntArray, end: State) -> State:
-    """Return states (1, n) with the joints of the ends (1, j) of paths where they differ."""
-    differs = measure_distance(robot, select_poses(state, rows), end) > SAME_JOINTS
-    rows, end = rows[differs], select_poses(end, differs)
-    old = select_poses(state, rows)
-    new = replace(old, T=end.T, joints=end.joints)
-    return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
-
-
-def _is_same_pose(robot: Mechanism, a: State, b: State) -> BoolArray:
-    """Return which platforms (n,) are equal."""
+def _is_same_pose(robot: Mechanism, a: State, b: State, tolerance: float) -> BoolArray:
+    """Return which platforms (n,) are equal to a tolerance: relative to the robot's size, [rad]."""
     gap = np.abs(geometry.pose_difference(a.T[0], b.T[0])) * robot.twist_scale
-    return gap.max(axis=1, initial=0.0) <= SAME_JOINTS * robot.size
+    return np.asarray(gap.max(axis=1, initial=0.0) <= tolerance * robot.size)
 
-
-# --- Inverse solutions in the mode of their start: those whose readings lead from there to the
-# target.
 
 SAME_POSE = 1e-7
 """Largest difference of equal poses: lengths relative to the robot's size, angles in radians.
@@ -240,7 +228,8 @@ def solve_in_mode(
     rows = np.flatnonzero(is_other)
     if not len(rows):
         return state
-    state = _mark_other(state, is_other)
+    status = np.where(is_other, np.int8(Status.OTHER_MODE), state.status)
+    state = replace(state, status=status)
     if has_one_solution(robot):
         return state
     first = select_poses(repeat_poses(begin, len(is_other)), rows)
@@ -269,11 +258,6 @@ def _select_new(
         return again, rows
     is_new = measure_distance(robot, again, select_poses(state, rows)) > SAME_JOINTS
     return select_poses(again, is_new), rows[is_new]
-
-
-def _mark_other(state: State, is_other: BoolArray) -> State:
-    """Return a state (1, n) with the status of another mode in some rows (n,)."""
-    return replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
 
 
 def has_one_solution(robot: Mechanism) -> bool:
@@ -306,10 +290,8 @@ def reach_coordinates(
 ) -> tuple[State, BoolArray | None]:
     """Solve inverse kinematics like `close_at_coordinates`, for coordinates (n, c).
 
-    Returns
-    -------
-    state : (1, n), also with the closure signs of `inverse_trials` where the next is not None.
-    arrives : (n,) rows whose readings are known to lead from the start to their pose.
+    Return states (1, n), and the rows (n,) whose readings are known to lead from the start to their
+    pose; where these are not None, the states have the closure signs of `inverse_trials`.
     """
     values, target = robot.values[None], target[None]
     is_plain = not (robot.stages or robot.is_serial or needs_readings(robot.program))
@@ -379,14 +361,10 @@ def _judge_by_readings(robot: Mechanism, state: State, begin: State) -> tuple[St
     goal = select_poses(state, rows)
     start = select_poses(begin, rows) if begin.T.shape[1] == len(closed) > 1 else begin
     back = forward_trials(robot, values, compute_readings(robot, values, goal), start)
-    is_other[rows] = ~((back.status[0] == Status.CONVERGED) & _is_near(robot, back, goal))
+    is_other[rows] = ~(
+        (back.status[0] == Status.CONVERGED) & _is_same_pose(robot, back, goal, SAME_POSE)
+    )
     return state, is_other
-
-
-def _is_near(robot: Mechanism, a: State, b: State) -> BoolArray:
-    """Return which poses (k,) of states (1, k) are the same."""
-    gap = np.abs(geometry.pose_difference(a.T[0], b.T[0]) * robot.twist_scale).max(axis=1)
-    return np.asarray(gap <= SAME_POSE * robot.size)
 
 
 def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
@@ -402,21 +380,16 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
     for connect in (connect_by_readings, connect_by_poses):
         if not len(rows):
             break
-        solutions, connected = connect(robot, *_select_both(start, goal, rows))
+        solutions, connected = connect(robot, select_poses(start, rows), select_poses(goal, rows))
         goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(solutions, len(rows), 1))
         is_other[rows] = ~connected
         rows = rows[~connected]
         unsure = rows[needs_path[rows]]
         if connect is connect_by_readings and len(unsure):
-            ends = _select_both(start, goal, unsure)
+            ends = select_poses(start, unsure), select_poses(goal, unsure)
             returns[unsure] = _solve_from(robot, *ends, follow=True)[0]
             rows = rows[returns[rows]]
     return goal, is_other
-
-
-def _select_both(first: State, goal: State, rows: IntArray) -> tuple[State, State]:
-    """Return rows of two states (1, n)."""
-    return select_poses(first, rows), select_poses(goal, rows)
 
 
 def _solve_from(
@@ -428,7 +401,7 @@ def _solve_from(
     back = close_at_joints(robot, e, joints, first, follow, goal)
     closed = back.status[0] == Status.CONVERGED
     is_near = back.status[0] == NEAR_GOAL
-    return is_near | closed & _is_near(robot, back, goal), ~(is_near | closed)
+    return is_near | closed & _is_same_pose(robot, back, goal, SAME_POSE), ~(is_near | closed)
 
 
 def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:
@@ -543,9 +516,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
         unknown) behind them.
     start : a solution of one row or n rows that selects the assembly mode (default: home).
 
-    Returns
-    -------
-    Solution; rows that fail are marked in `status`, never raised.
+    Rows that fail are marked in `status`, never raised.
 
     Raises
     ------
@@ -578,10 +549,8 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
         has these, the row is `UNREACHABLE`.
     start : solution that selects the working mode (default: home).
 
-    Returns
-    -------
-    Solution; rows that fail are marked in `status`, never raised. A row is marked `OTHER_MODE`
-    where the loops close at the target, but the readings lead from the start to another pose.
+    Rows that fail are marked in `status`, never raised. A row is marked `OTHER_MODE` where the
+    loops close at the target, but the readings lead from the start to another pose.
 
     Raises
     ------
@@ -600,7 +569,13 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     if is_pose:
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
-        state = solve_in_mode(robot, partial(_reach_pose, robot), T, begin)
+
+        def reach_pose(T: FloatArray, start: State | None) -> tuple[State, BoolArray | None]:
+            if controls_all(robot):
+                return reach_coordinates(robot, read_coordinates(T, robot.controlled), start)
+            return find_nearest_reachable(robot, values, T[None], start), None
+
+        state = solve_in_mode(robot, reach_pose, T, begin)
     elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
         coordinates = np.atleast_2d(wanted)
         state = solve_in_mode(robot, partial(reach_coordinates, robot), coordinates, begin)
@@ -715,15 +690,6 @@ def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = Non
     )
 
 
-def _reach_pose(
-    robot: Mechanism, T: FloatArray, start: State | None
-) -> tuple[State, BoolArray | None]:
-    """Return what `reach_coordinates` returns, for poses (n, 4, 4)."""
-    if controls_all(robot):
-        return reach_coordinates(robot, read_coordinates(T, robot.controlled), start)
-    return find_nearest_reachable(robot, robot.values[None], T[None], start), None
-
-
 def _check_poses(T: FloatArray) -> None:
     """Refuse matrices that are not poses: name the first bad row and the reason."""
     # a row of NaN is marked in the solution, like readings that are NaN
@@ -743,8 +709,6 @@ def _check_poses(T: FloatArray) -> None:
             "homogeneous matrices"
         )
 
-
-# --- The reachable pose nearest to a full pose that a machine with fewer freedoms cannot take.
 
 PROJECTION_STEPS, PROJECTION_ITERATIONS = 20, 12
 """Gauss-Newton steps of a projection, and Newton steps of each: it begins close to its solution."""
