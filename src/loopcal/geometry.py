@@ -199,7 +199,7 @@ def project_to_rotations(matrix: FloatArray) -> FloatArray:
     return (U * sign[..., None, :]) @ V
 
 
-# --- Poses as 4x4 matrices, and the twist by which loopcal updates and compares them.
+# Poses as 4x4 matrices, and the twist by which loopcal updates and compares them.
 
 _LAST = np.ones((1, 1))
 """The last number of the last row of a pose."""
@@ -284,7 +284,7 @@ def differentiate_by_entries(T: FloatArray) -> FloatArray:
     return scale * np.swapaxes(differentiate_entries(T), -1, -2)
 
 
-# --- Orientation by three angles: the 24 Euler conventions, and tilt and torsion.
+# Orientation by three angles: the 24 Euler conventions, and tilt and torsion.
 
 _SEQUENCES = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx", "xyx", "xzx", "yxy", "yzy", "zxz", "zyz")
 EULER_ORDERS = _SEQUENCES + tuple(sequence.upper() for sequence in _SEQUENCES)
@@ -489,7 +489,7 @@ def tilt_torsion_rates_inverse(
     )
 
 
-# --- Forms of orientation in columns: rotation vector, quaternion, tilt and torsion, Euler angles.
+# Forms of orientation in columns: rotation vector, quaternion, tilt and torsion, Euler angles.
 
 Conversion = Callable[[FloatArray], FloatArray]
 
@@ -595,7 +595,7 @@ def parse_orientation(name: str) -> OrientationForm:
     )
 
 
-# --- Alignment in closed form: frames, points and centers from points, poses, rays or lengths.
+# Alignment in closed form: frames, points and centers from points, poses, rays or lengths.
 
 _SIGNED_PERMUTATIONS = [
     np.eye(3)[list(order)] * sign

@@ -217,9 +217,9 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
         ),
     )
     if robot.program.sigma is not None and np.any(given == 0.0):
-        name = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
+        exact = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
-            f"the readings of {name} are stated to be exact, but {robot.name!r} has "
+            f"the readings of {exact} are stated to be exact, but {robot.name!r} has "
             f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom; "
             "readings of redundant actuators cannot be exact: state a sigma above 0 for each, a "
             "small one for very good encoders"

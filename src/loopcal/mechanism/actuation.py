@@ -32,6 +32,13 @@ from loopcal.mechanism.transmission import (
 from loopcal.typing import FloatArray
 
 
+class Derivatives(NamedTuple):
+    """Derivatives by parameters (t, n, .., p) and by readings (t, n, .., a)."""
+
+    parameters: FloatArray
+    readings: FloatArray
+
+
 class DrivenJoints(NamedTuple):
     """What values and readings make of a robot of one stage.
 
@@ -73,7 +80,7 @@ def drive_sums(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenSum
         return DrivenSums(e, evaluate_sums(q, tau, robot.slots.frequency), weights)
 
 
-# --- Redundant actuation with a prescribed pose: readings and passive joints follow limb by limb.
+# Redundant actuation with a prescribed pose: readings and passive joints follow limb by limb.
 
 
 class PoseDrivenSensitivity(NamedTuple):
@@ -142,17 +149,10 @@ def differentiate_at_pose(
     )
 
 
-# --- Summed drives: s(q) = W l, with l the values of the driven joints.
+# Summed drives: s(q) = W l, with l the values of the driven joints.
 
 ITERATIONS = 25
 """Newton steps of a pose; those within reach need fewer than ten."""
-
-
-class Motion(NamedTuple):
-    """Derivatives by parameters (t, n, .., p) and by readings (t, n, .., a)."""
-
-    parameters: FloatArray
-    readings: FloatArray
 
 
 def solve_open_sums(
@@ -173,7 +173,14 @@ def solve_open_sums(
     t = max(len(e), len(weights), len(sums), begin.T.shape[0])
     n = max(sums.shape[1], begin.T.shape[1])
     wanted = np.broadcast_to(sums, (t, n, sums.shape[2]))
-    units = _find_row_units(program, weights)
+    turns = np.zeros(program.n_joints, dtype=bool)
+    for group in program.groups:
+        for j, columns in enumerate(group.actuator):
+            if columns[0] >= 0:
+                turns[columns] = group.joints[j : j + 1] == "R"
+    # sums of angles count as lengths at the size of the robot
+    is_angle = (weights[0] != 0.0)[:, turns].any(axis=1)
+    units = np.where(is_angle, program.size, 1.0)
 
     def compare(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
         trial, pose = np.divmod(rows, n)
@@ -216,7 +223,7 @@ def differentiate_open_sums(
     q: FloatArray,
     state: State,
     columns: ParameterUnits | None = None,
-) -> Motion:
+) -> Derivatives:
     """Return the derivatives of the twist of the platform, (t, n, 6, p) and (t, n, 6, a).
 
     columns : the parameters and their units; all parameters in SI without it.
@@ -225,7 +232,7 @@ def differentiate_open_sums(
     at_pose = differentiate_at_pose(robot, values, q, state).readings
     by_parameters = at_pose[0][..., chosen.places] * chosen.units
     weights, moved = _differentiate_sums(robot, values, q, state)
-    moved = Motion(moved.parameters[..., chosen.places] * chosen.units, moved.readings)
+    moved = Derivatives(moved.parameters[..., chosen.places] * chosen.units, moved.readings)
     inverse = invert_weights(np.matmul(weights, at_pose[1]))
     own = moved.parameters - np.matmul(weights, by_parameters)
     shape, freedoms = state.T.shape[:2], list(robot.program.freedoms)
@@ -234,12 +241,12 @@ def differentiate_open_sums(
         twist = np.zeros((*shape, 6, right.shape[-1]))
         twist[:, :, freedoms] = np.matmul(inverse, right)
         out.append(twist)
-    return Motion(*out)
+    return Derivatives(*out)
 
 
 def differentiate_driven_joints(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, platform: Motion
-) -> Motion:
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, platform: Derivatives
+) -> Derivatives:
     """Return the derivatives of the driven joints, (t, n, J, p) and (t, n, J, a).
 
     platform : those of its twist, by all parameters in SI and by readings.
@@ -247,12 +254,11 @@ def differentiate_driven_joints(
     if robot.has_open_sums:
         by_parameters, by_pose = differentiate_at_pose(robot, values, q, state).readings
         freedoms = list(robot.program.freedoms)
-        follow = (np.matmul(by_pose, part[:, :, freedoms]) for part in platform)
-        moved, driven = follow
-        return Motion(moved + by_parameters, driven)
+        moved, driven = (np.matmul(by_pose, part[:, :, freedoms]) for part in platform)
+        return Derivatives(moved + by_parameters, driven)
     weights, moved = _differentiate_sums(robot, values, q, state)
     inverse = invert_weights(weights)
-    return Motion(*(np.matmul(inverse, part) for part in moved))
+    return Derivatives(*(np.matmul(inverse, part) for part in moved))
 
 
 def differentiate_joints_by_readings(
@@ -268,7 +274,7 @@ def differentiate_joints_by_readings(
 
 def _differentiate_sums(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
-) -> tuple[FloatArray, Motion]:
+) -> tuple[FloatArray, Derivatives]:
     """Return the weights (t | 1, 1, a, J), and the derivatives of s - W l at constant lengths l."""
     slots = robot.slots
     _, tau = slots(values)
@@ -281,15 +287,4 @@ def _differentiate_sums(
     by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
     slopes = joint_slopes(q, tau, slots.frequency)
     by_readings = slopes[..., None] * np.eye(slopes.shape[-1])
-    return weights[:, None], Motion(by_parameters, by_readings)
-
-
-def _find_row_units(program: Program, weights: FloatArray) -> FloatArray:
-    """Return what turns sums (a,) into lengths [m]: 1, or of angles the size of the robot."""
-    turns = np.zeros(program.n_joints, dtype=bool)
-    for group in program.groups:
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                turns[columns] = group.joints[j : j + 1] == "R"
-    is_angle = (weights[0] != 0.0)[:, turns].any(axis=1)
-    return np.where(is_angle, program.size, 1.0)
+    return weights[:, None], Derivatives(by_parameters, by_readings)

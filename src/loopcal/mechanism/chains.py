@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, STALLED, Group, State
+from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, STALLED, State
+from loopcal.mechanism.actuation import Derivatives
 from loopcal.mechanism.limb_rows import follow_limb, measure_rod
 from loopcal.mechanism.model import Mechanism, ParameterUnits, Stage
 from loopcal.mechanism.platform_coordinates import (
@@ -31,7 +32,7 @@ from loopcal.mechanism.transmission import joint_slopes, readings_from_joints
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- States of a chain: those of its stages, joined, and the frames of its platforms.
+# States of a chain: those of its stages, joined, and the frames of its platforms.
 
 SEVERITY = (CONVERGED, EXHAUSTED, STALLED, NOT_FINITE)
 """Statuses of stages, of which the last one in this order is that of the chain. Any other status,
@@ -58,9 +59,16 @@ class ChainState(State):
 def join_stage_states(robot: Mechanism, states: Sequence[State]) -> ChainState:
     """Return the state of a chain (t, n) whose stages have these states (t, n)."""
     poses = tuple(state.T for state in states)
+
+    def rank(status: NDArray[np.int8]) -> NDArray[np.int8]:
+        severity = np.ones(status.shape, np.int8)  # of another mode, among others
+        for place, known in enumerate(SEVERITY):
+            severity[status == known] = 0 if known == CONVERGED else place + 1
+        return severity
+
     status = states[0].status
     for state in states[1:]:
-        status = np.where(_rank(state.status) > _rank(status), state.status, status)
+        status = np.where(rank(state.status) > rank(status), state.status, status)
     return ChainState(
         locate_platforms(robot, poses)[-1],
         tuple(joints for state in states for joints in state.joints),
@@ -71,14 +79,6 @@ def join_stage_states(robot: Mechanism, states: Sequence[State]) -> ChainState:
         poses,
         tuple(state.closure_sign for state in states),
     )
-
-
-def _rank(status: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Return how severe statuses are: 0 converged, 1 another mode, then as in SEVERITY."""
-    rank = np.ones(status.shape, np.int8)
-    for place, known in enumerate(SEVERITY):
-        rank[status == known] = 0 if known == CONVERGED else place + 1
-    return rank
 
 
 def split_stage_states(robot: Mechanism, state: State) -> list[State]:
@@ -187,53 +187,13 @@ def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int
     return transports
 
 
-class StageSolver(Protocol):
-    """Solves forward kinematics of one stage, as `forward_trials` does."""
-
-    def __call__(
-        self, robot: Mechanism, values: FloatArray, q: FloatArray, start: State | None
-    ) -> State:
-        """Return the state (t, n) at readings q (t | 1, n, a) and values (t | 1, p)."""
-        ...
-
-
-class Derivatives(NamedTuple):
-    """Derivatives by parameters (t, n, .., p) and by readings (t, n, .., a)."""
-
-    parameters: FloatArray
-    readings: FloatArray
-
-
-class OwnDerivatives(Protocol):
-    """Derivatives of one stage, by its own parameters and readings; shapes as in `Derivatives`."""
-
-    @property
-    def parameters(self) -> FloatArray:
-        """Derivatives by parameters."""
-        ...
-
-    @property
-    def readings(self) -> FloatArray:
-        """Derivatives by readings."""
-        ...
-
-
-class PoseDerivative(Protocol):
-    """Differentiates the pose of one stage, as `differentiate_pose` does."""
-
-    def __call__(
-        self,
-        robot: Mechanism,
-        values: FloatArray,
-        q: FloatArray,
-        state: State,
-        columns: ParameterUnits | None = None,
-    ) -> OwnDerivatives:
-        """Return (t, n, 6, p) by all parameters in SI, or by those of `columns`."""
-        ...
-
-
-JointDerivative = Callable[[Mechanism, FloatArray, FloatArray, State], OwnDerivatives]
+StageSolver = Callable[[Mechanism, FloatArray, FloatArray, State | None], State]
+"""Solves forward kinematics of one stage at values (t | 1, p) and readings (t | 1, n, a), as
+`forward_trials` does.
+"""
+PoseDerivative = Callable[..., Derivatives]
+"""Differentiates the pose of one stage, as `differentiate_pose` does."""
+JointDerivative = Callable[[Mechanism, FloatArray, FloatArray, State], Any]
 """Differentiates the passive joints of one stage, as `differentiate_passive_joints` does."""
 
 
@@ -381,7 +341,11 @@ def _differentiate_platform(
     whole = _make_zeros(robot, state, 6, len(columns.places))
     for i, transport in transport_to_end(robot, state, end):
         stage = robot.stages[i]
-        place, own_columns = _select_columns(stage, columns)
+        first, last = stage.parameters.start, stage.parameters.stop
+        place = np.flatnonzero((columns.places >= first) & (columns.places < last))
+        own_columns = ParameterUnits(
+            stage.robot.slots, columns.places[place] - first, columns.units[place]
+        )
         own = differentiate(
             stage.robot,
             values[:, stage.parameters],
@@ -394,14 +358,6 @@ def _differentiate_platform(
     return whole
 
 
-def _select_columns(stage: Stage, columns: ParameterUnits) -> tuple[IntArray, ParameterUnits]:
-    """Return which columns are parameters of a stage, and these parameters by its own numbers."""
-    first, last = stage.parameters.start, stage.parameters.stop
-    chosen = np.flatnonzero((columns.places >= first) & (columns.places < last))
-    places = columns.places[chosen] - first
-    return chosen, ParameterUnits(stage.robot.slots, places, columns.units[chosen])
-
-
 def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> Derivatives:
     """Return derivatives (t, n, rows, ..) of zero by `columns` parameters and all readings."""
     t, n = state.T.shape[:2]
@@ -410,7 +366,7 @@ def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> Deri
     )
 
 
-# --- A sphere that the platform cannot leave, from the lengths of the links.
+# A sphere that the platform cannot leave, from the lengths of the links.
 
 ROUNDING = 1e-9
 """Excess, relative to the robot's size, of a target at the bound itself."""
@@ -460,8 +416,9 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
     for group, joints in zip(robot.program.groups, robot.home_state.joints, strict=True):
         displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
         for k in range(len(group.limbs)):
-            if not _has_fixed_links(group, k):
-                continue
+            slides = "P" in group.joints or bool(group.pitch[k].any()) or group.actuator[-1, k] >= 0
+            if slides or any(slot.axis == PITCH for slot in group.slots):
+                continue  # a joint changes the distance of its neighbors
             own = displacements[:, k]
             start = np.broadcast_to(joints[:1, :1, k], (len(own), 1, joints.shape[-1]))
             frames, attachment = follow_limb(group, k, own, start)
@@ -475,13 +432,7 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
     return center, radius
 
 
-def _has_fixed_links(group: Group, k: int) -> bool:
-    """Return whether no joint of limb k of a group changes the distance of its neighbors."""
-    slides = "P" in group.joints or bool(group.pitch[k].any()) or group.actuator[-1, k] >= 0
-    return not (slides or any(slot.axis == PITCH for slot in group.slots))
-
-
-# --- Inverse kinematics by the forward one: Newton's method on the readings, c(T(q)) = c*.
+# Inverse kinematics by the forward one: Newton's method on the readings, c(T(q)) = c*.
 
 STEPS = 60
 """Newton steps of a row."""
@@ -505,27 +456,12 @@ PATH_STEPS = 8
 """Steps of the path from the start's pose to a target."""
 
 
-class ForwardSolver(Protocol):
-    """Solves forward kinematics, as `forward_trials` does."""
-
-    def __call__(
-        self,
-        robot: Mechanism,
-        values: FloatArray,
-        q: FloatArray,
-        start: State | None = None,
-        follow: bool = True,
-    ) -> State:
-        """Return the state (t, n) at readings q (t | 1, n, a) and values (t | 1, p)."""
-        ...
-
-
-class Proposal(Protocol):
-    """Proposes states near targets, whose readings are only almost right."""
-
-    def __call__(self, values: FloatArray, target: FloatArray, start: State) -> State:
-        """Return states for targets (R, c); all three are (1, R) or (R, 1), like the start."""
-        ...
+ForwardSolver = Callable[..., State]
+"""Solves forward kinematics, as `forward_trials` does."""
+Proposal = Callable[[FloatArray, FloatArray, State], State]
+"""Returns states near targets (R, c), whose readings are only almost right, from the values and a
+start; states are (1, R) or (R, 1), like the start.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -604,18 +540,15 @@ class _Rows:
         step[:, moving] = -np.matmul(np.linalg.pinv(slope), residual[..., None])[..., 0]
         gap = np.where(ok, np.linalg.norm(residual, axis=1), np.inf)
         sign = np.where(ok, np.sign(np.linalg.det(slope)), 0.0)
-        return _Iterate(q, state, gap, self._limit(q, step), sign)
-
-    def _limit(self, q: FloatArray, step: FloatArray) -> FloatArray:
-        """Return steps (R, a) of readings, shortened so that no joint moves too far."""
-        robot = self.robot
+        # no joint moves farther than the longest step: in radians, or sizes of the robot
+        joints = (joint for limb in robot.assembly.limbs for joint in limb.joints)
+        turning = {joint.actuator for joint in joints if joint.kind == "R"}
+        turns = [not turning.isdisjoint(a.driven_joints) for a in robot.actuators]
         _, tau = robot.slots(self.values)
-        frequency = robot.slots.frequency
-        shown = np.expand_dims(q, 1 - self.axis)
-        slopes = np.broadcast_to(joint_slopes(shown, tau, frequency), shown.shape).reshape(q.shape)
-        length = np.abs(step * slopes) / _find_units(robot)
+        slopes = np.broadcast_to(joint_slopes(shown, tau, robot.slots.frequency), shown.shape)
+        length = np.abs(step * slopes.reshape(q.shape)) / np.where(turns, 1.0, robot.size)
         longest = np.maximum(length.max(axis=1, initial=0.0), LONGEST_STEP)
-        return step * (LONGEST_STEP / longest)[:, None]
+        return _Iterate(q, state, gap, step * (LONGEST_STEP / longest)[:, None], sign)
 
     def iterate(self, q: FloatArray, begin: State, on_path: bool = False) -> _Iterate:
         """Return the last iterates from readings q (R, a); a row has arrived if its gap is small.
@@ -719,7 +652,8 @@ def _solve_within_reach(
     Rows whose target is farther away than the links span stay at the start.
     """
     is_near = measure_target_excess(rows.robot, rows.values, rows.target) <= 0.0
-    solved = replace(start, state=_mark_stalled(start.state))
+    stalled = np.full_like(start.state.status, STALLED)
+    solved = replace(start, state=replace(start.state, status=stalled))
     near = np.flatnonzero(is_near)
     if not len(near):
         return solved
@@ -730,11 +664,6 @@ def _solve_within_reach(
     if not (follow and len(wrong)):
         return solved
     return rows.put(solved, wrong, _follow_path(rows.select(wrong), rows.take(start, wrong)))
-
-
-def _mark_stalled(state: State) -> State:
-    """Return a state whose rows have stalled."""
-    return replace(state, status=np.full_like(state.status, STALLED))
 
 
 def _begin_near_targets(
@@ -788,14 +717,7 @@ def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:
     return now
 
 
-def _find_units(robot: Mechanism) -> FloatArray:
-    """Return the units (a,) of long steps of joints and of sums: a radian, or the size [m]."""
-    turning = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
-    turns = (not turning.isdisjoint(a.driven_joints) for a in robot.actuators)
-    return np.array([1.0 if is_angle else robot.size for is_angle in turns])
-
-
-# --- Forward kinematics of a single limb whose joints are all driven: the product of its links.
+# Forward kinematics of a single limb whose joints are all driven: the product of its links.
 
 
 def solve_serial(

@@ -101,11 +101,18 @@ def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[
         number = robot.to_quantity(value, p.dimension)
         if is_large[i]:
             limit = robot.to_quantity(LARGEST, p.dimension)
-            code, data = "mechanism.value-too-large", {"limit": limit}
+            yield (
+                p.name,
+                report_finding("mechanism.value-too-large", name=p.name, value=number, limit=limit),
+            )
         else:
             nominal = robot.to_quantity(p.nominal, p.dimension)
-            code, data = "mechanism.value-not-positive", {"nominal": nominal}
-        yield p.name, report_finding(code, name=p.name, value=number, **data)
+            yield (
+                p.name,
+                report_finding(
+                    "mechanism.value-not-positive", name=p.name, value=number, nominal=nominal
+                ),
+            )
 
 
 DEFAULT_SIZE = 1.0

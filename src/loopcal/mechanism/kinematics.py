@@ -50,7 +50,7 @@ from loopcal.mechanism.transmission import (
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
-# --- Loops closed at joint values or their sums, and along straight paths of these from a start.
+# Loops closed at joint values or their sums, and along straight paths of these from a start.
 
 PATH_STEPS = (8, 64)
 """Steps of the path from the start's readings, tried in turn where the direct solution fails."""
@@ -73,11 +73,6 @@ def clear_sign(robot: Mechanism, state: State) -> State:
     if is_square(robot):
         return state
     return replace(state, closure_sign=np.zeros_like(state.closure_sign))
-
-
-def _find_open_rows(robot: Mechanism, state: State) -> BoolArray:
-    """Return the rows that failed or left a wide gap."""
-    return (state.status != Status.CONVERGED.value) | (state.residual > WIDE * robot.size)
 
 
 def find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
@@ -173,7 +168,8 @@ def _take_steps(
         solved = loops.select(moving).solve(q, begun)
         current = replace_rows(current, moving, zero, solved)
         if leave and step < count:
-            failed = moving[_find_open_rows(robot, current)[moving, 0]]
+            gap, status = current.residual[moving, 0], current.status[moving, 0]
+            failed = moving[(status != Status.CONVERGED.value) | (gap > WIDE * robot.size)]
             if len(failed):
                 zero = np.zeros(len(failed), int)
                 state = select_rows(current, (len(target), 1), failed, zero)
@@ -218,11 +214,9 @@ def forward_trials(
         return close_at_joints(robot, e, sums, start, follow, weights=weights)
     e, tau, joints = driven or drive_joints(robot, values, q)
     state = close_at_joints(robot, e, joints, start, follow, goal)
-    return _mark_out_of_reach(robot, state, q, tau) if len(find_triangles(tau)) else state
-
-
-def _mark_out_of_reach(robot: Mechanism, state: State, q: FloatArray, tau: FloatArray) -> State:
-    """Return a state (t, n) whose rows with a length that no angle reaches are unreachable."""
+    if not len(find_triangles(tau)):
+        return state
+    # a length of a triangle that no angle reaches
     excess = np.broadcast_to(measure_excess(q, tau, robot.slots.frequency), state.status.shape)
     is_beyond = (state.status == Status.NOT_FINITE.value) & (excess > 0.0) & np.isfinite(excess)
     return replace(
@@ -453,7 +447,7 @@ def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, sta
     )
 
 
-# --- Frames of the links along each limb, for limits of joints and for pictures.
+# Frames of the links along each limb, for limits of joints and for pictures.
 
 
 def compute_limb_frames(
@@ -461,12 +455,6 @@ def compute_limb_frames(
 ) -> tuple[FloatArray, ...]:
     """Return the frames along each limb, for limits and pictures.
 
-    Parameters
-    ----------
-    values : (t, p). state : (t, n).
-
-    Returns
-    -------
     For each limb of the mechanism, in its order, an array (t, n, J + 2, 4, 4): T_base_link behind
     each link 0..J (the last one is the tip), then the attachment.
     """
@@ -484,7 +472,7 @@ def compute_limb_frames(
     return tuple(frames[i] for i in sorted(frames))
 
 
-# --- Where the anchors of triangle drives are, for pictures and lists.
+# Where the anchors of triangle drives are, for pictures and lists.
 
 
 @dataclass(frozen=True, eq=False)

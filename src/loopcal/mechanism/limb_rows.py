@@ -207,7 +207,7 @@ def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) 
     return np.concatenate(columns_of_limbs, axis=2)
 
 
-# --- Frames along a limb for displacements and joint values, and the length of its rod.
+# Frames along a limb for displacements and joint values, and the length of its rod.
 
 
 def follow_limb(

@@ -239,7 +239,7 @@ def list_main_freedoms(names: Sequence[str], direction: FloatArray) -> list[str]
     return [str(names[i]) for i in np.argsort(-size) if size[i] > MAIN_SHARE * size.max()]
 
 
-# --- Checks of an assembly: names, limbs, freedoms and ranges that fit together.
+# Checks of an assembly: names, limbs, freedoms and ranges that fit together.
 
 
 def check_assembly(assembly: Assembly, *, is_stage: bool = False) -> None:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     pass
 
 
-# --- The parameters by which poses are differentiated, and how they move displacements and joints.
+# The parameters by which poses are differentiated, and how they move displacements and joints.
 
 
 class MovedSlots(NamedTuple):

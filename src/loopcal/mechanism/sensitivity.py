@@ -20,8 +20,8 @@ import numpy as np
 from loopcal import engine
 from loopcal.engine import State
 from loopcal.mechanism.actuation import (
+    Derivatives,
     DrivenJoints,
-    Motion,
     differentiate_driven_joints,
     differentiate_joints_by_readings,
     differentiate_open_sums,
@@ -46,37 +46,24 @@ from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
 
 
-class PoseSensitivity(NamedTuple):
-    """Derivatives of the platform pose.
-
-    Attributes
-    ----------
-    parameters : (t, n, 6, p) twist (omega in base axes, velocity of the platform's origin) per unit
-        of each parameter.
-    readings : (t, n, 6, a) the same per unit of each reading.
-    """
-
-    parameters: FloatArray
-    readings: FloatArray
-
-
 def differentiate_pose(
     robot: Mechanism,
     values: FloatArray,
     q: FloatArray,
     state: State,
     columns: ParameterUnits | None = None,
-) -> PoseSensitivity:
+) -> Derivatives:
     """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
+    Return the twists (omega in base axes, velocity of the platform's origin) per unit of each
+    parameter (t, n, 6, p) and reading (t, n, 6, a).
     Of loops that may stay open, the derivatives are those of the least-squares closure.
 
     `columns` : the parameters and their units; all parameters in SI without it. Rows of singular
     states have infinities or NaN.
     """
     if robot.stages:
-        whole = differentiate_end(robot, values, q, state, differentiate_pose, columns)
-        return PoseSensitivity(*whole)
+        return differentiate_end(robot, values, q, state, differentiate_pose, columns)
     if robot.has_open_sums:
         derivatives = differentiate_open_sums(robot, values, q, state, columns)
     else:
@@ -95,7 +82,7 @@ def differentiate_pose(
     if lost.any():
         for derivative in derivatives:
             derivative[lost] = np.nan
-    return PoseSensitivity(*derivatives)
+    return Derivatives(*derivatives)
 
 
 def fold_pose_rows(
@@ -151,8 +138,7 @@ def differentiate_passive_joints(
     platform, freedoms = differentiate_pose(robot, values, q, state), list(robot.program.freedoms)
     summed = None
     if robot.has_sums:
-        twist = Motion(platform.parameters, platform.readings)
-        summed = differentiate_driven_joints(robot, values, q, state, twist)
+        summed = differentiate_driven_joints(robot, values, q, state, platform)
     for rows, limbs in linearize_limbs(robot, values, q, state):
         by_parameter = platform.parameters[rows][:, :, freedoms]
         by_reading = platform.readings[rows][:, :, freedoms]

@@ -28,7 +28,7 @@ from loopcal.mechanism.assembly import Actuator
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray, IntArray
 
-# --- Sums of joint values: s = W joints, with a weight for each reading and driven joint.
+# Sums of joint values: s = W joints, with a weight for each reading and driven joint.
 
 SINGULAR = 1e-9
 """Ratio of singular values of weights, each row divided by its largest weight, below which they are
@@ -62,7 +62,7 @@ def count_independent(weights: FloatArray) -> int:
     return int(are_nonzero(s, SINGULAR).sum())
 
 
-# --- Triangle drives: a linear actuator that turns a revolute joint through two anchor points.
+# Triangle drives: a linear actuator that turns a revolute joint through two anchor points.
 
 TRIANGLE_TERMS = (
     *("foot.x", "foot.y", "foot.z", "head.x", "head.y", "head.z", "skew.x", "skew.y"),

@@ -430,7 +430,7 @@ class Autocollimation(AxisKind):
         """Return rows whose mirror faces away from the instrument."""
         away = np.abs(measured) >= np.pi / 2
         return list_rows(
-            away.any(axis=-1),
+            np.asarray(np.any(away, axis=-1)),
             lambda i: (
                 f"has an angle of {np.rad2deg(measured[i][away[i]][0]):.6g} deg, at which the "
                 "mirror faces away from the instrument; check the unit"

@@ -42,7 +42,7 @@ from loopcal.mechanism.families.records import (
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
-# --- Legs of a hexapod as chains: universal joint, driven slide, then a ball or a screw and a
+# Legs of a hexapod as chains: universal joint, driven slide, then a ball or a screw and a
 # second universal joint.
 
 Direction = tuple[Ratio, Ratio, Ratio]

@@ -40,7 +40,7 @@ from loopcal.mechanism.transmission import (
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
-# --- Records of triangle drives: a linear actuator that turns a revolute joint through two
+# Records of triangle drives: a linear actuator that turns a revolute joint through two
 # anchors.
 
 ON_AXIS = 1e-9
@@ -587,7 +587,7 @@ def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
         )
 
 
-# --- Drives of `limbs` files whose readings are sums of joint values: `sum: {m: 1, n: 2}`.
+# Drives of `limbs` files whose readings are sums of joint values: `sum: {m: 1, n: 2}`.
 
 WEIGHT = "weight"
 

@@ -85,7 +85,7 @@ from loopcal.mechanism.families.records import (
 from loopcal.typing import FloatArray
 from loopcal.units import ARTICLES, Dimension
 
-# --- Parameters of `limbs` files: unknown terms of drives, and units of named parameters.
+# Parameters of `limbs` files: unknown terms of drives, and units of named parameters.
 
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)
@@ -309,7 +309,13 @@ class Limbs(LimbsFile, RobotRecord):
         names = tuple(limb.name for limb in self.limbs)
         for limb in self.limbs:
             refuse_branch(limb, names)
-        _refuse_many(self)
+        counts = [1 if limb.copies is None else limb.copies.count for limb in self.limbs]
+        for limb, count in zip(self.limbs, counts, strict=True):
+            if not 1 <= count <= MOST_COPIES:
+                raise MechanismError(
+                    f"limb {limb.name!r} has {count} copies; give 1 to {MOST_COPIES}"
+                )
+        refuse_more(MOST_LIMBS, sum(counts), f"{self.name} has", "limbs")
         members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
         copies = [member for group in members.values() for member in group]
         drives = self._place_drives(copies)
@@ -432,15 +438,6 @@ Drives = Mapping[str, PlacedDrive]
 """Drives by name, with the joints that they move."""
 
 
-def _refuse_many(robot: Limbs) -> None:
-    """Refuse too many copies, and too many limbs, before they are made."""
-    counts = [1 if limb.copies is None else limb.copies.count for limb in robot.limbs]
-    for limb, count in zip(robot.limbs, counts, strict=True):
-        if not 1 <= count <= MOST_COPIES:
-            raise MechanismError(f"limb {limb.name!r} has {count} copies; give 1 to {MOST_COPIES}")
-    refuse_more(MOST_LIMBS, sum(counts), f"{robot.name} has", "limbs")
-
-
 def _copies(limb: LimbRecord) -> Iterator[_Member]:
     """Yield the copies of a limb."""
     if limb.copies is None:
@@ -474,9 +471,12 @@ def _place_copy(limb: LimbRecord, suffix: str, turn: FloatArray) -> PlacedLimb:
     else:
         tip = turn @ tip
     drive = limb.actuated + suffix if limb.actuated else None
-    cones = tuple(Cone(cone.end, _plain(axis_vector(cone.axis)), cone.angle) for cone in limb.cones)
+    cones = []
+    for cone in limb.cones:
+        x, y, z = axis_vector(cone.axis).tolist()
+        cones.append(Cone(cone.end, (x, y, z), cone.angle))
     name, ending, length = limb.name + suffix, limb.ending, limb.length
-    return place_limb(name, tuple(steps), tip, ending, attachment, length, drive, cones)
+    return place_limb(name, tuple(steps), tip, ending, attachment, length, drive, tuple(cones))
 
 
 def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlacement]:
@@ -514,7 +514,11 @@ def _shifts(limb: PlacedLimb, entry: Shifts) -> ErrorModel:
     label = f"{limb.name}.{entry.name or entry.of}"
     for axis in entry.shift:
         if axis == "length":
-            _check_rod(limb, entry)
+            if limb.limb.ending != "distance" or entry.of != "rod":
+                raise MechanismError(
+                    f"{limb.name!r}: 'length' belongs to a rod; write 'of: rod' in a limb that "
+                    "ends in a distance"
+                )
             name = label if entry.name else f"{limb.name}.length"
             errors.append(rod_length_error(limb, name, sd))
             continue
@@ -523,14 +527,6 @@ def _shifts(limb: PlacedLimb, entry: Shifts) -> ErrorModel:
         nominal = (place[:3, :3].T @ place[:3, 3])["xyz".index(axis)]
         errors.append(displacement_error(f"{label}.{axis}", limb, element, axis, sd, nominal))
     return join_errors(errors)
-
-
-def _check_rod(limb: PlacedLimb, entry: Shifts) -> None:
-    if limb.limb.ending != "distance" or entry.of != "rod":
-        raise MechanismError(
-            f"{limb.name!r}: 'length' belongs to a rod; write 'of: rod' in a limb that ends in a "
-            "distance"
-        )
 
 
 def _tilts(limb: PlacedLimb, entry: Tilts) -> ErrorModel:
@@ -593,8 +589,3 @@ def _map_entry(
             yield from map_displacement(name, limb, element, axis, coefficient)
         else:
             yield LinearMap(name, Address(limb.name, entry.element, axis), coefficient)
-
-
-def _plain(vector: FloatArray) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in vector)
-    return x, y, z

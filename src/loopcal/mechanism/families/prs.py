@@ -184,7 +184,7 @@ def carriage_errors(
     return join_errors(errors)
 
 
-# --- RU-PUS-PRS solar trackers: a platform on a post, tilted about two axes by two carriages.
+# RU-PUS-PRS solar trackers: a platform on a post, tilted about two axes by two carriages.
 
 POST_ANGLES = (
     ("thOx", "pivot", "rx"),
@@ -276,7 +276,7 @@ class RuPusPrs(RobotRecord):
         )
 
 
-# --- 3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls.
+# 3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls.
 
 
 @dataclass(frozen=True)

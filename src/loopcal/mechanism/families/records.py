@@ -32,7 +32,7 @@ from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import SD_RANGE, Angle, Dimension, Length, Ratio, is_sd
 
-# --- Limbs with joints about any axis, placed one after the other, in the form of the engine.
+# Limbs with joints about any axis, placed one after the other, in the form of the engine.
 
 EX, EY, EZ = np.eye(3)
 
@@ -232,7 +232,7 @@ def rotate_about(axis: str, angle: float) -> FloatArray:
     return rotation_matrix(geometry.exp_so3(angle * np.eye(3)["xyz".index(axis)]))
 
 
-# --- Error models: named parameters with their maps, by hand for `ideal`, by rule for `complete`.
+# Error models: named parameters with their maps, by hand for `ideal`, by rule for `complete`.
 
 KEPT_AXES: Mapping[str, tuple[str, ...]] = {"R": ("rx", "ry", "x", "y"), "P": ("rx", "ry")}
 """Displacements of a link that its joint does not repeat."""

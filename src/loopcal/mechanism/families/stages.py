@@ -59,7 +59,7 @@ from loopcal.parameters import CommonError
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
-# --- The assembly of a chain: those of its stages, with the stage before each name.
+# The assembly of a chain: those of its stages, with the stage before each name.
 
 
 class StageError(MechanismError):

@@ -107,7 +107,7 @@ def turn_between(vector: FloatArray, target: FloatArray) -> FloatArray:
     return geometry.exp_so3(across / sine * np.arctan2(sine, cosine))
 
 
-# --- Coordinates in which a mechanism can be commanded: those that its motions change
+# Coordinates in which a mechanism can be commanded: those that its motions change
 # independently.
 
 INDEPENDENT = 1e-3

@@ -259,7 +259,7 @@ class JointGraph:
         )
 
 
-# --- Poses at which the loops of a mechanism close, and which of them is a good home.
+# Poses at which the loops of a mechanism close, and which of them is a good home.
 
 STARTS, SPREAD = 24, 0.6
 """Tries to close the loops, and range of their first joint values [rad, sizes]."""
@@ -461,7 +461,7 @@ def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
     )
 
 
-# --- Loops that close but for the rounded digits of their file.
+# Loops that close but for the rounded digits of their file.
 
 
 @dataclass(frozen=True)

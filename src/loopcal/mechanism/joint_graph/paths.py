@@ -31,7 +31,7 @@ from loopcal.mechanism.joint_graph.loops import (
 )
 from loopcal.typing import FloatArray
 
-# --- Blocks of a mechanism: joints in no loop, and groups of loops that share more than one body.
+# Blocks of a mechanism: joints in no loop, and groups of loops that share more than one body.
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +322,7 @@ def _get_end(path: Sequence[GraphJoint], body: str) -> str:
     return body
 
 
-# --- A mechanism of bodies and joints as a chain of stages, from the base to the platform.
+# A mechanism of bodies and joints as a chain of stages, from the base to the platform.
 
 FIRM, FIRM_DRAWN = 0.5, 0.01
 """Share of the best firmness that a home pose must have, and the pose that was drawn [1]."""
@@ -586,7 +586,7 @@ def _describe_branch(whole: JointGraph, block: Block, platform: str) -> object:
     return report_finding("files.no-limbs", platform=platform, platforms=others)
 
 
-# --- From links, joints and welded frames to a mechanism: rigid bodies, pins, a tree and its
+# From links, joints and welded frames to a mechanism: rigid bodies, pins, a tree and its
 # closures.
 
 COAXIAL = 1e-9
