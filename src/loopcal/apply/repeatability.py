@@ -34,6 +34,7 @@ from loopcal.diagnose.row_errors import (
     compute_row_errors,
 )
 from loopcal.errors import DataError
+from loopcal.estimate.residual_test import coverage_factor
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.data_checks import check_actuators
@@ -318,7 +319,7 @@ def describe_visits(attained: FloatArray, is_position: bool) -> VisitedPose:
     """
     n = len(attained)
     mean, sd = attained.mean(axis=0), attained.std(axis=0, ddof=1)
-    half = _student_quantile(n - 1) * sd / np.sqrt(n)
+    half = coverage_factor(n - 1) * sd / np.sqrt(n)
     low, high = (np.sqrt((n - 1) / compute_chi_square_quantile(n - 1, p)) for p in (TAIL, 1 - TAIL))
     return VisitedPose(
         pose="",
@@ -362,7 +363,7 @@ def _estimate_accuracy(attained: FloatArray) -> Estimate:
         return Estimate(size, size, size)
     along = float(mean @ covariance @ mean) / size**2 if size > 0.0 else 0.0
     unit = max(along, SMALLEST_SHARE * trace)
-    factor, degrees = _student_quantile(n - 1), trace / unit
+    factor, degrees = float(coverage_factor(n - 1)), trace / unit
     unit *= (factor / NORMAL) ** 2 / n
     statistic = size**2 / unit
     if statistic > LARGE:
@@ -391,13 +392,6 @@ def _estimate_repeatability(attained: FloatArray) -> Estimate:
     drawn = compute_repeatability(stream.standard_normal((DRAWS, n, len(root))) * root)
     low, high = np.quantile(drawn / true, [TAIL, 1.0 - TAIL])
     return Estimate(value, value / float(high), value / float(low))
-
-
-def _student_quantile(degrees: int) -> float:
-    """Return the quantile of Student's t for intervals of 95 %."""
-    from loopcal.numerics.special_functions import stdtrit
-
-    return float(stdtrit(degrees, 1.0 - TAIL))
 
 
 def _find_variations(poses: Sequence[VisitedPose]) -> dict[tuple[str, str], float]:

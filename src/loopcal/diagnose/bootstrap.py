@@ -29,14 +29,7 @@ from loopcal.diagnose.cluster_covariance import (
     divide_into_clusters,
 )
 from loopcal.diagnose.influence import TESTABLE
-from loopcal.diagnose.intervals import (
-    NAMED,
-    OFF,
-    Intervals,
-    compare_ends,
-    half_widths,
-    report_intervals,
-)
+from loopcal.diagnose.intervals import NAMED, OFF, Intervals, compare_ends, report_intervals
 from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
@@ -48,7 +41,7 @@ from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.pose_linearization import linearize_rows
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.resampling import Resamples, draw_centers, fit_resamples, join_fits
-from loopcal.estimate.residual_test import LEVEL
+from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
@@ -480,7 +473,7 @@ class Bootstrap(TableResult):
             shift, error = (ends.quantile - ends.linear) / half, ends.error / half
         lower, upper = self._ends(kind, level, ends.quantile)
         degrees = self.scatter.degrees if self.scheme != "normal" else np.inf
-        widen = half_widths(level, degrees) / half_widths(level)
+        widen = coverage_factor(degrees, level) / coverage_factor(np.inf, level)
         linear = estimate + (ends.linear - estimate) * (widen if kind == "widened" else 1.0)
         return Intervals(
             names=self.fit.names,
@@ -522,7 +515,7 @@ class Bootstrap(TableResult):
         if kind == "percentile" or (kind == "widened" and self.scheme == "normal"):
             return quantile[0], quantile[1]
         if kind == "widened":
-            factor = half_widths(level, self.scatter.degrees) / half_widths(level)
+            factor = coverage_factor(self.scatter.degrees, level) / coverage_factor(np.inf, level)
             return tuple(estimate + (quantile - estimate) * factor)
         if kind == "studentized":
             ratio = (self.draws - estimate) / self.sd

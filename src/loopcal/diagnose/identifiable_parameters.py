@@ -354,7 +354,23 @@ def identifiability(
             )
         )
     decomposition = decompose(factor, np.full(1, count), tolerance=rank_tolerance)
-    return _summarize(free, decomposition, factor[0, :-1, :-1])
+    rows = factor[0, :-1, :-1]
+    s, V = decomposition.singular_values[0], decomposition.directions[0]
+    rank, equations = int(decomposition.rank[0]), int(decomposition.rows[0])
+    null, n_improved = decomposition.null_space(), int((s[:rank] > 1.0).sum())
+    weakest = range(rank - 1, max(n_improved, rank - MOST_WEAK) - 1, -1)
+    combinations = describe_null_space(free, null)
+    return Identifiability(
+        free,
+        rows,
+        decomposition,
+        unidentifiable=interpret_combinations(free, combinations),
+        weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
+        indices=compute_observability(s, rank, equations),
+        parameters=_judge_parameters(
+            free, null, compute_remaining_sd(rows, free.correlation_root())
+        ),
+    )
 
 
 def compute_remaining_sd(rows: FloatArray, root: FloatArray) -> FloatArray:
@@ -363,28 +379,6 @@ def compute_remaining_sd(rows: FloatArray, root: FloatArray) -> FloatArray:
     """
     _, s, vt = np.linalg.svd(rows @ root, full_matrices=False)
     return np.sqrt(((root @ vt.T) ** 2 / (1.0 + s**2)).sum(axis=1))
-
-
-def _summarize(
-    free: FreeParameters, decomposition: Decomposition, factor: FloatArray
-) -> Identifiability:
-    """Return the identifiability by a decomposition (t = 1) of a factor (p, p)."""
-    s, V = decomposition.singular_values[0], decomposition.directions[0]
-    rank, equations = int(decomposition.rank[0]), int(decomposition.rows[0])
-    null, n_improved = decomposition.null_space(), int((s[:rank] > 1.0).sum())
-    weakest = range(rank - 1, max(n_improved, rank - MOST_WEAK) - 1, -1)
-    combinations = describe_null_space(free, null)
-    return Identifiability(
-        free,
-        factor,
-        decomposition,
-        unidentifiable=interpret_combinations(free, combinations),
-        weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
-        indices=compute_observability(s, rank, equations),
-        parameters=_judge_parameters(
-            free, null, compute_remaining_sd(factor, free.correlation_root())
-        ),
-    )
 
 
 def _judge_parameters(

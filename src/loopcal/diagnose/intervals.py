@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.estimate.residual_test import coverage_factor
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.statistics import compute_single_level
 from loopcal.results.description import Field, fields, label_axes
@@ -139,7 +140,7 @@ class Intervals(TableResult):
         tested = int(np.isfinite(self.shift).sum())
         if not tested:
             return np.zeros(len(self.names), dtype=bool)
-        quantile = float(half_widths(1.0 - compute_single_level(FALSE_ALARMS, tested)))
+        quantile = float(coverage_factor(np.inf, 1.0 - compute_single_level(FALSE_ALARMS, tested)))
         beyond = np.abs(self.shift) - quantile * self.shift_error
         return np.asarray((np.where(np.isnan(beyond), 0.0, beyond) > OFF).any(axis=0))
 
@@ -185,24 +186,13 @@ def compare_ends(
     reference = weighted_quantiles(linear, linear_weight, tails)
     mean = linear_weight @ linear
     sd = np.sqrt(linear_weight @ (linear - mean) ** 2)
-    density = np.exp(-0.5 * float(half_widths(level)) ** 2) / np.sqrt(2.0 * np.pi)
+    density = np.exp(-0.5 * float(coverage_factor(np.inf, level)) ** 2) / np.sqrt(2.0 * np.pi)
     error = np.zeros_like(quantile)
     for i, tail in enumerate(tails):
         own = weight[:, None] * ((draws <= quantile[i]) - tail)
         other = linear_weight[:, None] * ((linear <= reference[i]) - tail)
         error[i] = np.sqrt(((own - other) ** 2).sum(axis=0)) * sd / density
     return EndDifference(quantile, reference, error)
-
-
-def half_widths(level: float, degrees: FloatArray | float = np.inf) -> FloatArray:
-    """Return half-widths in standard deviations of two-sided intervals, by Student's t."""
-    from loopcal.numerics.special_functions import ndtri, stdtrit
-
-    quantile = 0.5 + 0.5 * level
-    nu = np.asarray(degrees, dtype=np.float64)
-    finite = np.isfinite(nu)
-    by_t = stdtrit(np.where(finite, nu, 1.0), quantile)
-    return np.asarray(np.where(finite, by_t, ndtri(quantile)))
 
 
 def report_intervals(intervals: Intervals, agrees: str, differs: str) -> list[Finding]:

@@ -24,10 +24,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from loopcal.diagnose.intervals import half_widths
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.posterior import Posterior
-from loopcal.estimate.residual_test import LEVEL
+from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
@@ -225,7 +224,7 @@ def compute_simultaneous_intervals(
     else:
         tail = 1.0 - level
         single = 1.0 - (compute_single_level(tail, q) if rule == "sidak" else tail / q)
-        factor = half_widths(single, degrees)
+        factor = coverage_factor(degrees, single)
     return SimultaneousIntervals(
         chosen.names,
         chosen.center,
@@ -233,7 +232,7 @@ def compute_simultaneous_intervals(
         level,
         rule,
         factor,
-        half_widths(level, degrees) * chosen.sd,
+        coverage_factor(degrees, level) * chosen.sd,
     )
 
 

@@ -20,7 +20,6 @@ from loopcal.diagnose.intervals import (
     compare_ends,
     effective_size,
     fit_tail_shape,
-    half_widths,
     normalize_weights,
     report_intervals,
 )
@@ -30,7 +29,7 @@ from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.prior import WithPrior
 from loopcal.estimate.resampling import repeat_trial, resample_rows
-from loopcal.estimate.residual_test import LEVEL
+from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
@@ -211,7 +210,7 @@ class PosteriorSample(TableResult):
         A quantile is the linear one plus the difference of the two in the same draws.
         """
         ends = compare_ends(self.draws, self.weight, self.draws, self.linear_weight, level)
-        half = half_widths(level, self.degrees) * self.linear_sd
+        half = coverage_factor(self.degrees, level) * self.linear_sd
         linear = self.linear_mean + np.array([[-1.0], [1.0]]) * half
         change = ends.quantile - ends.linear
         known = np.where(np.isfinite(self.linear_sd), 1.0, np.nan)

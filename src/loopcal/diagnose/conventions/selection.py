@@ -339,8 +339,16 @@ def _test_all(
     """Test all single interpretations of data as written, `reached` where the robot reaches them;
     those of the values only if it reaches enough poses.
     """
-    values = [] if reached is None else _test_values(free, reached, misfit)
-    return values + _test_readings(free, data, misfit, nearest)
+    tests = []
+    if reached is not None:
+        listed, few = list(list_interpretations(reached)), reached.take(_select_few(reached))
+        screened = compute_misfits(free, few, listed, QUICK)
+        promising = _select_promising(screened, misfit)
+        judged = np.full(len(listed), np.inf)
+        chosen = [listed[i] for i in promising]
+        judged[promising] = compute_misfits(free, reached, chosen, THOROUGH)
+        tests = _list_tests(listed, screened, judged)
+    return tests + _test_readings(free, data, misfit, nearest)
 
 
 def _test_pairs(
@@ -440,16 +448,6 @@ def _select_few(data: Measurements) -> IntArray:
     if n <= count or shares_poses(data):
         return np.arange(n)
     return find_distinct(np.linspace(0, n - 1, count).astype(np.intp))
-
-
-def _test_values(free: FreeParameters, data: Measurements, misfit: float) -> list[_Test]:
-    """Test all interpretations of the measured values."""
-    listed = list(list_interpretations(data))
-    screened = compute_misfits(free, data.take(_select_few(data)), listed, QUICK)
-    promising = _select_promising(screened, misfit)
-    judged = np.full(len(listed), np.inf)
-    judged[promising] = compute_misfits(free, data, [listed[i] for i in promising], THOROUGH)
-    return _list_tests(listed, screened, judged)
 
 
 def _test_readings(
