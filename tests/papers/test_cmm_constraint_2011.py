@@ -264,7 +264,8 @@ def test_every_verdict_can_be_does_not_agree(results) -> None:
 def test_fits_that_did_not_converge_are_left_out_of_the_medians() -> None:
     errors = np.array([[1.0], [2.0], [100.0]])
     converged = {LS: np.array([True, True, False]), PRIOR: np.zeros(3, dtype=bool)}
-    of_methods, count = dict.fromkeys((BEFORE, LS, PRIOR), errors), np.zeros(3, dtype=int)
+    count = np.zeros(3, dtype=int)
+    of_methods: dict[str, np.ndarray] = {name: errors for name in (BEFORE, LS, PRIOR)}  # noqa: C420
     cell = Cell(1e-3, 1e-5, of_methods, count, converged, errors, {})
     assert cell.compute_median(BEFORE, MEASURES[0]) == 2.0
     assert cell.compute_median(LS, MEASURES[0]) == 1.5

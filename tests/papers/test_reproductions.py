@@ -124,7 +124,9 @@ def test_legend_covers_no_curve_and_lies_within_the_picture(count, log) -> None:
         xy = axes.transData.transform(line.get_xydata())
         inside = (xy[:, 0] >= x0) & (xy[:, 0] <= x1) & (xy[:, 1] >= y0) & (xy[:, 1] <= y1)
         assert not inside.any()
-    assert not legend.overlaps(axes.get_tightbbox())
+    drawn = axes.get_tightbbox()
+    assert drawn is not None
+    assert not legend.overlaps(drawn)
     assert canvas.bbox.x0 <= x0
     assert x1 <= canvas.bbox.x1
     assert canvas.bbox.y0 <= y0

@@ -8,6 +8,7 @@ Page: docs/papers/tsvd-2016.md.
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -398,7 +399,7 @@ def test_tables_state_accuracy_after_commanding(results) -> None:
     for draws in results.draws:
         table = make_medians(draws)
         place = table.columns.index("phi and theta after commanding [deg]")
-        rows = {row[0]: row for row in table.rows}
+        rows: dict[Any, Any] = {row[0]: row for row in table.rows}
         assert rows[TRUE][place] < 1e-9
         assert rows[BEFORE][place] > 10.0 * rows[PRIOR][place] > 0.0
         assert rows[PRIOR][place - 1] == pytest.approx(rows[TRUE][place - 1], rel=0.1)

@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 
 from loopcal.findings.wording import fill_template
-from loopcal.typing import FloatArray
 
 OWN_CHECK = "our own check, not a statement of the paper"
 """Place of a claim that the paper does not make."""
@@ -114,9 +113,7 @@ class Claim:
             return self._word([self.decide({**data, **drawn}) for drawn in draws], data)
         return self._word([], data, self.decide(data))
 
-    def judge_everywhere(
-        self, places: Mapping[str, Mapping[str, FloatArray]], /, **data: Any
-    ) -> Verdict:
+    def judge_everywhere(self, places: Mapping[str, Mapping[str, Any]], /, **data: Any) -> Verdict:
         """Return the verdict on a claim that holds in a draw if it holds there in all places.
 
         Parameters

@@ -72,7 +72,7 @@ class Series:
     y: tuple[float, ...]
 
     @classmethod
-    def of(cls, label: str, x: Sequence[Any] | FloatArray, y: Sequence[Any] | FloatArray) -> Series:
+    def of(cls, label: str, x: Iterable[Any], y: Iterable[Any]) -> Series:
         """Return a line of numbers."""
         return cls(label, tuple(map(float, x)), tuple(map(float, y)))
 
@@ -272,9 +272,12 @@ class PaperText:
     ) -> Figure:  # fmt: skip
         """Return a figure; log : default that of text.yaml."""
         text = self.content["figures"][name]
-        words = (fill_template(text[key], **data) for key in ("title", "x", "y", "caption"))
+        title, x, y, caption = (
+            fill_template(text[key], **data) for key in ("title", "x", "y", "caption")
+        )
         log = text.get("log", "y") if log is None else log
-        return Figure(file_name or name, *words, tuple(series), levels or {}, log, joined)
+        name, lines = file_name or name, tuple(series)
+        return Figure(name, title, x, y, caption, lines, levels or {}, log, joined)
 
 
 def last_digit(text: str) -> float:

@@ -132,7 +132,7 @@ def write_folder(
     return path
 
 
-def choose_styles(figures: Sequence[Figure]) -> dict[str, dict[str, str]]:
+def choose_styles(figures: Sequence[Figure]) -> dict[str, dict[str, Any]]:
     """Return color and marker of each label of the legends: the same in all figures of a study;
     labels of one figure differ in color as far as there are colors.
     """
@@ -150,7 +150,7 @@ def choose_styles(figures: Sequence[Figure]) -> dict[str, dict[str, str]]:
     }
 
 
-def draw(figure: Figure, styles: Mapping[str, Mapping[str, str]]) -> Canvas:
+def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
     """Draw a figure with its legend below the axes; styles : see `choose_styles`."""
     from matplotlib.ticker import MaxNLocator
 

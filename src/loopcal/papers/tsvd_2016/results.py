@@ -462,7 +462,7 @@ def _draw_steps(results: Results) -> Figure:
 # --- verdicts -----------------------------------------------------------------------------------
 
 
-Numbers = Mapping[str, FloatArray]
+Numbers = Mapping[str, Any]
 """Quantity -> (t,) its number in each draw."""
 
 

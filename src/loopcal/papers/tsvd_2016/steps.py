@@ -586,7 +586,7 @@ def run_situation(measured: Study, progress: Callable[[str], None] = lambda _: N
     ks = np.arange(p, p // 3, -1)
     k = len(ks)
     penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(LAMBDAS, p)])
-    settings = np.concatenate([ks, LAMBDAS])
+    settings = np.concatenate([ks.astype(np.float64), LAMBDAS])
     parts = []
     for first in range(0, t, TOGETHER):
         progress(f"{measured.label}, machine {first + 1} of {t}")
