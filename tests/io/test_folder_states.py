@@ -15,7 +15,6 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from evidence.interruption import INTERRUPT, KILL, LEFTOVER, TRACED, strike
 from loopcal.errors import FileError
-from loopcal.io.core import replacement
 from loopcal.io.core.result_folder import FolderKind, describe_leftover, write_result_folder
 from tests.io.folder_writing import RUN, run_in_copy, write
 
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.forks
 STUDY = FolderKind("study", "result.json", ("made_by", "paper"), ("page.md", "tables/*.csv"))
 
 
-def write_until(path: Path, value: int, force: bool, how: str, moment: int, exchange: bool) -> str:
+def write_until(path: Path, value: int, force: bool, how: str, moment: int) -> str:
     """Write a folder, but strike before a line of Python; return why it was refused."""
     lines = 0
 
@@ -38,8 +37,6 @@ def write_until(path: Path, value: int, force: bool, how: str, moment: int, exch
                 strike(os.getpid(), how)
         return trace
 
-    if not exchange:
-        replacement._find_renameat2 = lambda: None
     sys.settrace(trace)
     try:
         return write(path, value, force)
@@ -90,21 +87,13 @@ class RunFolder(RuleBasedStateMachine):
             self.value = value
             assert [p.name for p in self.place.iterdir()] == ["run"]
 
-    @rule(
-        force=st.booleans(),
-        how=st.sampled_from([KILL, INTERRUPT]),
-        moment=st.integers(1, 400),
-        exchange=st.booleans(),
-    )
-    def stop(self, force: bool, how: str, moment: int, exchange: bool) -> None:
+    @rule(force=st.booleans(), how=st.sampled_from([KILL, INTERRUPT]), moment=st.integers(1, 400))
+    def stop(self, force: bool, how: str, moment: int) -> None:
         expected, value = self.expect(force), self.next
         self.next += 1
-        status, said = run_in_copy(
-            lambda: write_until(self.path, value, force, how, moment, exchange)
-        )
+        status, said = run_in_copy(lambda: write_until(self.path, value, force, how, moment))
         assert said is not None or os.WIFSIGNALED(status)
         if not self.path.exists() and self.value is not None:
-            assert not exchange
             sentence = describe_leftover(self.path, RUN.document)
             assert "an interrupted command left it as" in sentence
             assert self.expect(force=False) in write(self.path, value, force=False)

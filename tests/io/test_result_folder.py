@@ -115,14 +115,14 @@ def test_folder_with_another_document_is_not_replaced(tmp_path, text) -> None:
 
 def test_folder_that_changes_during_the_exchange_is_kept(tmp_path, monkeypatch) -> None:
     write(tmp_path / "a")
-    exchange = replacement._exchange_names
+    exchange = replacement._exchange
 
     def add_a_file_first(first: Path, second: Path) -> bool:
         if first.name.startswith(".loopcal-new") and not (first / "mine").exists():
             (second / "mine").touch()
         return exchange(first, second)
 
-    monkeypatch.setattr(replacement, "_exchange_names", add_a_file_first)
+    monkeypatch.setattr(replacement, "_exchange", add_a_file_first)
     with pytest.raises(FileError, match="a: this folder also contains mine"):
         write(tmp_path / "a", force=True, text="new")
     assert sorted(read_all(tmp_path / "a")) == ["arrays.npz", "mine", "result.json", "robot.yaml"]
@@ -144,11 +144,21 @@ def test_symbolic_link_stays_a_link(tmp_path) -> None:
         refuse_folder(tmp_path / "circle", RUN, force=True)
 
 
-def test_folder_without_exchange_is_replaced_by_two_renames(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(replacement, "_find_renameat2", lambda: None)
+def test_folder_whose_name_is_taken_between_two_renames_is_written(tmp_path, monkeypatch) -> None:
+    """Another command takes the name while the old folder is set aside."""
+    take, other = replacement._take_free_name, tmp_path / "b"
+    write(other, text="other")
+
+    def take_later(temporary: Path, target: Path) -> bool:
+        if other.exists() and not target.exists() and list_leftovers(target, OLD):
+            other.rename(target)
+        return take(temporary, target)
+
+    monkeypatch.setattr(replacement, "_take_free_name", take_later)
     write(tmp_path / "a")
-    write(tmp_path / "a", force=True, text="new")
-    assert b"new" in read_all(tmp_path / "a")["result.json"]
+    for text in ("new", "newer"):  # the second one removes the folder that was set aside
+        write(tmp_path / "a", force=True, text=text)
+        assert f'"{text}"'.encode() in read_all(tmp_path / "a")["result.json"]
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 

@@ -2,9 +2,8 @@
 """Files and folders that take a name only when they are complete.
 
 New content has a temporary name beside its target, such as `.loopcal-new-0123456789abcdef-run`. It
-is created exclusively, and locked as long as its writer lives. A folder and its successor exchange
-their names in one step where the operating system can (Linux: renameat2). Elsewhere, the old folder
-is first set aside as `.loopcal-old-0123456789abcdef-run`.
+is created exclusively, and locked as long as its writer lives. An old folder, also locked, is first
+set aside as `.loopcal-old-0123456789abcdef-run`, for the moment between two renames.
 
 What a killed writer leaves behind has such a name and no lock. The next write to the target returns
 a folder that was set aside to its name, and removes the rest if it is loopcal's.
@@ -12,7 +11,6 @@ a folder that was set aside to its name, and removes the rest if it is loopcal's
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import os
 import re
@@ -21,7 +19,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache
 from pathlib import Path
 
 from loopcal.output_record import identify, note_output
@@ -179,7 +176,8 @@ def place_folder(
                 continue
             if check is not None:
                 check(target)
-            _exchange(temporary, target)
+            if not _exchange(temporary, target):
+                continue
             if check is not None:
                 _check_replaced(temporary, target, check)
             sync_folder(target.parent)
@@ -287,50 +285,21 @@ def _check_replaced(old: Path, target: Path, check: Callable[[Path], None]) -> N
         raise
 
 
-def _exchange(new: Path, old: Path) -> None:
-    """Exchange the names of two folders; in one step where the operating system can."""
-    if _exchange_names(new, old):
-        return
+def _exchange(new: Path, old: Path) -> bool:
+    """Exchange the names of two folders; return False where another program has taken the name of
+    the old one, which then stays set aside, while it had none.
+    """
     aside = _name_beside(old, OLD)
     try:
         old.rename(aside)
-        new.rename(old)
+        if not _take_free_name(new, old):
+            return False
     except BaseException:
         if aside.exists() and not old.exists():
             aside.rename(old)
         raise
     aside.rename(new)
-
-
-def _exchange_names(first: Path, second: Path) -> bool:
-    """Exchange two names in one step; return False where that is not supported."""
-    function = _find_renameat2()
-    if function is None:
-        return False
-    at_cwd, exchange = -100, 2
-    if function(at_cwd, os.fsencode(first), at_cwd, os.fsencode(second), exchange) == 0:
-        return True
-    number = ctypes.get_errno()
-    if number in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM):
-        return False
-    raise OSError(number, os.strerror(number), str(second))
-
-
-@cache
-def _find_renameat2() -> Callable[[int, bytes, int, bytes, int], int] | None:
-    """Return renameat2 of the C library; None where it is missing."""
-    try:
-        function = ctypes.CDLL(None, use_errno=True).renameat2
-    except (AttributeError, OSError, TypeError):
-        return None
-    function.argtypes = [
-        ctypes.c_int,
-        ctypes.c_char_p,
-        ctypes.c_int,
-        ctypes.c_char_p,
-        ctypes.c_uint,
-    ]
-    return function
+    return True
 
 
 def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
