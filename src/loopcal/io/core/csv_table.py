@@ -39,7 +39,7 @@ from loopcal.plain_text import quote
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import LARGEST, Dimension, find_unit
 
-# --- Many numbers as text at once, to the same doubles as one after the other by `parse_exact`.
+# Many numbers as text at once, to the same doubles as one after the other by `parse_exact`.
 
 MOST_DIGITS = 18
 """Digits of a plain decimal, so that its whole number is below 2^63."""
@@ -147,7 +147,7 @@ def _find_rounding(a: FloatArray, b: FloatArray, product: FloatArray) -> FloatAr
     return np.asarray(error + a_low * b_low)
 
 
-# --- Numbers as text: the fewest digits that read back as the same double.
+# Numbers as text: the fewest digits that read back as the same double.
 
 DIGITS = range(12, 18)
 """Significant digits that are tried, fewest first; 17 always suffice for one double."""

@@ -72,7 +72,9 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
         content = json.loads(
             text,
             parse_float=lambda number: _refuse_infinite(float(number), number),
-            parse_int=lambda number: _refuse_infinite(_read_whole(number), number),
+            parse_int=lambda number: _refuse_infinite(
+                int(number) if len(number) <= LONGEST_WHOLE else math.inf, number
+            ),
             parse_constant=lambda name: _refuse_infinite(math.nan, name),
             object_pairs_hook=_refuse_duplicates,
         )
@@ -83,22 +85,12 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
         raise FileError(f"not valid JSON ({error}); {action}", path) from None
     except RecursionError:
         raise JSON_DEPTH.make_error(what, path) from None
-    JSON_DEPTH.check(_measure_depth(content), what, path)
-    return content
-
-
-def _measure_depth(content: Any) -> int:
-    """Return how many lists and mappings are inside each other."""
     depth, layer = 0, [content]
     while layer := [node for node in layer if isinstance(node, list | dict)]:
         depth += 1
         layer = [c for n in layer for c in (n.values() if isinstance(n, dict) else n)]
-    return depth
-
-
-def _read_whole(text: str) -> float:
-    """Return a whole number, as infinite where no double is as large."""
-    return int(text) if len(text) <= LONGEST_WHOLE else math.inf
+    JSON_DEPTH.check(depth, what, path)
+    return content
 
 
 def _refuse_infinite(value: float, text: str) -> float:

@@ -109,6 +109,30 @@ YAML_DEPTH = FileLimit(
     "lists and mappings inside each other",
     "write it with fewer levels",
 )
+COPIES = FileLimit("copies of a limb", MOST_COPIES, "copies", "`copies: {count: ..}` of a limb")
+LIMBS = FileLimit("limbs of a robot", MOST_LIMBS, "limbs", "copies included")
+JOINTS = FileLimit("joints of a limb", MOST_JOINTS, "joints", "a universal joint counts as two")
+ACTUATORS = FileLimit("actuators of a robot", MOST_ACTUATORS, "actuators", "of all limbs together")
+PARAMETERS = FileLimit(
+    "parameters of a robot", MOST_PARAMETERS, "parameters", "those that are fixed included"
+)
+NAME_LENGTH = FileLimit(
+    "length of a name",
+    200,
+    "characters",
+    "robots, limbs, actuators, sessions, targets, and every other text of a YAML file",
+    "shorten it",
+)
+COMPOSED_LENGTH = FileLimit(
+    "length of a composed name",
+    1_000,
+    "characters",
+    "names such as `monday.tracker.x`, headers of columns, names of poses",
+    "shorten it",
+)
+TEXT_LENGTH = FileLimit(
+    "length of a text that is no name", 10_000, "characters", "`source` of a robot", "shorten it"
+)
 TABLE_SIZE = FileLimit(
     "size of a measurement file",
     500,
@@ -145,60 +169,6 @@ LINE_LENGTH = FileLimit(
     "lines of measurement files and exports",
     "check that this is a table of text, one row in a line",
 )
-PROGRAM_SIZE = FileLimit(
-    "size of a file of another program",
-    5,
-    "MB",
-    "files that `loopcal import` and `loopcal export` read",
-    "check that this is the file that was meant, or remove what does not belong there",
-    MEGABYTE,
-)
-XML_JOINTS = FileLimit(
-    "joints of a URDF",
-    300,
-    "joints",
-    "fixed ones included",
-    "leave out joints that belong to no loop",
-)
-JSON_VALUES = FileLimit(
-    "values in JSON text",
-    10_000_000,
-    "values",
-    "`result.json` of a run, samples of a cable robot; keys included",
-    "check that this is the file that was meant",
-)
-JSON_DEPTH = FileLimit(
-    "nesting of JSON text",
-    200,
-    "levels of nesting",
-    "lists and objects inside each other",
-    "simplify it",
-)
-XML_DEPTH = FileLimit(
-    "nesting of a URDF",
-    50,
-    "levels of nesting",
-    "elements inside each other",
-    "check that this is the file that was meant",
-)
-XML_ELEMENTS = FileLimit(
-    "elements of a URDF",
-    20_000,
-    "elements",
-    "elements of every kind",
-    "leave out what loopcal does not read, such as visuals",
-)
-ARRAYS_SIZE = FileLimit(
-    "size of `arrays.npz`",
-    4_000,
-    "MB",
-    "arrays of a run folder, as a file and in memory; they are never compressed",
-    "repeat the calibration with fewer poses",
-    MEGABYTE,
-)
-ARRAYS_COUNT = FileLimit(
-    "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"
-)
 PATTERN_LENGTH = FileLimit(
     "length of a pattern of a profile",
     1_000,
@@ -219,60 +189,62 @@ PATTERN_SECONDS = FileLimit(
     "seconds",
     "for one export, and 0.1 ms more for each of its lines",
 )
-NAME_LENGTH = FileLimit(
-    "length of a name",
+PROGRAM_SIZE = FileLimit(
+    "size of a file of another program",
+    5,
+    "MB",
+    "files that `loopcal import` and `loopcal export` read",
+    "check that this is the file that was meant, or remove what does not belong there",
+    MEGABYTE,
+)
+JSON_VALUES = FileLimit(
+    "values in JSON text",
+    10_000_000,
+    "values",
+    "`result.json` of a run, samples of a cable robot; keys included",
+    "check that this is the file that was meant",
+)
+JSON_DEPTH = FileLimit(
+    "nesting of JSON text",
     200,
-    "characters",
-    "robots, limbs, actuators, sessions, targets, and every other text of a YAML file",
-    "shorten it",
+    "levels of nesting",
+    "lists and objects inside each other",
+    "simplify it",
 )
-COMPOSED_LENGTH = FileLimit(
-    "length of a composed name",
-    1_000,
-    "characters",
-    "names such as `monday.tracker.x`, headers of columns, names of poses",
-    "shorten it",
+XML_JOINTS = FileLimit(
+    "joints of a URDF",
+    300,
+    "joints",
+    "fixed ones included",
+    "leave out joints that belong to no loop",
 )
-TEXT_LENGTH = FileLimit(
-    "length of a text that is no name", 10_000, "characters", "`source` of a robot", "shorten it"
+XML_ELEMENTS = FileLimit(
+    "elements of a URDF",
+    20_000,
+    "elements",
+    "elements of every kind",
+    "leave out what loopcal does not read, such as visuals",
 )
-COPIES = FileLimit("copies of a limb", MOST_COPIES, "copies", "`copies: {count: ..}` of a limb")
-LIMBS = FileLimit("limbs of a robot", MOST_LIMBS, "limbs", "copies included")
-JOINTS = FileLimit("joints of a limb", MOST_JOINTS, "joints", "a universal joint counts as two")
-ACTUATORS = FileLimit("actuators of a robot", MOST_ACTUATORS, "actuators", "of all limbs together")
-PARAMETERS = FileLimit(
-    "parameters of a robot", MOST_PARAMETERS, "parameters", "those that are fixed included"
+XML_DEPTH = FileLimit(
+    "nesting of a URDF",
+    50,
+    "levels of nesting",
+    "elements inside each other",
+    "check that this is the file that was meant",
+)
+ARRAYS_SIZE = FileLimit(
+    "size of `arrays.npz`",
+    4_000,
+    "MB",
+    "arrays of a run folder, as a file and in memory; they are never compressed",
+    "repeat the calibration with fewer poses",
+    MEGABYTE,
+)
+ARRAYS_COUNT = FileLimit(
+    "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"
 )
 
-LIMITS: tuple[FileLimit, ...] = (
-    YAML_SIZE,
-    YAML_NODES,
-    YAML_DEPTH,
-    COPIES,
-    LIMBS,
-    JOINTS,
-    ACTUATORS,
-    PARAMETERS,
-    NAME_LENGTH,
-    COMPOSED_LENGTH,
-    TEXT_LENGTH,
-    TABLE_SIZE,
-    TABLE_ROWS,
-    TABLE_LINES,
-    TABLE_COLUMNS,
-    LINE_LENGTH,
-    PATTERN_LENGTH,
-    PATTERN_COUNTS,
-    PATTERN_SECONDS,
-    PROGRAM_SIZE,
-    JSON_VALUES,
-    JSON_DEPTH,
-    XML_JOINTS,
-    XML_ELEMENTS,
-    XML_DEPTH,
-    ARRAYS_SIZE,
-    ARRAYS_COUNT,
-)
+LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit))
 """All limits, in the order of docs/files.md."""
 
 
@@ -312,24 +284,10 @@ REPLICATES = CountLimit(
 )
 WORKERS = CountLimit(4_096, "workers", "`workers` of `loopcal study run` and `extend`")
 
-COUNT_LIMITS: tuple[CountLimit, ...] = (
-    DRAWN_POSES,
-    PLANNED_POSES,
-    CANDIDATES,
-    GROUPS,
-    POINTS,
-    RESAMPLES,
-    DRAWS,
-    TRIALS,
-    STEPS,
-    FOLDS,
-    REPLICATES,
-    WORKERS,
-)
+COUNT_LIMITS = tuple(value for value in vars().values() if isinstance(value, CountLimit))
 """The limits of counts, in the order of docs/files.md."""
 
-
-# --- The rule for names in files: of robots, limbs, actuators, poses, sessions, targets, columns.
+# The rule for names in files: of robots, limbs, actuators, poses, sessions, targets, columns.
 
 LONGEST_NAME, LONGEST_COMPOSED = NAME_LENGTH.count, COMPOSED_LENGTH.count
 """Characters of a name, and of one that is composed of others, such as `monday.tracker.x`."""

@@ -23,7 +23,7 @@ from pathlib import Path
 
 from loopcal.output_record import identify, note_output
 
-# --- Open files and folders: locks, identity, and writing to the disk.
+# Open files and folders: locks, identity, and writing to the disk.
 
 try:
     import fcntl
@@ -44,14 +44,6 @@ def watch_folder(path: Path) -> Iterator[Callable[[], bool]]:
     finally:
         if descriptor is not None:
             os.close(descriptor)
-
-
-def sync_tree(folder: Path) -> None:
-    """Write all files of a folder, and their names, to the disk."""
-    for place, _, names in os.walk(folder):
-        for name in names:
-            sync_file(Path(place, name))
-        sync_folder(Path(place))
 
 
 def sync_file(path: Path) -> None:
@@ -168,7 +160,10 @@ def place_folder(
     check : is called with a folder that is to be replaced, and raises where it must stay. It is
         called again with what was replaced, which another program may have changed.
     """
-    sync_tree(temporary)
+    for place, _, names in os.walk(temporary):
+        for name in names:
+            sync_file(Path(place, name))
+        sync_folder(Path(place))
     note_output(path, target, temporary)
     while not _take_free_name(temporary, target):
         with _lock_folder(target) as is_locked:
@@ -178,8 +173,14 @@ def place_folder(
                 check(target)
             if not _exchange(temporary, target):
                 continue
-            if check is not None:
-                _check_replaced(temporary, target, check)
+            try:
+                if check is not None:
+                    check(temporary)
+            except BaseException:  # it was changed in the last moment, and gets its name again
+                _exchange(temporary, target)
+                if check is not None:
+                    check(target)  # names the folder as the user does
+                raise
             sync_folder(target.parent)
             _remove(temporary)
             return
@@ -251,7 +252,10 @@ def restore_files(targets: Sequence[Path]) -> Iterator[None]:
     with ExitStack() as locks:
         try:
             for target, aside in asides.items():
-                _copy_or_link(target, aside)
+                try:
+                    aside.hardlink_to(target)
+                except OSError:  # the file system has no second names
+                    shutil.copy2(target, aside)
                 locks.enter_context(_hold(aside))
             try:
                 yield
@@ -265,24 +269,6 @@ def restore_files(targets: Sequence[Path]) -> Iterator[None]:
         finally:
             for aside in asides.values():
                 aside.unlink(missing_ok=True)
-
-
-def _copy_or_link(file: Path, name: Path) -> None:
-    """Give a file a second name; where the file system has none, copy it."""
-    try:
-        name.hardlink_to(file)
-    except OSError:
-        shutil.copy2(file, name)
-
-
-def _check_replaced(old: Path, target: Path, check: Callable[[Path], None]) -> None:
-    """Return a folder to its name where it was changed in the last moment, and raise."""
-    try:
-        check(old)
-    except BaseException:
-        _exchange(old, target)
-        check(target)  # names the folder as the user does
-        raise
 
 
 def _exchange(new: Path, old: Path) -> bool:

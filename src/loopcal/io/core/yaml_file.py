@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -63,7 +63,9 @@ class YamlFile:
         node, line = self.tree, 0
         for step in location:
             if has_child(node, step):
-                line = _line_of(node, step, line)
+                with suppress(AttributeError, KeyError, TypeError, IndexError):  # line unknown
+                    find = node.lc.key if isinstance(node, Mapping) else node.lc.item
+                    line = int(find(step)[0])
                 node = node[step]
         return line + self.first_line
 
@@ -217,15 +219,6 @@ def _inside(location: Location) -> str:
     return f" in {name_location(location)!r}" if location else ""
 
 
-def _line_of(node: Any, step: str | int, line: int) -> int:
-    """Return the line (from 0) of a key or an item; `line` where it is unknown."""
-    try:
-        positions = node.lc
-        return int(positions.key(step)[0] if isinstance(node, Mapping) else positions.item(step)[0])
-    except (AttributeError, KeyError, TypeError, IndexError):
-        return line
-
-
 def _to_plain(node: Any, file: YamlFile, location: Location) -> Any:
     """Return `node` as plain Python values; see `YamlFile.content`."""
     if isinstance(node, Mapping):
@@ -239,7 +232,12 @@ def _to_plain(node: Any, file: YamlFile, location: Location) -> Any:
     if isinstance(node, str):
         return str(node)
     if isinstance(node, int | float):
-        return _finite(int(node) if isinstance(node, int) else float(node), file, location)
+        value = int(node) if isinstance(node, int) else float(node)
+        with suppress(OverflowError):
+            if math.isfinite(float(value)):
+                return value
+        shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
+        raise file.error(f"{name_location(location)!r} is {shown}; write a finite number", location)
     if isinstance(node, Sequence):
         return [_to_plain(value, file, (*location, i)) for i, value in enumerate(node)]
     if isinstance(node, datetime.date):
@@ -262,19 +260,7 @@ def _refuse_names(node: Any, file: YamlFile, location: Location) -> None:
         raise file.error(fault, location)
 
 
-def _finite(value: float, file: YamlFile, location: Location) -> float:
-    """Return a number that fits a double."""
-    try:
-        is_finite = math.isfinite(float(value))
-    except OverflowError:
-        is_finite = False
-    if not is_finite:
-        shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
-        raise file.error(f"{name_location(location)!r} is {shown}; write a finite number", location)
-    return value
-
-
-# --- A composer of YAML that refuses deep documents, those whose aliases stand for too much, and
+# A composer of YAML that refuses deep documents, those whose aliases stand for too much, and
 # keys that are lists or mappings.
 
 
@@ -297,10 +283,6 @@ class KeyTypeError(Exception):
 
 def make_bounded_composer(loader: Any) -> Any:
     """Return a composer of ruamel.yaml that counts values and levels, and checks keys.
-
-    Parameters
-    ----------
-    loader : of ruamel.yaml.
 
     Raises
     ------
@@ -370,7 +352,7 @@ def make_bounded_composer(loader: Any) -> Any:
     return BoundedComposer()
 
 
-# --- Text of YAML: names in quotes where they need them, and one key added to or removed from a
+# Text of YAML: names in quotes where they need them, and one key added to or removed from a
 # file.
 
 PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*", re.IGNORECASE)
@@ -486,15 +468,13 @@ def _format_inside(content: dict[str, Any]) -> str:
 
 def _escape(text: str) -> str:
     """Return JSON with escapes for all characters that YAML does not allow or breaks lines at."""
-    return "".join(c if c.isprintable() else _escape_one(c) for c in text)
+    codes = ((c, ord(c)) for c in text)
+    return "".join(
+        c if c.isprintable() else f"\\u{n:04x}" if n < 1 << 16 else f"\\U{n:08x}" for c, n in codes
+    )
 
 
-def _escape_one(character: str) -> str:
-    code = ord(character)
-    return f"\\u{code:04x}" if code < 1 << 16 else f"\\U{code:08x}"
-
-
-# --- Names of other files in a file: they stay in the folder of the file that names them.
+# Names of other files in a file: they stay in the folder of the file that names them.
 
 KEYS = ("poses", "controller")
 """Settings of measurement files that name another file."""
@@ -517,8 +497,10 @@ def find_file_beside(file: YamlFile, name: str, location: Location) -> Path | No
     ------
     FileError : the path leaves the folder of `file`; at its line.
     """
-    path = file.path.parent / name
-    if not Path(name).is_absolute() and not _is_inside(path, file.path.parent):
+    path, is_inside = file.path.parent / name, False
+    with suppress(OSError, RuntimeError):  # a loop of links
+        is_inside = path.resolve().is_relative_to(file.path.parent.resolve())
+    if not Path(name).is_absolute() and not is_inside:
         key = name_location(location)
         finding = report_finding("files.reference-outside", key=key, path=escape(name))
         raise file.error(finding, location)
@@ -533,11 +515,3 @@ def list_absolute_references(file: YamlFile) -> tuple[Finding, ...]:
         for key, path in stated
         if Path(path).is_absolute()
     )
-
-
-def _is_inside(path: Path, folder: Path) -> bool:
-    """Return whether a path, with its symbolic links followed, is in a folder."""
-    try:
-        return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # a loop of links
-        return False

@@ -405,7 +405,7 @@ def get_dimension(coordinate: str) -> Dimension:
     return Dimension.LENGTH if coordinate in ("x", "y", "z") else Dimension.ANGLE
 
 
-# --- Names that files of measurements, poses and plans cannot have as a column.
+# Names that files of measurements, poses and plans cannot have as a column.
 
 SHEET_COLUMNS = ("step", "role", "hold", "tolerance")
 """Further columns of the operator's sheet of a plan."""

@@ -261,7 +261,7 @@ def _format_frame(T: FloatArray) -> str:
     return format_flow_mapping(texts)
 
 
-# --- Prior knowledge of setup parameters (frames, targets, surfaces, offsets) in measurement
+# Prior knowledge of setup parameters (frames, targets, surfaces, offsets) in measurement
 # files.
 
 KEY, FIXED = "unknowns", "fixed"
@@ -389,7 +389,7 @@ def _read_one(
     return [StatedValue(entry.name, sd, stated.start) for entry in matching]
 
 
-# --- The instrument in the settings of a measurement file: a name, or facts for traceability.
+# The instrument in the settings of a measurement file: a name, or facts for traceability.
 
 INSTRUMENT_KEY = "instrument"
 
@@ -432,7 +432,7 @@ def format_instrument(record: InstrumentRecord) -> str:
     return format_flow_mapping({name: quote_scalar(value) for name, value in stated.items()})
 
 
-# --- Errors that the rows of a session share, in the settings of a kind.
+# Errors that the rows of a session share, in the settings of a kind.
 
 UNKNOWN = "unknown"
 SETTINGS: Mapping[str, str] = {

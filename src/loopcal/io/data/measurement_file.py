@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from loopcal.measure.observations import Observations
 
 
-# --- Rows of measurement files that measure targets on the base, and checks of these targets.
+# Rows of measurement files that measure targets on the base, and checks of these targets.
 
 FEWEST = 2
 """Fewest targets on the base that may determine the frame of an instrument. A single one shows no
@@ -126,7 +126,7 @@ def _find_frame(kind: Kind) -> str:
     return str(getattr(kind, "frame", "")) if "frame" in kind.unknown else ""
 
 
-# --- The poses of measurement files: their names, readings, reading noise and blocks.
+# The poses of measurement files: their names, readings, reading noise and blocks.
 
 READING_NOISE = "reading_noise"
 RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12
@@ -488,7 +488,7 @@ def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArr
     return np.array([numbers[key] for key in keys])
 
 
-# --- The column `use`: which poses are held out for validation.
+# The column `use`: which poses are held out for validation.
 
 
 def read_held_out(tables: Sequence[Table], poses: PoseRows) -> BoolArray:

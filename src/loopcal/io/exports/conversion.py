@@ -58,7 +58,7 @@ from loopcal.io.exports.profile import (
 )
 from loopcal.plain_text import quote
 
-# --- The lines of an export as cells, each with the header that applies to it.
+# The lines of an export as cells, each with the header that applies to it.
 
 
 class Misfit(Exception):  # noqa: N818

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from loopcal.measure.kinds.kind import Column, Kind
 
 
-# --- Regular expressions of users, with a limit on their time.
+# Regular expressions of users, with a limit on their time.
 
 SECONDS_PER_LINE = 1e-4
 """Time that each line of an export adds to the limit [s]."""
@@ -125,7 +125,7 @@ def _multiply_counts(text: str) -> int:
     return math.prod(counts)
 
 
-# --- Profiles: how to read the text that an instrument's software exports.
+# Profiles: how to read the text that an instrument's software exports.
 
 DELIMITERS: Mapping[str, str | None] = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}
 DECIMALS: Mapping[str, str] = {"point": ".", "comma": ","}
@@ -568,7 +568,7 @@ def _check_encoding(file: YamlFile, name: str) -> None:
         raise file.error(sentence, ("encoding",)) from None
 
 
-# --- Profiles that come with loopcal, and what differs between two computers with the same
+# Profiles that come with loopcal, and what differs between two computers with the same
 # software.
 
 

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from loopcal.measure.measurements import Measurements
 
 
-# --- The geometry of a linear delta in the mm and degrees of printer firmware, and its robot file.
+# The geometry of a linear delta in the mm and degrees of printer firmware, and its robot file.
 
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
 """Angles of the towers in firmware, before any correction [deg]."""
@@ -140,7 +140,7 @@ def get_geometry(source: ExportSource, format_name: str, decimals: int) -> Delta
     )
 
 
-# --- Words of G-code commands in a file: read with their places, replaced, and added.
+# Words of G-code commands in a file: read with their places, replaced, and added.
 
 COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
 FRONT = re.compile(r"\s*(?:ECHO:)?\s*(?:N\s*\d+)?")
@@ -261,7 +261,7 @@ def _blank_asides(line: str) -> str:
     return ASIDE.sub(blank, line)
 
 
-# --- Heights that the firmware of a delta printer reports, as measurements.
+# Heights that the firmware of a delta printer reports, as measurements.
 
 FEWEST = 7
 """Points below which six numbers of a firmware cannot be determined and tested."""

@@ -261,7 +261,7 @@ FORMAT = Format(
 )
 
 
-# --- LinuxCNC's INI file: HOME_OFFSET of the struts of a hexapod with the kinematics genhexkins.
+# LinuxCNC's INI file: HOME_OFFSET of the struts of a hexapod with the kinematics genhexkins.
 
 STRUTS = 6
 OFFSET = "HOME_OFFSET"

@@ -229,7 +229,7 @@ def get_byte_order_mark(path: Path) -> str:
     return "\ufeff" if read_bytes(path, "file").startswith(b"\xef\xbb\xbf") else ""
 
 
-# --- Text files of controllers whose values are read and replaced by name, and nothing else in
+# Text files of controllers whose values are read and replaced by name, and nothing else in
 # them.
 
 DECIMALS = 6

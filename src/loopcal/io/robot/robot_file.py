@@ -51,7 +51,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit, to_si
 
-# --- The `identified:` table of a corrected robot file: values of parameters.
+# The `identified:` table of a corrected robot file: values of parameters.
 
 TABLE = "identified"
 PLUS_MINUS = "+/-"
@@ -404,7 +404,7 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     return record.assembly(expanded)
 
 
-# --- The stages of a robot file: each one is a serial joint, or a robot of another family.
+# The stages of a robot file: each one is a serial joint, or a robot of another family.
 
 OWN_KEYS = ("on", "mount", "joint", "family")
 """Keys of a stage that are not those of its family; both have a name."""
@@ -449,7 +449,7 @@ def _read_stage(file: YamlFile, i: int, stage: StageRecord, units: Units) -> Rob
     return read_record(file, rest, families[stage.family], units, (KEY, i))
 
 
-# --- Stored values of parameters to compare a fit with: published ones, or those of a firmware.
+# Stored values of parameters to compare a fit with: published ones, or those of a firmware.
 
 STORED_WHAT = "file of stored values"
 
@@ -476,7 +476,7 @@ def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] |
     return read_rows(file, robot)
 
 
-# --- Reference of file keys, taken from the records that read them: types, defaults, docstrings.
+# Reference of file keys, taken from the records that read them: types, defaults, docstrings.
 
 SECTION = re.compile(r"^(Attributes|Examples|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
 SHORT = re.compile(r"(?:^ *|(?<=[.;] ))((?:\w+, )*\w+) :\s", re.MULTILINE)
@@ -595,7 +595,7 @@ def _describe_default(field: dataclasses.Field[Any]) -> str:
     return f"{field.default:g}" if isinstance(field.default, float) else str(field.default)
 
 
-# --- Robot files made from others: a new robot of a family, and a robot with more parameters
+# Robot files made from others: a new robot of a family, and a robot with more parameters
 # fixed.
 
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar", "stages": "arm-6r"}

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from loopcal.io.runs.run_folder import Run
 
 
-# --- What a digital calibration certificate states beside the results: laboratory, customer,
+# What a digital calibration certificate states beside the results: laboratory, customer,
 # dates.
 
 WHAT = "certificate file"

@@ -129,7 +129,7 @@ def _format_error(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.{DIGITS}g}"
 
 
-# --- The CSV file of a comparison of runs: one row for each run and parameter.
+# The CSV file of a comparison of runs: one row for each run and parameter.
 
 
 def save_comparison(path: Path, titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -149,7 +149,7 @@ def save_comparison(path: Path, titles: Sequence[str], rows: Sequence[Sequence[s
     write_text(path, text)
 
 
-# --- The folder of regularization curves.
+# The folder of regularization curves.
 
 FORMAT = 1
 RESULT, POINTS, PICTURE = "curves.json", "curves.csv", "curves.png"
@@ -182,7 +182,7 @@ def write_curves(
     write_result_folder(path, CURVES, {"format": FORMAT, **document}, files, force)
 
 
-# --- Draws of parameters as a CSV file: one row for each draw, units in the header.
+# Draws of parameters as a CSV file: one row for each draw, units in the header.
 
 WEIGHT = "weight"
 """Column of the weights of draws, whose sum is 1; absent where all draws weigh the same."""

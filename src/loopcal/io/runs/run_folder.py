@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from loopcal.typing import Progress
 
 
-# --- Whether the numbers of a run may be written for a machine: corrected robot, controller,
+# Whether the numbers of a run may be written for a machine: corrected robot, controller,
 # commands.
 
 ROBOT, FAILED_ROBOT = "robot.yaml", "robot-not-calibrated.yaml"
@@ -123,7 +123,7 @@ def find_file_failure(path: Path) -> Finding | None:
     return report_finding("gates.run-not-calibrated", run=str(path), reasons=())
 
 
-# --- A calibration that was read from its run folder.
+# A calibration that was read from its run folder.
 
 
 @dataclass(frozen=True, eq=False)

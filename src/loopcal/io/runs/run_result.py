@@ -282,7 +282,7 @@ def _list_halved(halved: StoredHalf | None) -> tuple[float | None, ...]:
     return () if halved is None else dataclasses.astuple(halved)
 
 
-# --- The arrays of a run folder: an archive of NumPy's, read without trust in what it says of
+# The arrays of a run folder: an archive of NumPy's, read without trust in what it says of
 # itself.
 
 WHAT = "archive of arrays"
@@ -367,7 +367,7 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarra
     return values.reshape(shape, order="F" if is_fortran else "C")
 
 
-# --- What loopcal reads back from the arrays.npz of a run: the declared form of its arrays.
+# What loopcal reads back from the arrays.npz of a run: the declared form of its arrays.
 
 Test = Callable[[np.ndarray], Any]
 

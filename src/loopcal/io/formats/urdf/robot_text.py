@@ -25,7 +25,7 @@ from loopcal.mechanism.joint_graph.loops import JointGraph, get_value, measure_r
 from loopcal.mechanism.joint_graph.paths import ClosedStage, LimbPaths, SerialStage, StagePaths
 from loopcal.typing import FloatArray
 
-# --- The text of one limb of a robot file, from the joints of a mechanism between base and
+# The text of one limb of a robot file, from the joints of a mechanism between base and
 # platform.
 
 ZERO = 1e-15

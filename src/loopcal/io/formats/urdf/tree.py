@@ -32,7 +32,7 @@ from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import parse_number
 from loopcal.typing import FloatArray
 
-# --- Joints and constraints of a URDF, from the attributes of their elements.
+# Joints and constraints of a URDF, from the attributes of their elements.
 
 SAME_AXIS = 1e-9
 """Difference of two axes that count as the same [1]."""

@@ -51,7 +51,7 @@ from loopcal.mechanism.joint_graph.paths import (
 )
 from loopcal.typing import FloatArray
 
-# --- Corrected origins of a URDF: from the parameters of the robot that was read from it.
+# Corrected origins of a URDF: from the parameters of the robot that was read from it.
 
 PLACED = 1e-9
 """Accepted difference between the places of a joint in URDF and robot file [m, 1]."""
