@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import FileError
-from loopcal.io.core.result_folder import FolderKind, write_result_folder
+from loopcal.io.core.outputs import FolderKind, write_result_folder
 
 RUN = FolderKind("run", "result.json", ("made_by", "fit"), ("arrays.npz", "robot.yaml"))
 

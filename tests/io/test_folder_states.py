@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from evidence.interruption import INTERRUPT, KILL, LEFTOVER, TRACED, strike
 from loopcal.errors import FileError
-from loopcal.io.core.result_folder import FolderKind, describe_leftover, write_result_folder
+from loopcal.io.core.outputs import FolderKind, describe_leftover, write_result_folder
 from tests.io.folder_writing import RUN, run_in_copy, write
 
 pytestmark = pytest.mark.forks

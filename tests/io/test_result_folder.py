@@ -9,13 +9,13 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.core import replacement
-from loopcal.io.core.replacement import NEW, OLD, list_leftovers
-from loopcal.io.core.result_folder import (
+from loopcal.io.core.outputs import (
     FolderKind,
     describe_leftover,
     refuse_folder,
     write_result_folder,
 )
+from loopcal.io.core.replacement import NEW, OLD, list_leftovers
 
 RUN = FolderKind("run", "result.json", ("made_by", "fit"), ("arrays.npz", "robot.yaml"))
 STUDY = FolderKind("study", "result.json", ("made_by", "paper"), ("page.md", "tables/*.csv"))

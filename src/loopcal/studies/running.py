@@ -13,7 +13,7 @@ from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.estimate.trial_identification import check_threads
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
+from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.core.text_file import as_path
 from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.robot.robot_file import format_robot

@@ -82,7 +82,7 @@ def reproduce(
         return
     chosen = find_paper(paper)
     if output is not None:
-        from loopcal.io.core.result_folder import refuse_folder
+        from loopcal.io.core.outputs import refuse_folder
         from loopcal.papers.reproduction import FOLDER
 
         refuse_folder(output, FOLDER, force)

@@ -371,7 +371,11 @@ def read_template(path: str | Path) -> Table:
         if line.strip() and not line.startswith("#")
     ]
     texts = [lines[number - 1] for number in numbers]
-    _check_size(path, numbers, texts)
+    TABLE_ROWS.check(len(texts) - 1, WHAT, path)
+    if lengths := list(map(len, texts)):
+        longest = max(lengths)
+        LINE_LENGTH.check(longest, WHAT, path, numbers[lengths.index(longest)])
+        TABLE_COLUMNS.check(texts[0].count(",") + 1, WHAT, path, numbers[0])
     if not numbers:
         raise FileError("this file has no header; its first line names columns and units", path)
     header_line, header = numbers[0], texts[0]
@@ -383,23 +387,12 @@ def read_template(path: str | Path) -> Table:
     cells = _parse_columns(path, numbers[1:], texts[1:], len(units))
     columns = dict(zip(units, cells, strict=True))
     table = Table(path, settings, header_line, units, columns, tuple(numbers[1:]))
-    _refuse_names(table)
+    for column in (name for name in NAME_COLUMNS if name in units):
+        longest = LONGEST_COMPOSED if column == "pose" else LONGEST_NAME
+        for cell in dict.fromkeys(table.text(column)):
+            if (fault := find_fault(cell, longest)) is not None:
+                raise table.row_error(table.text(column).index(cell), fault)
     return table
-
-
-def _check_size(path: Path, numbers: Sequence[int], texts: Sequence[str]) -> None:
-    """Raise FileError for too many rows or columns, or a line that is too long.
-
-    Parameters
-    ----------
-    numbers : of the lines of header and rows. texts : these lines.
-    """
-    TABLE_ROWS.check(len(texts) - 1, WHAT, path)
-    lengths = list(map(len, texts))
-    longest = max(lengths, default=0)
-    if longest:
-        LINE_LENGTH.check(longest, WHAT, path, numbers[lengths.index(longest)])
-        TABLE_COLUMNS.check(texts[0].count(",") + 1, WHAT, path, numbers[0])
 
 
 def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
@@ -429,11 +422,10 @@ def format_header(units: Mapping[str, str | None]) -> tuple[str, ...]:
 
 def format_row(cells: Iterable[str]) -> str:
     """Return a line of cells, in quotes where one contains a comma, a quote or a number sign."""
-    return ",".join(map(_quote_cell, cells))
-
-
-def _quote_cell(text: str) -> str:
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"#') else text
+    return ",".join(
+        '"' + cell.replace('"', '""') + '"' if any(c in cell for c in ',"#') else cell
+        for cell in cells
+    )
 
 
 def read_settings(path: str | Path) -> YamlFile:
@@ -506,29 +498,13 @@ def _parse_header(path: Path, line: int, text: str) -> dict[str, str | None]:
         elif fault is None and name in units:
             fault = f"duplicate column {name!r}; remove one"
         if fault is not None:
-            is_ours = any(_is_header(cell) for cell in cells)
+            # by its form the header of a column: a known name, or with a unit
+            is_ours = any(cell in NAME_COLUMNS or cell.endswith(("]", ")")) for cell in cells)
             finding = fault if is_ours else report_finding("files.header-not-recognized")
             raise FileError(finding, path, line)
         assert match is not None
         units[name] = match["unit"].strip() if match["unit"] is not None else None
     return units
-
-
-def _is_header(cell: str) -> bool:
-    """Return whether a cell is by its form the header of a column: a known name, or with a unit."""
-    return cell in NAME_COLUMNS or cell.endswith(("]", ")"))
-
-
-def _refuse_names(table: Table) -> None:
-    """Raise FileError for the first cell that is no name; see `loopcal.io.core.limits`."""
-    for column in NAME_COLUMNS:
-        if column not in table.units:
-            continue
-        cells = table.text(column)
-        longest = LONGEST_COMPOSED if column == "pose" else LONGEST_NAME
-        for cell in dict.fromkeys(cells):
-            if (fault := find_fault(cell, longest)) is not None:
-                raise table.row_error(cells.index(cell), fault)
 
 
 def _parse_columns(
@@ -543,21 +519,15 @@ def _parse_columns(
     columns: list[list[str]] = [[] for _ in range(count)]
     for begin in range(0, len(texts), CHUNK):
         part = slice(begin, begin + CHUNK)
-        pairs = zip(numbers[part], texts[part], strict=True)
-        rows = [_parse_row(path, number, text, count) for number, text in pairs]
+        rows = [_split_cells(path, *line) for line in zip(numbers[part], texts[part], strict=True)]
+        for number, row in zip(numbers[part], rows, strict=True):
+            if len(row) != count:
+                sentence = f"this row has {len(row)} cells, but the header has {count} columns"
+                act = "write one cell for each column, empty where not measured, and decimal points"
+                raise FileError(f"{sentence}; {act}", path, number)
         for column, cells in zip(columns, zip(*rows, strict=True), strict=True):
             column.extend(cells)
     return list(map(tuple, columns))
-
-
-def _parse_row(path: Path, line: int, text: str, count: int) -> tuple[str, ...]:
-    """Return the cells of a row, as many as the header has."""
-    cells = _split_cells(path, line, text)
-    if len(cells) != count:
-        sentence = f"this row has {len(cells)} cells, but the header has {count} columns"
-        act = "write one cell for each column, empty where not measured, and decimal points"
-        raise FileError(f"{sentence}; {act}", path, line)
-    return cells
 
 
 def _split_cells(path: Path, line: int, text: str) -> tuple[str, ...]:

@@ -1,22 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """Output files, all checked before the first one is written, and result folders.
 
-Files and folders are written whole or not at all, and never over something else.
+Files and folders are written whole or not at all, and never over something else: a folder only
+over one that loopcal made. One document of each folder, such as result.json, lists under `files`
+all others and itself with their sha256. With `force`, a folder of the same kind is replaced if it
+contains these files and no others, all unchanged. Folders of versions before this list may contain
+files of known names only.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.json_text import read_json
+from loopcal.io.core.json_text import convert_document, format_content, read_json
 from loopcal.io.core.limits import TABLE_SIZE
-from loopcal.io.core.replacement import create_temporary, place_folder, restore_files
-from loopcal.io.core.text_file import report_write_errors, resolve_target
+from loopcal.io.core.replacement import (
+    create_temporary,
+    list_leftovers,
+    place_folder,
+    remove_leftovers,
+    restore_files,
+    watch_folder,
+)
+from loopcal.io.core.text_file import report_write_errors, resolve_target, sha256
 
 FILES = "files"
 """Key of the list of files in the document of a result folder."""
@@ -129,3 +143,239 @@ def replace_folder(path: Path, check: Callable[[Path], None] | None = None) -> I
         with create_temporary(target, is_folder=True) as temporary:
             yield temporary
             place_folder(temporary, target, path, check)
+
+
+_BLANK = "0" * 64
+"""Stands for the document's own digest where this is computed."""
+
+
+class FolderKind(NamedTuple):
+    """What a command writes as a folder, and by what it is recognized.
+
+    Parameters
+    ----------
+    content : what the folder contains, for messages, such as "run".
+    document : name of the file that lists the others.
+    keys : of the document, by which it differs from those of others.
+    names : patterns of the other files, such as `tables/*.csv`.
+    filled_in : of these, the files that users fill in.
+    """
+
+    content: str
+    document: str
+    keys: tuple[str, ...]
+    names: tuple[str, ...]
+    filled_in: tuple[str, ...] = ()
+
+    def expects(self, name: str) -> bool:
+        """Return whether a file of this name belongs to the folder."""
+        return name == self.document or any(
+            name.count("/") == pattern.count("/") and fnmatchcase(name, pattern)
+            for pattern in self.names
+        )
+
+
+def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Path] = ()) -> None:
+    """Refuse a folder that cannot or must not be written; a folder set aside gets its name again.
+
+    Parameters
+    ----------
+    force : a folder that loopcal made may be replaced. inputs : files that the command reads.
+
+    Raises
+    ------
+    FileError
+        The path is a file, or the working folder; its place is not writable; the folder is in use
+        (without `force`), or protected; or it contains an input, or anything but an unchanged
+        result of this kind.
+    """
+    target = resolve_folder(path)
+    with report_write_errors(path):
+        restore_leftovers(path, kind)
+        if target.exists() and not target.is_dir():
+            sentence = f"this is a file, but the {kind.content} is a folder; choose another name"
+            raise FileError(sentence, path)
+        _refuse_place(path, target)
+        for file in inputs:
+            if file.exists() and file.resolve().is_relative_to(target):
+                sentence = f"this folder contains the input {file} and cannot be replaced"
+                raise FileError(f"{sentence}; choose another name", path)
+        if target.is_dir() and any(target.iterdir()):
+            if not force:
+                finding = report_finding("files.folder-in-use", content=kind.content)
+                raise FileError(finding, path)
+            refuse_other_content(path, kind)
+            if not all(os.access(place, os.W_OK | os.X_OK) for place, _, _ in os.walk(target)):
+                sentence = "this folder is protected against changes, so it cannot be replaced"
+                raise FileError(f"{sentence}; choose another name, or permit writing in it", path)
+
+
+def _refuse_place(path: Path, target: Path) -> None:
+    """Raise FileError where no folder can take this name, as far as is known beforehand."""
+    is_mount = target.is_mount()
+    if is_mount or Path.cwd().is_relative_to(target):
+        example = str(path / "result")
+        finding = report_finding("files.folder-in-place", is_mount=is_mount, example=example)
+        raise FileError(finding, path)
+    parent = next(folder for folder in target.parents if folder.exists())
+    if not parent.is_dir():
+        raise FileError(f"cannot write here: {parent} is not a folder; choose another place", path)
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise FileError("cannot write here (permission denied); choose another folder", path)
+
+
+def refuse_other_content(path: Path, kind: FolderKind) -> None:
+    """Raise FileError where a folder is not an unchanged result of this kind, and nothing else."""
+    while True:
+        with watch_folder(path.resolve()) as is_same:
+            try:
+                _check_content(path, kind)
+                return
+            except (FileError, OSError):
+                if is_same():
+                    raise  # otherwise another command has replaced the folder meanwhile
+
+
+def _check_content(path: Path, kind: FolderKind) -> None:
+    """Raise FileError as `refuse_other_content`."""
+    document = _read_document(path / kind.document)
+    if document is None or any(key not in document for key in kind.keys):
+        raise FileError(report_finding("files.folder-of-others", content=kind.content), path)
+    listed = _list_digests(document)
+    names = list(_list_entries(path))
+    if foreign := tuple(name for name in names if not _is_expected(path, name, kind, listed)):
+        code = "files.foreign-files"
+        raise FileError(report_finding(code, content=kind.content, files=foreign), path)
+    changed = tuple(name for name in names if _is_changed(path, name, kind, listed))
+    if changed:
+        code = "files.changed-files"
+        raise FileError(report_finding(code, content=kind.content, files=changed), path)
+
+
+def list_changed_files(path: Path, kind: FolderKind) -> tuple[str, ...]:
+    """Return the files of a folder that differ from what was written; without a list of files the
+    document itself, because nothing is known of it.
+    """
+    document = _read_document(path / kind.document)
+    listed = {} if document is None else _list_digests(document)
+    if kind.document not in listed:
+        return (kind.document,)
+    present = (name for name in listed if (path / name).is_file())
+    return tuple(name for name in present if _is_changed(path, name, kind, listed))
+
+
+def write_result_folder(
+    path: Path,
+    kind: FolderKind,
+    document: Mapping[str, Any],
+    files: Mapping[str, bytes],
+    force: bool = False,
+) -> None:
+    """Write a folder whole or not at all.
+
+    Parameters
+    ----------
+    document : content of the document, to which the list of files is added.
+    files : name -> content.
+    force : see `refuse_folder`.
+
+    Raises
+    ------
+    FileError : see `refuse_folder`; or the folder cannot be written.
+    """
+    digests = dict.fromkeys((*sorted(files), kind.document), _BLANK)
+    computed = convert_document({**document, FILES: digests})
+
+    refuse_folder(path, kind, force)
+    with replace_folder(path, lambda old: refuse_folder(old, kind, force)) as folder:
+        for name, content in files.items():
+            file = folder / name
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(content)
+        written = digests | {name: sha256(folder / name) for name in files}
+        text = format_content({**computed, FILES: written})
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        text = text.replace(_quote(kind, _BLANK), _quote(kind, digest))
+        (folder / kind.document).write_bytes(text.encode())
+
+
+def restore_leftovers(path: Path, kind: FolderKind) -> None:
+    """Remove what killed commands left beside a folder; one that was set aside is renamed back."""
+    remove_leftovers(resolve_folder(path), lambda folder: _is_own(folder, kind))
+
+
+def describe_leftover(path: Path, document: str) -> str:
+    """Return a sentence on a folder that a killed command set aside; empty where there is none."""
+    for folder in list_leftovers(resolve_folder(path)):
+        if (folder / document).is_file():
+            return f"an interrupted command left it as {folder}; rename this folder"
+    return ""
+
+
+def _is_own(folder: Path, kind: FolderKind) -> bool:
+    """Return whether a leftover only contains what loopcal wrote: a part of a result, or all."""
+    document = _read_document(folder / kind.document)
+    listed = {} if document is None else _list_digests(document)
+    try:
+        return folder.is_dir() and not any(
+            not _is_expected(folder, name, kind, listed)
+            or (bool(listed) and _is_changed(folder, name, kind, listed))
+            for name in _list_entries(folder)
+        )
+    except (OSError, FileError):  # it disappears meanwhile
+        return False
+
+
+def _is_expected(path: Path, name: str, kind: FolderKind, listed: Mapping[str, str]) -> bool:
+    """Return whether an entry belongs to the folder: a file, or an empty folder for files."""
+    entry = path / name
+    if entry.is_symlink():
+        return False
+    if entry.is_dir():
+        return any(pattern.startswith(f"{name}/") for pattern in kind.names)
+    is_listed = kind.document not in listed or name in listed
+    return kind.expects(name) and is_listed and entry.is_file()
+
+
+def _is_changed(path: Path, name: str, kind: FolderKind, listed: Mapping[str, str]) -> bool:
+    """Return whether a file differs from what was written, as far as is known."""
+    if (path / name).is_dir():
+        return False
+    if name not in listed:
+        return name in kind.filled_in
+    if name != kind.document:
+        return sha256(path / name) != listed[name]
+    digest = _quote(kind, listed[name]).encode()
+    content = (path / name).read_bytes().replace(digest, _quote(kind, _BLANK).encode())
+    return hashlib.sha256(content).hexdigest() != listed[name]
+
+
+def _quote(kind: FolderKind, digest: str) -> str:
+    """Return the document's own entry in the list of files."""
+    return f'"{kind.document}": "{digest}"'
+
+
+def _list_entries(path: Path, prefix: str = "") -> Iterator[str]:
+    """Yield the names of all files, links and empty folders, in order."""
+    for entry in sorted(path.iterdir()):
+        if entry.is_dir() and not entry.is_symlink() and any(entry.iterdir()):
+            yield from _list_entries(entry, f"{prefix}{entry.name}/")
+        else:
+            yield f"{prefix}{entry.name}"
+
+
+def _read_document(path: Path) -> dict[str, Any] | None:
+    """Return the document of a folder; None where it is missing or damaged."""
+    try:
+        content = read_json(path, "result", "repeat the command", TABLE_SIZE)
+    except FileError:
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _list_digests(document: Mapping[str, Any]) -> dict[str, str]:
+    """Return name -> sha256 of a document's files; nothing where it does not list them."""
+    files = document.get(FILES)
+    if not isinstance(files, dict):
+        return {}
+    return {str(name): str(digest) for name, digest in files.items()}

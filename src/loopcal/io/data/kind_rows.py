@@ -247,16 +247,17 @@ def _read_values(table: Table, robot: Mechanism, entry: KindRows) -> tuple[Float
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]
     require_columns(table, names, f"which the kind {kind.name!r} measures")
-    measured = _stack_columns([known[name].parse(table)[rows] for name in names], len(rows))
+    measured = np.zeros((len(rows), len(names)))
+    for i, name in enumerate(names):
+        measured[:, i] = known[name].parse(table)[rows]
     for i, doubt in kind.find_invalid_rows(measured):
         raise table.row_error(int(rows[i]), f"this row {doubt}")
     absent = np.zeros((len(rows), len(kind.noise_columns)), bool)
     if kind.noise_columns == kind.columns:  # then a value that was not measured needs no sigma
         absent = np.isnan(measured)
-    sigma = _stack_columns(
-        [_read_sigma(table, robot, entry, i, absent[:, i]) for i in range(absent.shape[1])],
-        len(rows),
-    )
+    sigma = np.zeros(absent.shape)
+    for i in range(absent.shape[1]):
+        sigma[:, i] = _read_sigma(table, robot, entry, i, absent[:, i])
     covariance = sigma[:, :, None] * np.eye(sigma.shape[1]) * sigma[:, None, :]
     for i, a in enumerate(kind.noise_columns):
         for j, b in enumerate(kind.noise_columns):
@@ -265,11 +266,6 @@ def _read_values(table: Table, robot: Mechanism, entry: KindRows) -> tuple[Float
                 covariance[:, i, j] = covariance[:, j, i] = known[name].parse(table)[rows]
     N = kind.linearize_noise(measured)
     return measured, N @ covariance @ np.swapaxes(N, -1, -2)
-
-
-def _stack_columns(columns: Sequence[FloatArray], rows: int) -> FloatArray:
-    """Return (rows, c) of c columns, of which there may be none."""
-    return np.column_stack(columns) if columns else np.zeros((rows, 0))
 
 
 def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:

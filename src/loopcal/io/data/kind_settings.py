@@ -98,14 +98,18 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
         sentence = f"{quote(name)} is not a kind of measurement{suggest_names(str(name), KINDS)}"
         raise file.error(f"{sentence}; allowed: {known}", (*location, "kind"))
     kind = KINDS[name]
-    record = _make_record(kind)
     settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
-    values = vars(read_record(file, settings, record, None, location))
+    values = vars(read_record(file, settings, _make_record(kind), None, location))
     for key, value in values.items():
         if isinstance(value, list) and not _is_array(value):
             sentence = f"{key!r} must be a list of numbers, or of lists of equal length; correct it"
             raise file.error(sentence, (*location, key))
-    given = {key: _to_setting(values[key], kind, key) for key in settings}
+    given, types = {}, list_kind_settings(kind)
+    for key in settings:
+        value = values[key]
+        is_single = isinstance(value, str) and "tuple" in str(types[key])
+        given[key] = value.matrix if isinstance(value, PoseRecord) else value
+        given[key] = (value,) if is_single else given[key]
     try:
         made = kind(**given)
     except DataError as error:
@@ -230,18 +234,15 @@ def _is_array(value: list[Any]) -> bool:
     return len(lengths) == 1 and all(_is_array(item) for item in value)
 
 
-def _to_setting(value: Any, kind: type[Kind], key: str) -> Any:
-    """Return a setting as the field of the kind takes it."""
-    if isinstance(value, PoseRecord):
-        return value.matrix
-    is_single = isinstance(value, str) and "tuple" in str(list_kind_settings(kind)[key])
-    return (value,) if is_single else value
-
-
 def _format_setting(key: str, value: Any) -> str:
     """Return a setting as text that `read_kind` reads."""
     if key.startswith("T_"):
-        return _format_frame(value)
+        angles = geometry.matrix_to_euler(value[:3, :3], "xyz")
+        numbers = [float(v) + 0.0 for v in (*value[:3, 3], *angles)]
+        names = ("x", "y", "z", "roll", "pitch", "yaw")
+        units = [Dimension.LENGTH] * 3 + [Dimension.ANGLE] * 3
+        texts = map(format_quantity, numbers, units)
+        return format_flow_mapping(dict(zip(names, texts, strict=True)))
     if isinstance(value, str):
         return quote_scalar(value)
     if isinstance(value, float):
@@ -250,15 +251,6 @@ def _format_setting(key: str, value: Any) -> str:
     if not isinstance(items, list | tuple):
         return _format_setting(key, items)
     return f"[{', '.join(_format_setting(key, item) for item in items)}]"
-
-
-def _format_frame(T: FloatArray) -> str:
-    """Return a pose (4, 4) as text of a `PoseRecord`."""
-    lengths = zip("xyz", T[:3, 3], strict=True)
-    turns = zip(("roll", "pitch", "yaw"), geometry.matrix_to_euler(T[:3, :3], "xyz"), strict=True)
-    texts = {k: format_quantity(float(v) + 0.0, Dimension.LENGTH) for k, v in lengths}
-    texts |= {k: format_quantity(float(v) + 0.0, Dimension.ANGLE) for k, v in turns}
-    return format_flow_mapping(texts)
 
 
 # Prior knowledge of setup parameters (frames, targets, surfaces, offsets) in measurement
@@ -270,18 +262,20 @@ EXAMPLE = (
 )
 
 
-def _make_nuisance_record(quantity: Any) -> type:
-    """Return a record of the knowledge of a parameter of one dimension."""
-    number = quantity | None
-    fields = [("start", number, None), ("sd", number, None), ("fixed", bool, False)]
-    return make_dataclass("KnownParameter", fields, frozen=True)
-
-
-RECORDS = {
-    Dimension.LENGTH: _make_nuisance_record(Length),
-    Dimension.ANGLE: _make_nuisance_record(Angle),
-    Dimension.RATIO: _make_nuisance_record(Ratio),
+KNOWN_NUMBERS: Mapping[Dimension, Any] = {
+    Dimension.LENGTH: Length,
+    Dimension.ANGLE: Angle,
+    Dimension.RATIO: Ratio,
 }
+RECORDS = {
+    dimension: make_dataclass(
+        "KnownParameter",
+        [("start", number | None, None), ("sd", number | None, None), ("fixed", bool, False)],
+        frozen=True,
+    )
+    for dimension, number in KNOWN_NUMBERS.items()
+}
+"""Dimension -> record of the knowledge of a parameter."""
 
 
 def read_stated_values(

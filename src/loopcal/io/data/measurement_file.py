@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from loopcal.measure.instrument import Instrument
     from loopcal.measure.kinds.kind import Kind
     from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
 
 
 # Rows of measurement files that measure targets on the base, and checks of these targets.
@@ -59,26 +58,6 @@ FEWEST = 2
 """Fewest targets on the base that may determine the frame of an instrument. A single one shows no
 rotation, and no other target would reveal its error.
 """
-
-
-def find_base_rows(table: Table, kinds: Sequence[KindRows]) -> BoolArray:
-    """Return the rows (rows,) of a file that measure the base."""
-    is_base = np.zeros(len(table), dtype=bool)
-    for entry in (entry for entry in kinds if entry.kind.is_of_base):
-        is_base[entry.rows] = True
-    return is_base
-
-
-def refuse_poses_of_base(table: Table, is_base: BoolArray, robot: Mechanism) -> None:
-    """Raise FileError where a row of the base names a pose, its use or block, or has readings."""
-    actuators = [actuator.name for actuator in robot.actuators]
-    names = ("pose", "use", "block", *actuators, *(COMMANDED + name for name in robot.controlled))
-    for name in (name for name in names if name in table.units):
-        cells = table.text(name)
-        for row in np.flatnonzero(is_base).tolist():
-            if cells[row]:
-                sentence = f"this row measures the base and belongs to no pose, but column {name!r}"
-                raise table.row_error(row, f"{sentence} is {cells[row]!r}; leave it empty")
 
 
 def check_base_targets(tables: Sequence[Table], kinds: Sequence[Sequence[KindRows]]) -> None:
@@ -238,7 +217,14 @@ def _read_file(table: Table, is_base: BoolArray, robot: Mechanism, several: bool
     """Read the poses of one file, which the rows (rows,) of the base do not name."""
     from loopcal.measure.readings import solve_commanded_poses
 
-    refuse_poses_of_base(table, is_base, robot)
+    actuators = [actuator.name for actuator in robot.actuators]
+    of_pose = ("pose", "use", "block", *actuators, *(COMMANDED + c for c in robot.controlled))
+    for name in (name for name in of_pose if name in table.units):
+        cells = table.text(name)
+        for row in np.flatnonzero(is_base).tolist():
+            if cells[row]:
+                sentence = f"this row measures the base and belongs to no pose, but column {name!r}"
+                raise table.row_error(row, f"{sentence} is {cells[row]!r}; leave it empty")
     if is_base.all() and len(is_base):
         nothing = np.full((len(table), len(robot.actuators)), np.nan)
         names = ("",) * len(table)
@@ -255,18 +241,17 @@ def _read_file(table: Table, is_base: BoolArray, robot: Mechanism, several: bool
     columns = _reading_columns(table, robot, controller)
     rows = np.column_stack([column.parse(table) for column in columns])
     may_be_absent = controller is None and states_reading_noise(table, robot)
-    hint = (
-        ""
-        if controller is not None
-        else f", or state '{READING_NOISE}', so that empty means not read"
-    )
     begin = np.array(
         [-1 if base else first.get(name, -1) for name, base in zip(names, is_base, strict=True)]
     )
     if not may_be_absent:
-        _refuse_empty_cells(
-            table, columns, rows, begin, several, hint if controller is None else ""
-        )
+        # with several files, another one may state all readings of a pose
+        absent, is_first = np.isnan(rows), begin == np.arange(len(rows))
+        hint = f", or state '{READING_NOISE}', so that empty means not read"
+        for row in np.flatnonzero(is_first & absent.any(axis=1) & ~(several & absent.all(axis=1))):
+            sentence = f"column {columns[int(np.argmax(absent[row]))].name!r} is empty"
+            act = f"write its value{hint if controller is None else ''}"
+            raise table.row_error(int(row), f"{sentence}; {act}")
     _refuse_other_readings(table, names, rows, begin)
     is_unread = np.asarray(np.isnan(rows).all(axis=1))
     unread = frozenset(name for name, row in first.items() if is_unread[row])
@@ -281,28 +266,6 @@ def _read_file(table: Table, is_base: BoolArray, robot: Mechanism, several: bool
     return _FilePoses(
         table, names, first, rows, sigma, read, unread if may_be_absent else frozenset()
     )
-
-
-def _refuse_empty_cells(
-    table: Table,
-    columns: Sequence[NumberColumn],
-    rows: FloatArray,
-    begin: IntArray,
-    several: bool,
-    hint: str,
-) -> None:
-    """Raise FileError where the first row of a pose lacks readings (rows, a); with `several` files,
-    another one may state all of them.
-
-    Parameters
-    ----------
-    begin : (rows,) first row of the pose, -1 for rows of two poses. hint : what else helps.
-    """
-    absent = np.isnan(rows)
-    is_first = begin == np.arange(len(rows))
-    for row in np.flatnonzero(is_first & absent.any(axis=1) & ~(several & absent.all(axis=1))):
-        column = columns[int(np.argmax(absent[row]))].name
-        raise table.row_error(int(row), f"column {column!r} is empty; write its value{hint}")
 
 
 def _refuse_other_readings(
@@ -405,7 +368,19 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> 
         An unknown actuator, a missing or wrong unit, a negative number, or an empty cell where no
         setting and no robot file states the noise.
     """
-    stated = _read_setting(table, robot)
+    file, node = table.settings, table.settings.content.get(READING_NOISE, {})
+    dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
+    places: dict[str, Location] = {name: (READING_NOISE, name) for name in dimensions}
+    if not isinstance(node, dict):
+        node = dict.fromkeys(dimensions, node)
+        places = dict.fromkeys(dimensions, (READING_NOISE,))
+    refuse_unknown_keys(file, list(node), list(dimensions), (READING_NOISE,))
+    stated: dict[str, float] = {}
+    for name, text in node.items():
+        stated[name] = file.quantity(text, dimensions[name], places[name])
+        if stated[name] != 0.0 and (fault := find_sd_fault(stated[name])):
+            sentence = f"the noise of readings is {text}; {fault}, or 0 where exact"
+            raise file.error(sentence, places[name])
     usual = [stated.get(actuator.name, np.nan) for actuator in robot.actuators]
     sigma = np.tile(usual, (len(readings), 1))
     known = list_columns(robot, ())
@@ -425,24 +400,6 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> 
                 act = f"write it, 0 where it is exact or inf, or state '{READING_NOISE}'"
                 raise table.row_error(int(row), f"{sentence}; {act}")
     return np.where(np.isnan(readings), np.inf, sigma)
-
-
-def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
-    """Return actuator -> standard deviation [SI] of the settings."""
-    file, node = table.settings, table.settings.content.get(READING_NOISE, {})
-    dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
-    places: dict[str, Location] = {name: (READING_NOISE, name) for name in dimensions}
-    if not isinstance(node, dict):
-        node = dict.fromkeys(dimensions, node)
-        places = dict.fromkeys(dimensions, (READING_NOISE,))
-    refuse_unknown_keys(file, list(node), list(dimensions), (READING_NOISE,))
-    stated = {}
-    for name, text in node.items():
-        stated[name] = file.quantity(text, dimensions[name], places[name])
-        if stated[name] != 0.0 and (fault := find_sd_fault(stated[name])):
-            sentence = f"the noise of readings is {text}; {fault}, or 0 where exact"
-            raise file.error(sentence, places[name])
-    return stated
 
 
 def _refuse_contradictions(
@@ -524,8 +481,6 @@ def read_held_out(tables: Sequence[Table], poses: PoseRows) -> BoolArray:
 FORMAT = 1
 WHAT = "measurement file"
 Paths = str | Path | Sequence[str | Path]
-FileRows = list[tuple["Observations", tuple[str, ...]]]
-"""Observations of a file, with the place of each row."""
 
 
 def load_measurements(
@@ -596,7 +551,10 @@ def _join_tables(
         sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
         raise FileError(sentence, tables[0].path)
     check_base_targets(tables, kinds)
-    of_base = [find_base_rows(t, of_file) for t, of_file in zip(tables, kinds, strict=True)]
+    of_base = [np.zeros(len(table), dtype=bool) for table in tables]
+    for is_base, of_file in zip(of_base, kinds, strict=True):
+        for entry in (entry for entry in of_file if entry.kind.is_of_base):
+            is_base[entry.rows] = True
     poses = read_pose_rows(tables, robot, of_base)
     context = [read_context(table) for table in tables]
     beside_poses = _collect_pose_context(tables, kinds, poses.members, context, len(poses.labels))
@@ -606,9 +564,17 @@ def _join_tables(
             tables, kinds, poses.members, context, strict=True
         )
     ]
-    read = _leave_out_unfilled(read)
+    # A file in which nothing was measured yet, the sheet of a plan, only contributes readings and
+    # uses of poses that the others name; if no file has a measured value, all rows are kept.
+    is_filled = [any(rows.is_measured.any() for rows, _ in of_file) for of_file in read]
+    if any(is_filled):
+        read = [of if filled else [] for of, filled in zip(read, is_filled, strict=True)]
     settings = [
-        (table.settings, [rows for rows, _ in of_file], _join_shared_errors(entries))
+        (
+            table.settings,
+            [rows for rows, _ in of_file],
+            {name: sd for entry in entries for name, sd in entry.shared_errors.items()},
+        )
         for table, of_file, entries in zip(tables, read, kinds, strict=True)
         if of_file
     ]
@@ -633,13 +599,12 @@ def _join_tables(
         check_strokes(data, robot, allow=allow_outside_stroke, places=_place_poses(data, places))
         places += [places_of_base for _, places_of_base in on_base]
         check_duplicates(data, allow=allow_duplicates, places=places)
-    is_named = _find_named_poses(kinds, read, poses.members, len(poses.labels))
+    # Poses that only an unfilled sheet names were planned, not measured.
+    is_named = np.zeros(len(poses.labels), dtype=bool)
+    for of_file, left, of_rows in zip(kinds, read, poses.members, strict=True):
+        if left or not of_file:
+            is_named[[pose for members in of_rows for pose in members]] = True
     return data if is_named.all() else data.take(is_named)
-
-
-def _join_shared_errors(entries: Sequence[KindRows]) -> dict[str, float]:
-    """Return the standard deviations of the biases and drifts of all kinds of a file."""
-    return {name: sd for entry in entries for name, sd in entry.shared_errors.items()}
 
 
 def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[int, str]:
@@ -649,35 +614,6 @@ def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[in
         repeated = [place for place in of_rows for _ in range(rows.kind.poses_per_row)]
         first |= zip(rows.rows.ravel()[::-1].tolist(), reversed(repeated), strict=True)
     return first
-
-
-def _leave_out_unfilled(read: list[FileRows]) -> list[FileRows]:
-    """Return the rows of each file, none of a file in which nothing was measured yet.
-
-    Such a file, the sheet of a plan, only contributes readings and uses of poses that the others
-    name. If no file has a measured value, all rows are kept.
-    """
-    is_filled = [any(rows.is_measured.any() for rows, _ in of_file) for of_file in read]
-    if not any(is_filled):
-        return read
-    return [of_file if filled else [] for of_file, filled in zip(read, is_filled, strict=True)]
-
-
-def _find_named_poses(
-    kinds: Sequence[Sequence[object]],
-    read: Sequence[FileRows],
-    members: Sequence[Sequence[tuple[int, ...]]],
-    count: int,
-) -> BoolArray:
-    """Return which poses (count,) another file than an unfilled sheet names.
-
-    The other poses of a sheet were planned, not measured: their uses and readings say nothing.
-    """
-    is_named = np.zeros(count, dtype=bool)
-    for of_file, left, of_rows in zip(kinds, read, members, strict=True):
-        if left or not of_file:
-            is_named[[pose for poses in of_rows for pose in poses]] = True
-    return is_named
 
 
 def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:

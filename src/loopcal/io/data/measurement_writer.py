@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,7 +135,11 @@ def format_measurements(
     names += [*(["kind"] if len(kinds) > 1 else []), *of_poses]
     names += [name for rows in observations for name in rows.context]
     names += [name for _, table in tables for name in table]
-    _refuse_columns(name for _, table in tables for name in table)
+    for name in (name for _, table in tables for name in table):
+        prefixes = (SIGMA, MEASURED, COVARIANCE)
+        plain = next((name.removeprefix(p) for p in prefixes if name.startswith(p)), name)
+        if fault := find_column_fault(plain, "measured value"):
+            raise DataError(fault)
     columns: list[Column] = [known.get(n, ContextColumn(n)) for n in dict.fromkeys(names)]
     lines.append(format_row(column.header for column in columns))
 
@@ -183,16 +187,11 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
     ]
     texts = [format_kind(kind, of, robot.tool) for kind, of in zip(kinds, noise, strict=True)]
     settings = _format_settings(robot, list(zip(labels, texts, strict=True)), "")
-    unknown = _describe_unknowns(kinds)
-    return "\n".join([*settings, header, ADDED, *unknown, *compared]) + "\n"
-
-
-def _describe_unknowns(kinds: Sequence[Kind]) -> list[str]:
-    """Return the remarks of a template on unknown frames and targets."""
     unknown = [(kind, getattr(kind, "unknown", ())) for kind in kinds]
     frames = [getattr(kind, "frame", "") for kind, names in unknown if "frame" in names]
     remarks = [UNKNOWN_FRAME.format(quote_scalar(name)) for name in dict.fromkeys(frames)]
-    return remarks + [UNKNOWN_TARGETS] * any("targets" in names for _, names in unknown)
+    remarks += [UNKNOWN_TARGETS] * any("targets" in names for _, names in unknown)
+    return "\n".join([*settings, header, ADDED, *remarks, *compared]) + "\n"
 
 
 def format_data_sheet(
@@ -270,15 +269,6 @@ def _refuse_names(data: Measurements) -> None:
     if len(set(labels)) < len(labels):
         name = next(name for name in labels if labels.count(name) > 1)
         raise DataError(f"two poses are named {name!r}, but names must differ; rename one")
-
-
-def _refuse_columns(names: Iterable[str]) -> None:
-    """Raise DataError for the name of a measured column that a file cannot have."""
-    for name in names:
-        prefixes = (SIGMA, MEASURED, COVARIANCE)
-        plain = next((name.removeprefix(p) for p in prefixes if name.startswith(p)), name)
-        if fault := find_column_fault(plain, "measured value"):
-            raise DataError(fault)
 
 
 def _tabulate_poses(data: Measurements, robot: Mechanism) -> tuple[str, dict[str, FloatArray]]:

@@ -49,7 +49,6 @@ from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COL
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.exports.profile import (
     ColumnSource,
-    Pattern,
     PatternClock,
     Place,
     Profile,
@@ -109,7 +108,12 @@ def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[
         cells = _split(line, profile.delimiter)
         names = [normalize_name(cell) for cell in cells] if named else []
         if named and named <= set(names):
-            header = _parse_header(path, number, names, named)
+            for name in sorted(named):
+                if names.count(name) > 1:
+                    sentence = f"duplicate column {name!r}; name it by its place in the profile"
+                    raise FileError(sentence, path, number)
+            places = {name: place for place, name in reversed(list(enumerate(names)))}
+            header = Header(places, len(names))
         elif not named or header is not None:
             lines.append(Line(number, cells, header))
             continue
@@ -206,15 +210,6 @@ def _decode(path: Path, profile: Profile) -> str:
     if not text.strip():
         raise FileError("this export is empty; export it again", path)
     return text
-
-
-def _parse_header(path: Path, number: int, cells: Sequence[str], named: set[str]) -> Header:
-    """Return the places of the columns; FileError where a needed name occurs twice."""
-    for name in sorted(named):
-        if cells.count(name) > 1:
-            sentence = f"duplicate column {name!r}; name it by its place in the profile"
-            raise FileError(sentence, path, number)
-    return Header({cell: place for place, cell in reversed(list(enumerate(cells)))}, len(cells))
 
 
 def _split(line: str, delimiter: str | None) -> list[str]:
@@ -396,9 +391,9 @@ def convert_export(
     """
     path = as_path(path, "export")
     clock = PatternClock(profile.file, pattern_seconds)
-    lines, skipped = read_lines(path, profile, clock)
+    read, skipped = read_lines(path, profile, clock)
     fitting, misfits = [], []
-    for line in lines:
+    for line in read:
         try:
             check_count(line, profile.delimiter)
             fitting.append((line, _parse_row(line, profile, clock)))
@@ -412,12 +407,16 @@ def convert_export(
             raise FileError("the profile skips every line of this export; correct it", path)
         number, reason = misfits[0]
         sentence = f"no line of this export fits {profile.file.path}"
-        if lines[0].header is None and not fitting:
+        if read[0].header is None and not fitting:
             # nothing shows that the profile is meant for this file, which may contain secrets
             raise FileError(f"{sentence}; compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
     settings = {"format": FORMAT, **profile.record.settings}
-    lines = _format_remarks(path, profile, misfits, findings)
+    remark = format_comment(f"converted from {path.name} by {profile.file.path.name}")
+    lines = [f"## {remark}"]
+    if misfits:
+        lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
+    lines += [f"## {format_comment(str(finding))}" for finding in findings]
     lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
     table = _tabulate(profile, rows)
     text = "\n".join([*lines, *map(format_row, table)]) + "\n"
@@ -446,7 +445,10 @@ def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:
             continue
         text = " ".join("" if cell in profile.missing else cell for cell in cells).strip()
         if source.pattern is not None:
-            row |= _match_name(text, source.pattern, clock)
+            groups = clock.match_all(source.pattern, text, ("columns", "pose", "match"))
+            if groups is None:
+                raise Misfit(f"the name {quote(text)} does not match {source.pattern.pattern}")
+            row |= {k: (groups[k] or "").strip() for k in ("pose", "target") if k in groups}
         else:
             row[name] = make_name(text) if name.startswith(NOTE) else text
             row[name] = _parse_time(text, source) if name == TIME else row[name]
@@ -503,14 +505,6 @@ def _scale_sigma(text: str, source: ColumnSource, name: str) -> str:
     return text if source.factor == 1.0 else f"{scaled.normalize():.17g}"
 
 
-def _match_name(name: str, pattern: Pattern, clock: PatternClock) -> Row:
-    """Return the pose, and the target, in a name."""
-    groups = clock.match_all(pattern, name, ("columns", "pose", "match"))
-    if groups is None:
-        raise Misfit(f"the name {quote(name)} does not match {pattern.pattern}")
-    return {key: (groups[key] or "").strip() for key in ("pose", "target") if key in groups}
-
-
 def _parse_time(text: str, source: ColumnSource) -> str:
     """Return a date and time in ISO 8601."""
     if not text:
@@ -537,17 +531,6 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
     R = geometry.project_to_rotations(matrix)
     quaternion = (repr(float(q)) for q in geometry.matrix_to_quaternion(R))
     return dict(zip(QUATERNION, quaternion, strict=True))
-
-
-def _format_remarks(
-    path: Path, profile: Profile, misfits: Sequence[tuple[int, str]], findings: Sequence[Finding]
-) -> list[str]:
-    """Return the remarks at the top of the measurement file."""
-    origin = format_comment(f"converted from {path.name} by {profile.file.path.name}")
-    lines = [f"## {origin}"]
-    if misfits:
-        lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
-    return lines + [f"## {format_comment(str(finding))}" for finding in findings]
 
 
 def _tabulate(profile: Profile, rows: Sequence[Row]) -> tuple[tuple[str, ...], ...]:

@@ -119,10 +119,8 @@ def _name_pattern(text: str) -> str:
 
 def _multiply_counts(text: str) -> int:
     """Return the product of all counts in braces, the larger one of each pair."""
-    counts = (
-        max(int(n) for n in (*match.groups("0"), "1") if n) for match in _COUNT.finditer(text)
-    )
-    return math.prod(counts)
+    found = (match.groups("0") for match in _COUNT.finditer(text))
+    return math.prod(max(int(n) for n in (*pair, "1") if n) for pair in found)
 
 
 # Profiles: how to read the text that an instrument's software exports.
@@ -348,9 +346,21 @@ def read_profile(path: str | Path) -> Profile:
         raise file.error("'comment' is empty; write the start of a comment line", ("comment",))
     if record.ignore is not None:
         refuse_pattern(file, record.ignore, ("ignore",))
-    _check_encoding(file, record.encoding)
+    try:
+        "".encode(codecs.lookup(record.encoding).name)  # refuses codecs not of text, such as hex
+    except (LookupError, ValueError):
+        sentence = f"{record.encoding!r} is not a known encoding"
+        act = "write utf-8, utf-16, latin-1 or cp1252"
+        raise file.error(f"{sentence}; {act}", ("encoding",)) from None
     profile = Profile(file, record, kind)
-    _check_matrix(profile)
+    if "matrix" in file.content:
+        places = record.matrix_places
+        _check_places(file, places, ("matrix",))
+        is_pose = kind is not None and kind.name == "pose"
+        is_quaternion = is_pose and getattr(kind, "orientation", None) == "quaternion"
+        if len(places) != 9 or not is_quaternion:
+            sentence = "a matrix has nine columns, row by row, and needs 'kind: pose, orientation:"
+            raise file.error(f"{sentence} quaternion'; correct it", ("matrix",))
     check_columns(profile)
     return profile
 
@@ -453,31 +463,31 @@ def _check_source(
         unit_place = (*place, "unit")
         wanted = dimensions.get(name.replace(MEASURED, ""), ())
         _check_unit(file, name, source.symbol, unit_place, wanted)
-        _check_header_unit(file, " ".join(map(str, source.places)), source.symbol, unit_place)
+        header = " ".join(map(str, source.places))
+        match = STATED.search(header)
+        stated = source.symbol if match is None else ALIASES.get(match["unit"], match["unit"])
+        known = {*list_symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}
+        if stated != source.symbol and stated in known:
+            sentence = f"the export's header is {header!r}, but the unit here is {source.symbol!r}"
+            act = f"write the unit {stated}, or name the column by its place"
+            raise file.error(f"{sentence}; {act}", unit_place)
     _check_scale(file, name, source, place)
     for key, value, owner in (("match", source.match, "pose"), ("format", source.format, TIME)):
         if value is not None and (name != owner or not is_text):
             sentence = f"{key!r} belongs to {owner!r}, not to {name!r}; remove it"
             raise file.error(sentence, (*place, key))
     if source.format is not None:
-        _check_time_format(file, source.format, (*place, "format"))
+        try:
+            datetime.strptime(SOME_TIME.strftime(source.format), source.format)
+        except (ValueError, re.error):  # strptime makes a regular expression of it
+            sentence = f"{quote(source.format)} is not a format of times"
+            act = "write each of its parts once, such as '%d.%m.%Y %H:%M:%S'"
+            raise file.error(f"{sentence}; {act}", (*place, "format")) from None
     if source.match is not None:
         refuse_pattern(file, source.match, (*place, "match"))
         if source.pattern is None or "pose" not in source.pattern.groupindex:
             sentence = "this pattern finds no pose; put its part of the name in (?P<pose>..)"
             raise file.error(sentence, (*place, "match"))
-
-
-def _check_time_format(file: YamlFile, text: str, place: Location) -> None:
-    """Raise FileError for a format with which Python cannot read the times that it writes."""
-    try:
-        datetime.strptime(SOME_TIME.strftime(text), text)
-    except (ValueError, re.error):  # strptime makes a regular expression of it
-        sentence = (
-            f"{quote(text)} is not a format of times; write each of its parts once, such as "
-            "'%d.%m.%Y %H:%M:%S'"
-        )
-        raise file.error(sentence, place) from None
 
 
 def _check_scale(file: YamlFile, name: str, source: ColumnSource, place: Location) -> None:
@@ -524,30 +534,6 @@ def _check_unit(
             raise file.error(sentence, place) from None
 
 
-def _check_header_unit(file: YamlFile, header: str, symbol: str, place: Location) -> None:
-    """Raise FileError where the export's header states another unit behind the name."""
-    match = STATED.search(header)
-    behind = symbol if match is None else match["unit"]
-    stated = ALIASES.get(behind, behind)
-    if stated != symbol and stated in {*list_symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}:
-        sentence = f"the export's header is {header!r}, but the unit here is {symbol!r}"
-        act = f"write the unit {stated}, or name the column by its place"
-        raise file.error(f"{sentence}; {act}", place)
-
-
-def _check_matrix(profile: Profile) -> None:
-    """Raise FileError for a matrix that does not have nine columns, or a kind without it."""
-    places, kind = profile.record.matrix_places, profile.kind
-    if "matrix" not in profile.file.content:
-        return
-    _check_places(profile.file, places, ("matrix",))
-    is_pose = kind is not None and kind.name == "pose"
-    is_quaternion = is_pose and getattr(kind, "orientation", None) == "quaternion"
-    if len(places) != 9 or not is_quaternion:
-        sentence = "a matrix has nine columns, row by row, and needs 'kind: pose, orientation:"
-        raise profile.file.error(f"{sentence} quaternion'; correct it", ("matrix",))
-
-
 def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -> None:
     """Raise FileError for places that are neither names nor numbers from 1."""
     for place in places:
@@ -557,15 +543,6 @@ def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -
     if not places:
         sentence = "no column is named; write a name in the export's header or a place from 1"
         raise file.error(sentence, location)
-
-
-def _check_encoding(file: YamlFile, name: str) -> None:
-    """Raise FileError for a name that is not a known encoding of text."""
-    try:
-        "".encode(codecs.lookup(name).name)  # refuses codecs that are not text, such as hex
-    except (LookupError, ValueError):
-        sentence = f"{name!r} is not a known encoding; write utf-8, utf-16, latin-1 or cp1252"
-        raise file.error(sentence, ("encoding",)) from None
 
 
 # Profiles that come with loopcal, and what differs between two computers with the same

@@ -33,7 +33,7 @@ from loopcal.measure.kinds.points import name_point
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.units import Dimension, find_unit
+from loopcal.units import find_unit
 
 Row = dict[str, str]
 """Column -> cell."""
@@ -57,14 +57,6 @@ class FilledSheet:
     data: Measurements
     unit: str
     findings: tuple[Finding, ...]
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Rows of an export by pose, with the units of their columns."""
-
-    units: Mapping[str, str | None]
-    rows: Sequence[tuple[str, Row]]
 
 
 def fill_sheet(
@@ -100,11 +92,14 @@ def fill_sheet(
     identical: list[str] = []
     has_sessions = len(exports) > 1 and not has_one_session
     for export in exports:
-        read = _read_points(Path(export), profile, entry, table, by_order, misfits)
-        _unite_units(units, read.units, Path(export))
+        of_export, rows = _read_points(Path(export), profile, entry, table, by_order, misfits)
+        for name, unit in of_export.items():  # the profile is one
+            if units.setdefault(name, unit) != unit:
+                sentence = f"column {name!r} has another unit than in the first export"
+                raise FileError(sentence, Path(export))
         if has_sessions:
             units.setdefault("session", None)
-        for pose, row in read.rows:
+        for pose, row in rows:
             if pose not in table.pose_names():
                 unknown += [name_point(pose, t, targets) for t in _list_measured(row, targets)]
                 continue
@@ -126,13 +121,15 @@ def fill_sheet(
     data = _build_measurements(robot, table, entry, body, units)
     source = " and ".join(map(str, exports))  # the file whose values a check doubts
     data = replace(data, observations=tuple(replace(o, source=source) for o in data.observations))
-    header = _list_header(table, units, columns)
+    # columns of the sheet, measured ones with the unit of the export, then further ones
+    header = {n: units.get(n, u) if n in columns else u for n, u in table.units.items()}
+    header |= {name: unit for name, unit in units.items() if name not in header}
     lines = _list_settings(table)
     cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
-    rows = (format_header(header), *cells)
-    text = "\n".join([*lines, *map(format_row, rows)]) + "\n"
+    written = (format_header(header), *cells)
+    text = "\n".join([*lines, *map(format_row, written)]) + "\n"
     unit = next((units.get(name) for name in columns if units.get(name)), None) or "mm"
-    return FilledSheet(text, rows, tuple(misfits), data, unit, tuple(findings))
+    return FilledSheet(text, written, tuple(misfits), data, unit, tuple(findings))
 
 
 def save_filled_sheet(filled: FilledSheet, path: str | Path) -> None:
@@ -161,8 +158,8 @@ def _read_points(
     table: Table,
     by_order: bool,
     misfits: list[tuple[str, int, str]],
-) -> _Points:
-    """Return the rows of an export, read as the kind of the sheet; add its misfits."""
+) -> tuple[Mapping[str, str | None], list[tuple[str, Row]]]:
+    """Return the units of the columns of an export, and its rows by pose; add its misfits."""
     kind, record = entry.kind, replace(profile.record, settings={})
     targets = tuple(getattr(kind, "targets", ()))
     if by_order:
@@ -177,7 +174,7 @@ def _read_points(
     units = {name: unit for name, unit in list_headers(mine).items() if name != "pose"}
     rows = [dict(zip(("pose", *units), cells, strict=True)) for cells in conversion.table[1:]]
     if not by_order:
-        return _Points(units, [(row.pop("pose"), row) for row in rows])
+        return units, [(row.pop("pose"), row) for row in rows]
     poses, k = table.pose_names(), max(len(targets), 1)
     if len(rows) != len(poses) * k:
         wanted, count = len(poses) * k, len(rows)
@@ -195,16 +192,7 @@ def _read_points(
         }
         own |= {of_target[name]: unit for name, unit in units.items()}
         named.append((poses[i // k], {of_target[name]: row[name] for name in units}))
-    return _Points(own, named)
-
-
-def _unite_units(
-    units: dict[str, str | None], of_export: Mapping[str, str | None], path: Path
-) -> None:
-    """Add the units of an export; the profile is one, so they are the same in all."""
-    for name, unit in of_export.items():
-        if units.setdefault(name, unit) != unit:
-            raise FileError(f"column {name!r} has another unit than in the first export", path)
+    return own, named
 
 
 def _add_row(rows: list[Row], row: Row, columns: Sequence[str]) -> bool:
@@ -277,14 +265,6 @@ def _merge(
             yield {**dict.fromkeys(units, ""), **kept, **{n: c for n, c in points.items() if c}}
 
 
-def _list_header(
-    table: Table, units: Mapping[str, str | None], columns: Sequence[str]
-) -> dict[str, str | None]:
-    """Return column -> unit: those of the sheet, measured ones with the unit of the export."""
-    header = {n: units.get(n, u) if n in columns else u for n, u in table.units.items()}
-    return header | {name: unit for name, unit in units.items() if name not in header}
-
-
 def _list_settings(table: Table) -> list[str]:
     """Return the lines above the header of a sheet."""
     lines = read_text(table.path, "sheet").lstrip("\ufeff").splitlines()
@@ -302,7 +282,11 @@ def _build_measurements(
     planned = load_measurements(table.path, robot, allow_outside_stroke=True, allow_duplicates=True)
     place = {name: i for i, name in enumerate(planned.labels)}
     columns = entry.kind.columns
-    factors = [_get_factor(units.get(c.name), c.dimension) for c in columns]
+    symbols = [units.get(column.name) for column in columns]
+    factors = [
+        1.0 if symbol is None else find_unit(symbol, column.dimension).factor_to_si
+        for symbol, column in zip(symbols, columns, strict=True)
+    ]
     measured = np.array(
         [
             [float(row.get(c.name) or "nan") * f for c, f in zip(columns, factors, strict=True)]
@@ -321,7 +305,3 @@ def _build_measurements(
         np.array([row.get("session", "") for row in body])[present],
     )
     return replace(planned, observations=(observations,))
-
-
-def _get_factor(symbol: str | None, dimension: Dimension) -> float:
-    return 1.0 if symbol is None else find_unit(symbol, dimension).factor_to_si

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
 import math
 import re
 import textwrap
@@ -102,21 +103,15 @@ def _format_rows(rows: Sequence[Mapping[str, str]]) -> str:
     return "".join(lines)
 
 
-def _read_number(text: str) -> float | None:
-    """Return what YAML reads from the text of a number, or from `null`."""
-    if text == "null":
-        return None
-    return int(text) if text.lstrip("-").isdigit() else float(text)
-
-
 def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = None) -> YamlFile:
     """Return a robot file without a table with that of `format_table`."""
     rows = _list_rows(robot, plus_minus)
     if not rows:
         return file
+    # JSON reads the texts of the numbers, and `null`, as YAML does
     numbers = ("value", PLUS_MINUS)
-    content: list[dict[str, Any]] = [
-        {key: _read_number(text) if key in numbers else text for key, text in row.items()}
+    content = [
+        {key: json.loads(text) if key in numbers else text for key, text in row.items()}
         for row in rows
     ]
     return add_key(file, _format_rows(rows), {TABLE: content})
@@ -255,7 +250,13 @@ def build_robot(file: YamlFile) -> Mechanism:
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file, record)
         robot = build(_assemble(record, file), symbols, origin)
-        _refuse_column_names(robot, file)
+        for actuator in robot.actuators:  # measurement files have them as columns
+            if fault := find_column_fault(actuator.name, "actuator"):
+                raise file.error(fault, ("actuators", actuator.name))
+        for i, limb in enumerate(robot.assembly.limbs):
+            for joint in limb.joints:
+                if fault := find_column_fault(f"{limb.name}.{joint.name}", "joint"):
+                    raise file.error(fault, ("limbs", i))
     if TABLE not in file.content:
         return robot
     return robot.with_values(read_possible_values(file, robot))
@@ -316,20 +317,13 @@ def find_robot_file(source: str | Path) -> Path:
     if str(source) in shipped and not path.is_file():
         return shipped[str(source)]
     if path.exists():
-        _refuse_file_of_program(path)
+        program = PROGRAMS.get(path.suffix.lower())
+        if program is not None and path.is_file():  # the configuration of a printer
+            raise FileError(report_finding("files.robot-of-program", program=program), path)
         return path
     hint, names = suggest_names(str(source), shipped), ", ".join(shipped) or "none"
     act = f"name a file, or one of the shipped robots: {names}"
     raise FileError(f"this robot file does not exist{hint}; {act}", path)
-
-
-def _refuse_file_of_program(path: Path) -> None:
-    """Raise FileError for the configuration of a printer, which must be imported first."""
-    if path.suffix.lower() not in PROGRAMS or not path.is_file():
-        return
-    program = PROGRAMS[path.suffix.lower()]
-    finding = report_finding("files.robot-of-program", program=program)
-    raise FileError(finding, path)
 
 
 def list_shipped_robots() -> dict[str, Path]:
@@ -365,17 +359,6 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
         sentence = f"{family!r} is not a family of robots{suggest_names(str(family), known)}"
         raise file.error(f"{sentence}; allowed: {', '.join(known)}", ("family",))
     return str(family)
-
-
-def _refuse_column_names(robot: Mechanism, file: YamlFile) -> None:
-    """Raise FileError for an actuator or joint that measurement files cannot have as a column."""
-    for actuator in robot.actuators:
-        if fault := find_column_fault(actuator.name, "actuator"):
-            raise file.error(fault, ("actuators", actuator.name))
-    for i, limb in enumerate(robot.assembly.limbs):
-        for joint in limb.joints:
-            if fault := find_column_fault(f"{limb.name}.{joint.name}", "joint"):
-                raise file.error(fault, ("limbs", i))
 
 
 def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:

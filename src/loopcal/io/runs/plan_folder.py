@@ -24,7 +24,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import format_row, parse_exact
-from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
+from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN, get_dimension
 from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
 from loopcal.mechanism.model import Mechanism
@@ -67,7 +67,10 @@ def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
     """
     robot = plan.robot
     headers, factors = _list_columns(robot)
-    path = _list_path_coordinates(robot)
+    # paths are straight in these coordinates; a tilt moves along its vector
+    names = [name for name in robot.controlled if name not in ("phi", "theta")]
+    tilt = ["theta*cos(phi)", "theta*sin(phi)"] if "phi" in robot.controlled else []
+    path = ", ".join([*names, *tilt])
     lines = [
         f"## Poses of {robot.name} to measure in this order, starting from home.",
         f"## Between two poses move straight in {path}. Measure {FIT} and",
@@ -159,13 +162,6 @@ def _list_columns(robot: Mechanism) -> tuple[list[str], list[float]]:
     units = {name: find_unit(robot.units[dimension]) for name, dimension in dimensions.items()}
     headers = [f"{name} [{unit.symbol}]" for name, unit in units.items()]
     return headers, [unit.factor_to_si for unit in units.values()]
-
-
-def _list_path_coordinates(robot: Mechanism) -> str:
-    """Return the coordinates in which paths are straight; a tilt moves along its vector."""
-    names = [name for name in robot.controlled if name not in ("phi", "theta")]
-    tilt = ["theta*cos(phi)", "theta*sin(phi)"] if "phi" in robot.controlled else []
-    return ", ".join([*names, *tilt])
 
 
 def _format(value: float, factor: float) -> str:

@@ -25,7 +25,7 @@ from loopcal.io.core.csv_table import (
     read_table,
     require_columns,
 )
-from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
+from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.columns import COMMANDED, NOTE, get_dimension
 from loopcal.mechanism.model import Mechanism

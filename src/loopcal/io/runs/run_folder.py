@@ -24,7 +24,7 @@ import numpy as np
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.result_folder import (
+from loopcal.io.core.outputs import (
     FolderKind,
     describe_leftover,
     list_changed_files,
