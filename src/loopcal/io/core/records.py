@@ -283,7 +283,7 @@ NEEDED: Mapping[type, tuple[tuple[type, ...], str, str]] = {
 """Type of a field -> types that a file may have there, in words, and what to do."""
 
 
-def _require(needed: type, node: Any, at: Location) -> Any:
+def _require(needed: Any, node: Any, at: Location) -> Any:
     """Return a node of the type that is needed; a whole number as a float where that is needed."""
     allowed, words, act = NEEDED[needed]
     if isinstance(node, allowed) and (needed is bool or not isinstance(node, bool)):
