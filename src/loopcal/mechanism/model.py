@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,12 +29,6 @@ from loopcal.results.description import Field, label_axes
 from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit, find_unit
-
-if TYPE_CHECKING:
-    pass
-
-
-# The parameters by which poses are differentiated, and how they move displacements and joints.
 
 
 class MovedSlots(NamedTuple):
@@ -104,21 +98,15 @@ class ParameterUnits:
         if slots.shared:
             of_slots, of_columns, units = self._entries
             slopes = slots.jacobian(values)[:, of_slots, of_columns] * units
-        return ParameterMap(
-            pattern,
-            slopes[:, :cut],
-            slopes[:, cut:],
-            self._evaluate_terms(q, tau),
-            self._evaluate_slopes(q, tau),
+        # with summed drives one for each joint, so that derivatives by readings are those by joints
+        by_readings = (
+            joint_slopes(q, tau, slots.frequency)
+            if (weights := select_weights(tau)) is None
+            else np.ones((1, 1, weights.shape[-1]))
         )
-
-    def _evaluate_slopes(self, q: FloatArray, tau: FloatArray) -> FloatArray:
-        """Return d joint / d reading (t | 1, n | 1, a); with summed drives one for each joint, so
-        that derivatives by readings are those by joints.
-        """
-        if (weights := select_weights(tau)) is not None:
-            return np.ones((1, 1, weights.shape[-1]))
-        return joint_slopes(q, tau, self.slots.frequency)
+        return ParameterMap(
+            pattern, slopes[:, :cut], slopes[:, cut:], self._evaluate_terms(q, tau), by_readings
+        )
 
     def _evaluate_terms(self, q: FloatArray, tau: FloatArray) -> FloatArray:
         """Return what the moved transmission terms contribute, (t | 1, n | 1, a, terms)."""

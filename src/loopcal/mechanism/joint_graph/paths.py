@@ -58,10 +58,13 @@ def list_blocks(graph: JointGraph) -> tuple[Block, ...]:
     carrier = {joint.body_b: joint for joint in graph.tree}
     group = {joint: joint for joint in graph.joints}
     for closing in graph.closing:
-        carriers_a, carriers_b = (
-            _list_carriers(carrier, body) for body in (closing.body_a, closing.body_b)
-        )
-        joined = {group[joint] for joint in {closing} | ({*carriers_a} ^ {*carriers_b})}
+        loop = {closing}
+        for end in (closing.body_a, closing.body_b):  # joints to the base that both have drop out
+            body = end
+            while body in carrier:
+                loop ^= {carrier[body]}
+                body = carrier[body].body_a
+        joined = {group[joint] for joint in loop}
         group = {joint: closing if of in joined else of for joint, of in group.items()}
     blocks = []
     for first in dict.fromkeys(group[joint] for joint in graph.tree):
@@ -81,18 +84,6 @@ def find_blocks(graph: JointGraph, platform: str) -> tuple[Block, ...]:
     return tuple(reversed(path))
 
 
-def list_end_blocks(graph: JointGraph) -> tuple[Block, ...]:
-    """Return the blocks with motors that carry no other block with motors."""
-    driven = [block for block in list_blocks(graph) if block.graph.motors]
-    carrying = {
-        joint
-        for block in driven
-        for before in find_blocks(graph, block.graph.base)
-        for joint in before.graph.joints
-    }
-    return tuple(block for block in driven if not carrying & {*block.graph.joints})
-
-
 def select_joints(graph: JointGraph, joints: Collection[GraphJoint]) -> JointGraph:
     """Return the mechanism with some of its joints only."""
     tree = tuple(joint for joint in graph.tree if joint in joints)
@@ -109,15 +100,6 @@ def keep_path(graph: JointGraph, platform: str) -> JointGraph:
     """Return the mechanism without the joints that move nothing between base and platform."""
     blocks = find_blocks(graph, platform)
     return select_joints(graph, {joint for block in blocks for joint in block.graph.joints})
-
-
-def _list_carriers(carrier: dict[str, GraphJoint], body: str) -> list[GraphJoint]:
-    """Return the joints of the tree from a body to the base."""
-    joints = []
-    while body in carrier:
-        joints.append(carrier[body])
-        body = carrier[body].body_a
-    return joints
 
 
 MOTION = 1e-9
@@ -172,7 +154,9 @@ def place_limbs(
     """
     graph, platform = block.graph, block.platform
     freedoms = list_freedoms(graph, home, platform, T_body_frame, is_complete)
-    limbs = _sort_limbs(limbs, graph.motors)
+    drives = {motor: i for i, motor in enumerate(graph.motors)}
+    last = len(drives)  # passive limbs
+    limbs = tuple(sorted(limbs, key=lambda limb: min(drives.get(j.name, last) for j in limb)))
     used = {joint.name for limb in limbs for joint in limb}
     used |= {joint.origin_b for limb in limbs for joint in limb}
     replaced = tuple(joint.name for joint in graph.joints if joint.name not in used)
@@ -259,16 +243,6 @@ def find_complete_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | 
         left = [joint for joint in left if joint not in path]
         limbs.append(_orient_path(path, graph.base))
     return tuple(limbs) if limbs and not left else None
-
-
-def _sort_limbs(limbs: tuple[Path, ...], motors: tuple[str, ...]) -> tuple[Path, ...]:
-    """Return the limbs in the order of their motors, passive ones last."""
-
-    def rank(limb: Path) -> int:
-        driven = [motors.index(joint.name) for joint in limb if joint.name in motors]
-        return min(driven, default=len(motors))
-
-    return tuple(sorted(limbs, key=rank))
 
 
 def _find_driven_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | None:
@@ -428,7 +402,11 @@ def find_stage_paths(
     repair = _repair_blocks(kept, find_blocks(kept, platform), measure_rounding)
     graph = repair.graph
     blocks = find_blocks(graph, platform)
-    _refuse_passive_blocks(blocks, platform)
+    for block in blocks:
+        if not block.graph.motors:
+            names = tuple(joint.name for joint in block.graph.joints)
+            finding = report_finding("files.joints-not-held", joints=names, platform=platform)
+            raise MechanismError(finding)
     if all(block.is_serial for block in blocks):
         blocks = (Block(graph, platform),)
     turned = [_turn_base(block) for block in blocks]
@@ -440,7 +418,11 @@ def find_stage_paths(
             homes = tuple(q for q in homes if is_translating(block, _select(graph, q, block)))
         if paths is None or not homes:
             raise MechanismError(_describe_branch(whole, block, platform))
-    home, motions = _choose_home(graph, homes, platform)
+    moving = [find_freedoms(graph, q, platform) for q in homes]
+    share = FIRM_DRAWN if is_drawn_pose(graph, homes[0]) else FIRM
+    limit = share * max(freedoms.firmness for freedoms in moving)
+    pairs = zip(homes, moving, strict=True)
+    home, motions = next(pair for pair in pairs if pair[1].firmness >= limit)
     stages: list[ClosedStage | SerialStage] = []
     for (block, mount), (paths, is_complete) in zip(turned, limbs, strict=True):
         assert paths is not None
@@ -464,7 +446,15 @@ def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
     unbranched chain are left out where another body has more limbs, and bodies that fewer joints
     than motors carry, where others have more.
     """
-    return tuple(body for block in list_end_blocks(graph) for body in _list_ends(block.graph))
+    driven = [block for block in list_blocks(graph) if block.graph.motors]
+    carrying = {
+        joint
+        for block in driven
+        for before in find_blocks(graph, block.graph.base)
+        for joint in before.graph.joints
+    }
+    ends = [block.graph for block in driven if not carrying & {*block.graph.joints}]
+    return tuple(body for end in ends for body in _list_ends(end))
 
 
 def _list_ends(graph: JointGraph) -> tuple[str, ...]:
@@ -479,15 +469,6 @@ def _list_ends(graph: JointGraph) -> tuple[str, ...]:
     counts = {body: count for body, count in counts.items() if carried[body] >= needed}
     most = max(counts.values(), default=0)
     return tuple(body for body, count in counts.items() if count == most)
-
-
-def _refuse_passive_blocks(blocks: tuple[Block, ...], platform: str) -> None:
-    """Refuse joints between base and platform that no motor holds; raises MechanismError."""
-    for block in blocks:
-        if not block.graph.motors:
-            names = tuple(joint.name for joint in block.graph.joints)
-            finding = report_finding("files.joints-not-held", joints=names, platform=platform)
-            raise MechanismError(finding)
 
 
 def _repair_blocks(
@@ -512,16 +493,6 @@ def _repair_blocks(
         max((repair.angle for repair in repairs), default=0.0),
         max((repair.turn for repair in repairs), default=0.0),
     )
-
-
-def _choose_home(
-    graph: JointGraph, homes: tuple[FloatArray, ...], platform: str
-) -> tuple[FloatArray, Freedoms]:
-    """Return the first home that is firm enough, with its motions."""
-    motions = [find_freedoms(graph, home, platform) for home in homes]
-    share = FIRM_DRAWN if is_drawn_pose(graph, homes[0]) else FIRM
-    limit = share * max(freedoms.firmness for freedoms in motions)
-    return next(pair for pair in zip(homes, motions, strict=True) if pair[1].firmness >= limit)
 
 
 def _select(graph: JointGraph, q: FloatArray, block: Block) -> FloatArray:
