@@ -8,6 +8,7 @@ around it is written by hand.
 
 import dataclasses
 import inspect
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -121,10 +122,16 @@ def format_kinds() -> str:
             )
         settings = format_table(
             ("setting", "meaning"),
-            [(f"`{key}`", meanings.get(key, "")) for key in list_kind_settings(kind)],
+            [(f"`{key}`", _word(meanings.get(key, ""))) for key in list_kind_settings(kind)],
         )
         sections.append(f"### `kind: {name}`\n\n{summarize(kind)}\n\n{columns}\n{settings}")
     return "\n".join(sections)
+
+
+def _word(meaning: str) -> str:
+    """Return the meaning of a setting without the shape of its array, as a sentence begins."""
+    words = re.sub(r"^\([^)]*\)( \[\w+\])?, ", "", meaning)
+    return words if words.startswith("T_") else words[:1].upper() + words[1:]
 
 
 def _describe_example(kind: Kind) -> tuple[str, str, str]:

@@ -72,12 +72,9 @@ class FileError(LoopcalError):
 
     Parameters
     ----------
-    sentence : str
-        What was found, what is allowed, what to do.
-    path : str or Path
-        The file (or folder) as the user named it.
-    line : int, optional
-        Line number, counted from 1; None where the whole file is meant.
+    sentence : what was found, what is allowed, what to do.
+    path : the file (or folder) as the user named it.
+    line : line number, counted from 1; None where the whole file is meant.
     """
 
     def __init__(self, sentence: object, path: str | Path, line: int | None = None) -> None:

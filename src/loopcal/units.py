@@ -122,8 +122,7 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
 
     Raises
     ------
-    UnitError
-        Not a finite number, unit missing, unknown, or of another dimension.
+    UnitError : not a finite number, unit missing, unknown, or of another dimension.
     """
     stripped, example = text.strip(), EXAMPLES[dimension or Dimension.LENGTH]
     cut = next((i for i in range(len(stripped), 0, -1) if _is_number(stripped[:i])), 0)
@@ -147,8 +146,7 @@ def to_si(value: float, unit: Unit) -> float:
 
     Raises
     ------
-    UnitError
-        The number is larger than LARGEST.
+    UnitError : the number is larger than LARGEST.
     """
     if not abs(value) <= LARGEST / unit.factor_to_si:
         shown = (

@@ -17,9 +17,8 @@ def check_array(
 
     Raises
     ------
-    DataError
-        If the value, which messages call `what`, is not numeric, has another shape, or a number is
-        infinite or, unless `allow_nan`, not measured.
+    DataError : the value, which messages call `what`, is not numeric, has another shape, or a
+        number is infinite or, unless `allow_nan`, not measured.
     """
     wanted = ", ".join("any" if n is None else str(n) for n in shape)
     try:

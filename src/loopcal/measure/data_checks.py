@@ -36,8 +36,7 @@ def check_closure(
 
     Raises
     ------
-    DataError
-        `data.closure-without-redundancy`, `data.closure-without-sigma`, or that of
+    DataError : `data.closure-without-redundancy`, `data.closure-without-sigma`, or that of
         `resolve_reading_sigma`.
     """
     check_redundancy(robot, kinds)
@@ -84,8 +83,7 @@ def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
 
     Raises
     ------
-    DataError
-        `data.wrong-actuator-count`, or those of `check_closure`.
+    DataError : `data.wrong-actuator-count`, or those of `check_closure`.
     """
     columns = measurements.readings.shape[1]
     if columns != len(robot.actuators):
@@ -242,8 +240,7 @@ def check_targets_move(
 
     Raises
     ------
-    DataError
-        `conventions.target-never-moves`, with the target, its range and the expected range;
+    DataError : `conventions.target-never-moves`, with the target, its range and the expected range;
         `conventions.column-never-changes`, with a column of equal numbers.
     """
     if allow:

@@ -144,8 +144,7 @@ def guess_nuisance_values(
 
     Raises
     ------
-    DataError
-        If the poses are too few or too similar to determine a parameter.
+    DataError : the poses are too few or too similar to determine a parameter.
     """
     collected = measurements.nuisance_parameters if nuisance is None else nuisance
     if not collected.table.free.any():
@@ -177,9 +176,8 @@ def guess_nuisance_values_batch(
 
     Raises
     ------
-    DataError
-        As `guess_nuisance_values`. Of several sets, one without candidates keeps the nominal values
-        instead.
+    DataError : as `guess_nuisance_values`. Of several sets, one without candidates keeps the
+        nominal values instead.
     """
     known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
     observations = measurements.all_observations

@@ -142,13 +142,11 @@ class Sensor:
         Poses of each row. Default: every pose once. Where a row compares poses: each pose with the
         next one, and the last with the first. Targets on the base are measured twice by default,
         before and after the poses; their rows belong to no pose, and only their number matters.
-    session, group : text or (r,) text, optional
-        See `Observations`.
+    session, group : text or (r,) text, see `Observations`.
 
     Raises
     ------
-    DataError
-        If the noise does not have one number for each noise column of the kind.
+    DataError : the noise does not have one number for each noise column of the kind.
     """
 
     kind: Kind

@@ -94,35 +94,27 @@ class Measurements(TableResult):
 
     Parameters
     ----------
-    readings : (n, a) [SI]
-        Actuator readings at each pose.
-    observations : tuple of Observations
-        Their rows are indices of poses.
-    block : (n,) int, optional
-        Poses of equal number belong together (repeats, a shared covariance) and are never split.
-        Default: each pose is a block.
-    labels : tuple of str, optional
-        Names of the poses, for messages and tables. Default "1", "2", ...
-    reading_sigma : (n, a) or an array that broadcasts to it [SI], optional
-        Standard deviation of each reading: 0 is exact, infinity is missing or ignored. A reading
-        may be NaN only where its sigma is infinite. Default None: exact, unless the robot states
-        the sigma of its actuators.
+    readings : (n, a) [SI], actuator readings at each pose.
+    observations : their rows are indices of poses.
+    block : (n,) int, poses of equal number belong together (repeats, a shared covariance) and are
+        never split. Default: each pose is a block.
+    labels : names of the poses, for messages and tables. Default "1", "2", ...
+    reading_sigma : (n, a) or an array that broadcasts to it [SI], standard deviation of each
+        reading: 0 is exact, infinity is missing or ignored. A reading may be NaN only where its
+        sigma is infinite. Default None: exact, unless the robot states the sigma of its actuators.
     stated_values : tuple of StatedValue, optional
         Priors and fixed values of nuisance parameters. Default: all are estimated from the data.
-    base_observations : tuple of Observations, optional
-        Rows of targets that are fixed to the base (kinds with `of="base"`). They belong to no pose:
-        whatever poses are taken, held out or weighted, these rows stay, and they are no errors of
-        poses.
-    is_held_out : (n,) bool, optional
-        Poses that are held out for validation, as the column `use` of a file states. A calibration
-        validates on them, and no fit uses them. Default: none.
+    base_observations : rows of targets that are fixed to the base (kinds with `of="base"`). They
+        belong to no pose: whatever poses are taken, held out or weighted, these rows stay, and they
+        are no errors of poses.
+    is_held_out : (n,) bool, poses that are held out for validation, as the column `use` of a file
+        states. A calibration validates on them, and no fit uses them. Default: none.
 
     Raises
     ------
-    DataError
-        If shapes differ, a reading is not finite though its sigma is, a sigma is negative, a row
-        refers to a pose that does not exist, a block is partly held out, or a target is on the base
-        and on a platform.
+    DataError : shapes differ, a reading is not finite though its sigma is, a sigma is negative, a
+        row refers to a pose that does not exist, a block is partly held out, or a target is on the
+        base and on a platform.
     """
 
     robot_name: str
@@ -277,9 +269,8 @@ class Measurements(TableResult):
 
         Raises
         ------
-        DataError
-            If a pose does not exist, is named twice, none is left, or `poses` is neither indices
-            nor a mask of all poses.
+        DataError : a pose does not exist, is named twice, none is left, or `poses` is neither
+            indices nor a mask of all poses.
         """
         given = np.asarray(poses)
         is_mask = given.dtype == bool
@@ -324,17 +315,14 @@ class Measurements(TableResult):
 
         Parameters
         ----------
-        hold_out : float
-            Share of the poses that is not fitted (0.25 fits three poses of four), as nearly as
-            whole blocks allow; both sets get at least one block. The `hold_out` of a calibration
+        hold_out : share of the poses that is not fitted (0.25 fits three poses of four), as nearly
+            as whole blocks allow; both sets get at least one block. The `hold_out` of a calibration
             is the same share.
-        seed : int
-            The same seed gives the same sets.
+        seed : the same seed gives the same sets.
 
         Raises
         ------
-        DataError
-            If the share is not between 0 and 1, or all poses are in one block.
+        DataError : the share is not between 0 and 1, or all poses are in one block.
         """
         check_seed(seed)
         if not 0.0 < hold_out < 1.0:
@@ -367,8 +355,7 @@ class Measurements(TableResult):
 
         Raises
         ------
-        DataError
-            If the number of weights is not that of the poses, or one is negative.
+        DataError : the number of weights is not that of the poses, or one is negative.
         """
         given = check_array(weight, "the weight of the poses", (self.n_poses,))
         observations = tuple(

@@ -32,17 +32,13 @@ class StatedValue:
 
     Parameters
     ----------
-    name : str
-        Full name, such as `monday.tracker.x`.
-    sd : float
-        Standard deviation of a prior [SI]; 0 fixes the parameter.
-    nominal : float, optional
-        Fixed value, or center of the prior [SI]; default: the nominal value of the kind.
+    name : full name, such as `monday.tracker.x`.
+    sd : standard deviation of a prior [SI]; 0 fixes the parameter.
+    nominal : fixed value, or center of the prior [SI]; default: the nominal value of the kind.
 
     Raises
     ------
-    DataError
-        If the standard deviation is negative, or a number is not finite.
+    DataError : the standard deviation is negative, or a number is not finite.
     """
 
     name: str
@@ -75,14 +71,12 @@ class NuisanceParameters:
 
     Attributes
     ----------
-    table : ParameterTable
-        The U parameters. A tolerance is a prior; a parameter without one is estimated from the data
-        alone; a fixed one keeps its value.
+    table : the U parameters. A tolerance is a prior; a parameter without one is estimated from the
+        data alone; a fixed one keeps its value.
     indices : tuple of (r, u) int
         For each kind of the measurements, the parameters that each row uses.
-    factors : tuple of (r, u) or None, optional
-        The parts of these parameters that each row takes, such as its progress in a drift; None
-        where all are 1. Default: all are 1.
+    factors : tuple of (r, u) or None, the parts of these parameters that each row takes, such as
+        its progress in a drift; None where all are 1. Default: all are 1.
     """
 
     table: ParameterTable
@@ -169,8 +163,7 @@ def collect_nuisance_parameters(
 
     Raises
     ------
-    DataError
-        If two kinds share the name of a parameter and state it differently.
+    DataError : two kinds share the name of a parameter and state it differently.
     """
     entries: dict[str, Parameter] = {}
     references: dict[str, FloatArray] = {}

@@ -51,8 +51,7 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
 
     Raises
     ------
-    DataError
-        If a covariance is not symmetric or not positive definite; rows are counted from 1.
+    DataError : a covariance is not symmetric or not positive definite; rows are counted from 1.
     """
     both = present[:, :, None] & present[:, None, :]
     diagonal = np.eye(present.shape[1], dtype=bool)
@@ -200,42 +199,30 @@ class Observations:
 
     Parameters
     ----------
-    kind : Kind
-        With the robot's tool, see `Kind.with_tool`.
-    rows : (r,) int
-        Index of the pose of each row; (r, l) for kinds that compare l poses. A row of targets on
-        the base belongs to no pose: its number does not matter, and becomes 0.
-    measured : (r, c) [SI]
-        NaN where not measured.
-    covariance : (r, m, m) or (m, m) [SI]
-        Of the residuals, see `from_sigma` and `Kind.linearize_noise`. Entries of missing components
-        are ignored.
-    weight : (r,), optional
-        Factor of the squared whitened residual; 0 excludes a row. Default 1.
-    session, group : text or (r,) text, optional
-        Rows of one session share frames and targets, rows of one group share a surface. Default:
-        one session and one group, without names.
-    context : name -> (r,), optional
-        Notes to each row that enter no equation: `time` [s], `temperature` and `temperature.PLACE`
-        [degC], NaN where missing.
+    kind : with the robot's tool, see `Kind.with_tool`.
+    rows : (r,) int, index of the pose of each row; (r, l) for kinds that compare l poses. A row of
+        targets on the base belongs to no pose: its number does not matter, and becomes 0.
+    measured : (r, c) [SI], NaN where not measured.
+    covariance : (r, m, m) or (m, m) [SI], of the residuals, see `from_sigma` and
+        `Kind.linearize_noise`. Entries of missing components are ignored.
+    weight : (r,), factor of the squared whitened residual; 0 excludes a row. Default 1.
+    session, group : text or (r,) text, rows of one session share frames and targets, rows of one
+        group share a surface. Default: one session and one group, without names.
+    context : name -> (r,), notes to each row that enter no equation: `time` [s], `temperature` and
+        `temperature.PLACE` [degC], NaN where missing.
     progress : (r,), optional
         Progress of each row through its session, from -0.5 to 0.5: the part that it takes of a
         drift, see `drift_part`. Default: by the time of the rows, or else in their order.
-    source : text, optional
-        Where the rows come from, such as the name of a file; for messages.
-    is_noise_assumed : bool, optional
-        Whether nobody stated the covariance: a program that wrote the rows assumed it. It then
-        decides no quality gate.
-    instrument : InstrumentRecord, optional
-        What measured the rows, and how that is traceable; for certificates.
+    source : where the rows come from, such as the name of a file; for messages.
+    is_noise_assumed : whether nobody stated the covariance: a program that wrote the rows assumed
+        it. It then decides no quality gate.
+    instrument : what measured the rows, and how that is traceable; for certificates.
 
     Attributes
     ----------
-    present : (r, m) bool
-        Residuals that exist; also those of rows of weight 0.
-    whitener : (r, m, m)
-        Inverse lower Cholesky factor of the covariance of the present components, times the root of
-        the weight.
+    present : (r, m) bool, residuals that exist; also those of rows of weight 0.
+    whitener : (r, m, m), inverse lower Cholesky factor of the covariance of the present components,
+        times the root of the weight.
 
     Raises
     ------
@@ -318,15 +305,13 @@ class Observations:
         ----------
         rows : (r,) int
         measured : (r, c) [SI]
-        sigma : number, (m,) or (r, m) [SI]
-            Standard deviations.
+        sigma : number, (m,) or (r, m) [SI], standard deviations.
         session, group : text or (r,) text
 
         Raises
         ------
-        DataError
-            As the class, and if sigma is negative or does not have one number for each noise
-            column.
+        DataError : as the class, and if sigma is negative or does not have one number for each
+            noise column.
         """
         check_type(kind, Kind, "kind", "such as loopcal.Pose()")
         try:

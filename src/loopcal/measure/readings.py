@@ -187,10 +187,9 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
 
     Raises
     ------
-    DataError
-        If a sigma is negative, not a number, or finite but too large to mean anything; or if a
-        reading of a robot with redundant actuators is exact. The poses of such a robot are free
-        and readings follow from them, so that no reading can be kept; see
+    DataError : a sigma is negative, not a number, or finite but too large to mean anything; or if a
+        reading of a robot with redundant actuators is exact. The poses of such a robot are free and
+        readings follow from them, so that no reading can be kept; see
         docs/theory/uncertain-readings.md.
     """
     if given is None:

@@ -133,24 +133,17 @@ class Trials:
 
     Attributes
     ----------
-    instrument : Instrument
-        With the robot's tool, and with explicit rows of every sensor.
-    readings : (n, a) [SI]
-        Of the controller, equal in all trials.
+    instrument : with the robot's tool, and with explicit rows of every sensor.
+    readings : (n, a) [SI], of the controller, equal in all trials.
     measured : tuple of (t, r, c) [SI]
         Columns of each sensor; NaN in rows that the true machine cannot reach.
-    truth : (t, p) [SI]
-        True parameter values of each trial.
-    T : (t, n, 4, 4)
-        True T_base_platform.
-    reached : (t, n) bool
-        Poses that the true machine reaches.
-    nuisance_parameters : NuisanceParameters
-        Of the kinds, with their true values as nominal ones.
+    truth : (t, p) [SI], true parameter values of each trial.
+    T : (t, n, 4, 4), true T_base_platform.
+    reached : (t, n) bool, poses that the true machine reaches.
+    nuisance_parameters : of the kinds, with their true values as nominal ones.
     recorded : (t, n, a) [SI], optional
         Recorded readings with their noise; None where they equal those of the controller.
-    reading_sigma : (n, a) [SI], optional
-        As in `Measurements`.
+    reading_sigma : (n, a) [SI], as in `Measurements`.
     """
 
     instrument: Instrument
@@ -212,10 +205,8 @@ def sample_truth(
 
     Raises
     ------
-    DataError
-        If there is no such distribution.
-    MechanismError
-        If the robot is over-constrained, so that its loops do not close with such errors.
+    DataError : there is no such distribution.
+    MechanismError : the robot is over-constrained, so that its loops do not close with such errors.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     refuse_drawn_errors(robot)
@@ -251,14 +242,10 @@ def simulate_trials(
 
     Parameters
     ----------
-    robot : Mechanism
-        Structure and tool of all machines; its own values do not matter.
-    truth : (t, p) [SI]
-        True parameter values of each machine, see `sample_truth`.
-    poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
-        As commanded.
-    seed : int or BlockStream
-        Trial i draws the same noise for any number of trials.
+    robot : structure and tool of all machines; its own values do not matter.
+    truth : (t, p) [SI], true parameter values of each machine, see `sample_truth`.
+    poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI], as commanded.
+    seed : trial i draws the same noise for any number of trials.
     controller : Mechanism, optional
         The geometry that turns poses into readings; default: the robot at its nominal values.
     nuisance_values : name -> value [SI], optional
@@ -266,17 +253,15 @@ def simulate_trials(
     reading_sigma : number, (a,) or (n, a) [SI], optional
         Standard deviation of the recorded readings, which are the true ones plus normal noise; 0 is
         exact, infinity is missing. Default: as the robot states for its actuators.
-    disturbance : Disturbance, optional
-        What happens at each pose although the model does not contain it.
+    disturbance : what happens at each pose although the model does not contain it.
     pose_names : (labels, places), optional
         Names of the poses, and their places such as `poses.csv:12`, for messages.
 
     Raises
     ------
-    DataError
-        If the controller cannot reach a pose, a setup parameter does not exist, `truth` has another
-        shape; or the kind `closure` is asked of a robot without redundant actuators or of exact
-        readings.
+    DataError : the controller cannot reach a pose, a setup parameter does not exist, `truth` has
+        another shape; or the kind `closure` is asked of a robot without redundant actuators or of
+        exact readings.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
@@ -343,9 +328,8 @@ def simulate(
 
     Raises
     ------
-    DataError
-        If the controller cannot reach a pose, or the true machine cannot reach it with the readings
-        of the controller.
+    DataError : the controller cannot reach a pose, or the true machine cannot reach it with the
+        readings of the controller.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     trials = simulate_trials(
@@ -384,8 +368,7 @@ def replace_measured_values(
 
     Raises
     ------
-    DataError
-        If the nominal or the true robot does not reach a pose.
+    DataError : the nominal or the true robot does not reach a pose.
     """
     nominal = forward(robot.nominal, data.readings)
     failed = np.flatnonzero(~nominal.converged)
@@ -449,9 +432,8 @@ def simulate_contacts(
 
     Raises
     ------
-    DataError
-        Another kind of rows, a machine that cannot move in x, y and z, or points that it cannot
-        bring to their surfaces.
+    DataError : another kind of rows, a machine that cannot move in x, y and z, or points that it
+        cannot bring to their surfaces.
     """
     other = [o.kind.name for o in sheet.observations if not isinstance(o.kind, Plane | Line)]
     if other:

@@ -133,9 +133,8 @@ def build(
 
     Raises
     ------
-    MechanismError
-        Duplicate or unknown names, loops that cannot be closed at home, wrong mobility (names the
-        freedoms that are too many or too few), coordinates that cannot be controlled.
+    MechanismError : duplicate or unknown names, loops that cannot be closed at home, wrong mobility
+        (names the freedoms that are too many or too few), coordinates that cannot be controlled.
     """
     check_assembly(assembly)
     if assembly.stages:
@@ -434,8 +433,7 @@ def _find_home(robot: Mechanism) -> State:
 
     Raises
     ------
-    MechanismError
-        Too few controlled coordinates, or loops that cannot be closed.
+    MechanismError : too few controlled coordinates, or loops that cannot be closed.
     """
     program, values = robot.program, robot.values[None]
     shared = program.shared_drive_count

@@ -61,9 +61,8 @@ def check_mobility(robot: Mechanism) -> None:
 
     Raises
     ------
-    MechanismError
-        The actuators leave the platform free to move, or the limbs constrain it too much; names
-        the freedoms.
+    MechanismError : the actuators leave the platform free to move, or the limbs constrain it too
+        much; names the freedoms.
     """
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]

@@ -424,8 +424,7 @@ class Mechanism(DrawnResult):
 
         Raises
         ------
-        MechanismError
-            Wrong number of values, or one that is not finite.
+        MechanismError : wrong number of values, or one that is not finite.
         """
         new = np.array(values, dtype=float)
         if new.shape != (len(self.parameters),):

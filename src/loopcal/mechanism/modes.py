@@ -107,10 +107,8 @@ def find_assembly_modes(
 
     Raises
     ------
-    DataError
-        q has another number of readings than the robot has actuators.
-    MechanismError
-        New modes were still found after `max_starts` starts.
+    DataError : q has another number of readings than the robot has actuators.
+    MechanismError : new modes were still found after `max_starts` starts.
     """
     readings = np.asarray(q, dtype=float).reshape(-1)
     if len(readings) != len(robot.actuators):

@@ -193,8 +193,7 @@ def trace_singularity(
 
     Raises
     ------
-    DataError
-        Both or neither are given.
+    DataError : both or neither are given.
     """
     if (readings is None) == (coordinates is None):
         raise DataError("give a path by its readings or by its coordinates, not both or neither")

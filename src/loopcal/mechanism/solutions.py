@@ -520,8 +520,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
 
     Raises
     ------
-    DataError
-        Another number of columns than the robot has actuators.
+    DataError : another number of columns than the robot has actuators.
     """
     a = len(robot.actuators)
     readings = np.atleast_2d(np.asarray(q, dtype=float))
@@ -554,8 +553,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
 
     Raises
     ------
-    DataError
-        Another shape, or a matrix that is not a pose.
+    DataError : another shape, or a matrix that is not a pose.
     """
     begin = None if start is None else start.state
     c = len(robot.controlled)

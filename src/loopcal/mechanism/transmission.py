@@ -191,8 +191,7 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
 
     Raises
     ------
-    MechanismError
-        Unknown term, or a gain of zero.
+    MechanismError : unknown term, or a gain of zero.
     """
     for actuator in actuators:
         wrong = sorted(set(actuator.terms) - set(ALL_TERMS))

@@ -159,9 +159,8 @@ def sample_workspace(
 
     Raises
     ------
-    MechanismError
-        n is below 1, the robot states no range for a controlled coordinate, or almost nothing of
-        its workspace can be reached.
+    MechanismError : n is below 1, the robot states no range for a controlled coordinate, or almost
+        nothing of its workspace can be reached.
     """
     if n < 1:
         raise MechanismError(f"{n} positions to draw; give 1 or more")
@@ -200,8 +199,7 @@ def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
 
     Raises
     ------
-    MechanismError
-        The robot states no range for a coordinate.
+    MechanismError : the robot states no range for a coordinate.
     """
     stated = dict(robot.assembly.workspace)
     if "theta" in stated:

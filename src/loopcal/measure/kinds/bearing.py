@@ -34,14 +34,12 @@ class Bearing(TargetKind):
 
     Parameters
     ----------
-    form : str
-        "theodolite" or "camera".
-    Others: see `TargetKind`; "frame" (the station) and "targets" may be unknown.
+    form : "theodolite" or "camera".
+    Others : see `TargetKind`; "frame" (the station) and "targets" may be unknown.
 
     Raises
     ------
-    DataError
-        As `TargetKind`, or for another form.
+    DataError : as `TargetKind`, or for another form.
 
     Examples
     --------

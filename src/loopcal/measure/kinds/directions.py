@@ -46,9 +46,8 @@ class DirectionKind(Kind):
 
     Parameters
     ----------
-    unknown : tuple of str
-        Which of `allowed_unknown`, (orientation, direction), are unknown: three and two numbers.
-        One value holds for a session.
+    unknown : which of `allowed_unknown`, (orientation, direction), are unknown: three and two
+        numbers. One value holds for a session.
     """
 
     unknown: tuple[str, ...] = ()
@@ -138,11 +137,9 @@ class AxisKind(DirectionKind):
 
     Parameters
     ----------
-    T_base_frame : (4, 4)
-        Frame of the instrument in the base; only its orientation matters.
-    frame : str
-        Name of the frame. Kinds that use the same name share its parameters.
-    Others: see `DirectionKind`.
+    T_base_frame : (4, 4), frame of the instrument in the base; only its orientation matters.
+    frame : name of the frame. Kinds that use the same name share its parameters.
+    Others : see `DirectionKind`.
     """
 
     T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
@@ -163,17 +160,14 @@ class Direction(AxisKind):
 
     Parameters
     ----------
-    axis : (3,)
-        The axis on the platform, of any length. If the axis is unknown, its nominal value.
-    axis_name : str
-        Name of the axis; its parameters begin with it.
-    Others: see `AxisKind`; "frame" and "axis" may be unknown.
+    axis : (3,), the axis on the platform, of any length. If the axis is unknown, its nominal value.
+    axis_name : name of the axis; its parameters begin with it.
+    Others : see `AxisKind`; "frame" and "axis" may be unknown.
 
     Raises
     ------
-    DataError
-        If the length of the axis is zero, the frame is not a pose, or `unknown` lists something
-        else.
+    DataError : the length of the axis is zero, the frame is not a pose, or `unknown` lists
+        something else.
 
     Examples
     --------
@@ -282,17 +276,13 @@ class Inclination(DirectionKind):
     ----------
     up : (3,)
         The upward vertical in the base, of any length. If gravity is unknown, its nominal value.
-    T_platform_sensor : (4, 4)
-        Mounting of the sensor; only its orientation matters.
-    sensor : str
-        Name of the sensor; the parameters of its mounting begin with it.
-    unknown : tuple of str
-        Which of "mounting" and "gravity" are unknown.
+    T_platform_sensor : (4, 4), mounting of the sensor; only its orientation matters.
+    sensor : name of the sensor; the parameters of its mounting begin with it.
+    unknown : which of "mounting" and "gravity" are unknown.
 
     Raises
     ------
-    DataError
-        If the length of the vertical is zero, the mounting is not a pose, or `unknown` lists
+    DataError : the length of the vertical is zero, the mounting is not a pose, or `unknown` lists
         something else.
 
     Examples
@@ -376,18 +366,15 @@ class Autocollimation(AxisKind):
 
     Parameters
     ----------
-    normal : (3,)
-        Normal of the mirror on the platform, of any length. If the mirror is unknown, its nominal
-        value.
-    mirror : str
-        Name of the mirror; its parameters begin with it.
-    Others: see `AxisKind`; "frame" and "mirror" may be unknown.
+    normal : (3,), normal of the mirror on the platform, of any length. If the mirror is unknown,
+        its nominal value.
+    mirror : name of the mirror; its parameters begin with it.
+    Others : see `AxisKind`; "frame" and "mirror" may be unknown.
 
     Raises
     ------
-    DataError
-        If the length of the normal is zero, the frame is not a pose, or `unknown` lists something
-        else.
+    DataError : the length of the normal is zero, the frame is not a pose, or `unknown` lists
+        something else.
 
     Examples
     --------

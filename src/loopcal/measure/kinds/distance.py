@@ -80,16 +80,13 @@ class Distance(LengthKind):
 
     Parameters
     ----------
-    anchor : (3,) [m]
-        The fixed point in the frame. If the anchor is unknown, its nominal value.
-    anchor_name : str
-        Name of the fixed point. Kinds that use the same name share its parameters.
-    Others: see `TargetKind`; "anchor", "targets" and "offset" (the zero of a wire) may be unknown.
+    anchor : (3,) [m], the fixed point in the frame. If the anchor is unknown, its nominal value.
+    anchor_name : name of the fixed point. Kinds that use the same name share its parameters.
+    Others : see `TargetKind`; "anchor", "targets" and "offset" (the zero of a wire) may be unknown.
 
     Raises
     ------
-    DataError
-        As `TargetKind`.
+    DataError : as `TargetKind`.
 
     Examples
     --------
@@ -133,8 +130,7 @@ class Distance(LengthKind):
 
         Raises
         ------
-        DataError
-            If all points are coplanar and the stated anchor does not say on which side it is.
+        DataError : all points are coplanar and the stated anchor does not say on which side it is.
         """
         _, _, points, distances = self.collect_points(T, measured)
         if "anchor" not in self.unknown or len(distances) < 4 or self.is_of_base:

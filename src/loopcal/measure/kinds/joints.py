@@ -35,18 +35,14 @@ class JointSensor(Kind):
 
     Parameters
     ----------
-    joints : tuple of str
-        Passive joints as `limb.joint`, driven ones by the name of their actuator. The columns have
-        the same names.
-    measures : str
-        "length" or "angle": the dimension of the joints.
-    unknown : tuple of str
-        "offset": the value that each sensor shows where its joint is zero.
+    joints : passive joints as `limb.joint`, driven ones by the name of their actuator. The columns
+        have the same names.
+    measures : "length" or "angle": the dimension of the joints.
+    unknown : "offset": the value that each sensor shows where its joint is zero.
 
     Raises
     ------
-    DataError
-        If no joint is named or one twice, or `unknown` lists something else.
+    DataError : no joint is named or one twice, or `unknown` lists something else.
 
     Examples
     --------
@@ -122,9 +118,8 @@ class Locked(JointSensor):
 
     Parameters
     ----------
-    unknown : tuple of str
-        Always "offset": the constant of each joint.
-    Others: see `JointSensor`.
+    unknown : always "offset": the constant of each joint.
+    Others : see `JointSensor`.
 
     Examples
     --------

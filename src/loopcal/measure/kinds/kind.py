@@ -70,11 +70,9 @@ class Evaluation(NamedTuple):
     Attributes
     ----------
     residual : (t, r, m) [SI]
-    jacobian : (t, r, m, 6)
-        By the platform twist (omega, v) in base axes; with an axis of poses before m where a row
-        compares several poses.
-    nuisance : (t, r, m, u) or None
-        By the nuisance parameters of the kind; None where it has none.
+    jacobian : (t, r, m, 6), by the platform twist (omega, v) in base axes; with an axis of poses
+        before m where a row compares several poses.
+    nuisance : (t, r, m, u) or None, by the nuisance parameters of the kind; None where it has none.
     joints : (t, r, m, j) or None
         By the values of the joints that the kind senses; None where it senses poses only.
     """
@@ -216,32 +214,23 @@ class Kind(ABC):
 
     Attributes
     ----------
-    name : str
-        Name in files and in `KINDS`.
-    poses_per_row : int
-        Number of poses that one row compares.
-    changes_with_pose : bool
-        Whether columns that stay constant while the robot moves indicate a mistake. It is False for
-        touched surfaces and for locked joints, whose columns stay at 0.
-    mixes_components : bool
-        Whether a motion of base and setup mixes the components of a residual, so that rows contain
-        it in proportion to the residual; see docs/theory/identification.md.
-    wraps_angles : bool
-        Whether differences of angles are wrapped into (-pi, pi].
+    name : name in files and in `KINDS`.
+    poses_per_row : number of poses that one row compares.
+    changes_with_pose : whether columns that stay constant while the robot moves indicate a mistake.
+        It is False for touched surfaces and for locked joints, whose columns stay at 0.
+    mixes_components : whether a motion of base and setup mixes the components of a residual, so
+        that rows contain it in proportion to the residual; see docs/theory/identification.md.
+    wraps_angles : whether differences of angles are wrapped into (-pi, pi].
     description : str
         What is measured, for suggestions to measure it with known setup; else "the" and the name.
     length_error, angle_error : str
         What its residuals are errors of, by dimension, such as "position"; see `list_error_groups`.
-    allowed_unknown : tuple of str
-        Setup items that `unknown` may list.
+    allowed_unknown : setup items that `unknown` may list.
     bias_item : str
         Setup item that the bias of a session is; the one that all kinds have, or one of its own.
-    unknown : tuple of str
-        Setup items that are unknown; "bias" stands for `bias_item`.
-    measures_points : bool
-        Whether it measures targets, which may be fixed to the base (`of: base`).
-    of : str
-        The stage of a chain whose platform is measured, or "base"; empty for the end platform.
+    unknown : setup items that are unknown; "bias" stands for `bias_item`.
+    measures_points : whether it measures targets, which may be fixed to the base (`of: base`).
+    of : the stage of a chain whose platform is measured, or "base"; empty for the end platform.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # every kind is a dataclass
@@ -505,13 +494,11 @@ class Kind(ABC):
             NaN where not measured. Or the same prepared by `prepare_columns`.
         nuisance : (t or 1, r or 1, u), optional
             Values of the nuisance parameters of each row; default: nominal.
-        joints : (t, r, j), optional
-            Values of the joints in `sensed_joints`.
+        joints : (t, r, j), values of the joints in `sensed_joints`.
 
         Raises
         ------
-        DataError
-            If the kind senses joints and none are given.
+        DataError : the kind senses joints and none are given.
         """
         if joints is None:
             self.stack_joints({}, np.zeros(0, dtype=np.intp))  # refuses where it senses any

@@ -37,29 +37,22 @@ class TargetKind(Kind):
 
     Parameters
     ----------
-    targets : tuple of str
-        Names of the k targets that one row measures. With several, columns are called `a.x` and so
-        on.
-    places : (k, 3) [m], optional
-        Targets on the platform; default: the origin of the robot's tool. If the targets are
-        unknown, these are their nominal values.
-    T_base_frame : (4, 4), optional
-        Frame of the instrument in the base; default: the base itself.
-    unknown : tuple of str
-        Which of `allowed_unknown` are unknown. One value holds for a session (of a surface: for a
-        group of rows).
-    frame : str
-        Name of the frame. Kinds that use the same name share its parameters.
-    of : str
-        Stage of a chain on whose platform the targets are; default: the end platform. "base" (of
+    targets : names of the k targets that one row measures. With several, columns are called `a.x`
+        and so on.
+    places : (k, 3) [m], targets on the platform; default: the origin of the robot's tool. If the
+        targets are unknown, these are their nominal values.
+    T_base_frame : (4, 4), frame of the instrument in the base; default: the base itself.
+    unknown : which of `allowed_unknown` are unknown. One value holds for a session (of a surface:
+        for a group of rows).
+    frame : name of the frame. Kinds that use the same name share its parameters.
+    of : stage of a chain on whose platform the targets are; default: the end platform. "base" (of
         the kinds position, bearing and distance): the targets are fixed to the base. Their rows
         belong to no pose, and unknown ones keep their places in all sessions.
 
     Raises
     ------
-    DataError
-        If shapes do not fit, a name occurs twice, `unknown` lists something that is not allowed, or
-        places of targets on the base are neither stated nor unknown.
+    DataError : shapes do not fit, a name occurs twice, `unknown` lists something that is not
+        allowed, or places of targets on the base are neither stated nor unknown.
     """
 
     targets: tuple[str, ...] = ("target",)

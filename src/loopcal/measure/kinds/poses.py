@@ -41,20 +41,16 @@ class ToolKind(Kind):
 
     Parameters
     ----------
-    T_base_frame : (4, 4), optional
-        Instrument frame in the base; default: the base itself. If the frame is unknown, this is its
-        nominal value.
-    T_platform_tool : (4, 4), optional
-        Tool on the platform; default: the tool of the robot.
+    T_base_frame : (4, 4), instrument frame in the base; default: the base itself. If the frame is
+        unknown, this is its nominal value.
+    T_platform_tool : (4, 4), tool on the platform; default: the tool of the robot.
     unknown : tuple of str
         Which of "frame" and "tool" are unknown, six numbers each. One value holds for a session.
-    frame : str
-        Name of the frame. Kinds that use the same name share its parameters.
+    frame : name of the frame. Kinds that use the same name share its parameters.
 
     Raises
     ------
-    DataError
-        If a frame is not a pose, or `unknown` lists something else.
+    DataError : a frame is not a pose, or `unknown` lists something else.
     """
 
     T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
@@ -150,18 +146,16 @@ class Pose(ToolKind):
 
     Parameters
     ----------
-    orientation : str
-        Form of the orientation columns, see `loopcal.geometry.OrientationForm`. Noise of a rotation
-        vector or a quaternion is a rotation error rx ry rz about the axes of the frame. Noise of
-        angles is noise of these angles, except near a singularity of the angles (`|det E| < 0.05`,
-        E their rates), where it is a rotation error too.
+    orientation : form of the orientation columns, see `loopcal.geometry.OrientationForm`. Noise of
+        a rotation vector or a quaternion is a rotation error rx ry rz about the axes of the frame.
+        Noise of angles is noise of these angles, except near a singularity of the angles (`|det E|
+        < 0.05`, E their rates), where it is a rotation error too.
     T_base_frame, T_platform_tool, unknown, frame
         See `ToolKind`.
 
     Raises
     ------
-    DataError
-        If the orientation form does not exist or a frame is not a pose.
+    DataError : the orientation form does not exist or a frame is not a pose.
 
     Examples
     --------
@@ -347,20 +341,17 @@ class Component(ToolKind):
 
     Parameters
     ----------
-    components : tuple of str
-        Measured coordinates in the order of the columns: x y z, and angles of the declared
+    components : measured coordinates in the order of the columns: x y z, and angles of the declared
         orientation.
-    orientation : str, optional
-        Form of the angles, "tilt-torsion" (phi theta psi) or "euler-" and an order (a b c).
-        Required if an angle is measured.
+    orientation : form of the angles, "tilt-torsion" (phi theta psi) or "euler-" and an order (a b
+        c). Required if an angle is measured.
     T_base_frame, T_platform_tool, unknown, frame
         See `ToolKind`.
 
     Raises
     ------
-    DataError
-        If a component does not exist or is named twice, if angles have no declared orientation, or
-        if phi is measured without theta.
+    DataError : a component does not exist or is named twice, if angles have no declared
+        orientation, or if phi is measured without theta.
 
     Examples
     --------

@@ -63,8 +63,7 @@ class Position(TargetKind):
 
         Raises
         ------
-        DataError
-            If the frame is unknown and all points are collinear.
+        DataError : the frame is unknown and all points are collinear.
         """
         if self.is_of_base:
             base = np.broadcast_to(np.eye(4), (len(measured), 4, 4))

@@ -35,22 +35,18 @@ class SurfaceKind(TargetKind):
 
     Parameters
     ----------
-    through : (3,) [m]
-        A point of the surface (of a sphere: its center) in the frame. If the surface is unknown,
-        its nominal value.
-    along : (3,)
-        Normal of a plane or direction of a line, in the frame; of any length.
-    surface : str
-        Name of the surface; its parameters begin with it. A plane and a line with the same name,
-        point and direction share `u` and `v`: the line is perpendicular to the plane.
-    Others: see `TargetKind`; "frame", "surface" and "targets" (the offsets of the probe) may be
+    through : (3,) [m], a point of the surface (of a sphere: its center) in the frame. If the
+        surface is unknown, its nominal value.
+    along : (3,), normal of a plane or direction of a line, in the frame; of any length.
+    surface : name of the surface; its parameters begin with it. A plane and a line with the same
+        name, point and direction share `u` and `v`: the line is perpendicular to the plane.
+    Others : see `TargetKind`; "frame", "surface" and "targets" (the offsets of the probe) may be
     unknown. Faces of a body with known dimensions, such as a datum cube, are known surfaces in one
     unknown frame.
 
     Raises
     ------
-    DataError
-        As `TargetKind`, and if the length of a direction is zero.
+    DataError : as `TargetKind`, and if the length of a direction is zero.
     """
 
     through: FloatArray = checked(check_point, "the point of the surface", np.zeros(3))
@@ -253,12 +249,11 @@ class Sphere(SurfaceKind):
     ----------
     radius : float [m]
         Sum of the radii of ball and probe. If the surface is unknown, its nominal value.
-    Others: see `SurfaceKind`; `through` is the center, and `along` does not matter.
+    Others : see `SurfaceKind`; `through` is the center, and `along` does not matter.
 
     Raises
     ------
-    DataError
-        As `SurfaceKind`, and if the radius is not above zero.
+    DataError : as `SurfaceKind`, and if the radius is not above zero.
 
     Examples
     --------

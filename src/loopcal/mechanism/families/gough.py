@@ -116,8 +116,7 @@ def build_screw_leg(
 
     Raises
     ------
-    MechanismError
-        A joint axis lies along the leg at home.
+    MechanismError : a joint axis lies along the leg at home.
     """
     s, length = _find_direction(name, base, top, home)
     lower = _normalize(name, screw.base_axis)
@@ -230,8 +229,7 @@ class Gough(RobotRecord):
 
         Raises
         ------
-        MechanismError
-            Another number of legs, or a model that this form cannot carry.
+        MechanismError : another number of legs, or a model that this form cannot carry.
         """
         self._check()
         legs, actuators, errors = [], [], ErrorModel()

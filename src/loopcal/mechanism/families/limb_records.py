@@ -629,8 +629,7 @@ def list_readings(
 
     Raises
     ------
-    SumError
-        A triangle drive, or a drive that is no sum and moves no joint.
+    SumError : a triangle drive, or a drive that is no sum and moves no joint.
     """
     readings: dict[str, tuple[str, Mapping[str, float]]] = {}
     for key, drive in actuators.items():
@@ -667,9 +666,8 @@ def check_sums(
 
     Raises
     ------
-    SumError
-        An unknown joint, a sum of an angle and a length, weights that are all zero or not finite,
-        a joint in no sum, more readings than joints, or sums that depend on each other.
+    SumError : an unknown joint, a sum of an angle and a length, weights that are all zero or not
+        finite, a joint in no sum, more readings than joints, or sums that depend on each other.
     """
     for name, weights in sums.items():
         _check_sum(name, weights, turning)
@@ -747,8 +745,7 @@ def weight_errors(
 
     Raises
     ------
-    SumError
-        The weight of a joint that is not in the sum.
+    SumError : the weight of a joint that is not in the sum.
     """
     unknown: tuple[str, ...] = getattr(drive, "unknown", ())
     tolerance: RatioTolerance | None = getattr(drive, "weights", None)

@@ -158,8 +158,7 @@ def drive_errors(name: str, placed: PlacedDrive) -> ErrorModel:
 
     Raises
     ------
-    MechanismError
-        A term that the drive does not have, or a harmonic without a period.
+    MechanismError : a term that the drive does not have, or a harmonic without a period.
     """
     drive = placed.drive
     known = _list_terms(drive, placed.dimension)
@@ -217,8 +216,7 @@ def is_always_positive(named: NamedParameter) -> bool:
 
     Raises
     ------
-    MechanismError
-        The file says so, but the nominal value is not above zero.
+    MechanismError : the file says so, but the nominal value is not above zero.
     """
     is_stated = isinstance(named, NamedLength) and named.positive
     nominal = get_quantity(named)[1]
@@ -237,8 +235,7 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
 
     Raises
     ------
-    MechanismError
-        The axis `pitch`, for which a file states the lead.
+    MechanismError : the axis `pitch`, for which a file states the lead.
     """
     if entry.axis == "pitch":
         raise MechanismError(
@@ -548,8 +545,7 @@ def _find_element(limb: PlacedLimb, name: str) -> str:
 
     Raises
     ------
-    MechanismError
-        No such link; lists the existing ones.
+    MechanismError : no such link; lists the existing ones.
     """
     for candidate in (name, f"{name}.1", f"{name}.turn"):
         if candidate in limb.elements:

@@ -144,8 +144,7 @@ def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
 
     Raises
     ------
-    MechanismError
-        The axis is zero.
+    MechanismError : the axis is zero.
     """
     length = float(np.linalg.norm(axis))
     if not length > 0:
@@ -197,8 +196,7 @@ def map_slide_tilt(
 
     Raises
     ------
-    MechanismError
-        The joint is not a slide.
+    MechanismError : the joint is not a slide.
     """
     names = limb.elements
     place = names.index(element)
@@ -462,8 +460,7 @@ def standard_deviation(
 
     Raises
     ------
-    MechanismError
-        Both or neither of sd and limits, or a value that is not positive.
+    MechanismError : both or neither of sd and limits, or a value that is not positive.
     """
     if tolerance is None:
         return None

@@ -162,8 +162,7 @@ def join_stages(
 
     Raises
     ------
-    StageError
-        A stage without actuators, or an actuator of two stages.
+    StageError : a stage without actuators, or an actuator of two stages.
     """
     _refuse_wrong_drives(stages)
     assemblies = [(stage.name, stage.assembly) for stage in stages]
@@ -363,8 +362,7 @@ class PlacedStages(Stages):
         ------
         StageError
             Names that do not fit together, a stage without actuators, a drive of two stages.
-        MechanismError
-            A stage that cannot be expanded.
+        MechanismError : a stage that cannot be expanded.
         """
         if self.home != PoseRecord():
             raise MechanismError(
