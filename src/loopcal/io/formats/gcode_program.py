@@ -143,16 +143,12 @@ def format_gcode(
     return "\n".join([*lines, "(back to home)", move(home), "M2"]) + "\n"
 
 
-def _get_factors(robot: Mechanism, unit: str) -> list[float]:
-    """Return SI per unit of each controlled coordinate in a program."""
-    symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
-    return [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
-
-
 def _format_words(robot: Mechanism, coordinates: FloatArray, unit: str) -> str:
     """Return the words of a move."""
+    symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
+    factors = [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
     numbers: Sequence[float] = coordinates.tolist()
-    triples = zip(robot.controlled, numbers, _get_factors(robot, unit), strict=True)
+    triples = zip(robot.controlled, numbers, factors, strict=True)
     return " ".join(
         f"{WORDS[name]}{format_short(value / f, DECIMALS)}" for name, value, f in triples
     )

@@ -114,7 +114,7 @@ def read_config(path: Path) -> KlipperConfig:
     ------
     FileError : it is unreadable, its saved part was edited, or it is not that of a delta printer.
     """
-    cfg = parse_config_file(path)
+    cfg = parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
     is_stated = cfg.has("printer", "kinematics")
     kinematics = cfg.text("printer", "kinematics") if is_stated else ""
     sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
@@ -255,11 +255,6 @@ def _list_options(wanted: Mapping[Name, float | str]) -> Exported:
         lines.append(f"{option}: {text}")
     content = "\n".join(lines) + "\n"
     return Exported(content, (report_finding("files.options-to-change"),))
-
-
-def parse_config_file(path: Path) -> KlipperConfig:
-    """Return the options of a file."""
-    return parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
 
 
 def _parse_probes(cfg: KlipperConfig) -> _Probes:

@@ -152,17 +152,12 @@ def read(path: Path, options: ImportOptions) -> Imported:
         base=_format_list(base, 2),
         platform=_format_list(platform, 2),
         home=home,
-        tolerances=_format_tolerances(options, unit.factor_to_si),
+        tolerances=""  # only of joint centers that were measured by hand
+        if options.sigma_tape is None
+        else TOLERANCES.format(sd=f"{options.sigma_tape / unit.factor_to_si:.7g}"),
         screw=screw,
     )
     return Imported(text, None, findings)
-
-
-def _format_tolerances(options: ImportOptions, factor: float) -> str:
-    """Return the tolerances of joint centers that were measured by hand; nothing for others."""
-    if options.sigma_tape is None:
-        return ""
-    return TOLERANCES.format(sd=f"{options.sigma_tape / factor:.7g}")
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:

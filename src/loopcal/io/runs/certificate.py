@@ -233,13 +233,9 @@ def _add(parent: Element, name: str, text: str | None = None) -> Element:
     """Add an element of the DCC."""
     element = SubElement(parent, f"{{{DCC}}}{name}")
     if text is not None:
-        element.text = clean_text(text)
+        # XML does not hold all characters: the others become visible escapes
+        element.text = NOT_XML.sub(lambda match: escape(match.group()), text).strip() or "-"
     return element
-
-
-def clean_text(text: str) -> str:
-    """Return text that XML can hold: other characters become visible escapes."""
-    return NOT_XML.sub(lambda match: escape(match.group()), text).strip() or "-"
 
 
 def _add_text(parent: Element, name: str, text: str) -> None:
