@@ -5,6 +5,7 @@ reference data.
 Under LOOPCAL_STRICT=1 a skipped test is a failure, so that no test is left out unnoticed.
 """
 
+import gc
 import os
 import signal
 from collections.abc import Generator
@@ -47,6 +48,12 @@ def pytest_report_header() -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the tests that fork first: copying a process takes longer the more it holds."""
     items.sort(key=lambda item: item.get_closest_marker("forks") is None)
+
+
+def pytest_collection_finish() -> None:
+    """Leave modules and collected tests out of all later searches for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

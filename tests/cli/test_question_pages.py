@@ -36,8 +36,8 @@ def test_commands_of_the_page_run(page, root, tmp_path, monkeypatch, capsys) -> 
     name = PAGES[page]
     text = (root / "examples" / "studies" / f"{name}.yaml").read_text("utf-8")
     text = re.sub(r"^ *block: \d+\n", "", text, flags=re.MULTILINE)
-    text = re.sub(r"replicates: \d+", "replicates: 4", text)
-    Path(f"{name}.yaml").write_text(text.replace("seed: 14", "seed: 14\nblock: 4"))
+    text = re.sub(r"replicates: \d+", "replicates: 2", text)
+    Path(f"{name}.yaml").write_text(text.replace("seed: 14", "seed: 14\nblock: 2"))
     commands = list_commands((root / "docs" / "questions" / f"{page}.md").read_text("utf-8"))
     for words in commands:
         if words[1] == "check":  # takes some seconds; it reads what `run` reads

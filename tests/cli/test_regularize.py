@@ -12,6 +12,11 @@ from loopcal.cli.entry_point import main
 
 
 @pytest.fixture
+def do_not_draw() -> None:
+    """Draw: the bytes of a picture are compared."""
+
+
+@pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
     """Run a command line in a folder with measurements; return exit code, output and errors."""
     monkeypatch.chdir(tmp_path)

@@ -113,10 +113,9 @@ def test_unknown_frames_are_scored_by_folds_that_are_fitted_again(robot) -> None
     curves = compute_regularization_curves(robot, data, folds=2, seed=2)
     assert (curves.scheme, curves.left_out) == ("folds", 2)
     assert len(curves.ridge.values) <= 13 + 2
-    for value in (curves.ridge.values[0], curves.ridge.values[6]):
-        method = FitOptions(method=Ridge(float(value)))
-        refitted = cross_validate(robot, data, options=method, count=2, seed=2)
-        assert curves.ridge.score_at(float(value)) == (refitted.score, refitted.standard_error)
+    value = float(curves.ridge.values[6])
+    refitted = cross_validate(robot, data, options=FitOptions(method=Ridge(value)), count=2, seed=2)
+    assert curves.ridge.score_at(value) == (refitted.score, refitted.standard_error)
 
 
 def test_excluded_poses_are_not_used(robot, data) -> None:

@@ -274,13 +274,13 @@ def test_fits_that_did_not_converge_are_left_out_of_the_medians() -> None:
 
 
 @pytest.mark.slow  # 17 of 50 converged while rotations of the residuals counted as information, so
-# that 12 of 12 had a chance of 2e-6; the evidence has 50
+# that 6 of 6 had a chance of 0.2 %; the evidence has 50
 def test_fits_with_surfaces_as_unknowns_converge_on_every_machine(study) -> None:
     noise = max(NOISES)
-    truth = draw_true_machines(study.robot, MM, 12, 0)
+    truth = draw_true_machines(study.robot, MM, 6, 0)
     q = study.layout.solve_readings(truth, noise, 0)
     row = compare_estimates(study.layout, q, noise, LS)
-    assert (row.machines, row.converged, row.ranks) == (12, 12, (33,))
+    assert (row.machines, row.converged, row.ranks) == (6, 6, (33,))
     assert row.iterations <= 8
     assert row.largest < 0.01  # [sd]; second order of the noise
 

@@ -201,5 +201,9 @@ def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
     assert "figures/figure_4.png" in written.pop("files")
     assert written == document
     assert (folder / "figures" / "figure_4.png").is_file()
-    again = PAPERS["hexapod-42"].run(0, 2)  # the same seed gives the same numbers
-    assert json.loads(to_json(again.to_dict())) == document
+
+
+@pytest.mark.evidence
+def test_same_seed_gives_the_same_document() -> None:
+    first, again = (to_json(PAPERS["hexapod-42"].run(0, 2).to_dict()) for _ in range(2))
+    assert first == again

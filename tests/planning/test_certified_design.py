@@ -55,7 +55,7 @@ def test_efficiency_of_20_out_of_1000_hexapod_poses_exceeds_95_percent() -> None
 def test_certified_design_is_no_worse_than_the_best_of_20_exchange_starts(
     robot: str, components: slice
 ) -> None:
-    rows = linearize_drawn_poses(robot, 250, components)
+    rows = linearize_drawn_poses(robot, 120, components)
     start = PriorInformation.none(rows.shape[2])
     found = choose_design(rows, 20, D(), start)
     best = fedorov_exchange(rows, 20, D(), start, starts=20)
