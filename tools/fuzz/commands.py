@@ -51,7 +51,7 @@ PATHS = (
 
 def list_commands() -> dict[str, click.Command]:
     """Return every command by name, but for those of groups, which have a corpus of their own."""
-    names = [name for members in entry_point.MODULES.values() for name in members]
+    names = [name for members in entry_point.SECTIONS.values() for name in members]
     group, context = entry_point.command_line, click.Context(entry_point.command_line)
     commands = {name: group.get_command(context, name) for name in names}
     return {

@@ -20,8 +20,8 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,116 +29,113 @@ from pathlib import Path
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.command_group import CommandGroup
 from loopcal.cli.hints import find_hint, word_hint
 from loopcal.environment import THREADS
-from loopcal.errors import LoopcalError
+from loopcal.errors import LoopcalError, suggest_names
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
 
-# --- Ctrl-C where Python cannot raise it.
-
-DELAY = 0.01
-"""From a lost interrupt to its repetition [s]; by then the callback has ended."""
-
-
-@contextmanager
-def repeat_lost_interrupts() -> Iterator[None]:
-    """Raise an interrupt that a callback lost again, a moment after the callback."""
-    report = sys.unraisablehook
-
-    def repeat_or_report(lost: sys.UnraisableHookArgs) -> None:
-        if issubclass(lost.exc_type, KeyboardInterrupt):
-            _thread.start_new_thread(_interrupt, ())  # raised here, it is lost again
-        else:
-            report(lost)
-
-    sys.unraisablehook = repeat_or_report
-    try:
-        yield
-    finally:
-        sys.unraisablehook = report
-
-
-def _interrupt() -> None:
-    """Interrupt the main thread, also while it waits where the operating system has signals."""
-    time.sleep(DELAY)
-    main = threading.main_thread().ident
-    if main is not None and hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(main, signal.SIGINT)
-    else:
-        _thread.interrupt_main()
-
-
 SECTIONS = {
     "Describe the robot": {
-        "new": "Write a robot file, and a measurement file, to fill in.",
-        "check": "Read a robot file and show what it contains.",
-        "view": "Show a robot, or a calibration, as a 3-D view in the browser.",
-        "import": "Read the file of a controller as a robot file.",
-        "export": "Write identified numbers into the file of a controller.",
+        "new": ("robot_commands", "Write a robot file, and a measurement file, to fill in."),
+        "check": ("robot_commands", "Read a robot file and show what it contains."),
+        "view": ("robot_commands", "Show a robot, or a calibration, as a 3-D view in the browser."),
+        "import": ("exchange_commands", "Read the file of a controller as a robot file."),
+        "export": ("exchange_commands", "Write identified numbers into the file of a controller."),
     },
     "Prepare measurements": {
-        "identifiability": "Show which parameters measurements determine.",
-        "plan": "Plan which poses to measure, and write a sheet for them.",
-        "gcode": "Write a program that moves a machine to the poses of a plan.",
-        "fill": "Fill in the sheet of a plan from the export of an instrument.",
-        "simulate": "Write a measurement file of a simulated machine.",
+        "identifiability": (
+            "measurement_commands",
+            "Show which parameters measurements determine.",
+        ),
+        "plan": ("plan_command", "Plan which poses to measure, and write a sheet for them."),
+        "gcode": (
+            "exchange_commands",
+            "Write a program that moves a machine to the poses of a plan.",
+        ),
+        "fill": (
+            "exchange_commands",
+            "Fill in the sheet of a plan from the export of an instrument.",
+        ),
+        "simulate": ("measurement_commands", "Write a measurement file of a simulated machine."),
     },
     "Calibrate": {
-        "calibrate": "Identify the parameters of a robot and validate them.",
-        "report": "Write the report of a calibration as HTML, JSON and PDF.",
-        "validate": "Validate a calibration, or a robot file, with measurements.",
-        "repeatability": "Compute pose accuracy and repeatability by ISO 9283.",
-        "budget": "Show the uncertainty of a calibration by source.",
-        "compare": "Compare calibrations side by side: has the machine changed, and where?",
-        "certificate": "Print a digital calibration certificate of a calibration.",
-        "compensate": "Compute readings or commands that reach targets.",
-        "regularize": "Show the error at held-out poses by the strength of regularization.",
+        "calibrate": (
+            "calibration_commands",
+            "Identify the parameters of a robot and validate them.",
+        ),
+        "report": (
+            "calibration_commands",
+            "Write the report of a calibration as HTML, JSON and PDF.",
+        ),
+        "validate": (
+            "calibration_commands",
+            "Validate a calibration, or a robot file, with measurements.",
+        ),
+        "repeatability": (
+            "calibration_commands",
+            "Compute pose accuracy and repeatability by ISO 9283.",
+        ),
+        "budget": ("calibration_commands", "Show the uncertainty of a calibration by source."),
+        "compare": (
+            "calibration_commands",
+            "Compare calibrations side by side: has the machine changed, and where?",
+        ),
+        "certificate": (
+            "calibration_commands",
+            "Print a digital calibration certificate of a calibration.",
+        ),
+        "compensate": ("calibration_commands", "Compute readings or commands that reach targets."),
+        "regularize": (
+            "calibration_commands",
+            "Show the error at held-out poses by the strength of regularization.",
+        ),
     },
     "Examine the uncertainty": {
-        "bootstrap": "Resample a calibration and compare the scatter with its intervals.",
-        "sample": "Draw from the exact posterior of a calibration.",
+        "bootstrap": (
+            "sampling_commands",
+            "Resample a calibration and compare the scatter with its intervals.",
+        ),
+        "sample": ("sampling_commands", "Draw from the exact posterior of a calibration."),
     },
     "Simulate many calibrations": {
-        "study": "Compare instruments, numbers of poses and methods by simulation."
+        "study": (
+            "study_commands",
+            "Compare instruments, numbers of poses and methods by simulation.",
+        )
     },
     "Published studies": {
-        "reproduce": "Repeat a published study and compare its numbers.",
-        "per-leg": "Identify a hexapod leg by leg, to compare with calibrate.",
+        "reproduce": ("paper_commands", "Repeat a published study and compare its numbers."),
+        "per-leg": ("paper_commands", "Identify a hexapod leg by leg, to compare with calibrate."),
     },
     "Begin": {
-        "example": "Write the files of an example, to try the commands with.",
-        "completion": "Print the script with which a shell completes commands.",
+        "example": ("robot_commands", "Write the files of an example, to try the commands with."),
+        "completion": ("robot_commands", "Print the script with which a shell completes commands."),
     },
 }
-"""Headings of the help, and the commands below each."""
+"""Heading of the help -> command -> its module, imported when it runs, and what it does."""
 
-MODULES = {
-    "robot_commands": ("new", "check", "view", "example", "completion"),
-    "exchange_commands": ("import", "export", "gcode", "fill"),
-    "measurement_commands": ("identifiability", "simulate"),
-    "plan_command": ("plan",),
-    "calibration_commands": (
-        "certificate",
-        "repeatability",
-        "calibrate",
-        "budget",
-        "validate",
-        "compensate",
-        "compare",
-        "report",
-        "regularize",
-    ),
-    "sampling_commands": ("bootstrap", "sample"),
-    "study_commands": ("study",),
-    "paper_commands": ("reproduce", "per-leg"),
-}
-"""Modules of `loopcal.cli.commands`, and the commands in each; imported when they run."""
+
+class CommandGroup(click.Group):
+    """A command that consists of commands; a wrong name is refused with similar ones."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in the order of the work, which is that of the code."""
+        return list(self.commands)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command of the first word, or fail with the names of similar ones."""
+        names = self.list_commands(ctx)
+        if args[0] not in names and not args[0].startswith("-"):
+            similar = suggest_names(args[0], names)
+            ctx.fail(f"{args[0]!r} is not a command{similar}; see {ctx.command_path} --help")
+        return super().resolve_command(ctx, args)
 
 
 class SectionedGroup(CommandGroup):
-    """A group whose help lists its commands below headings, in the order of the work."""
+    """The command `loopcal`, whose help lists its commands below headings."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
@@ -152,16 +149,16 @@ class SectionedGroup(CommandGroup):
         """Write the sections."""
         for heading, members in SECTIONS.items():
             with formatter.section(heading):
-                formatter.write_dl(list(members.items()))
+                formatter.write_dl([(name, what) for name, (_, what) in members.items()])
 
 
 def find_command(name: str) -> click.Command | None:
     """Import a command; None where there is none of this name."""
-    module = next((module for module, names in MODULES.items() if name in names), None)
-    if module is None:
-        return None
-    function = name.replace("-", "_") + "_" * keyword.iskeyword(name)
-    return getattr(import_module(f"loopcal.cli.commands.{module}"), function)
+    for members in SECTIONS.values():
+        if name in members:
+            module = import_module(f"loopcal.cli.commands.{members[name][0]}")
+            return getattr(module, name.replace("-", "_") + "_" * keyword.iskeyword(name))
+    return None
 
 
 def find_running_command(words: Sequence[str]) -> click.Command | None:
@@ -211,8 +208,6 @@ def _print_version(context: click.Context, is_asked: bool) -> None:
     """Print the version of loopcal and the engine that computes, and exit."""
     if not is_asked or context.resilient_parsing:
         return
-    from importlib.metadata import version
-
     from loopcal.engine import get_current_engine
 
     click.echo(f"loopcal {version('loopcal')}\nengine {get_current_engine()}")
@@ -247,10 +242,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _has_working_folder() -> bool:
     """Return whether the working folder exists, from which relative paths count."""
-    try:
+    with suppress(OSError):
         return Path.cwd().is_dir()
-    except OSError:
-        return False
+    return False
 
 
 def _report(
@@ -308,31 +302,63 @@ def _refuse(sentence: str, hint: str | None = None) -> int:
     return 1
 
 
-# --- What the command line does with an exception that is no mistake of the user: a defect report.
+DELAY = 0.01
+"""From a lost interrupt to its repetition [s]; by then the callback has ended."""
+
+
+@contextmanager
+def repeat_lost_interrupts() -> Iterator[None]:
+    """Raise an interrupt that a callback lost again, a moment after the callback."""
+    report = sys.unraisablehook
+
+    def repeat_or_report(lost: sys.UnraisableHookArgs) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            _thread.start_new_thread(_interrupt, ())  # raised here, it is lost again
+        else:
+            report(lost)
+
+    sys.unraisablehook = repeat_or_report
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
+
+
+def _interrupt() -> None:
+    """Interrupt the main thread, also while it waits where the operating system has signals."""
+    time.sleep(DELAY)
+    main = threading.main_thread().ident
+    if main is not None and hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(main, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+
 
 PACKAGES = ("loopcal", "numpy", "scipy", "ruamel.yaml", "msgspec", "click")
-"""Packages whose versions a report states."""
-
-PREFIX, SUFFIX = "loopcal-defect-", ".txt"
-"""Beginning and end of the name of a report; the rest is drawn by the operating system."""
+"""Packages whose versions a report of a defect states."""
 
 DEFECT_CODE = 3
 """Exit code of a command that ended by a defect of loopcal."""
 
 
 def describe_defect(error: BaseException, words: Sequence[str]) -> str:
-    """Save a report of an unexpected exception, and return the sentence for the screen.
-
-    Parameters
-    ----------
-    error : the exception. words : of the command line after `loopcal`.
+    """Save a report of an exception that is no mistake of the user, and return the sentence for the
+    screen.
     """
-    sentence = f"this is a defect of loopcal, not of your input ({_name_place(error)})"
-    path = save_report(format_report(error, words))
+    package = Path(__file__).resolve().parents[1]
+    frames = traceback.extract_tb(error.__traceback__, limit=-100)
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(package)]
+    place = type(error).__name__
+    if own:
+        file = Path(own[-1].filename).relative_to(package.parent).as_posix()
+        place = f"{place} at {file}:{own[-1].lineno}"
+    sentence = f"this is a defect of loopcal, not of your input ({place})"
+    versions = {name: _find_version(name) for name in PACKAGES}
+    path = save_report(format_report(error, words, versions))
     if path is None:
         return (
             f"{sentence}; no report could be saved: send the developers this message, the command "
-            f"and the version {_find_version('loopcal')}"
+            f"and the version {versions['loopcal']}"
         )
     return (
         f"{sentence}; please read {path}, which contains the command, versions and the Python "
@@ -340,53 +366,41 @@ def describe_defect(error: BaseException, words: Sequence[str]) -> str:
     )
 
 
-def format_report(error: BaseException, words: Sequence[str]) -> str:
+def format_report(error: BaseException, words: Sequence[str], versions: Mapping[str, str]) -> str:
     """Return the text of a report: command, versions and traceback."""
-    versions = [f"{name} {_find_version(name)}" for name in PACKAGES]
-    trace = "".join(traceback.format_exception(error, limit=-100))
+    listed = ", ".join(f"{name} {number}" for name, number in versions.items())
     machine = platform.uname()
     lines = (
         "loopcal stopped because of a defect. This report and the input files make it repeatable.",
         f"command: {shlex.join(['loopcal', *words])}",
-        f"versions: {', '.join(versions)}, Python {platform.python_version()}",
+        f"versions: {listed}, Python {platform.python_version()}",
         f"system: {machine.system} {machine.release} {machine.machine}",
         "",
-        trace,
+        "".join(traceback.format_exception(error, limit=-100)),
     )
     return "\n".join(lines)
 
 
 def save_report(text: str) -> Path | None:
-    """Write a report to a new file in the temporary folder, or where that fails in the current one.
+    """Write a report to a new file in the temporary folder, or where that fails in the current one;
+    return None where no file can be written.
 
     The name is unpredictable, and the file is made exclusively: nothing is replaced and no symbolic
-    link is followed. None where no file can be written.
+    link is followed.
     """
     for folder in (None, "."):
         try:
-            number, name = tempfile.mkstemp(SUFFIX, PREFIX, folder)
+            number, name = tempfile.mkstemp(".txt", "loopcal-defect-", folder)
         except OSError:
             continue
-        path = Path(name)
         try:
             with os.fdopen(number, "w", encoding="utf-8", errors="backslashreplace") as stream:
                 stream.write(text)
         except OSError:
-            path.unlink(missing_ok=True)
+            Path(name).unlink(missing_ok=True)
             continue
-        return path
+        return Path(name)
     return None
-
-
-def _name_place(error: BaseException) -> str:
-    """Return the kind of an exception and the innermost line of loopcal that it passed."""
-    package = Path(__file__).resolve().parent.parent
-    frames = traceback.extract_tb(error.__traceback__, limit=-100)
-    own = [frame for frame in frames if Path(frame.filename).is_relative_to(package)]
-    if not own:
-        return type(error).__name__
-    place = Path(own[-1].filename).relative_to(package.parent).as_posix()
-    return f"{type(error).__name__} at {place}:{own[-1].lineno}"
 
 
 def _find_version(package: str) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from inspect import signature
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -49,9 +50,6 @@ def complete_robot(
 
 
 robot_argument = click.argument("robot", metavar="ROBOT", shell_complete=complete_robot)
-json_option = click.option(
-    "--json", "as_json", is_flag=True, help="Print one JSON document instead of text."
-)
 verbose_option = click.option(
     "-v", "--verbose", is_flag=True, help="Print all findings and tables, not only the summary."
 )
@@ -139,7 +137,7 @@ class Count(click.IntRange):
 def _import(place: str) -> Any:
     """Return what a place such as `package.module:NAME` names."""
     module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
+    return attrgetter(name)(import_module(module))
 
 
 class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
@@ -367,13 +365,7 @@ def read_checked_measurements(
     allow_implausible: bool = False,
     **allowed: bool,
 ) -> Measurements:
-    """Read measurement files as `read_measurements`, and check their conventions.
-
-    Raises
-    ------
-    LoopcalError
-        See `loopcal.io.data.measurement_file.load_measurements` and `loopcal.check_conventions`.
-    """
+    """Read measurement files as `read_measurements`, and check their conventions."""
     from loopcal.diagnose.conventions.convention_check import check_conventions
 
     data = read_measurements(paths, robot, **allowed)
@@ -423,11 +415,6 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
 
     Print a note where a file names another robot, or another file by its absolute path, or contains
     no measured value.
-
-    Raises
-    ------
-    LoopcalError
-        See `loopcal.io.data.measurement_file.load_measurements`.
     """
     from loopcal.cli import terminal
     from loopcal.findings import report_finding
@@ -457,8 +444,6 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
         terminal.print_note(str(report_finding("files.no-measured-value", file=str(file))))
     return data
 
-
-# --- Options that choose the method, the loss and the noise of a fit.
 
 FIT = "loopcal.estimate.options:FitOptions"
 
@@ -539,13 +524,7 @@ FIT_OPTIONS = (
 
 
 def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
-    """Return the options of the library from those of `fit_options`.
-
-    Raises
-    ------
-    DataError
-        A number that belongs to another method.
-    """
+    """Return the options of the library from those of `fit_options`."""
     from loopcal.estimate.options import FitOptions, find_foreign_setting
 
     stated = {name: options[name] for name in FIT_OPTIONS}
@@ -556,8 +535,6 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
         )
     return FitOptions.from_dict(stated)
 
-
-# --- Options that describe an instrument, its noise and the poses at which it measures.
 
 TILT = {"phi", "theta", "psi"}
 """Components that are angles of tilt and torsion."""
@@ -574,6 +551,8 @@ DESCRIPTION = (
 )
 """Names of the options that describe an instrument."""
 
+
+INSTRUMENT = "loopcal.apply.simulated_measurements:InstrumentDescription"
 
 instrument_options = add_options(
     click.option(
@@ -592,16 +571,16 @@ instrument_options = add_options(
         metavar="FORM",
         help="Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...",
     ),
-    click.option(
+    library_option(
         "--sigma-position",
+        of=INSTRUMENT,
         type=POSITIVE_LENGTH,
-        default="0.01mm",
         help="Standard deviation of each measured length.",
     ),
-    click.option(
+    library_option(
         "--sigma-angle",
+        of=INSTRUMENT,
         type=POSITIVE_ANGLE,
-        default="50urad",
         help="Standard deviation of each measured angle.",
     ),
 )
@@ -635,10 +614,10 @@ draw_option = click.option(
     help="Number of poses to draw evenly from the workspace where no poses are given.",
 )
 
-distribution_option = click.option(
+distribution_option = library_option(
     "--distribution",
-    type=click.Choice(("normal", "uniform")),
-    default="normal",
+    of=INSTRUMENT,
+    type=Words("loopcal.measure.instrument:Distribution"),
     help="Distribution of the noise of measured values. Uniform noise lies within sqrt(3) = 1.732 "
     "standard deviations; a limit of 1 um is --sigma-position 0.57735um.",
 )
@@ -656,11 +635,6 @@ def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) 
     """Return the instrument of `instrument_options`, and of `unknown_options` if there are any.
 
     `robot` : gives targets of unknown place an assumed one; only needed where there are targets.
-
-    Raises
-    ------
-    DataError
-        Options that contradict each other, or an unknown kind, frame or component.
     """
     from loopcal.apply.simulated_measurements import (
         InstrumentDescription,
@@ -695,13 +669,7 @@ def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) 
 
 
 def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None:
-    """Return the standard deviations (a,) [SI] that --sigma-reading states; None without it.
-
-    Raises
-    ------
-    DataError
-        A negative number, a wrong unit, or an actuator that the robot does not have.
-    """
+    """Return the standard deviations (a,) [SI] that --sigma-reading states; None without it."""
     import numpy as np
 
     if text is None:
@@ -728,9 +696,6 @@ def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None
     return np.array(list(sigma.values()))
 
 
-# --- Options for an accuracy goal, and for constraints on planned poses.
-
-
 class Goal(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
     """A length or an angle with its unit: of positions ("position") or of orientations."""
 
@@ -751,10 +716,10 @@ class Goal(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # ge
 
 
 constraint_options = add_options(
-    click.option(
+    library_option(
         "--min-margin",
+        of="loopcal.planning.constraints:Constraints",
         type=float,
-        default=0.1,
         help="Smallest distance from a singularity, as a share of the median of the workspace.",
     ),
     click.option(
@@ -775,16 +740,16 @@ constraint_options = add_options(
         metavar="X,Y,Z",
         help="With --seen-from: direction of the target in the axes of the platform.",
     ),
-    click.option(
+    library_option(
         "--cone",
+        of="loopcal.planning.constraints:LineOfSight",
         type=ANGLE,
-        default="90deg",
         help="With --seen-from: half angle of the cone in which the target is visible.",
     ),
-    click.option(
+    library_option(
         "--nearest",
+        of="loopcal.planning.constraints:LineOfSight",
         type=LENGTH,
-        default="0mm",
         help="With --seen-from: smallest distance of the target.",
     ),
     click.option(

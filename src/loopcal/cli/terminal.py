@@ -8,8 +8,10 @@ import shutil
 import sys
 import textwrap
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import wraps
 from io import TextIOWrapper
 from pathlib import Path
 from types import TracebackType
@@ -37,6 +39,47 @@ DELAY = 2.0
 def width() -> int:
     """Return the characters of a line: those of the terminal, or 80 where there is none."""
     return min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
+
+
+@dataclass(frozen=True)
+class Output:
+    """What a command has found out.
+
+    Attributes
+    ----------
+    document : for --json. page : makes the paragraphs and tables for people, or text as it is;
+        nothing is printed where they are empty.
+    failures : quality gates that are not met. shown : whether the page contains them; then a
+        terminal does not repeat them. exit_code : 2 where there are failures, unless it is stated.
+    """
+
+    document: Any
+    page: Callable[[], Sequence[Block] | str]
+    failures: Iterable[Finding | str] = ()
+    shown: bool = False
+    exit_code: int | None = None
+
+
+def shows_output(function: Callable[..., Output]) -> Callable[..., int]:
+    """Return the function of a command that prints its output, with the option --json."""
+
+    @click.option(
+        "--json", "as_json", is_flag=True, help="Print one JSON document instead of text."
+    )
+    @wraps(function)
+    def run(as_json: bool, **options: Any) -> int:
+        output = function(**options)
+        page = None if as_json else output.page()
+        if as_json and output.document is not None:
+            print_json(output.document)
+        elif isinstance(page, str):
+            print_text(page)
+        elif page:
+            print_page(page)
+        code = print_failures(output.failures, output.shown and not as_json)
+        return code if output.exit_code is None else output.exit_code
+
+    return run
 
 
 def print_page(blocks: Iterable[Block]) -> None:

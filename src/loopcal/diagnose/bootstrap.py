@@ -16,7 +16,7 @@ See docs/theory/resampling.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -81,17 +81,20 @@ def list_observed_columns(
     width = 0 if root is None else len(root)
     kinds = [_make_empty(problem, rows, width) for rows in problem.rows]
     for block, poses in problem.poses.iterate_poses(solution, z):
-        for kind, numbers, rows in zip(kinds, block.row_numbers, block.rows, strict=True):
+        for i, (numbers, rows) in enumerate(zip(block.row_numbers, block.rows, strict=True)):
             if not len(numbers):
                 continue
-            own = linearize_rows(rows, poses, trials, fixed)
+            kind, own = kinds[i], linearize_rows(rows, poses, trials, fixed)
             columns = own.by_parameters[0]
             if own.by_nuisance is not None and estimate is not None:
                 wide = spread_columns(own.by_nuisance, rows.nuisance, width)[0]
                 columns = columns + wide @ estimate.elimination.slope[0]
                 kind.by_nuisance[numbers] = wide @ root
             kind.residual[numbers], kind.by_parameters[numbers] = own.residual[0], columns
-            if own.by_coordinates is not None and kind.by_coordinates is not None:
+            if own.by_coordinates is not None:
+                if kind.by_coordinates is None:
+                    shape = (len(kind.residual), *own.by_coordinates.shape[2:])
+                    kind = kinds[i] = replace(kind, by_coordinates=np.zeros(shape))
                 kind.by_coordinates[numbers] = own.by_coordinates[0]
     return tuple(kinds)
 
@@ -99,12 +102,8 @@ def list_observed_columns(
 def _make_empty(problem: Problem, rows: ObservationRows, width: int) -> ObservedColumns:
     """Return arrays of zeros for the rows of a kind and `width` nuisance parameters."""
     r, m = rows.whitener.shape[1:3]
-    coordinates = None
-    if problem.coordinates is not None:
-        links = rows.poses_by_link.shape[1]
-        coordinates = np.zeros((r, links, m, problem.coordinates.freedoms))
     by_parameters = np.zeros((r, m, problem.parameters))
-    return ObservedColumns(np.zeros((r, m)), np.zeros((r, m, width)), by_parameters, coordinates)
+    return ObservedColumns(np.zeros((r, m)), np.zeros((r, m, width)), by_parameters, None)
 
 
 # Errors of the blocks of a fit, estimated from its residuals and corrected for leverage.

@@ -17,6 +17,7 @@ from loopcal.cli.options import (
     FILE,
     Count,
     PoseShare,
+    Words,
     data_argument,
     data_options,
     file_option,
@@ -24,8 +25,8 @@ from loopcal.cli.options import (
     flag_option,
     force_option,
     frame_option,
-    json_option,
     leave_out_held_out,
+    library_option,
     limit_options,
     make_fit_options,
     print_convention_note,
@@ -36,10 +37,12 @@ from loopcal.cli.options import (
     take_flags,
     verbose_option,
 )
+from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
+    from loopcal.results.tables import Block
 
 ALLOWED = ("allow_outside_stroke", "allow_duplicates")
 """Options that accept doubtful measurements."""
@@ -59,10 +62,10 @@ TAKEN_OPTIONS = (
 @robot_argument
 @data_argument("DATA...")
 @file_option("-o", "--output", help="Run folder to make.", required=True)
-@click.option(
+@library_option(
     "--hold-out",
+    of="loopcal.apply.calibration_options:CalibrationOptions",
     type=PoseShare(),
-    default=0.0,
     metavar="SHARE",
     help="Share of the poses, from 0 to below 1, to keep out of the fit for validation, such as "
     "0.25. The poses are those of data.split(hold_out=SHARE, seed=SEED) in Python.",
@@ -95,7 +98,7 @@ TAKEN_OPTIONS = (
 @data_options
 @force_option("the run", ", and call the robot file of a failed calibration robot.yaml")
 @verbose_option
-@json_option
+@shows_output
 def calibrate(
     robot: str,
     data: tuple[Path, ...],
@@ -106,9 +109,8 @@ def calibrate(
     seed: int,
     force: bool,
     verbose: bool,
-    as_json: bool,
     **options: Any,
-) -> int:
+) -> Output:
     """Identify the free parameters of ROBOT from DATA, validate them on held-out poses, and write a
     run folder with the corrected robot file.
 
@@ -165,13 +167,14 @@ def calibrate(
     with terminal.ProgressBar() as progress:
         progress(0, 1, "writing the run folder")
         save_run(output, report, inputs, sys.argv, force)
-    if as_json:
-        terminal.print_json(build_document(report, inputs, sys.argv))
-    else:
-        written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
-        terminal.print_page([*view_calibration(report, verbose, hint_for), "", written])
-    terminal.print_failures(report.failures, shown=not as_json)
-    return report.exit_code
+    written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
+    return Output(
+        build_document(report, inputs, sys.argv),
+        lambda: [*view_calibration(report, verbose, hint_for), "", written],
+        report.failures,
+        shown=True,
+        exit_code=report.exit_code,
+    )
 
 
 def _list_inputs(
@@ -192,8 +195,8 @@ def _list_inputs(
 
 @click.command()
 @click.argument("run", metavar="RUN", type=FILE)
-@json_option
-def budget(run: Path, as_json: bool) -> int:
+@shows_output
+def budget(run: Path) -> Output:
     """Show the uncertainty budget of RUN, a run folder: what each source of errors contributes to
     poses and parameters, and what half its sigma would gain.
 
@@ -210,11 +213,7 @@ def budget(run: Path, as_json: bool) -> int:
 
     calibrated = load_run(run)
     content = calibrated.load_budget()
-    if as_json:
-        terminal.print_json(content)
-    else:
-        terminal.print_page(view_budget(content, calibrated.robot))
-    return 0
+    return Output(content, lambda: view_budget(content, calibrated.robot))
 
 
 @click.command()
@@ -231,7 +230,7 @@ def budget(run: Path, as_json: bool) -> int:
 )
 @flag_option("--allow-fitted-data", help="Accept measurements that the run was fitted to.")
 @verbose_option
-@json_option
+@shows_output
 def validate(
     run: Path,
     data: tuple[Path, ...],
@@ -240,9 +239,8 @@ def validate(
     refit: tuple[str, ...],
     allow_fitted_data: bool,
     verbose: bool,
-    as_json: bool,
     **flags: bool,
-) -> int:
+) -> Output:
     """Compare the robot of RUN, a run folder or a robot file, with DATA, one file or several.
 
     The errors are those before and after calibration; of a robot file without identified values
@@ -285,25 +283,23 @@ def validate(
         refit=refit,
         uncertainty=calibrated.load_uncertainty(),
     )
-    if as_json:
-        complete = replace(validation, findings=(*validation.findings, *noted))
-        terminal.print_json(complete.to_dict())
-    else:
-        is_changed = bool((calibrated.robot.values != calibrated.initial_robot.values).any())
-        page = view_validation(validation, is_changed, verbose)
-        hints = [hint for f in validation.findings if (hint := hint_for(f))]
-        terminal.print_page([*page, *(f"Hint: {hint}" for hint in hints)])
-    return terminal.print_failures(validation.failures)
+    is_changed = bool((calibrated.robot.values != calibrated.initial_robot.values).any())
+    hints = [f"Hint: {hint}" for f in validation.findings if (hint := hint_for(f))]
+    return Output(
+        replace(validation, findings=(*validation.findings, *noted)).to_dict(),
+        lambda: [*view_validation(validation, is_changed, verbose), *hints],
+        validation.failures,
+    )
 
 
 @click.command()
 @click.argument("run", metavar="RUN", type=FILE)
 @click.argument("targets", metavar="TARGETS", type=FILE)
 @file_option("-o", "--output", help="CSV file to write; without it the CSV text is printed.")
-@click.option(
+@library_option(
     "--mode",
-    type=click.Choice(("readings", "commands")),
-    default="readings",
+    of="loopcal.apply.compensation:compensate",
+    type=Words("loopcal.apply.compensation:Mode"),
     help="Actuator readings to set, or shifted commands for a controller that cannot be changed.",
 )
 @click.option(
@@ -311,12 +307,15 @@ def validate(
     metavar="ROBOT",
     help="Robot file with the geometry of the controller; by default the nominal robot.",
 )
-@click.option(
-    "--steps", type=Count("STEPS", 1), default=3, help="Iterations of the shifted commands."
+@library_option(
+    "--steps",
+    of="loopcal.apply.compensation:compensate",
+    type=Count("STEPS", 1),
+    help="Iterations of the shifted commands.",
 )
 @frame_option()
 @force_option("the output file", ", and compute also from a calibration that failed")
-@json_option
+@shows_output
 def compensate(
     run: Path,
     targets: Path,
@@ -326,8 +325,7 @@ def compensate(
     steps: int,
     frame: str,
     force: bool,
-    as_json: bool,
-) -> int:
+) -> Output:
     """Compute readings or commands with which the machine of RUN reaches TARGETS, a CSV file of
     controlled coordinates.
 
@@ -354,7 +352,7 @@ def compensate(
     refuse_outputs((output,), inputs, force)
     failure = find_failure(run)
     if failure is not None and not force:
-        return terminal.print_failures([with_hint(failure, hint_for)])
+        return Output(None, list, [with_hint(failure, hint_for)])
     known = load_posterior_or_robot(run)
     robot = known if isinstance(known, Mechanism) else known.robot
     coordinates, labels = load_targets(targets, robot)
@@ -365,29 +363,27 @@ def compensate(
         )
     if output is not None:
         save_compensation(result, output)
-    if as_json:
-        terminal.print_json(result.to_dict())
-    elif output is None:
-        terminal.print_text(format_compensation(result))
-    else:
-        terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
     missed = [
         f"target {label!r}: {with_hint(result.findings[i], hint_for)}"
         for i, (label, is_usable) in enumerate(zip(labels, result.usable, strict=True))
         if not is_usable
     ]
-    return terminal.print_failures([*([] if failure is None else [failure]), *missed])
 
+    def view() -> list[Block] | str:
+        if output is None:
+            return format_compensation(result)
+        return [*view_compensation(result), "", f"Written to {output}"]
 
-# --- `loopcal certificate`: a digital calibration certificate of a run.
+    failures = [*([] if failure is None else [failure]), *missed]
+    return Output(result.to_dict(), view, failures)
 
 
 @click.command()
 @click.argument("run", metavar="[RUN]", type=FILE, required=False)
 @click.argument("facts", metavar="[FACTS]", type=FILE, required=False)
 @flag_option("--new", help="Print a file FACTS to fill in.")
-@json_option
-def certificate(run: Path | None, facts: Path | None, new: bool, as_json: bool) -> int:
+@shows_output
+def certificate(run: Path | None, facts: Path | None, new: bool) -> Output:
     """Print a digital calibration certificate of RUN: XML by PTB's schema DCC 3.3.0.
 
     FACTS is a YAML file with what a run does not know: laboratory, customer, dates, serial number.
@@ -404,23 +400,11 @@ def certificate(run: Path | None, facts: Path | None, new: bool, as_json: bool) 
     if new:
         if run is not None:
             raise DataError("--new prints a file to fill in; leave out RUN and FACTS")
-        return _print("facts", TEMPLATE, as_json)
+        return Output({"facts": TEMPLATE}, lambda: TEMPLATE)
     if run is None or facts is None:
         raise DataError("RUN and FACTS are needed; loopcal certificate --new prints a file FACTS")
     text = format_certificate(load_run_or_robot(run), load_administration(facts))
-    return _print("certificate", text, as_json)
-
-
-def _print(name: str, text: str, as_json: bool) -> int:
-    """Print a text, or a JSON object that holds it, and return the exit code."""
-    if as_json:
-        terminal.print_json({name: text})
-    else:
-        click.echo(text, nl=False)
-    return 0
-
-
-# --- `loopcal compare`: calibrations side by side.
+    return Output({"certificate": text}, lambda: text)
 
 
 @click.command()
@@ -441,15 +425,10 @@ def _print(name: str, text: str, as_json: bool) -> int:
 )
 @data_options
 @force_option("the output file")
-@json_option
+@shows_output
 def compare(
-    runs: tuple[Path, ...],
-    data: tuple[Path, ...],
-    output: Path | None,
-    force: bool,
-    as_json: bool,
-    **flags: Any,
-) -> int:
+    runs: tuple[Path, ...], data: tuple[Path, ...], output: Path | None, force: bool, **flags: Any
+) -> Output:
     """Compare calibrations side by side: two or more run folders, of sessions, machines or methods.
 
     The first RUN is the reference of the others. Where the data are independent, whether the
@@ -481,24 +460,17 @@ def compare(
     comparison = compare_runs(loaded, measurements)
     if output is not None:
         write_comparison(output, comparison)
-    if as_json:
-        terminal.print_json(comparison.to_dict())
-        return 0
-    units = find_error_units(comparison)
-    page = view_comparison(comparison, units.__getitem__)
-    terminal.print_page(page if output is None else [*page, "", f"Written to {output}"])
-    return 0
-
-
-# --- `loopcal repeatability`: pose accuracy and repeatability by ISO 9283.
+    written = [] if output is None else ["", f"Written to {output}"]
+    units = find_error_units(comparison).__getitem__
+    return Output(comparison.to_dict(), lambda: [*view_comparison(comparison, units), *written])
 
 
 @click.command()
 @click.argument("robot", metavar="ROBOT", type=FILE)
 @data_argument("DATA...")
 @data_options
-@json_option
-def repeatability(robot: Path, data: tuple[Path, ...], as_json: bool, **flags: bool) -> int:
+@shows_output
+def repeatability(robot: Path, data: tuple[Path, ...], **flags: bool) -> Output:
     """Compute pose accuracy (AP) and repeatability (RP) by ISO 9283 from DATA, in which each pose
     of ROBOT, a run folder or a robot file, was visited several times.
 
@@ -518,14 +490,7 @@ def repeatability(robot: Path, data: tuple[Path, ...], as_json: bool, **flags: b
     calibrated = load_run_or_robot(robot)
     measurements = read_checked_measurements(data, calibrated.robot, **flags)
     result = assess_repeatability(calibrated.robot, measurements, calibrated.nuisance_values)
-    if as_json:
-        terminal.print_json(result.to_dict())
-    else:
-        terminal.print_page(view_repeatability(result, calibrated.robot))
-    return 0
-
-
-# --- `loopcal report`: a calibration as a document to read, sign and archive.
+    return Output(result.to_dict(), lambda: view_repeatability(result, calibrated.robot))
 
 
 @click.command()
@@ -541,8 +506,8 @@ def repeatability(robot: Path, data: tuple[Path, ...], as_json: bool, **flags: b
     "--pdf", help="Also print the report to a PDF file beside it, by an installed Chromium."
 )
 @force_option("the output files")
-@json_option
-def report(run: Path, output: Path, pdf: bool, force: bool, as_json: bool) -> int:
+@shows_output
+def report(run: Path, output: Path, pdf: bool, force: bool) -> Output:
     """Write the report of RUN, a run folder, as one HTML file that needs no network.
 
     It contains the verdict with its scope, what the data do not determine, errors at held-out
@@ -571,25 +536,19 @@ def report(run: Path, output: Path, pdf: bool, force: bool, as_json: bool) -> in
         if pdf:
             progress(0, 1, "printing the report")
             print_pdf(output, files[-1])
-    failure = calibrated.failure
-    if as_json:
-        terminal.print_json({"output": files, "reasons": [] if failure is None else [failure]})
-    else:
-        terminal.print_page([f"Written to {', '.join(str(file) for file in files)}"])
-    return terminal.print_failures([] if failure is None else [failure])
-
-
-# --- `loopcal regularize`: the held-out error against the strength of regularization.
+    failures = [] if calibrated.failure is None else [calibrated.failure]
+    written = f"Written to {', '.join(str(file) for file in files)}"
+    return Output({"output": files, "reasons": failures}, lambda: [written], failures)
 
 
 @click.command()
 @robot_argument
 @data_argument("DATA...")
 @file_option("-o", "--output", help="Folder to make, with the curves and their figure.")
-@click.option(
+@library_option(
     "--folds",
+    of="loopcal.diagnose.regularization_curves:compute_regularization_curves",
     type=Count("FOLDS", 2),
-    default=5,
     metavar="N",
     help="Number of folds of poses where frames, targets or surfaces are unknown.",
 )
@@ -599,7 +558,7 @@ def report(run: Path, output: Path, pdf: bool, force: bool, as_json: bool) -> in
 @seed_option("the folds")
 @force_option("the folder")
 @data_options
-@json_option
+@shows_output
 def regularize(
     robot: str,
     data: tuple[Path, ...],
@@ -608,9 +567,8 @@ def regularize(
     drop: tuple[str, ...],
     seed: int,
     force: bool,
-    as_json: bool,
     **flags: Any,
-) -> None:
+) -> Output:
     """Show how the error at held-out poses depends on the ridge parameter lam and on the number k
     of directions of truncated SVD, for your own DATA, and which values the rules choose.
 
@@ -651,9 +609,7 @@ def regularize(
         made_by = collect_provenance(["loopcal", *sys.argv[1:]], inputs, {"folds": seed})
         document = {**curves.to_dict(), "made_by": made_by}
         write_curves(output, document, tabulate_points(curves).to_csv(), picture, force)
-    if as_json:
-        terminal.print_json(curves.to_dict())
-        return
-    written = f"Written to {output}: curves.json, curves.csv, curves.png"
-    page = view_regularization(curves)
-    terminal.print_page(page if output is None else [*page, "", written])
+    written = ["", f"Written to {output}: curves.json, curves.csv, curves.png"]
+    return Output(
+        curves.to_dict(), lambda: [*view_regularization(curves), *(written if output else [])]
+    )

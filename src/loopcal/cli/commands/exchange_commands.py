@@ -23,7 +23,6 @@ from loopcal.cli.options import (
     flag_option,
     force_option,
     format_option,
-    json_option,
     name_option,
     print_convention_note,
     profile_option,
@@ -31,6 +30,7 @@ from loopcal.cli.options import (
     refuse_given,
     robot_argument,
 )
+from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import DataError
 from loopcal.units import Dimension, find_unit, list_symbols
 
@@ -41,9 +41,6 @@ if TYPE_CHECKING:
     from loopcal.mechanism.model import Mechanism
     from loopcal.results.tables import Block
 
-
-# --- `loopcal gcode` and `loopcal fill`: from a plan to the machine, and from the export of an
-# instrument back to its sheet. Also what `loopcal import` does with an instrument's export.
 
 SHOWN = 20
 """Lines that do not match a profile that are listed."""
@@ -71,7 +68,7 @@ SHOWN = 20
 )
 @file_option("-o", "--output", help="Program to write, such as poses.ngc.", required=True)
 @force_option("the output file")
-@json_option
+@shows_output
 def gcode(
     robot: str,
     plan: Path,
@@ -80,8 +77,7 @@ def gcode(
     unit: Literal["mm", "in"] | None,
     output: Path,
     force: bool,
-    as_json: bool,
-) -> None:
+) -> Output:
     """Write G-code that moves ROBOT to the poses of PLAN, a folder or its plan.csv, in order.
 
     The program starts at home, waits at each pose, passes home where the plan does, and returns to
@@ -117,10 +113,8 @@ def gcode(
     text = format_gcode(machine, stops, home, GcodeSettings(speed, pause, program_unit))
     write_text(output, text)
     counts = {"stops": len(stops.labels), "unit": program_unit}
-    if as_json:
-        terminal.print_json({"program": output, **counts})
-        return
-    terminal.print_page([f"{output}: {counts['stops']} stops, lengths in {program_unit}"])
+    page = [f"{output}: {counts['stops']} stops, lengths in {program_unit}"]
+    return Output({"program": output, **counts}, lambda: page)
 
 
 @click.command()
@@ -149,7 +143,7 @@ def gcode(
 )
 @file_option("-o", "--output", help="Measurement file to write.", required=True)
 @force_option("the output file")
-@json_option
+@shows_output
 def fill(
     robot: str,
     sheet: Path,
@@ -162,8 +156,7 @@ def fill(
     allow_implausible: bool,
     output: Path,
     force: bool,
-    as_json: bool,
-) -> None:
+) -> Output:
     """Fill in SHEET, the measurements.csv of a plan of ROBOT, with the points of an instrument's
     EXPORT.
 
@@ -205,11 +198,8 @@ def fill(
     print_convention_note(conventions, exports)
     save_filled_sheet(filled, output)
     findings = (*filled.findings, *examined)
-    if as_json:
-        misfits = [{"file": f, "line": n, "reason": reason} for f, n, reason in filled.misfits]
-        document = {"measurements": output, "misfits": misfits, "findings": findings}
-        terminal.print_json(document)
-        return
+    misfits = [{"file": f, "line": n, "reason": reason} for f, n, reason in filled.misfits]
+    document = {"measurements": output, "misfits": misfits, "findings": findings}
     first, *others = (with_hint(finding, hint_for) for finding in findings)
     page = [f"{output}: {first}", *(f"note: {text}" for text in others)]
     page += [
@@ -219,17 +209,12 @@ def fill(
     if len(filled.misfits) > SHOWN:
         page.append(f"note: {len(filled.misfits) - SHOWN} more lines do not match")
     page.append(f"Next: loopcal calibrate {shlex.join((robot, str(output)))} -o run")
-    terminal.print_page(page)
+    return Output(document, lambda: page)
 
 
 def convert_instrument_export(
-    file: Path,
-    profile: str,
-    local: tuple[str | None, bool],
-    output: Path,
-    force: bool,
-    as_json: bool,
-) -> int:
+    file: Path, profile: str, local: tuple[str | None, bool], output: Path, force: bool
+) -> Output:
     """Write the measurements of an export; report lines that were skipped or do not match.
 
     `local` : the unit of lengths in place of that of the profile, and whether commas are decimal.
@@ -249,18 +234,14 @@ def convert_instrument_export(
     refuse_outputs((output,), (file, path), force)
     converted = convert_export(file, with_local_settings(read_profile(path), *local))
     save_conversion(converted, output)
-    if as_json:
-        misfits = [{"line": line, "reason": reason} for line, reason in converted.misfits]
-        document = {
-            "measurements": output,
-            "rows": converted.rows,
-            "passed": converted.passed,
-            "misfits": misfits,
-            "notes": [str(finding) for finding in converted.findings],
-            "findings": converted.findings,
-        }
-        terminal.print_json(document)
-        return 0
+    document = {
+        "measurements": output,
+        "rows": converted.rows,
+        "passed": converted.passed,
+        "misfits": [{"line": line, "reason": reason} for line, reason in converted.misfits],
+        "notes": [str(finding) for finding in converted.findings],
+        "findings": converted.findings,
+    }
     page = [
         f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
         *(f"note: {with_hint(finding, hint_for)}" for finding in converted.findings),
@@ -272,8 +253,7 @@ def convert_instrument_export(
     more = len(converted.misfits) - SHOWN
     if more > 0:
         page.append(f"note: {more} more lines do not match; {output} lists them")
-    terminal.print_page(page)
-    return 0
+    return Output(document, lambda: page)
 
 
 CORRECTED_ALONE = (
@@ -340,7 +320,7 @@ TAPED = (
     help="Link that is the platform (urdf); by default the one on a fixed joint.",
 )
 @force_option("an output file", ", and write --corrected even where the calibration failed")
-@json_option
+@shows_output
 def import_(
     file: Path,
     format_name: str | None,
@@ -350,9 +330,8 @@ def import_(
     data: Path | None,
     corrected: Path | None,
     force: bool,
-    as_json: bool,
     **settings: Any,
-) -> int:
+) -> Output:
     """Read FILE, which another program wrote, as a robot file and, where it contains any,
     measurements.
 
@@ -382,7 +361,7 @@ def import_(
 
     if profile is not None:
         local = (settings["length_unit"], decimal == "comma")
-        return convert_instrument_export(file, profile, local, output, force, as_json)
+        return convert_instrument_export(file, profile, local, output, force)
     refuse_given(("decimal",), "without --profile")
     source = choose_format(file, format_name)
     read = _find_reader(source)
@@ -408,14 +387,17 @@ def import_(
         "corrected": corrected if correction is not None and correction.is_written else None,
         "notes": [str(finding) for finding in noted],
         "findings": imported.findings,
+        "fit": correction and correction.report.identification,
+        "verdict": correction and correction.report.verdict,
+        "reasons": correction and correction.report.failures,
+        "changes": correction and correction.changes,
     }
-    if as_json:
-        terminal.print_json({**document, **_list_calibration(correction)})
-    else:
-        terminal.print_page(_view_import(robot, document, noted, correction))
-    if correction is None or correction.failure is None:
-        return 0
-    return terminal.print_failures([with_hint(correction.failure, hint_for)])
+    failure = None if correction is None else correction.failure
+    return Output(
+        document,
+        lambda: _view_import(robot, document, noted, correction),
+        [] if failure is None else [with_hint(failure, hint_for)],
+    )
 
 
 def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
@@ -455,17 +437,6 @@ class _Correction:
     failure: Finding | None
     changes: tuple[str, ...]
     is_written: bool
-
-
-def _list_calibration(correction: _Correction | None) -> dict[str, Any]:
-    """Return the calibration of an import for JSON; its parts are None where there is none."""
-    report = None if correction is None else correction.report
-    return {
-        "fit": report and report.identification,
-        "verdict": report and report.verdict,
-        "reasons": report and report.failures,
-        "changes": correction and correction.changes,
-    }
 
 
 def _correct_file(
@@ -537,15 +508,10 @@ def _view_import(
     help="File to write; without it, --format prints what to type, with sensible digits.",
 )
 @force_option("the output file", ", and write also the numbers of a calibration that failed")
-@json_option
+@shows_output
 def export(
-    source: str,
-    format_name: str | None,
-    into: Path | None,
-    output: Path | None,
-    force: bool,
-    as_json: bool,
-) -> int:
+    source: str, format_name: str | None, into: Path | None, output: Path | None, force: bool
+) -> Output:
     """Write the parameters of RUN, or of a robot file, as another program reads them.
 
     Without -o, the lines are printed for people: each identified value has three digits of its
@@ -576,25 +542,22 @@ def export(
     failure = find_failure(source)
     failures = [] if failure is None else [failure]
     if failures and not force:
-        if as_json:
-            document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
-            terminal.print_json(document)
-        return terminal.print_failures(with_hint(failure, hint_for) for failure in failures)
+        document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
+        return Output(document, list, [with_hint(failure, hint_for) for failure in failures])
     loaded = replace(load_source(source), is_for_people=output is None)
     exported = export_robot(loaded, target, into)
     if output is not None:
         write_text(output, exported.text)
-    if as_json:
-        notes = [str(finding) for finding in exported.findings]
-        document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
-        document |= {"text": exported.text} if output is None else {}
-        terminal.print_json(document)
-        return terminal.print_failures(failures)
-    noted = [with_hint(finding, hint_for) for finding in exported.findings]
-    if output is None:
+    notes = [str(finding) for finding in exported.findings]
+    document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
+    document |= {"text": exported.text} if output is None else {}
+
+    def view() -> list[str] | str:
+        noted = [with_hint(finding, hint_for) for finding in exported.findings]
+        if output is not None:
+            return [*noted, f"Written to {output}"]
         for note in noted:
             terminal.print_note(note)
-        terminal.print_text(exported.text)
-    else:
-        terminal.print_page([*noted, f"Written to {output}"])
-    return terminal.print_failures(failures)
+        return exported.text
+
+    return Output(document, view, failures)

@@ -25,7 +25,6 @@ from loopcal.cli.options import (
     force_option,
     instrument_options,
     is_given,
-    json_option,
     leave_out_held_out,
     make_instrument,
     name_option,
@@ -40,12 +39,12 @@ from loopcal.cli.options import (
     unknown_options,
     verbose_option,
 )
+from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.apply.inspection import IdentifiabilityReport
     from loopcal.apply.simulated_measurements import SimulatedMeasurements
-    from loopcal.diagnose.parameter_subset import IdentifiableSubset
     from loopcal.mechanism.model import Mechanism
 
 
@@ -86,7 +85,7 @@ DETAILS = "the first combinations, the singular values and a table of all parame
 )
 @data_options
 @verbose_option
-@json_option
+@shows_output
 def identifiability(
     robot: str,
     data: tuple[Path, ...],
@@ -101,9 +100,8 @@ def identifiability(
     useful: float | None,
     useful_angle: float | None,
     verbose: bool,
-    as_json: bool,
     **options: Any,
-) -> None:
+) -> Output:
     """Show which parameters of ROBOT the measurements DATA determine, which combinations they
     cannot determine, and which further measurement does.
 
@@ -123,14 +121,15 @@ def identifiability(
     from loopcal.apply.inspection import analyze_identifiability
     from loopcal.apply.simulated_measurements import predict_noise_free
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_reduced_robot
     from loopcal.report.calibration_view import view_identifiability
 
     if data:
         _refuse_beside_data(poses)
     if output is not None and not reduced:
         raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
-    _check_useful(useful, useful_angle)
+    if useful is None and useful_angle is not None:
+        raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
     refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
     machine, drawn = load_robot(robot), []
     if data:
@@ -150,14 +149,14 @@ def identifiability(
     accuracy = None if useful is None else (useful, useful_angle)
     report = analyze_identifiability(machine, measurements, reduced, rank_tolerance, accuracy)
     if report.subset is not None and output is not None:
-        _write_subset(output, report.subset)
-    if as_json:
-        terminal.print_json(report.to_dict())
-        return
-    page = [*drawn, *view_identifiability(report, verbose), *_list_hints(report, verbose)]
+        subset = report.subset
+        words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
+        save_reduced_robot(subset.robot, words, output)
+    written = []
     if output is not None:
-        page += ["", f"Written to {output}: the robot with the other parameters fixed"]
-    terminal.print_page(page)
+        written = ["", f"Written to {output}: the robot with the other parameters fixed"]
+    view, hints = view_identifiability(report, verbose), _list_hints(report, verbose)
+    return Output(report.to_dict(), lambda: [*drawn, *view, *hints, *written])
 
 
 def _list_hints(report: IdentifiabilityReport, verbose: bool) -> list[str]:
@@ -166,12 +165,6 @@ def _list_hints(report: IdentifiabilityReport, verbose: bool) -> list[str]:
     hints = [hint for finding in report.summary if not asked and (hint := hint_for(finding))]
     hints.append("use --json for all combinations" if verbose else f"use --verbose for {DETAILS}")
     return [f"Hint: {hint}" for hint in hints]
-
-
-def _check_useful(length: float | None, angle: float | None) -> None:
-    """Refuse an accuracy of angles without one of lengths."""
-    if length is None and angle is not None:
-        raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
 
 
 def _refuse_beside_data(poses: Path | None) -> None:
@@ -208,14 +201,6 @@ def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
     return f"{count} poses drawn from the workspace of {robot.name}, seed {seed}"
 
 
-def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
-    """Write the robot file with the parameters fixed that are left out."""
-    from loopcal.io.robot.robot_file import save_reduced_robot
-
-    words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
-    save_reduced_robot(subset.robot, words, output)
-
-
 @click.command()
 @robot_argument
 @file_option(
@@ -239,7 +224,7 @@ def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
 @file_option("--truth", help="Also write the true machine, as a robot file.")
 @seed_option("poses, errors and noise")
 @force_option("an output file")
-@json_option
+@shows_output
 def simulate(
     robot: str,
     poses: Path | None,
@@ -252,9 +237,8 @@ def simulate(
     truth: Path | None,
     seed: int,
     force: bool,
-    as_json: bool,
     **options: Any,
-) -> None:
+) -> Output:
     """Command ROBOT to poses by its nominal geometry, and write what an instrument measures of the
     true machine.
 
@@ -303,37 +287,19 @@ def simulate(
     if draw_errors and not any(p.free and p.tolerance for p in machine.parameters.entries):
         finding = report_finding("data.no-errors-drawn", robot=machine.name)
         terminal.print_note(str(finding))
-    if as_json:
-        terminal.print_json({"output": output, "truth": truth, **_count(result, seed)})
-    else:
-        terminal.print_page(_summarize(result, machine.name, f"{output}", seed))
-
-
-def _count(result: SimulatedMeasurements, seed: int) -> dict[str, Any]:
-    """Return what was simulated, for JSON."""
-    data = result.data
-    return {
-        "n_poses": data.n_poses,
-        "n_rows": data.n_rows,
-        "n_base_rows": data.n_base_rows,
-        "seed": seed,
-        "skipped": result.skipped,
-    }
-
-
-def _summarize(result: SimulatedMeasurements, robot: str, output: str, seed: int) -> list[str]:
-    """Return the lines that say what was simulated."""
-    n_poses, values = result.data.n_poses, f"{result.data.n_rows} measured values"
-    if result.data.n_base_rows:
-        values += f" and {result.data.n_base_rows} of targets on the base"
-    page = [f"{output}: {n_poses} poses of {robot}, {values}, seed {seed}"]
+    counts = {name: getattr(result.data, name) for name in ("n_poses", "n_rows", "n_base_rows")}
+    document = {"output": output, "truth": truth, **counts, "seed": seed, "skipped": result.skipped}
+    n_poses, values = counts["n_poses"], f"{counts['n_rows']} measured values"
+    if counts["n_base_rows"]:
+        values += f" and {counts['n_base_rows']} of targets on the base"
+    page = [f"{output}: {n_poses} poses of {machine.name}, {values}, seed {seed}"]
     if result.skipped:
-        count, names = len(result.skipped), ", ".join(result.skipped)
+        skipped, names = len(result.skipped), ", ".join(result.skipped)
         page.append(
-            f"{count} of {count + n_poses} poses are outside its reach or strokes and are skipped: "
-            f"{names}"
+            f"{skipped} of {skipped + n_poses} poses are outside its reach or strokes and are "
+            f"skipped: {names}"
         )
-    return page
+    return Output(document, lambda: page)
 
 
 def _fill_in(

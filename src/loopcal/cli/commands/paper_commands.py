@@ -18,13 +18,14 @@ from loopcal.cli.options import (
     file_option,
     flag_option,
     force_option,
-    json_option,
     leave_out_held_out,
+    library_option,
     read_checked_measurements,
     refuse_given,
     robot_argument,
     take_flags,
 )
+from loopcal.cli.terminal import Output, shows_output
 
 if TYPE_CHECKING:
     from loopcal.estimate.published_steps import PerLegEstimate
@@ -52,15 +53,10 @@ HEADING = 18
     help="Number of trials behind each statistical number.  [default: 50]",
 )
 @flag_option("--force", help="Replace an earlier result in FOLDER.")
-@json_option
+@shows_output
 def reproduce(
-    paper: str | None,
-    output: Path | None,
-    seed: int,
-    trials: int | None,
-    force: bool,
-    as_json: bool,
-) -> None:
+    paper: str | None, output: Path | None, seed: int, trials: int | None, force: bool
+) -> Output:
     """Repeat the study PAPER; without PAPER, list the studies.
 
     Every number called computed comes from this run. Statements of the paper that it does not
@@ -78,8 +74,7 @@ def reproduce(
         refuse_given(
             ("output", "seed", "trials", "force"), "without the name of a study, which is repeated"
         )
-        _list_papers(as_json)
-        return
+        return _list_papers()
     chosen = find_paper(paper)
     if output is not None:
         from loopcal.io.core.outputs import refuse_folder
@@ -93,32 +88,29 @@ def reproduce(
 
         command = ["loopcal", *sys.argv[1:]]
         write_folder(output, result, collect_provenance(command, {}, {"seed": seed}), force)
-    if as_json:
-        terminal.print_json(result.to_dict())
-        return
     last = "Add -o FOLDER for all tables and figures."
     if output is not None:
         last = f"Written to {output}: page.md, tables, figures"
-    terminal.print_page([*_view_reproduction(result), "", last])
+    return Output(result.to_dict(), lambda: [*_view_reproduction(result), "", last])
 
 
 @click.command()
 @robot_argument
 @data_argument("DATA...")
-@click.option("--steps", type=Count("STEPS", 1), default=3, metavar="N", help="Gauss-Newton steps.")
+@library_option(
+    "--steps",
+    of="loopcal.estimate.published_steps:identify_per_leg",
+    type=Count("STEPS", 1),
+    metavar="N",
+    help="Gauss-Newton steps.",
+)
 @file_option("-o", "--output", help="Robot file to write, with the identified values.")
 @force_option("the output file")
 @data_options
-@json_option
+@shows_output
 def per_leg(
-    robot: str,
-    data: tuple[Path, ...],
-    steps: int,
-    output: Path | None,
-    force: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+    robot: str, data: tuple[Path, ...], steps: int, output: Path | None, force: bool, **options: Any
+) -> Output:
     """Identify the hexapod ROBOT leg by leg from full poses DATA, as the study hexapod-42 does.
 
     All equations have weight one, and the noise that the legs share is ignored. The result has no
@@ -141,10 +133,8 @@ def per_leg(
     estimate = identify_per_leg(machine, measurements, steps)
     if output is not None:
         save_robot(estimate.robot, output)
-    if as_json:
-        terminal.print_json(estimate.to_dict())
-        return
-    terminal.print_page(_view_legs(estimate, len(measurements.readings), output))
+    poses = len(measurements.readings)
+    return Output(estimate.to_dict(), lambda: _view_legs(estimate, poses, output))
 
 
 def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> list[Block]:
@@ -176,16 +166,13 @@ def _print_step(text: str) -> None:
         terminal.print_message(text)
 
 
-def _list_papers(as_json: bool) -> None:
-    """Print the studies."""
+def _list_papers() -> Output:
+    """Return name, title and source of the studies."""
     from loopcal.papers.paper import PAPERS
 
-    if as_json:
-        rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
-        terminal.print_json({"papers": rows})
-        return
-    for paper in PAPERS.values():
-        terminal.print_page([paper.name, f"    {paper.title}", f"    {paper.source}"])
+    rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
+    lines = [text for r in rows for text in (r["name"], f"    {r['title']}", f"    {r['source']}")]
+    return Output({"papers": rows}, lambda: lines)
 
 
 def _view_reproduction(result: Reproduction) -> list[Block]:

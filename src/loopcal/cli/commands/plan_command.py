@@ -25,7 +25,7 @@ from loopcal.cli.options import (
     frame_option,
     instrument_options,
     is_given,
-    json_option,
+    library_option,
     make_constraints,
     make_instrument,
     name_option,
@@ -34,21 +34,22 @@ from loopcal.cli.options import (
     seed_option,
     unknown_options,
 )
+from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.measure.instrument import Instrument
     from loopcal.measure.measurements import Measurements
     from loopcal.mechanism.model import Mechanism
-    from loopcal.planning.constraints import Constraints, PlanOptions
+    from loopcal.planning.constraints import PlanOptions
     from loopcal.planning.plane_line_planning import SurfacePlan
     from loopcal.planning.result import Plan
 
 PLANE_LINE = "plane-line"
 """Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
 
-GROUPS, POINTS = 10, 8
-"""Default numbers of planes with a line, and of points on each."""
+PLAN = "loopcal.planning.constraints:PlanOptions"
+SURFACES = "loopcal.planning.plane_line_planning:SurfaceOptions"
 
 _COUNTED = "which is counted by --groups and --points"
 _HELD = "where a measuring machine holds x, y or z to --sigma-position"
@@ -56,7 +57,7 @@ _CHOSEN = "which moves points within the workspace and chooses by criterion D"
 EXCLUDED_BY_PLANE_LINE = {
     **dict.fromkeys(("poses", "accuracy", "curve"), _COUNTED),
     **dict.fromkeys(("like", "kind", "components", "orientation", "sigma_angle"), _HELD),
-    **dict.fromkeys(("criterion", "candidates", "allowed"), _CHOSEN),
+    **dict.fromkeys(("criterion", "n_candidates", "allowed"), _CHOSEN),
     "hold_out": "where every point is fitted",
     "measured": "which plans without earlier measurements",
     "frames": "whose surfaces are unknown in every group",
@@ -79,10 +80,10 @@ EXCLUDED_BY_PLANE_LINE = {
     type=Goal(),
     help="Instead of --poses: expected error to reach, such as 20um or 10urad.",
 )
-@click.option(
+@library_option(
     "--criterion",
+    of=PLAN,
     type=click.Choice(("I", "D")),
-    default="I",
     help="What the plan minimizes: the mean predicted variance of poses (I), or the uncertainty of "
     "the parameters (D).",
 )
@@ -96,17 +97,19 @@ EXCLUDED_BY_PLANE_LINE = {
 @data_option("--like", "Measurement file whose settings describe the instrument.")
 @unknown_options
 @instrument_options
-@click.option(
+@library_option(
     "--groups",
+    of=SURFACES,
     type=Count("GROUPS"),
     metavar="N",
-    help="With --measure plane-line: number of planes with a line.  [default: 10]",
+    help="With --measure plane-line: number of planes with a line.",
 )
-@click.option(
+@library_option(
     "--points",
+    of=SURFACES,
     type=Count("POINTS"),
     metavar="N",
-    help="With --measure plane-line: number of points on each.  [default: 8]",
+    help="With --measure plane-line: number of points on each.",
 )
 @file_option(
     "--allowed", help="Poses to choose from; by default drawn from the workspace.", metavar="CSV"
@@ -115,10 +118,11 @@ EXCLUDED_BY_PLANE_LINE = {
     "--measured", "Measurements that exist already. May be given several times.", multiple=True
 )
 @constraint_options
-@click.option(
+@library_option(
     "--candidates",
+    "n_candidates",
+    of=PLAN,
     type=Count("CANDIDATES", 10),
-    default=1000,
     metavar="N",
     help="Number of candidate poses to draw.",
 )
@@ -126,20 +130,19 @@ EXCLUDED_BY_PLANE_LINE = {
 @frame_option("fitted, base, or relative (to home)")
 @seed_option("all random choices")
 @force_option("the plan")
-@json_option
+@shows_output
 def plan(
     robot: str,
     output: Path,
     like: Path | None,
     allowed: Path | None,
     measured: tuple[Path, ...],
-    groups: int | None,
-    points: int | None,
+    groups: int,
+    points: int,
     seed: int,
     force: bool,
-    as_json: bool,
     **options: Any,
-) -> None:
+) -> Output:
     """Plan which poses of ROBOT to measure with an instrument. Write a folder with a sheet for the
     measurement and a data file to fill in.
 
@@ -156,20 +159,30 @@ def plan(
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
     """  # noqa: D301
-    from loopcal.io.robot.robot_file import load_robot
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot
     from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
 
-    inputs = _list_inputs(robot, like, allowed, measured)
+    files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
+    files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
+    inputs = {role: path for role, path in files.items() if path is not None}
     refuse_plan_folder(output, force, list(inputs.values()))
     machine = load_robot(robot)
     if options["measure"] == PLANE_LINE:
-        _refuse_beside_plane_line()
-        result = _plan_surfaces(
-            machine, groups, points, options["sigma_position"], make_constraints(options), seed
-        )
+        from loopcal.planning.plane_line_planning import SurfaceOptions, plan_surfaces
+
+        for name, reason in EXCLUDED_BY_PLANE_LINE.items():
+            if is_given(name):
+                raise DataError(
+                    f"{name_option(name)} cannot be combined with --measure plane-line, {reason}; "
+                    "leave it out"
+                )
+        sigma, constraints = options["sigma_position"], make_constraints(options)
+        surface_options = SurfaceOptions(groups, points, sigma, constraints, seed)
+        with terminal.ProgressBar() as progress:
+            result = plan_surfaces(machine, surface_options, progress)
         document = result.to_dict()
     else:
-        if groups is not None or points is not None:
+        if is_given("groups") or is_given("points"):
             raise DataError("--groups and --points belong to --measure plane-line; leave them out")
         instrument = _find_instrument(machine, like, options)
         plan_options = _make_plan_options(machine, allowed, measured, seed, options)
@@ -178,20 +191,16 @@ def plan(
         with terminal.ProgressBar() as progress:
             result = plan_poses(machine, instrument, options=plan_options, progress=progress)
         document = {"format": FORMAT, **result.to_dict()}
-    files = _write_plan(output, result, inputs, seed, force)
-    if as_json:
-        terminal.print_json(document)
-        return
+    written = _write_plan(output, result, inputs, seed, force)
     data = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
-    terminal.print_page(
-        [
-            str(result),
-            *(f"Hint: {hint}" for finding in result.findings if (hint := hint_for(finding))),
-            "",
-            f"Written to {output}: {files}",
-            f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
-        ]
-    )
+    page = [
+        str(result),
+        *(f"Hint: {hint}" for finding in result.findings if (hint := hint_for(finding))),
+        "",
+        f"Written to {output}: {written}",
+        f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
+    ]
+    return Output(document, lambda: page)
 
 
 def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
@@ -238,7 +247,7 @@ def _make_plan_options(
         frame=options["frame"],
         constraints=make_constraints(options),
         allowed_poses=None if allowed is None else load_poses(allowed, robot),
-        n_candidates=options["candidates"],
+        n_candidates=options["n_candidates"],
         measured=earlier,
         used_names=names,
         curve=options["curve"],
@@ -259,17 +268,6 @@ def _read_earlier(
     if data.is_held_out.all():
         raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
     return data.fitted, data.labels
-
-
-def _list_inputs(
-    robot: str, like: Path | None, allowed: Path | None, measured: tuple[Path, ...]
-) -> dict[str, Path]:
-    """Return role -> file of everything that is read."""
-    from loopcal.io.robot.robot_file import find_robot_file
-
-    files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
-    files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
-    return {role: path for role, path in files.items() if path is not None}
 
 
 def _write_plan(
@@ -304,35 +302,3 @@ def _write_plan(
     write_plan_folder(output, texts, document, pictures, force)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
     return f"{files}, pictures" if pictures else files
-
-
-def _refuse_beside_plane_line() -> None:
-    """Raise DataError for the first option that has no effect with --measure plane-line."""
-    for name, reason in EXCLUDED_BY_PLANE_LINE.items():
-        if is_given(name):
-            raise DataError(
-                f"{name_option(name)} cannot be combined with --measure plane-line, {reason}; "
-                "leave it out"
-            )
-
-
-def _plan_surfaces(
-    robot: Mechanism,
-    groups: int | None,
-    points: int | None,
-    sigma: float,
-    constraints: Constraints,
-    seed: int,
-) -> SurfacePlan:
-    """Plan groups of points on planes and lines."""
-    from loopcal.planning.plane_line_planning import SurfaceOptions, plan_surfaces
-
-    options = SurfaceOptions(
-        GROUPS if groups is None else groups,
-        POINTS if points is None else points,
-        sigma,
-        constraints,
-        seed,
-    )
-    with terminal.ProgressBar() as progress:
-        return plan_surfaces(robot, options, progress)

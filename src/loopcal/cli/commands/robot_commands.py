@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,11 +16,14 @@ from loopcal.cli.options import (
     flag_option,
     force_option,
     instrument_options,
-    json_option,
     make_instrument,
     robot_argument,
     unknown_options,
 )
+from loopcal.cli.terminal import Output, shows_output
+
+if TYPE_CHECKING:
+    from loopcal.results.tables import Block
 
 
 @click.command()
@@ -30,10 +33,10 @@ from loopcal.cli.options import (
 @unknown_options
 @instrument_options
 @force_option("an output file")
-@json_option
+@shows_output
 def new(
-    family: str, output: Path, measurements: Path | None, force: bool, as_json: bool, **options: Any
-) -> None:
+    family: str, output: Path, measurements: Path | None, force: bool, **options: Any
+) -> Output:
     """Write a robot file of FAMILY: gough, linear-delta, 3-prs, ru-pus-prs, limbs, stages, or the
     name of a shipped robot.
 
@@ -68,9 +71,6 @@ def new(
         write_text(output, robot_text)
         if measurements is not None:
             write_text(measurements, template)
-    if as_json:
-        terminal.print_json({"robot": output, "measurements": measurements})
-        return
     page = [
         f"{output}: a complete robot. Replace its numbers with yours.",
         f"Next: loopcal check {shlex.quote(str(output))}",
@@ -80,7 +80,7 @@ def new(
             f"{measurements}: columns without rows. Fill in your measurements.",
             f"Next: loopcal calibrate {shlex.join(map(str, (output, measurements)))} -o run",
         ]
-    terminal.print_page(page)
+    return Output({"robot": output, "measurements": measurements}, lambda: page)
 
 
 @click.command()
@@ -90,8 +90,8 @@ def new(
 )
 @force_option("the picture")
 @flag_option("--expand", help="Also show links, joints, transmissions, and how parameters enter.")
-@json_option
-def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: bool) -> None:
+@shows_output
+def check(robot: str, plot: Path | None, force: bool, expand: bool) -> Output:
     """Read ROBOT, a robot file or the name of a shipped robot, and show its actuators and
     parameters.
 
@@ -116,34 +116,27 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
         from loopcal.report.pictures import save_figure
 
         save_figure(plot, draw_robot(inspection.robot), write=write_bytes)
-    if as_json:
-        assembly = {"assembly": inspection.robot.assembly} if expand else {}
-        terminal.print_json(inspection.to_dict() | assembly)
-        return
-    from loopcal.report.robot_view import view_assembly, view_robot
 
-    page = view_robot(inspection)
-    if expand:
-        page += view_assembly(inspection.robot)
-    if plot is not None:
-        page += ["", f"Picture: {plot}"]
-    terminal.print_page(page)
+    def view() -> list[Block]:
+        from loopcal.report.robot_view import view_assembly, view_robot
 
+        page = view_robot(inspection)
+        page += view_assembly(inspection.robot) if expand else []
+        return page if plot is None else [*page, "", f"Picture: {plot}"]
 
-# --- `loopcal view`: a robot, or a calibration, as an interactive 3-D view in the browser.
-
-OUTPUT = Path("view.html")
+    assembly = {"assembly": inspection.robot.assembly} if expand else {}
+    return Output(inspection.to_dict() | assembly, view)
 
 
 @click.command()
 @click.argument("source", metavar="RUN|ROBOT", shell_complete=complete_robot)
 @file_option(
-    "-o", "--output", help=f"HTML file to write; its name ends in .html. Default: {OUTPUT}."
+    "-o", "--output", default="view.html", help="HTML file to write; its name ends in .html."
 )
 @flag_option("--no-browser", help="Do not open the view in the browser.")
 @force_option("the output file")
-@json_option
-def view(source: str, output: Path | None, no_browser: bool, force: bool, as_json: bool) -> int:
+@shows_output
+def view(source: str, output: Path, no_browser: bool, force: bool) -> Output:
     """Show RUN, a run folder, or a robot file as an interactive 3-D view in the browser.
 
     The view is one HTML file that needs no network. It shows the robot at home; of a run also at
@@ -161,7 +154,6 @@ def view(source: str, output: Path | None, no_browser: bool, force: bool, as_jso
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.runs.run_folder import load_run_or_robot
 
-    output = output or OUTPUT
     check_ending(output, "view")
     run = load_run_or_robot(source)
     files = [Path(source) / name for name in run.result.get("files", {})]
@@ -170,27 +162,17 @@ def view(source: str, output: Path | None, no_browser: bool, force: bool, as_jso
         progress(0, 1, "writing the view")
         write_view(output, run if run.result else run.robot)
     is_open = not no_browser and open_page(output.resolve().as_uri())
-    failure = run.failure
-    failures = [] if failure is None else [failure]
-    if as_json:
-        terminal.print_json({"output": output, "opened": is_open, "reasons": failures})
-    else:
-        unopened = "" if is_open or no_browser else "; no browser could be started here"
-        terminal.print_page([f"Written to {output}{unopened}"])
-    return terminal.print_failures(failures)
-
-
-# --- `loopcal example` and `loopcal completion`: files to begin with, and a shell that completes.
-
-SHELLS = ("bash", "zsh", "fish")
-"""Shells whose completion click can write."""
+    failures = [] if run.failure is None else [run.failure]
+    unopened = "" if is_open or no_browser else "; no browser could be started here"
+    document = {"output": output, "opened": is_open, "reasons": failures}
+    return Output(document, lambda: [f"Written to {output}{unopened}"], failures)
 
 
 @click.command()
 @click.argument("name", metavar="[NAME]", required=False)
 @file_option("-o", "--output", help="Folder to make; by default one with the name of the example.")
-@json_option
-def example(name: str | None, output: Path | None, as_json: bool) -> int:
+@shows_output
+def example(name: str | None, output: Path | None) -> Output:
     """Write the files of an example into a new folder; without NAME, list the examples.
 
     \b
@@ -204,26 +186,19 @@ def example(name: str | None, output: Path | None, as_json: bool) -> int:
 
     if name is None:
         titles = {name: describe_example(folder) for name, folder in list_examples().items()}
-        if as_json:
-            terminal.print_json({"examples": titles})
-            return 0
         columns = (word_column("example"), word_column("content", wraps=True))
         table = Table("Examples; loopcal example NAME writes one", columns, tuple(titles.items()))
-        terminal.print_page([table])
-        return 0
+        return Output({"examples": titles}, lambda: [table])
     folder = Path(name) if output is None else output
     files = write_example(name, folder)
-    if as_json:
-        terminal.print_json({"example": name, "folder": str(folder), "files": files})
-    else:
-        terminal.print_page([f"Written to {folder}: {', '.join(files)}"])
-    return 0
+    document = {"example": name, "folder": str(folder), "files": files}
+    return Output(document, lambda: [f"Written to {folder}: {', '.join(files)}"])
 
 
 @click.command()
-@click.argument("shell", type=click.Choice(SHELLS))
-@json_option
-def completion(shell: str, as_json: bool) -> int:
+@click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
+@shows_output
+def completion(shell: str) -> Output:
     """Print the script with which SHELL completes commands, options, names of robots and files.
 
     \b
@@ -241,11 +216,7 @@ def completion(shell: str, as_json: bool) -> int:
     from loopcal.cli.entry_point import command_line
 
     writer = get_completion_class(shell)
-    assert writer is not None  # SHELLS are those of click
+    assert writer is not None  # click has one for each of these shells
     script = writer(command_line, {}, "loopcal", "_LOOPCAL_COMPLETE")
     text = script.source_template % script.source_vars()
-    if as_json:
-        terminal.print_json({"shell": shell, "script": text})
-    else:
-        terminal.print_text(text)
-    return 0
+    return Output({"shell": shell, "script": text}, lambda: text)

@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from loopcal.cli import terminal
 from loopcal.cli.options import (
     Count,
+    Words,
     add_options,
     data_argument,
     data_options,
@@ -19,14 +20,15 @@ from loopcal.cli.options import (
     fit_options,
     flag_option,
     force_option,
-    json_option,
     leave_out_held_out,
+    library_option,
     make_fit_options,
     read_checked_measurements,
     refuse_given,
     seed_option,
     take_flags,
 )
+from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import LoopcalError
 
 if TYPE_CHECKING:
@@ -36,26 +38,37 @@ if TYPE_CHECKING:
     from loopcal.estimate.result import Identification
     from loopcal.measure.measurements import Measurements
     from loopcal.results.tables import Block
-    from loopcal.typing import FloatArray
 
+MOST_DIGITS = 10
+"""Digits of a number of poses; a longer text is no unit of resampling."""
 
-# --- The fit that a command examines further: that of a run folder, repeated, or a new one.
+BOOTSTRAP = "loopcal.diagnose.bootstrap"
+
+source_options = add_options(
+    click.argument("source", metavar="RUN|ROBOT"), data_argument("[DATA...]", required=False)
+)
+"""Decorator of a command that takes a run folder, or a robot and its measurements."""
+
+draw_options = add_options(
+    library_option(
+        "--level",
+        of=f"{BOOTSTRAP}:Bootstrap.intervals",
+        type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+        metavar="SHARE",
+        help="Coverage of the intervals.",
+    ),
+    seed_option("the random draws"),
+    file_option("-o", "--output", help="CSV file for the draws, one row each.", metavar="CSV"),
+    force_option("the output file"),
+)
+"""Decorator of a command that draws."""
 
 
 def load_fit(
-    source: str, data: Sequence[Path], options: Mapping[str, Any]
+    source: str, data: tuple[Path, ...], options: Mapping[str, Any]
 ) -> tuple[Identification, Measurements]:
-    """Return a fit with its measurements, and with the uncertainty that `calibrate` states.
-
-    Parameters
-    ----------
-    source : a run folder, or with `data` a robot file. options : those of `fit_options` and
-        `data_options`.
-
-    Raises
-    ------
-    LoopcalError : see `loopcal.identify` and `Run.load_measurements`; or the run cannot be
-        repeated.
+    """Return a fit with its measurements, and with the uncertainty that `calibrate` states: that of
+    a run folder, repeated, or of a robot file and data by `fit_options` and `data_options`.
     """
     from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
     from loopcal.estimate.identification import identify
@@ -63,13 +76,11 @@ def load_fit(
     from loopcal.io.runs.run_folder import load_run, repeat_fit
 
     if data:
-        robot = load_robot(source)
-        flags = take_flags(options)
+        robot, flags = load_robot(source), take_flags(options)
         measurements = leave_out_held_out(read_checked_measurements(data, robot, **flags))
+        chosen = make_fit_options(options)
         with terminal.ProgressBar() as progress:
-            fit = identify(
-                robot, measurements, options=make_fit_options(options), progress=progress
-            )
+            fit = identify(robot, measurements, options=chosen, progress=progress)
     else:
         if Path(source).is_file():
             raise LoopcalError(
@@ -83,38 +94,19 @@ def load_fit(
     return adjust_uncertainty(fit, measurements), measurements
 
 
-MOST_DIGITS = 10
-"""Digits of a number of poses; a longer text is no unit of resampling."""
-
-source_options = add_options(
-    click.argument("source", metavar="RUN|ROBOT"), data_argument("[DATA...]", required=False)
-)
-"""Decorator of a command that takes a run folder, or a robot and its measurements."""
-
-draw_options = add_options(
-    click.option(
-        "--level",
-        type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-        default=0.95,
-        metavar="SHARE",
-        help="Coverage of the intervals.",
-    ),
-    seed_option("the random draws"),
-    file_option("-o", "--output", help="CSV file for the draws, one row each.", metavar="CSV"),
-    force_option("the output file"),
-)
-"""Decorator of a command that draws."""
-
-
 @click.command()
 @source_options
-@click.option(
-    "--count", type=Count("RESAMPLES", 2), default=1000, metavar="N", help="Number of resamples."
+@library_option(
+    "--count",
+    of=f"{BOOTSTRAP}:bootstrap",
+    type=Count("RESAMPLES", 2),
+    metavar="N",
+    help="Number of resamples.",
 )
-@click.option(
+@library_option(
     "--scheme",
-    type=click.Choice(("wild", "pairs", "normal")),
-    default="wild",
+    of=f"{BOOTSTRAP}:bootstrap",
+    type=Words(f"{BOOTSTRAP}:Scheme"),
     help="wild: errors of each block times a random factor. pairs: blocks drawn with replacement. "
     "normal: normal errors of the stated sigma.",
 )
@@ -124,31 +116,30 @@ draw_options = add_options(
     help="What is resampled together: pose, block, session, day, or a number of consecutive "
     "poses.  [default: the largest unit with at least 12 blocks]",
 )
-@click.option(
+@library_option(
     "--interval",
     "kind",
-    type=click.Choice(("widened", "percentile", "bias-corrected", "studentized")),
-    default="widened",
+    of=f"{BOOTSTRAP}:Bootstrap.intervals",
+    type=Words(f"{BOOTSTRAP}:IntervalKind"),
     help="How intervals are read from the resamples.",
 )
 @draw_options
 @fit_options
 @data_options
-@json_option
+@shows_output
 def bootstrap(
     source: str,
     data: tuple[Path, ...],
     count: int,
-    scheme: Literal["wild", "pairs", "normal"],
+    scheme: Any,
     unit: str | None,
-    kind: Literal["widened", "percentile", "bias-corrected", "studentized"],
+    kind: Any,
     level: float,
     seed: int,
     output: Path | None,
     force: bool,
-    as_json: bool,
     **options: Any,
-) -> None:
+) -> Output:
     """Resample a calibration by blocks of poses, fit every resample, and compare the scatter with
     the stated intervals.
 
@@ -173,14 +164,17 @@ def bootstrap(
             fit, measurements, count, scheme=scheme, unit=chosen, seed=seed, progress=progress
         )
     intervals = result.intervals(level, kind)
-    page = view_bootstrap(result, intervals)
-    _finish(result, intervals, page, output, as_json)
+    return _finish(result, intervals, view_bootstrap(result, intervals), output)
 
 
 @click.command()
 @source_options
-@click.option(
-    "--count", type=Count("DRAWS", 100), default=4000, metavar="N", help="Number of draws."
+@library_option(
+    "--count",
+    of="loopcal.diagnose.posterior_sample:sample_posterior",
+    type=Count("DRAWS", 100),
+    metavar="N",
+    help="Number of draws.",
 )
 @flag_option(
     "--region",
@@ -196,30 +190,29 @@ def bootstrap(
     help="Parameter for --region, or a pattern such as 'leg1.*'. May be given several times.  "
     "[default: all]",
 )
-@click.option(
+@library_option(
     "--rule",
-    type=click.Choice(("maximum", "sidak", "bonferroni", "scheffe")),
-    default="maximum",
+    of="loopcal.diagnose.joint_regions:compute_simultaneous_intervals",
+    type=Words("loopcal.diagnose.joint_regions:Rule"),
     help="How --region makes intervals that hold together; maximum gives the narrowest.",
 )
 @draw_options
 @fit_options
 @data_options
-@json_option
+@shows_output
 def sample(
     source: str,
     data: tuple[Path, ...],
     count: int,
     region: bool,
     names: tuple[str, ...],
-    rule: Literal["maximum", "sidak", "bonferroni", "scheffe"],
+    rule: Any,
     level: float,
     seed: int,
     output: Path | None,
     force: bool,
-    as_json: bool,
     **options: Any,
-) -> None:
+) -> Output:
     """Draw parameters from the exact posterior of a calibration, and compare its intervals with the
     linear ones. With --region, show intervals that hold for all selected parameters at once.
 
@@ -238,16 +231,14 @@ def sample(
 
     if region:
         refuse_given(("count", "seed", "output", "force"), "with --region")
-        _show_region(source, data, options, names, rule, level, as_json)
-        return
+        return _show_region(source, data, options, names, rule, level)
     refuse_given(("names", "rule"), "without --region")
     _refuse_output(output, source, data, force)
     fit, measurements = load_fit(source, data, options)
     with terminal.ProgressBar() as progress:
         result = sample_posterior(fit, measurements, count, seed=seed, progress=progress)
     intervals = result.intervals(level)
-    page = view_posterior(result, intervals)
-    _finish(result, intervals, page, output, as_json, result.weight)
+    return _finish(result, intervals, view_posterior(result, intervals), output)
 
 
 def _show_region(
@@ -255,11 +246,10 @@ def _show_region(
     data: tuple[Path, ...],
     options: dict[str, Any],
     names: tuple[str, ...],
-    rule: Literal["maximum", "sidak", "bonferroni", "scheffe"],
+    rule: Any,
     level: float,
-    as_json: bool,
-) -> None:
-    """Print simultaneous intervals, and the joint region of parameters that were named."""
+) -> Output:
+    """Return simultaneous intervals, and the joint region of parameters that were named."""
     from loopcal.diagnose.joint_regions import compute_joint_region, compute_simultaneous_intervals
     from loopcal.io.runs.run_folder import load_run
     from loopcal.report.validation_view import view_region
@@ -272,11 +262,10 @@ def _show_region(
     chosen = names or None
     intervals = compute_simultaneous_intervals(posterior, chosen, level, rule)
     joint = compute_joint_region(posterior, chosen, level) if names else None
-    if as_json:
-        content = None if joint is None else joint.to_dict()
-        terminal.print_json({"intervals": intervals.to_dict(), "region": content})
-        return
-    terminal.print_page(view_region(joint, intervals, posterior.robot))
+    return Output(
+        {"intervals": intervals.to_dict(), "region": None if joint is None else joint.to_dict()},
+        lambda: view_region(joint, intervals, posterior.robot),
+    )
 
 
 def _refuse_output(output: Path | None, source: str, data: tuple[Path, ...], force: bool) -> None:
@@ -291,17 +280,13 @@ def _finish(
     intervals: Intervals,
     page: list[Block],
     output: Path | None,
-    as_json: bool,
-    weight: FloatArray | None = None,
-) -> None:
-    """Write the draws, where a file is named, and print the page or JSON."""
+) -> Output:
+    """Write the draws, where a file is named, and return what to print."""
     from loopcal.io.runs.result_files import save_draws
 
     if output is not None:
         factors, units = result.fit.free_parameters.display()
+        weight = getattr(result, "weight", None)
         save_draws(output, result.fit.names, units, factors, result.draws, weight)
         page = [*page, "", f"Written to {output}"]
-    if as_json:
-        terminal.print_json({**result.to_dict(), "intervals": intervals.to_dict()})
-    else:
-        terminal.print_page(page)
+    return Output({**result.to_dict(), "intervals": intervals.to_dict()}, lambda: page)

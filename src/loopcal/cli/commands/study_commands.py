@@ -6,16 +6,13 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.command_group import CommandGroup
+from loopcal.cli.entry_point import CommandGroup
 from loopcal.cli.options import (
     FILE,
     Count,
@@ -23,18 +20,17 @@ from loopcal.cli.options import (
     file_option,
     flag_option,
     force_option,
-    json_option,
     refuse_given,
 )
+from loopcal.cli.terminal import Output, shows_output
 
 if TYPE_CHECKING:
-    from loopcal.studies.driver import RunReport, Share
+    from loopcal.results.tables import Block
+    from loopcal.studies.driver import Share
     from loopcal.studies.execution.executors import Executor
     from loopcal.studies.files.store import StudyStore
     from loopcal.studies.specification.study import Study
 
-
-# --- Options for the workers of a study, and what commands that compute one say.
 
 STOPPED, INCOMPLETE = 1, 2
 """Exit codes of a study that was stopped, and of one with blocks that could not be computed."""
@@ -81,47 +77,50 @@ worker_options = add_options(
 )
 
 
-@dataclass(frozen=True)
-class Work:
-    """Who computes a study, and which share of it."""
-
-    executor: Executor
-    share: Share
-
-
-def choose_work(share: Share | None, workers: int | None, dask: str | None, ray: bool) -> Work:
-    """Return what the values of `worker_options` mean."""
+def choose_work(
+    share: Share | None, workers: int | None, dask: str | None, ray: bool
+) -> tuple[Executor, Share]:
+    """Return who computes a study, and which share of it, from the values of `worker_options`."""
     from loopcal.studies.driver import WHOLE
-
-    return Work(_make_executor(workers, dask, ray), share or WHOLE)
-
-
-def run_and_report(
-    chosen: Study, store: StudyStore, folder: Path, work: Work, as_json: bool
-) -> int:
-    """Compute what is missing in an open store, print the report, and return the exit code."""
-    from loopcal.studies.driver import run_blocks
-
-    with _keep_when_stopped(chosen, store, work.share, folder) as stop:
-        with terminal.ProgressBar() as progress:
-            report = run_blocks(chosen, store, work.executor, work.share, progress)
-        _print_report(report, folder, as_json)
-        return 0 if report.is_complete else INCOMPLETE
-    return stop[0]
-
-
-def _make_executor(workers: int | None, dask: str | None, ray: bool) -> Executor:
-    """Return the workers that the options name."""
     from loopcal.studies.execution.executors import Dask, Ray
     from loopcal.studies.running import make_local
 
+    share = share or WHOLE
     if dask is not None:
         refuse_given(("workers", "ray"), "with --dask")
-        return Dask(dask)
+        return Dask(dask), share
     if ray:
         refuse_given(("workers",), "with --ray")
-        return Ray()
-    return make_local(count_processors() if workers is None else workers)
+        return Ray(), share
+    return make_local(count_processors() if workers is None else workers), share
+
+
+def run_and_report(
+    chosen: Study, store: StudyStore, folder: Path, work: tuple[Executor, Share]
+) -> Output:
+    """Compute what is missing in an open store; Ctrl-C ends it with what is kept."""
+    from loopcal.findings import report_finding
+    from loopcal.results.serialization import to_json
+    from loopcal.studies.driver import count_blocks, count_stored, run_blocks
+
+    executor, share = work
+    try:
+        with terminal.ProgressBar() as progress:
+            report = run_blocks(chosen, store, executor, share, progress)
+    except KeyboardInterrupt:
+        done, total = count_stored(chosen, store, share), count_blocks(chosen, share)
+        finding = report_finding("store.stopped", done=done, total=total, folder=str(folder))
+        terminal.print_message(f"loopcal: {finding}")
+        terminal.print_message("Hint: use --resume to continue")
+        raise click.exceptions.Exit(STOPPED) from None
+    for finding in report.findings:
+        terminal.print_message(f"loopcal: {finding}")
+    stored = f"{report.before + report.computed} of {report.total} blocks are stored in {folder}"
+    spent = f"{report.trials} trials in {round_duration(report.seconds)}"
+    page = [f"{stored}: {report.computed} new, {spent}"]
+    page += [f"Next: loopcal study summary {folder}"] if report.is_complete else []
+    document = {**to_json(report), "is_complete": report.is_complete, "folder": str(folder)}
+    return Output(document, lambda: page, exit_code=0 if report.is_complete else INCOMPLETE)
 
 
 def round_duration(seconds: float) -> str:
@@ -134,51 +133,6 @@ def count_processors() -> int:
     """Return the number of processors that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-
-
-@contextmanager
-def _keep_when_stopped(
-    chosen: Study, store: StudyStore, share: Share, folder: Path
-) -> Iterator[list[int]]:
-    """Say what is kept where the body is stopped by Ctrl-C.
-
-    Yields a list that receives the exit code.
-    """
-    from loopcal.findings import report_finding
-    from loopcal.studies.driver import count_blocks, count_stored
-
-    codes: list[int] = []
-    try:
-        yield codes
-    except KeyboardInterrupt:
-        done, total = count_stored(chosen, store, share), count_blocks(chosen, share)
-        finding = report_finding("store.stopped", done=done, total=total, folder=str(folder))
-        terminal.print_message(f"loopcal: {finding}")
-        terminal.print_message("Hint: use --resume to continue")
-        codes.append(STOPPED)
-
-
-def _print_report(report: RunReport, folder: Path, as_json: bool) -> None:
-    """Print what a driver did."""
-    for finding in report.findings:
-        terminal.print_message(f"loopcal: {finding}")
-    if as_json:
-        terminal.print_json({**_list_numbers(report), "folder": str(folder)})
-        return
-    stored = report.before + report.computed
-    blocks = f"{stored} of {report.total} blocks are stored in {folder}"
-    trials = f"{report.computed} new, {report.trials} trials in {round_duration(report.seconds)}"
-    page = [f"{blocks}: {trials}"]
-    if report.is_complete:
-        page.append(f"Next: loopcal study summary {folder}")
-    terminal.print_page(page)
-
-
-def _list_numbers(report: RunReport) -> dict[str, Any]:
-    """Return a report for JSON."""
-    from loopcal.results.serialization import to_json
-
-    return {**to_json(report), "is_complete": report.is_complete}
 
 
 study_argument = click.argument("study_file", metavar="STUDY", type=FILE)
@@ -209,8 +163,8 @@ def study() -> None:
 )
 @click.option("--paper", metavar="PAPER", help="Write the study of a paper that reproduce repeats.")
 @force_option("STUDY")
-@json_option
-def new(study_file: Path, robot: str | None, paper: str | None, force: bool, as_json: bool) -> None:
+@shows_output
+def new(study_file: Path, robot: str | None, paper: str | None, force: bool) -> Output:
     """Write a study file to fill in, with a comment for each setting.
 
     With --paper, write the study of a paper: its errors, noises and methods. --robot replaces its
@@ -226,45 +180,37 @@ def new(study_file: Path, robot: str | None, paper: str | None, force: bool, as_
     from loopcal.studies.files.study_file import write_template
 
     if paper is not None:
-        _write_paper_study(study_file, paper, robot, force, as_json)
-        return
+        return _write_paper_study(study_file, paper, robot, force)
     robot = "linear-delta" if robot is None else robot
     refuse_outputs((study_file,), (), force)
     write_template(study_file, robot)
-    if as_json:
-        terminal.print_json({"written": str(study_file), "robot": robot})
-        return
-    terminal.print_page([f"Written: {study_file}", f"Next: loopcal study check {study_file}"])
+    page = [f"Written: {study_file}", f"Next: loopcal study check {study_file}"]
+    return Output({"written": str(study_file), "robot": robot}, lambda: page)
 
 
-def _write_paper_study(
-    study_file: Path, paper: str, robot: str | None, force: bool, as_json: bool
-) -> None:
-    """Write the study of a paper and report its files."""
+def _write_paper_study(study_file: Path, paper: str, robot: str | None, force: bool) -> Output:
+    """Write the study of a paper and return its files."""
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.papers.paper import find_paper, make_paper_study
 
     made = make_paper_study(find_paper(paper), study_file, robot)
     refuse_outputs(made.outputs, (), force)
     made.write()
-    if as_json:
-        written = [str(path) for path in made.outputs]
-        terminal.print_json(
-            {"written": written, "paper": paper, "robot": made.robot, "replaced": made.replaced}
-        )
-        return
+    written = [str(path) for path in made.outputs]
     page = [f"Written: {', '.join(map(str, made.outputs))}"]
     if made.replaced:
         keys = " and ".join(made.replaced)
         page.append(f"The {keys} of the paper belong to its robot and were replaced, too.")
-    terminal.print_page([*page, f"Next: loopcal study check {study_file}"])
+    page.append(f"Next: loopcal study check {study_file}")
+    document = {"written": written, "paper": paper, "robot": made.robot, "replaced": made.replaced}
+    return Output(document, lambda: page)
 
 
 @study.command()
 @study_argument
 @quick_option
-@json_option
-def check(study_file: Path, quick: bool, as_json: bool) -> None:
+@shows_output
+def check(study_file: Path, quick: bool) -> Output:
     """Read STUDY, show its cells, and estimate the time that it takes from one block of each robot.
 
     \b
@@ -278,11 +224,8 @@ def check(study_file: Path, quick: bool, as_json: bool) -> None:
     chosen = read_source(study_file, quick).study
     with terminal.ProgressBar() as progress:
         estimate = estimate_time(chosen, count_processors(), progress)
-    if as_json:
-        terminal.print_json(estimate)
-        return
-    page = view_estimate(chosen, estimate, round_duration)
-    terminal.print_page([*page, f"Next: loopcal study run {study_file} -o FOLDER"])
+    following = f"Next: loopcal study run {study_file} -o FOLDER"
+    return Output(estimate, lambda: [*view_estimate(chosen, estimate, round_duration), following])
 
 
 @study.command()
@@ -294,10 +237,8 @@ def check(study_file: Path, quick: bool, as_json: bool) -> None:
     help="Continue FOLDER where it exists. STUDY may have more replicates or levels than before.",
 )
 @quick_option
-@json_option
-def run(
-    study_file: Path, folder: Path, resume: bool, quick: bool, as_json: bool, **options: Any
-) -> int:
+@shows_output
+def run(study_file: Path, folder: Path, resume: bool, quick: bool, **options: Any) -> Output:
     """Compute STUDY, and store its trials in FOLDER.
 
     Every block of trials is stored when it is finished. A study that is stopped, by Ctrl-C or in
@@ -315,7 +256,7 @@ def run(
 
     source, work = read_source(study_file, quick), choose_work(**options)
     with open_study(folder, source, resume) as store:
-        return run_and_report(source.study, store, folder, work, as_json)
+        return run_and_report(source.study, store, folder, work)
 
 
 @study.command()
@@ -328,8 +269,8 @@ def run(
     help="Trials of a cell.",
 )
 @worker_options
-@json_option
-def extend(folder: Path, replicates: int, as_json: bool, **options: Any) -> int:
+@shows_output
+def extend(folder: Path, replicates: int, **options: Any) -> Output:
     """Compute further trials of each cell of a study, until there are N; finished ones are kept.
 
     \b
@@ -340,13 +281,13 @@ def extend(folder: Path, replicates: int, as_json: bool, **options: Any) -> int:
 
     work = choose_work(**options)
     with extend_study(folder, replicates) as store:
-        return run_and_report(load_specification(store), store, folder, work, as_json)
+        return run_and_report(load_specification(store), store, folder, work)
 
 
 @study.command()
 @folder_argument
-@json_option
-def status(folder: Path, as_json: bool) -> None:
+@shows_output
+def status(folder: Path) -> Output:
     """Show how much of a study is stored, also while it runs.
 
     \b
@@ -356,10 +297,7 @@ def status(folder: Path, as_json: bool) -> None:
     from loopcal.studies.results.study_result import read_status, view_status
 
     state = read_status(folder)
-    if as_json:
-        terminal.print_json(state)
-    else:
-        terminal.print_page(view_status(state, round_duration))
+    return Output(state, lambda: view_status(state, round_duration))
 
 
 @study.command()
@@ -370,8 +308,8 @@ def status(folder: Path, as_json: bool) -> None:
 @click.option(
     "--against", metavar="FACTOR", help="Factor along the axis of figures, such as poses."
 )
-@json_option
-def summary(folder: Path, scores: tuple[str, ...], against: str | None, as_json: bool) -> None:
+@shows_output
+def summary(folder: Path, scores: tuple[str, ...], against: str | None) -> Output:
     """Show medians and coverage of each cell, with intervals, the failed trials by reason, and the
     answers to the questions of the study file.
 
@@ -402,11 +340,10 @@ def summary(folder: Path, scores: tuple[str, ...], against: str | None, as_json:
         page = view_summary(result.study, summarized, shown)
         figures = render_figures(result.study, summarized, shown, against)
         write_summary(folder, result.study, summarized, answered, figures)
-    if as_json:
-        terminal.print_json(build_document(summarized, answered))
-        return
-    written = ", ".join(("summary.json", "summary.csv", *figures))
-    terminal.print_page([*page, "", *view_answers(answered), f"Written to {folder}: {written}"])
+    written = f"Written to {folder}: {', '.join(('summary.json', 'summary.csv', *figures))}"
+    return Output(
+        build_document(summarized, answered), lambda: [*page, "", *view_answers(answered), written]
+    )
 
 
 @study.command()
@@ -426,16 +363,10 @@ def summary(folder: Path, scores: tuple[str, ...], against: str | None, as_json:
     metavar="SHARE",
     help="Share of the machines that stay within the limit.",
 )
-@json_option
+@shows_output
 def ask(
-    folder: Path,
-    smallest: str | None,
-    largest: str | None,
-    score: str,
-    limit: str,
-    share: float,
-    as_json: bool,
-) -> None:
+    folder: Path, smallest: str | None, largest: str | None, score: str, limit: str, share: float
+) -> Output:
     """Find the smallest or largest level of a factor that reaches a limit on a share of machines.
 
     The answer says which levels reach it for certain, and which may. Run more replicates where it
@@ -457,18 +388,15 @@ def ask(
         if smallest is not None
         else result.find_largest(largest or "", score, limit, share)
     )
-    if as_json:
-        terminal.print_json(answered)
-    else:
-        terminal.print_page(view_answers([answered]))
+    return Output(answered, lambda: view_answers([answered]))
 
 
 @study.command()
 @folder_argument
 @file_option("-o", "--output", required=True, metavar="FILE", help="Table: .csv or .parquet.")
 @force_option("FILE")
-@json_option
-def export(folder: Path, output: Path, force: bool, as_json: bool) -> None:
+@shows_output
+def export(folder: Path, output: Path, force: bool) -> Output:
     """Write all trials of a study as one table, with all factors as columns and numbers in SI.
 
     \b
@@ -484,17 +412,15 @@ def export(folder: Path, output: Path, force: bool, as_json: bool) -> None:
     refuse_outputs((output,), (), force)
     with read_store(folder) as store, terminal.ProgressBar() as progress:
         count = export_trials(load_specification(store), store, output, progress)
-    if as_json:
-        terminal.print_json({"written": str(output), "trials": count})
-    else:
-        terminal.print_page([f"Written: {output} ({count} trials)"])
+    document = {"written": str(output), "trials": count}
+    return Output(document, lambda: [f"Written: {output} ({count} trials)"])
 
 
 @study.command()
 @click.argument("part_folders", metavar="PART...", nargs=-1, required=True, type=FILE)
 @file_option("-o", "--output", required=True, metavar="FOLDER", help="Folder to make or to add to.")
-@json_option
-def merge(part_folders: tuple[Path, ...], output: Path, as_json: bool) -> None:
+@shows_output
+def merge(part_folders: tuple[Path, ...], output: Path) -> Output:
     """Join folders of jobs that each computed a share of one study (see run --cells).
 
     \b
@@ -507,11 +433,11 @@ def merge(part_folders: tuple[Path, ...], output: Path, as_json: bool) -> None:
     with terminal.ProgressBar() as progress:
         count = merge_studies(part_folders, output, progress)
     state = read_status(output)
-    if as_json:
-        terminal.print_json({"new_blocks": count, "status": state})
-        return
-    page = view_status(state, round_duration)
-    terminal.print_page([f"Written to {output}: {count} new blocks", *page])
+    written = f"Written to {output}: {count} new blocks"
+    return Output(
+        {"new_blocks": count, "status": state},
+        lambda: [written, *view_status(state, round_duration)],
+    )
 
 
 @study.command()
@@ -519,8 +445,8 @@ def merge(part_folders: tuple[Path, ...], output: Path, as_json: bool) -> None:
 @click.argument("trial", metavar="CELL/TRIAL")
 @file_option("-o", "--output", required=True, metavar="RUN", help="Run folder to make.")
 @force_option("RUN")
-@json_option
-def replay(folder: Path, trial: str, output: Path, force: bool, as_json: bool) -> int:
+@shows_output
+def replay(folder: Path, trial: str, output: Path, force: bool) -> Output:
     """Repeat one trial of a study as a normal calibration, with all its checks and a run folder.
 
     Cells and trials count from 0; status lists the cells. A second folder beside the run folder,
@@ -542,11 +468,11 @@ def replay(folder: Path, trial: str, output: Path, force: bool, as_json: bool) -
         done = calibrate_trial(
             folder, int(match[1]), int(match[2]), output, sys.argv, force, progress
         )
-    if as_json:
-        terminal.print_json(done.document)
-    else:
+
+    def view() -> list[Block]:
         for finding in done.findings:
             terminal.print_note(str(finding))
-        page = view_calibration(done.report, False, hint_for)
-        terminal.print_page([*page, "", f"Written to {output}, and its inputs to {done.inputs}"])
-    return done.report.exit_code
+        written = f"Written to {output}, and its inputs to {done.inputs}"
+        return [*view_calibration(done.report, False, hint_for), "", written]
+
+    return Output(done.document, view, exit_code=done.report.exit_code)
