@@ -107,8 +107,11 @@ class Registry(Mapping[str, T]):
         return any(name in names for names in known) or name in self._offered
 
     # a registry is itself, not its entries: it may stand in an annotation
-    __hash__ = object.__hash__
-    __eq__ = object.__eq__
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
     def __repr__(self) -> str:
         return f"<Registry of {self.noun}: {', '.join(self)}>"

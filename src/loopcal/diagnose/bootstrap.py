@@ -92,10 +92,12 @@ def list_observed_columns(
                 kind.by_nuisance[numbers] = wide @ root
             kind.residual[numbers], kind.by_parameters[numbers] = own.residual[0], columns
             if own.by_coordinates is not None:
-                if kind.by_coordinates is None:
+                by_coordinates = kind.by_coordinates
+                if by_coordinates is None:
                     shape = (len(kind.residual), *own.by_coordinates.shape[2:])
-                    kind = kinds[i] = replace(kind, by_coordinates=np.zeros(shape))
-                kind.by_coordinates[numbers] = own.by_coordinates[0]
+                    by_coordinates = np.zeros(shape)
+                    kinds[i] = replace(kind, by_coordinates=by_coordinates)
+                by_coordinates[numbers] = own.by_coordinates[0]
     return tuple(kinds)
 
 

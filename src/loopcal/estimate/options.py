@@ -216,7 +216,7 @@ def _to_plain(value: Any) -> Any:
 
 def _name_entry(registry: Registry[Any], value: Any) -> Any:
     """Return an instance of a registered class as its name, or as a mapping with its settings."""
-    name = getattr(type(value), "name", None)
+    name = getattr(type(value), "name", "")
     is_plain = dataclasses.is_dataclass(value) or not vars(value)
     if name not in registry or registry[name] is not type(value) or not is_plain:
         return {OBJECT: repr(value)}
