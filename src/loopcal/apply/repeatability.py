@@ -353,7 +353,7 @@ def _estimate_accuracy(attained: FloatArray) -> Estimate:
     chi-square of trace over this variance degrees of freedom, which is exact for equal variances.
     That the variance is estimated widens the interval as Student's t does.
     """
-    from loopcal.numerics.special_functions import chndtr, chndtrinc
+    from scipy.special import chndtr, chndtrinc
 
     n, mean = len(attained), attained.mean(axis=0)
     size = float(np.linalg.norm(mean))
