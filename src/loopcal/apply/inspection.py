@@ -28,7 +28,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import evaluate_limits
 from loopcal.numerics.decomposition import RANK_TOLERANCE
-from loopcal.results.serialization import json_fields
+from loopcal.results.description import Field, fields, within
 from loopcal.typing import FloatArray
 
 FEW = 3  # combinations that change poses and that a summary lists one by one
@@ -103,16 +103,12 @@ class IdentifiabilityReport:
             )
         ]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the report by name for JSON."""
-        document = {
-            **json_fields(self.analysis),
-            "summary": self.summary,
-            "remedies": self.suggestions,
-        }
-        if self.useful is not None:
-            document["useful"] = self.useful
-        return document if self.subset is None else {**document, "reduction": self.subset}
+    FIELDS = (
+        *within("analysis", [field for field in Identifiability.FIELDS if field.name != "scaling"]),
+        *fields("summary", remedies="suggestions"),
+        Field("useful", is_optional=True),
+        Field("reduction", "subset", is_optional=True),
+    )
 
 
 def analyze_identifiability(
@@ -150,39 +146,28 @@ class RobotInspection:
     home_readings: FloatArray  # (a,) readings of the actuators at home [SI]
     findings: tuple[Finding, ...]  # notes of the robot file, and limits that home exceeds
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the robot by name for JSON, SI."""
-        robot, table = self.robot, self.robot.parameters
-        return {
-            "name": robot.name,
-            "path": robot.record.path,
-            "freedoms": robot.freedoms,
-            "controlled": robot.controlled,
-            "size": robot.size,
-            "home": robot.home,
-            "tool": robot.tool,
-            "actuators": [
-                {"name": a.name, "dimension": a.dimension, "stroke": a.stroke}
-                for a in robot.actuators
-            ],
-            "parameters": [
-                {
-                    "name": p.name,
-                    "dimension": p.dimension,
-                    "nominal": p.nominal,
-                    "value": robot.values[i],
-                    "tolerance": p.tolerance,
-                    "free": p.free,
-                }
-                for i, p in enumerate(table.entries)
-            ],
-            "common_errors": [
-                {"name": c.name, "parameters": c.parameters, "tolerance": c.tolerance}
-                for c in table.common
-            ],
-            "notes": [str(finding) for finding in robot.findings],
-            "findings": self.findings,
-        }
+    FIELDS = (
+        *fields(name="robot.name", path="robot.record.path", freedoms="robot.freedoms"),
+        *fields(controlled="robot.controlled", size="robot.size", home="robot.home"),
+        *fields(tool="robot.tool", actuators=lambda inspection: inspection.list_actuators()),
+        *fields(parameters=lambda inspection: inspection.list_parameters()),
+        *fields(common_errors="robot.parameters.common"),
+        *fields(notes=lambda inspection: list(map(str, inspection.robot.findings)), findings=""),
+    )
+
+    def list_actuators(self) -> list[dict[str, Any]]:
+        """Return name, dimension and stroke of each actuator."""
+        names = ("name", "dimension", "stroke")
+        return [{name: getattr(a, name) for name in names} for a in self.robot.actuators]
+
+    def list_parameters(self) -> list[dict[str, Any]]:
+        """Return what the robot states of each parameter [SI]."""
+        names = ("name", "dimension", "nominal", "value", "tolerance", "free")
+        entries = zip(self.robot.parameters.entries, self.robot.values, strict=True)
+        return [
+            {name: value if name == "value" else getattr(p, name) for name in names}
+            for p, value in entries
+        ]
 
 
 def inspect_robot(robot: Mechanism) -> RobotInspection:

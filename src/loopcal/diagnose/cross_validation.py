@@ -42,13 +42,13 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import are_nonzero, decompose
-from loopcal.results.description import Field, each, fields, label_axes
+from loopcal.results.description import Field, each, fields, label_axes, pick
 from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
-    from loopcal.results.tables import Block
+    from loopcal.results.tables import Block, Table
 
 # Determinant of 1 - leverage of a block below which the other blocks do not determine its rows.
 NOTHING_LEFT = 1e-12
@@ -333,7 +333,7 @@ class Candidate:
     conditioning: Conditioning  # by all data, at the values before calibration
 
     FIELDS = (
-        Field("name", title="free"),
+        Field("name"),
         Field("parameters", show=lambda names: str(len(names))),
         Field("score", unit="sigma^2", digits=4),
         Field("standard_error", unit="sigma^2", title="+/-", digits=2),
@@ -350,6 +350,9 @@ class Candidate:
     def standard_error(self) -> float:
         """Standard error of the score; NaN where it is not known."""
         return np.nan if self.validation is None else self.validation.standard_error
+
+
+SHOWN = ("rank", "condition", "score", "standard_error")  # columns of tables, in this order
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,12 +375,25 @@ class ModelChoice(TableResult):
         Field(
             "parameters", lambda choice: [len(c.parameters) for c in choice.candidates], "set", "1"
         ),
-        *each(
-            "candidates", "set", Candidate.FIELDS, "rank", "condition", "score", "standard_error"
-        ),
+        *each("candidates", "set", Candidate.FIELDS, *SHOWN),
         Field("chosen", lambda choice: [c is choice.chosen for c in choice.candidates], "set"),
     )
     LABELS = label_axes(set="candidates.name")
+
+    def compare_sets(self) -> Table:
+        """Return the table of the sets, in which the chosen one is marked."""
+        from loopcal.results.tables import build_table, word_column
+
+        return build_table(
+            "Parameter sets: mean square error on held-out poses [sigma^2], conditioning",
+            self.candidates,
+            (word_column("free"), lambda c: c.name + " (chosen)" * (c is self.chosen)),
+            *pick(Candidate.FIELDS, "parameters", *SHOWN),
+        )
+
+    def page(self) -> list[Block]:
+        """Return the comparison of parameter sets and the choice."""
+        return [self.compare_sets(), str(self.finding)]
 
     @property
     def finding(self) -> Finding:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from loopcal.report.validation_view import (
     view_error_statistics,
     view_errors,
 )
+from loopcal.results.description import Field
 from loopcal.results.tables import (
     ABSENT,
     Block,
@@ -45,7 +47,6 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
-    from loopcal.diagnose.cross_validation import ModelChoice
     from loopcal.diagnose.fit_examination import ReadingError
     from loopcal.estimate.prior_conflict import PriorConflict
 
@@ -195,7 +196,7 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
     if report.budget is not None:
         blocks.append(build_budget_table(report.budget.to_dict(), report.robot))
     if report.model_choice is not None:
-        blocks.append(build_model_table(report.model_choice))
+        blocks.append(report.model_choice.compare_sets())
     if report.reading_errors is not None:
         blocks.append(build_reading_table(report.robot, report.reading_errors))
     errors = report.validation or report.fitted_errors
@@ -272,24 +273,16 @@ def _note_intervals(fit: Identification) -> list[Block]:
 
 def build_prior_table(conflict: PriorConflict) -> Table:
     """Return the tests of the stated tolerances."""
-    rows = (
-        ("all deviations", conflict.statistic, conflict.degrees, conflict.p_value, ()),
-        *(
-            (title, test.statistic, test.count, test.p_value, test.names)
-            for title, test in (
-                ("worst direction", conflict.direction),
-                ("worst parameter", conflict.parameter),
-            )
-        ),
-    )
+    whole = ("all deviations", conflict.statistic, conflict.degrees, conflict.p_value, ())
+    tests = (("worst direction", conflict.direction), ("worst parameter", conflict.parameter))
     return build_table(
         f"Stated tolerances against the data: p = {format_number(conflict.joint_p_value, 2)} "
         "for the three tests together",
-        rows,
-        (word_column("test"), lambda row: row[0]),
-        (Column("statistic [1]"), lambda row: format_number(row[1], 3)),
-        (Column("degrees or number"), lambda row: format_number(row[2], 3)),
-        (Column("p"), lambda row: format_number(row[3], 2)),
+        (whole, *((title, t.statistic, t.count, t.p_value, t.names) for title, t in tests)),
+        Field("test", itemgetter(0)),
+        Field("statistic [1]", itemgetter(1), digits=3),
+        Field("degrees or number", itemgetter(2), digits=3),
+        Field("p", itemgetter(3), digits=2),
         (word_column("parameters"), lambda row: list_names(row[4])),
     )
 
@@ -299,44 +292,27 @@ def build_last_value_table(rows: Iterable[Mapping[str, Any]]) -> Table:
     return build_table(
         "Where the iteration ended (no estimates)",
         rows,
-        (word_column("name"), lambda row: row["name"]),
-        (Column("nominal"), lambda row: format_number(row["nominal"])),
-        (Column("last value"), lambda row: format_number(row["estimate"], LAST_DIGITS)),
-        (word_column("unit"), lambda row: row["unit"]),
-    )
-
-
-def build_model_table(choice: ModelChoice) -> Table:
-    """Return the comparison of parameter sets."""
-    return build_table(
-        "Parameter sets: mean square error on held-out poses [sigma^2], conditioning",
-        choice.candidates,
-        (word_column("free"), lambda row: row.name + " (chosen)" * (row is choice.chosen)),
-        (Column("parameters"), lambda row: str(len(row.parameters))),
-        (Column("rank"), lambda row: str(row.conditioning.rank)),
-        (Column("condition"), lambda row: format_number(row.conditioning.condition, 3)),
-        (Column("score"), lambda row: format_number(row.score, 4)),
-        (Column("+/-"), lambda row: format_number(row.standard_error, 2)),
+        Field("name"),
+        Field("nominal"),
+        Field("estimate", title="last value", digits=LAST_DIGITS),
+        Field("unit"),
     )
 
 
 def build_reading_table(robot: Mechanism, errors: Sequence[ReadingError]) -> Table:
     """Return recorded actuator readings minus the estimated ones."""
-    units = units_of(robot)
     count = max(error.count for error in errors)
     return build_table(
         f"Actuator readings, recorded minus estimated, of up to {count} poses",
         errors,
-        (word_column("reading"), lambda row: row.name),
-        (Column("rms"), lambda row: format_in(units[row.reading_dimension], row.reading, 3)),
-        (word_column("unit"), lambda row: units[row.reading_dimension].symbol),
-        (
-            Column("rms of the joint"),
-            lambda row: format_in(units[row.joint_dimension], row.joint, 3),
-        ),
-        (Column("largest"), lambda row: format_in(units[row.joint_dimension], row.largest, 3)),
-        (word_column("unit"), lambda row: units[row.joint_dimension].symbol),
-        (word_column("at pose"), lambda row: row.pose),
+        Field("name", title="reading"),
+        Field("reading", title="rms", digits=3, units="reading_dimension"),
+        Field("reading_dimension", title="unit"),
+        Field("joint", title="rms of the joint", digits=3, units="joint_dimension"),
+        Field("largest", digits=3, units="joint_dimension"),
+        Field("joint_dimension", title="unit"),
+        Field("pose", title="at pose"),
+        units=units_of(robot),
     )
 
 
@@ -593,7 +569,7 @@ def _view_useful(useful: UsefulAccuracy) -> list[Block]:
             word_column("combination of length one", wraps=True),
             lambda row: _name_terms(row.names, row.coefficients),
         ),
-        (Column("sd / useful accuracy"), lambda row: format_number(row.sd, 3)),
+        Field("sd", title="sd / useful accuracy", digits=3),
     )
     return [table]
 
@@ -610,7 +586,7 @@ def _view_parameters(report: IdentifiabilityReport) -> list[Block]:
     table = build_table(
         "Parameters",
         report.analysis.parameters,
-        (word_column("name"), lambda row: row.name),
+        Field("name"),
         (
             word_column("determined", wraps=True),
             lambda row: (
@@ -628,7 +604,7 @@ def _view_indices(report: IdentifiabilityReport) -> Table:
     return build_table(
         "Observability",
         report.analysis.indices.rows(),
-        (word_column("index"), lambda row: row[0]),
-        (word_column("meaning", wraps=True), lambda row: row[2]),
-        (Column("value"), lambda row: format_number(row[1], 3)),
+        Field("index", itemgetter(0)),
+        (word_column("meaning", wraps=True), itemgetter(2)),
+        Field("value", itemgetter(1), digits=3),
     )

@@ -10,12 +10,10 @@ from loopcal.apply.repeatability import Repeatability
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import Validation
 from loopcal.diagnose.bootstrap import Bootstrap
-from loopcal.diagnose.cross_validation import ModelChoice
 from loopcal.diagnose.posterior_sample import PosteriorSample
 from loopcal.diagnose.regularization_curves import RegularizationCurves
 from loopcal.estimate.result import Identification
 from loopcal.report.calibration_view import (
-    build_model_table,
     view_calibration,
     view_compensation,
     view_fit,
@@ -60,12 +58,6 @@ def write_heights(heights: HeightErrors) -> list[Block]:
 def write_compensation(result: Compensation) -> list[Block]:
     """Return the targets, and the findings of those that are not reached."""
     return [str(result), *view_compensation(result)]
-
-
-@register("page", ModelChoice)
-def write_model_choice(choice: ModelChoice) -> list[Block]:
-    """Return the comparison of parameter sets and the choice."""
-    return [build_model_table(choice), str(choice.finding)]
 
 
 @register("page", Bootstrap)

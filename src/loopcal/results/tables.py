@@ -7,12 +7,15 @@ import csv
 import io
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeVar
+from functools import partial
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from loopcal.findings.wording import count_decimals
 from loopcal.plain_text import escape
+from loopcal.results.description import Field, look_up
 from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
@@ -178,11 +181,37 @@ class Table:
 
 
 def build_table(
-    caption: str, rows: Iterable[Row], *columns: tuple[Column, Callable[[Row], str]]
+    caption: str,
+    rows: Iterable[Row],
+    *columns: Field | tuple[Column, Callable[[Row], str]],
+    units: Mapping[Dimension, Unit] = MappingProxyType({}),
 ) -> Table:
-    """Return a table from objects: each column with the function that gives its cell of a row."""
-    cells = tuple(tuple(cell_of(row) for _, cell_of in columns) for row in rows)
-    return Table(caption, tuple(column for column, _ in columns), cells)
+    """Return a table from objects: fields of theirs, or columns with functions that give the cell
+    of a row.
+
+    units : in which fields with dimensions are shown.
+    """
+    rows, shown, cells = list(rows), [], []
+    for column in columns:
+        if isinstance(column, Field):
+            is_words = all(isinstance(column.get(row), str | Dimension) for row in rows)
+            heading = Column(column.title or column.name, align="left" if is_words else "right")
+            column = heading, partial(_format_field, column, units)
+        shown.append(column[0])
+        cells.append([column[1](row) for row in rows])
+    return Table(caption, tuple(shown), tuple(zip(*cells, strict=True)))
+
+
+def _format_field(field: Field, units: Mapping[Dimension, Unit], row: Any) -> str:
+    """Return the cell of a field."""
+    value = field.get(row)
+    if field.show is not None:
+        return field.show(value)
+    if isinstance(value, str | int | Dimension):
+        return units[value].symbol if isinstance(value, Dimension) else str(value)
+    if field.units:
+        return format_in(units[look_up(row, field.units)], value, field.digits)
+    return format_number(value, field.digits)
 
 
 def _total(widths: Sequence[int]) -> int:

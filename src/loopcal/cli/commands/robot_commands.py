@@ -108,6 +108,7 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool) -> Output:
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_bytes
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
+    from loopcal.results.serialization import json_fields
 
     refuse_outputs((plot,), (find_robot_file(robot),), force)
     inspection = inspect_robot(load_robot(robot))
@@ -125,7 +126,7 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool) -> Output:
         return page if plot is None else [*page, "", f"Picture: {plot}"]
 
     assembly = {"assembly": inspection.robot.assembly} if expand else {}
-    return Output(inspection.to_dict() | assembly, view)
+    return Output(json_fields(inspection) | assembly, view)
 
 
 @click.command()
