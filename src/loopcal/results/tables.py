@@ -9,7 +9,6 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -196,13 +195,15 @@ def build_table(
         if isinstance(column, Field):
             is_words = all(isinstance(column.get(row), str | Dimension) for row in rows)
             heading = Column(column.title or column.name, align="left" if is_words else "right")
-            column = heading, partial(_format_field, column, units)
-        shown.append(column[0])
-        cells.append([column[1](row) for row in rows])
+            shown.append(heading)
+            cells.append([_format_field(column, row, units) for row in rows])
+        else:
+            shown.append(column[0])
+            cells.append([column[1](row) for row in rows])
     return Table(caption, tuple(shown), tuple(zip(*cells, strict=True)))
 
 
-def _format_field(field: Field, units: Mapping[Dimension, Unit], row: Any) -> str:
+def _format_field(field: Field, row: Any, units: Mapping[Dimension, Unit]) -> str:
     """Return the cell of a field."""
     value = field.get(row)
     if field.show is not None:

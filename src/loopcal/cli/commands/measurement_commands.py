@@ -123,6 +123,7 @@ def identifiability(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_reduced_robot
     from loopcal.report.calibration_view import view_identifiability
+    from loopcal.results.serialization import json_fields
 
     if data:
         _refuse_beside_data(poses)
@@ -156,7 +157,7 @@ def identifiability(
     if output is not None:
         written = ["", f"Written to {output}: the robot with the other parameters fixed"]
     view, hints = view_identifiability(report, verbose), _list_hints(report, verbose)
-    return Output(report.to_dict(), lambda: [*drawn, *view, *hints, *written])
+    return Output(json_fields(report), lambda: [*drawn, *view, *hints, *written])
 
 
 def _list_hints(report: IdentifiabilityReport, verbose: bool) -> list[str]:
