@@ -29,6 +29,7 @@ from loopcal.planning.pose_groups import (
 )
 from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import find_sample_size, prepare_problem
+from loopcal.results.serialization import to_json
 from tests.findings.expectations import expect_refusal
 
 UM, URAD = 1e-6, 1e-6
@@ -302,7 +303,7 @@ def test_lower_bound_on_pairs_holds_for_all_pairs_of_twelve_poses(caliper_proble
     assert ({"counted": "pairs", "decided_by_equations": False} | numbers).items() <= (
         finding.data.items()
     )
-    assert needed.to_dict()["counted"] == "pairs"
+    assert to_json(needed)["counted"] == "pairs"
 
 
 def test_candidate_pairs_are_distinct_and_better_than_random_pairs():

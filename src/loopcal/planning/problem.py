@@ -48,6 +48,7 @@ from loopcal.planning.pose_groups import (
     linearize_candidate_groups,
 )
 from loopcal.planning.prediction import DIMENSIONS, ExpectedErrors, Prediction, linearize_prediction
+from loopcal.results.description import fields
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 PREDICTED = 200  # poses of the workspace whose errors are predicted
@@ -378,21 +379,12 @@ class ErrorCurve:
             decided_by_equations=bool(self.enough == self.numbers[0]),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything by name for JSON, SI."""
-        return {
-            "target": self.target,
-            "counted": self.counted,
-            "n_candidates": self.n_candidates,
-            "numbers": self.numbers.tolist(),
-            "position": [e.position for e in self.expected],
-            "orientation": [e.orientation for e in self.expected],
-            "values": self.values.tolist(),
-            "bounds": self.bounds.tolist(),
-            "goal": self.goal,
-            "enough": self.enough,
-            "at_least": self.at_least,
-        }
+    FIELDS = fields(
+        *("target", "counted", "n_candidates", "numbers"),
+        position="expected.position",
+        orientation="expected.orientation",
+        **dict.fromkeys(("values", "bounds", "goal", "enough", "at_least"), ""),
+    )
 
 
 def compute_error_curve(

@@ -318,7 +318,7 @@ def build_reading_table(robot: Mechanism, errors: Sequence[ReadingError]) -> Tab
 
 def view_fit(fit: Identification) -> list[Block]:
     """Return the parameters of a fit and how it ended."""
-    rows = fit.to_dict()["parameters"]
+    rows = fit.list_parameters()
     caption = f"{fit.robot.name}: {len(fit.names)} parameters"
     table = build_parameter_table(caption, rows)
     shown = [table, *_note_intervals(fit)] if fit.converged else [build_last_value_table(rows)]
