@@ -20,13 +20,13 @@ from loopcal.diagnose.error_frames import (
 from loopcal.diagnose.fit_examination import estimate_calibration_gain
 from loopcal.diagnose.frame_motions import probe_readings
 from loopcal.errors import EstimationError
-from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import MeasuredFrames, posterior_from_arrays
 from loopcal.estimate.prior import prior_from
 from loopcal.estimate.result import Identification
+from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.nuisance import StatedValue

@@ -11,7 +11,7 @@ from loopcal.diagnose.start_values import check_start_values
 from loopcal.errors import EstimationError
 from loopcal.estimate import fit_descent as module
 from loopcal.estimate import fit_descent as part_start
-from loopcal.estimate import frame_freedoms
+from loopcal.estimate import unfixed_motions
 from loopcal.estimate.descent import StepControl
 from loopcal.estimate.fit_descent import FEWEST_POSES, SHARE, select_part, spread_poses
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -80,7 +80,7 @@ def fit_both(
 ) -> tuple[Identification, Identification]:
     """Return the fit, and the one that begins with all poses."""
     fit = identify(DELTA, data, options=options)
-    monkeypatch.setattr(module, "descend_in_parts", lambda *_: None)
+    monkeypatch.setattr(module, "fit_part_first", lambda *_: None)
     return fit, identify(DELTA, data, options=options)
 
 
@@ -114,7 +114,7 @@ def test_the_result_is_that_of_all_poses_from_the_beginning(monkeypatch, data, m
 def test_the_history_has_the_steps_of_the_part_with_comparable_sums_of_squares(monkeypatch, data):
     said: list[str] = []
     fit = identify(DELTA, data, LeastSquares(), progress=lambda *parts: said.append(parts[2]))
-    monkeypatch.setattr(module, "descend_in_parts", lambda *_: None)
+    monkeypatch.setattr(module, "fit_part_first", lambda *_: None)
     plain = identify(DELTA, data, LeastSquares())
     history = fit.history
     assert history.iterations == len(history.cost) - 1 == len(history.estimate) - 1
@@ -269,13 +269,13 @@ def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot
     noise = Gaussian(np.full(len(kind.noise_columns), SIGMA))
     measured = simulate(robot, poses, Instrument((Sensor(kind, noise),)), 0)
     folded: list[int] = []
-    fold = frame_freedoms.FrameRows.add_rows
+    fold = unfixed_motions.FrameRows.add_rows
     monkeypatch.setattr(
-        frame_freedoms.FrameRows, "add_rows", lambda *parts: (folded.append(1), fold(*parts))
+        unfixed_motions.FrameRows, "add_rows", lambda *parts: (folded.append(1), fold(*parts))
     )
     fit = identify(robot, measured, LeastSquares())
     assert len(folded) == (2 if count else 1)  # where all motions are fixed, no more rows are
-    monkeypatch.setattr(frame_freedoms, "FIXED", np.inf)
+    monkeypatch.setattr(unfixed_motions, "FIXED", np.inf)
     plain = identify(robot, measured, LeastSquares())
     assert fit.posterior.frames is not None
     assert plain.posterior.frames is not None
@@ -309,7 +309,7 @@ def test_poses_out_of_reach_that_are_not_in_the_part_are_refused_as_without_it(m
     measured, options = measure(mixed, truth=DELTA), FitOptions(LeastSquares(), start=values)
     with pytest.raises(EstimationError, match="5 of") as refused:
         identify(DELTA, measured, options=options)
-    monkeypatch.setattr(module, "descend_in_parts", lambda *_: None)
+    monkeypatch.setattr(module, "fit_part_first", lambda *_: None)
     with pytest.raises(EstimationError) as expected:
         identify(DELTA, measured, options=options)
     assert str(refused.value) == str(expected.value)

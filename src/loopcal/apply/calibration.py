@@ -30,11 +30,11 @@ from loopcal.diagnose.frame_motions import interpret_fit
 from loopcal.diagnose.start_values import check_start_values
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_types, exclude_poses
-from loopcal.estimate.frame_freedoms import list_instrument_frames
 from loopcal.estimate.identification import identify
 from loopcal.estimate.information import count_equations
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.result import Identification
+from loopcal.estimate.unfixed_motions import list_instrument_frames
 from loopcal.findings import Finding, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.measurements import Measurements

@@ -28,9 +28,9 @@ import numpy as np
 from loopcal import geometry
 from loopcal.diagnose.frame_motions import find_frame_motions, probe_readings, twist_weights
 from loopcal.errors import EstimationError, suggest_names
-from loopcal.estimate.frame_freedoms import MOTIONS, frame_twists
 from loopcal.estimate.posterior import InstrumentFrame, Posterior
 from loopcal.estimate.result import Identification
+from loopcal.estimate.unfixed_motions import MOTIONS, frame_twists
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.kinematics import compute_readings, forward_trials

@@ -52,7 +52,7 @@ class FrameMotions:
     frames: tuple[str, ...]  # names of the moved frames: (), ("base",), ("platform",) or both
     count: int  # number of independent combinations that move frames
     # (12, g) motions of the two frames by these combinations, in the units of
-    # `loopcal.estimate.frame_freedoms.frame_twists`, each of length one
+    # `loopcal.estimate.unfixed_motions.frame_twists`, each of length one
     motions: FloatArray
     has_scale: bool = False  # whether a further combination enlarges all poses by one factor
 

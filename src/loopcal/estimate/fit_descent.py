@@ -49,7 +49,7 @@ directions, for example, depends on how many equations there are."""
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
-def descend_in_parts(
+def fit_part_first(
     problem: Problem,
     deviation: FloatArray,
     method: Method,
@@ -150,7 +150,7 @@ def _is_converged(fit: Descent) -> bool:
     return bool(fit.status[0] == DescentStatus.CONVERGED.value)
 
 
-def descend_once(
+def fit_rows(
     problem: Problem,
     z: FloatArray,
     start: Start | None,
@@ -174,7 +174,7 @@ def descend_once(
     return replace(fit.after(first), is_start_exhausted=is_exhausted)
 
 
-def descend_weighted(
+def fit_with_loss(
     problem: Problem,
     data: Measurements,
     z: FloatArray,
@@ -184,7 +184,7 @@ def descend_weighted(
     """Descend with or without a loss; return also the weight (n,) of each pose and the problem with
     these weights.
     """
-    run: Run = partial(descend_once, options=options, progress=progress)
+    run: Run = partial(fit_rows, options=options, progress=progress)
     if options.loss is None:
         return run(problem, z, None), np.ones(data.n_poses), problem
     estimated, blocks = options.noise == "estimated", linked_blocks(data)
@@ -192,7 +192,7 @@ def descend_weighted(
     return robust.fit, robust.weight, robust.problem
 
 
-def _descend_from_part(
+def _fit_part_first(
     problem: Problem, z: FloatArray, options: FitOptions, progress: Progress
 ) -> Descent | None:
     """Descend first with a part of very many poses; None where this is of no use or not possible.
@@ -203,10 +203,10 @@ def _descend_from_part(
     if options.begin != "kinematics" or options.loss is not None or options.prior is not None:
         return None
     control, tolerance = options.control, options.rank_tolerance
-    return descend_in_parts(problem, z, get_method(options), control, tolerance, progress)
+    return fit_part_first(problem, z, get_method(options), control, tolerance, progress)
 
 
-def descend_to_prior(
+def fit_with_tolerances(
     problem: Problem,
     data: Measurements,
     z: FloatArray,
@@ -217,9 +217,9 @@ def descend_to_prior(
     """Descend, and again as long as the data ask for other components of the tolerances; return
     also the options with these.
     """
-    first = _descend_from_part(problem, z, options, progress)
+    first = _fit_part_first(problem, z, options, progress)
     if first is None:
-        fit, weights, weighted = descend_weighted(problem, data, z, options, progress)
+        fit, weights, weighted = fit_with_loss(problem, data, z, options, progress)
     else:
         fit, weights, weighted = first, np.ones(data.n_poses), problem
     for _ in range(ROUNDS):
@@ -227,7 +227,7 @@ def descend_to_prior(
         if method is None:
             break
         other = replace(options, method=method)
-        again, new_weights, new_problem = descend_weighted(
+        again, new_weights, new_problem = fit_with_loss(
             problem, data, fit.deviation, other, progress
         )
         if again.status[0] != DescentStatus.CONVERGED.value:
@@ -243,13 +243,13 @@ def repeat_trials(
     for i, method in choose_methods(free, fit, get_method(options)).items():
         alone, chosen = np.array([i]), replace(options, method=method)
         own = problem.take(alone)
-        again = descend_once(own, fit.deviation[alone], None, chosen)
+        again = fit_rows(own, fit.deviation[alone], None, chosen)
         for _ in range(ROUNDS - 1):
             other = choose_methods(free, again, get_method(chosen)).get(0)
             if other is None:
                 break
             chosen = replace(options, method=other)
-            again = descend_once(own, again.deviation, None, chosen)
+            again = fit_rows(own, again.deviation, None, chosen)
         if again.status[0] == DescentStatus.CONVERGED.value:
             fit = fit.put(alone, again)
     return fit

@@ -11,7 +11,7 @@ import numpy as np
 
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.descent import Descent
-from loopcal.estimate.fit_descent import descend_to_prior, get_method
+from loopcal.estimate.fit_descent import fit_with_tolerances, get_method
 from loopcal.estimate.fit_input import (
     check_count,
     check_rows,
@@ -20,7 +20,6 @@ from loopcal.estimate.fit_input import (
     count_spare_equations,
     exclude_poses,
 )
-from loopcal.estimate.frame_freedoms import FrameRows, describe_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.losses import Loss
@@ -56,6 +55,7 @@ from loopcal.estimate.result import (
     report_unknown_bias,
     report_used_poses,
 )
+from loopcal.estimate.unfixed_motions import FrameRows, describe_frames
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
@@ -239,7 +239,7 @@ def identify(
     check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
-    fit, weights, weighted, options = descend_to_prior(problem, data, z, options, free, progress)
+    fit, weights, weighted, options = fit_with_tolerances(problem, data, z, options, free, progress)
     if fit.status[0] == DescentStatus.BAD_START.value:
         check_start(problem, data, z, fit.cost)
     open_poses = find_open_poses(robot.with_values(values), data)

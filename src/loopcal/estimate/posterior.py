@@ -323,7 +323,7 @@ class MeasuredFrames:
     Attributes
     ----------
     unfixed : (12, k) orthonormal motions of both frames that change no measured value, see
-        `loopcal.estimate.frame_freedoms`; k = 0 where the measurements determine both frames.
+        `loopcal.estimate.unfixed_motions`; k = 0 where the measurements determine both frames.
     readings : (m, a) of measured poses, at most some hundred [m, rad].
     instruments : name, such as "tracker" or "monday.tracker" -> its frame.
     """

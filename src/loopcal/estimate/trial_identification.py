@@ -18,8 +18,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.descent import Descent, LinearModel, descend
-from loopcal.estimate.fit_descent import descend_once, get_method, repeat_trials
-from loopcal.estimate.frame_freedoms import find_measured_frames
+from loopcal.estimate.fit_descent import fit_rows, get_method, repeat_trials
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.options import FitOptions, merge_options
@@ -27,6 +26,7 @@ from loopcal.estimate.penalties import MAP, Method, adapt_method, fix_penalty
 from loopcal.estimate.pose_linearization import PoseSolution, linearize_rows
 from loopcal.estimate.posterior import Posterior, VarianceSources, compute_posterior
 from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
+from loopcal.estimate.unfixed_motions import find_measured_frames
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.simulation import Trials
 from loopcal.mechanism.model import Mechanism
@@ -309,7 +309,7 @@ def _fit_parts(
     def fit(part: IntArray) -> _Part:
         own, begin = _cut_problem(problem, part), None if start is None else start.take(part)
         if shared is None:
-            first = descend_once(own, z[part], begin, options)
+            first = fit_rows(own, z[part], begin, options)
         else:
             first = _descend_from_chords(own, z[part], options, shared)
         fit = repeat_trials(own, first, options, free)
@@ -341,7 +341,7 @@ def _descend_from_chords(
     again = np.flatnonzero(fit.status != DescentStatus.CONVERGED)
     if not again.size:
         return fit
-    usual = descend_once(problem.take(again), z[again], None, options)
+    usual = fit_rows(problem.take(again), z[again], None, options)
     return usual if len(again) == len(z) else fit.put(again, usual)
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.estimate.posterior import intersect_motions
 from loopcal.estimate.problem import problem_of
+from loopcal.estimate.unfixed_motions import find_measured_frames
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_closure

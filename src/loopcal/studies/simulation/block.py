@@ -15,9 +15,9 @@ import numpy as np
 from loopcal import geometry
 from loopcal.diagnose.error_frames import fit_frames
 from loopcal.errors import DataError
-from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.options import FitOptions
+from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.instrument import BlockStream, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials, simulate_trials
