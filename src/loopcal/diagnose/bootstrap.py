@@ -527,7 +527,7 @@ class Bootstrap(TableResult):
 
     def _bias_corrected(self, tails: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return quantiles (p,) shifted by the share of resamples below the estimate."""
-        from loopcal.numerics.special_functions import ndtr, ndtri
+        from scipy.special import ndtr, ndtri
 
         share = (self.draws < self.fit.estimate).mean(axis=0)
         least = 0.5 / len(self.draws)

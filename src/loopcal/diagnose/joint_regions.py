@@ -117,7 +117,7 @@ class JointRegion(TableResult):
         """Return the probability (..,) of estimates as far from values (.., q) [SI], if these were
         true.
         """
-        from loopcal.numerics.special_functions import chdtrc, fdtrc
+        from scipy.special import chdtrc, fdtrc
 
         square, q = self.measure_distance(values), len(self.names)
         if np.isinf(self.degrees):

@@ -348,7 +348,7 @@ class _Proposal:
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return draws (count, K) and the logarithm of their density (count,)."""
-        from loopcal.numerics.special_functions import gammaln
+        from scipy.special import gammaln
 
         size, nu = len(self.mean), self.degrees
         normal = rng.standard_normal((count, size))

@@ -78,7 +78,7 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
         return _untested("residuals.repeats-with-weights", groups, pure, degrees, scale)
     if lack_degrees < 1.0 or pure <= 0.0:
         return _untested("residuals.repeats-only", groups, pure, degrees, scale)
-    from loopcal.numerics.special_functions import fdtrc
+    from scipy.special import fdtrc
 
     ratio = max(lack, 0.0) / lack_degrees / (pure / degrees)
     p_value = float(fdtrc(lack_degrees, degrees, ratio))

@@ -417,7 +417,7 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
 
 def _compute_beta_tail(observed: float, mean: float, variance: float) -> float:
     """Return the probability of a larger value of a beta variable on (-1, 1)."""
-    from loopcal.numerics.special_functions import betainc
+    from scipy.special import betainc
 
     center, spread = 0.5 * (1.0 + mean), 0.25 * variance
     total = center * (1.0 - center) / spread - 1.0

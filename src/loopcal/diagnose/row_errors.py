@@ -285,7 +285,7 @@ class KindErrors:
 
         values : measured values that are left to check the geometry.
         """
-        from loopcal.numerics.special_functions import stdtr
+        from scipy.special import stdtr
 
         degrees = min(self.count, values) - 1
         if degrees < 1 or not np.isfinite(self.change):

@@ -158,7 +158,7 @@ def _gain_p_value(fit: Identification, gain: float, last: float) -> float:
     """Probability of a larger gain by noise alone: by the stated noise where it is consistent, else
     by that of the residuals.
     """
-    from loopcal.numerics.special_functions import fdtrc
+    from scipy.special import fdtrc
 
     if _is_noise_consistent(fit):
         return float(compute_chi_square_tail(fit.rank, gain))

@@ -147,7 +147,7 @@ def block_limit(single: float, degrees: FloatArray) -> FloatArray:
     single : limit of one normal residual, in standard deviations. degrees : (u,) residuals of each
         block.
     """
-    from loopcal.numerics.special_functions import ndtr
+    from scipy.special import ndtr
 
     exceedance = 2.0 * float(ndtr(-single))
     # a quantile takes 30 us or more, and most blocks have the same number of residuals

@@ -230,7 +230,7 @@ def coverage_factor(degrees: FloatArray | float, level: float = LEVEL) -> FloatA
 
     They are those of Student's t, and of the normal distribution for infinite degrees of freedom.
     """
-    from loopcal.numerics.special_functions import ndtri, stdtrit
+    from scipy.special import ndtri, stdtrit
 
     quantile = 0.5 + 0.5 * level
     degrees = np.asarray(degrees, dtype=np.float64)

@@ -72,7 +72,7 @@ def find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) ->
     largest = float(chance[agree].max())
     if largest <= CHANCE:
         return agree
-    from loopcal.numerics.special_functions import bdtrc
+    from scipy.special import bdtrc
 
     # whether more rows agree than repeats by chance would, each with this probability
     count = int(agree.sum())

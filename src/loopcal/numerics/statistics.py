@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chi-square and F distributions: tail probabilities and quantiles."""
+"""The chi-square and F distributions: tail probabilities and quantiles.
+
+The functions of scipy are imported when a function is called, so that `import loopcal` does not
+pay for them.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal.numerics.special_functions import chdtrc, chdtri, fdtrc, fdtri, ndtr
 from loopcal.typing import FloatArray
 
 NODES = 101
@@ -23,6 +26,8 @@ def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatAr
     ----------
     degrees : degrees of freedom. statistic : sum of squares [1]. Both broadcast.
     """
+    from scipy.special import chdtrc
+
     degrees = np.asarray(degrees, dtype=float)
     tail = chdtrc(np.where(degrees > 0.0, degrees, 1.0), statistic)
     return np.where(degrees > 0.0, tail, 1.0)
@@ -38,6 +43,8 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
     degrees : degrees of freedom of the statistic; without one the probability is 1.
     left : of the residuals; infinite for known noise. All broadcast.
     """
+    from scipy.special import fdtrc
+
     degrees, left = np.asarray(degrees, dtype=float), np.asarray(left, dtype=float)
     tested = np.where(degrees > 0.0, degrees, 1.0)
     is_estimated = (left > 0.0) & np.isfinite(left)
@@ -56,6 +63,8 @@ def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> F
     ----------
     degrees : degrees of freedom, above 0. probability : of a larger value [1]. Both broadcast.
     """
+    from scipy.special import chdtri
+
     return np.asarray(chdtri(degrees, probability), dtype=float)
 
 
@@ -68,6 +77,8 @@ def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLi
     left : of the estimated noise, above 0; infinite for a known one: chi-square over `degrees`.
     probability : of a larger value [1]. All broadcast.
     """
+    from scipy.special import fdtri
+
     left = np.asarray(left, dtype=float)
     is_known = np.isinf(left)
     known = compute_chi_square_quantile(degrees, probability) / np.asarray(degrees)
@@ -88,6 +99,8 @@ def compute_averaged_tail(
     sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
         of freedom nu of its variance.
     """
+    from scipy.special import chdtri
+
     total = sum(part for part, _ in sources)
     probability = (np.arange(NODES) + 0.5) / NODES
     true = np.zeros(1)
@@ -185,6 +198,8 @@ def _tail(values: FloatArray) -> float:
     K(t) = -1/2 sum log(1 - 2 t values), K'(t) = 0, w = sign(t) sqrt(-2 K(t)),
     v = t sqrt(K''(t)), tail = 1 - Phi(w + log(v / w) / w).
     """
+    from scipy.special import ndtr
+
     if not (values.max() > 0.0 > values.min()):
         return 1.0 if values.min() >= 0.0 else 0.0
     low, high = 0.5 / values.min(), 0.5 / values.max()

@@ -318,7 +318,7 @@ def _draw_histogram(axes: Axes, whitened: np.ndarray) -> None:
 
 def _draw_normal_plot(axes: Axes, whitened: np.ndarray) -> None:
     """Draw the sorted residuals over sigma against the quantiles of a normal distribution."""
-    from loopcal.numerics.special_functions import ndtri
+    from scipy.special import ndtri
 
     values = np.sort(whitened)
     x = ndtri((np.arange(len(values)) + 0.5) / max(len(values), 1))

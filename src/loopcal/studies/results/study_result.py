@@ -359,7 +359,7 @@ def estimate_quantile(ordered: FloatArray, share: float) -> Interval:
     l and h contains it with the probability of l <= number < h, at least `LEVEL`. Where the values
     are too few, an end is infinite.
     """
-    from loopcal.numerics.special_functions import bdtr
+    from scipy.special import bdtr
 
     n = len(ordered)
     below = bdtr(np.arange(n + 1), n, share)  # P(number <= k)
@@ -378,7 +378,7 @@ def estimate_mean(values: FloatArray) -> Interval:
 
     The interval of a single value is infinite.
     """
-    from loopcal.numerics.special_functions import stdtrit
+    from scipy.special import stdtrit
 
     n, mean = len(values), float(np.mean(values))
     if n < 2:
@@ -406,7 +406,7 @@ def compute_binomial_interval(count: float, number: float, confidence: float = L
 
     Numbers that are not whole are effective ones.
     """
-    from loopcal.numerics.special_functions import betaincinv
+    from scipy.special import betaincinv
 
     if number <= 0.0:
         return Interval(np.nan, 0.0, 1.0)
