@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How results describe themselves, and what follows from a description; see docs/design.md."""
+"""How results describe themselves, and what follows from it (example: tests/results)."""
