@@ -199,26 +199,6 @@ def mask_unreached(
     return complete.with_errors(free.errors)
 
 
-def join_located(
-    poses_of_blocks: Sequence[tuple[FloatArray, LinearizedPoses]],
-    names: Sequence[str],
-    order: IntArray,
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return poses (n, 4, 4) and joints name -> (1, n) of one trial.
-
-    `poses_of_blocks` are T (m, 4, 4) and the rest; `order` (n,) are places among all of them, one
-    block after the other.
-    """
-    joints = {
-        name: np.concatenate(
-            [np.broadcast_to(p.joints[name], p.is_reached.shape) for _, p in poses_of_blocks],
-            axis=1,
-        )[:, order]
-        for name in names
-    }
-    return np.concatenate([T for T, _ in poses_of_blocks])[order], joints
-
-
 class KindRows(NamedTuple):
     """Whitened rows of one kind.
 
