@@ -5,6 +5,7 @@ interpretations, and data that nothing explains.
 
 from collections import Counter
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -177,6 +178,7 @@ def test_order_that_is_a_symmetry_of_robot_and_frame_is_no_reason_to_refuse() ->
     assert not compare_conventions(load_cached_robot("linear-delta"), turned).is_refused
 
 
+@cache
 def simulate_cables(n: int, measured: int, seed: int = 0) -> Measurements:
     """Simulate a cable robot at `n` poses, of which the first are measured."""
     robot = load_cached_robot("cable-4")
@@ -190,13 +192,16 @@ def simulate_cables(n: int, measured: int, seed: int = 0) -> Measurements:
     return replace(data, observations=(rows.take(np.arange(measured)),))
 
 
+def test_right_belts_of_a_redundant_robot_are_accepted() -> None:
+    assert compare_conventions(load_cached_robot("cable-4"), simulate_cables(20, 6)).finding is None
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 3)])
+@pytest.mark.parametrize("pair", [(0, 1), (1, 2), pytest.param((0, 3), marks=pytest.mark.evidence)])
 def test_swapped_belts_of_a_redundant_robot_are_refused(pair) -> None:
     """Few poses are measured; the redundant readings of the others must agree as well."""
     data, (a, b) = simulate_cables(20, 6), pair
     robot = load_cached_robot("cable-4")
-    assert compare_conventions(robot, data).finding is None
     order = list(range(4))
     order[a], order[b] = b, a
     result = compare_conventions(robot, change_readings(data, lambda q: q[:, order]))

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom, kstest
 from scipy.stats import f as f_distribution
-from scipy.stats import kstest
 
 from loopcal.diagnose.residual_patterns import (
     ResidualRows,
@@ -43,9 +43,10 @@ CLEAN = [
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("fits", [15, pytest.param(40, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize(("robot", "kind", "n", "method"), CLEAN)
-def test_independent_errors_give_uniform_probabilities(robot, kind, n, method):
-    fits, p_values, found = 40, [], 0
+def test_independent_errors_give_uniform_probabilities(robot, kind, n, method, fits):
+    p_values, found = [], 0
     m = {"component": 3, "pose": 6, "tracker": 9}[kind]
     for seed in range(fits):
         context = {"time": 60.0 * np.arange(n), "temperature": 20.0 + np.sin(np.arange(n) / 5.0)}
@@ -57,7 +58,7 @@ def test_independent_errors_give_uniform_probabilities(robot, kind, n, method):
         )
         patterns = find_patterns(rows, data, ROBOTS[robot])
         found += bool(patterns.effects) or patterns.is_correlated
-    assert found <= 7  # 5 % of 40: more than 7 has a probability of 1e-3
+    assert found <= binom.isf(1e-3, fits, 0.05)
     for column in np.array(p_values).T:
         assert kstest(column, "uniform").pvalue > 1e-3
 

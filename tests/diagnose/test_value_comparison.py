@@ -108,8 +108,8 @@ def test_validation_keeps_the_frame_of_the_fit_unless_a_refit_is_requested(fit):
 
 ROBOT = load_robot("linear-delta")
 SIGMA = 20e-6  # [m]
-COUNT = 100
-"""Simulated machines. Their p values differ from uniform ones by less than 0.163 (KS test, 1 %)."""
+SIZES = [(30, 0.290), pytest.param(100, 0.163, marks=pytest.mark.evidence)]
+"""Simulated machines, and how far their p values may be from uniform ones (KS test, 1 %)."""
 
 
 class UnderstatedNoise(Noise):
@@ -126,7 +126,7 @@ class UnderstatedNoise(Noise):
         return self.scale * SIGMA * generator.standard_normal((n, 1))
 
 
-def simulate_printers(scale: float = 1.0, count: int = COUNT):
+def simulate_printers(scale: float, count: int):
     """Simulate heights of machines with drawn errors; the noise is `scale` times the stated one."""
     poses = np.random.default_rng(7).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.02], (14, 3))
     free = [name for name in ROBOT.parameters.names if "arm" not in name and name != "tower3.angle"]
@@ -144,6 +144,7 @@ def measure_uniformity(p_values: list[float]) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("count", "limit"), SIZES)
 @pytest.mark.parametrize(
     ("options", "scale"),
     [
@@ -153,9 +154,11 @@ def measure_uniformity(p_values: list[float]) -> float:
     ],
     ids=["least squares", "tolerances as prior", "sigma three times too small, estimated"],
 )
-def test_p_value_of_a_right_answer_is_uniform_and_a_wrong_one_is_rejected(options, scale) -> None:
+def test_p_value_of_a_right_answer_is_uniform_and_a_wrong_one_is_rejected(
+    options, scale, count, limit
+) -> None:
     right, some, wrong = [], [], []
-    for robot, data, truth in simulate_printers(scale):
+    for robot, data, truth in simulate_printers(scale, count):
         fit = identify(robot, data, options=options)
         values = dict(zip(robot.parameters.names, truth, strict=True))
         result = compare_with_values(fit, values)
@@ -164,27 +167,30 @@ def test_p_value_of_a_right_answer_is_uniform_and_a_wrong_one_is_rejected(option
         some.append(compare_with_values(fit, part).p_value)
         moved = {**values, "tower1.stop": values["tower1.stop"] + 2e-3}
         wrong.append(compare_with_values(fit, moved).agrees)
-    assert measure_uniformity(right) < 0.163
-    assert measure_uniformity(some) < 0.163
+    assert measure_uniformity(right) < limit
+    assert measure_uniformity(some) < limit
     assert not any(wrong)
 
 
 def test_stated_sigma_that_is_wrong_decides_unless_it_is_estimated() -> None:
-    """A sigma three times too small rejects right answers; estimated noise does not."""
+    """A sigma three times too small rejects right answers; estimated noise does not.
+
+    Fewer than 12 of 15 intervals of 95 % contain the truth with a probability of 0.5 %.
+    """
     accepted: dict[Literal["given", "estimated"], int] = {"given": 0, "estimated": 0}
-    for robot, data, truth in simulate_printers(3.0, 30):
+    for robot, data, truth in simulate_printers(3.0, 15):
         for basis in accepted:
             options = FitOptions(method=LeastSquares(), noise=basis)
             fit = identify(robot, data, options=options)
             result = compare_with_truth(fit, truth)
             assert result.noise == ("estimated" if basis == "estimated" else "widened")
             accepted[basis] += result.p_value > 0.05
-    assert accepted["estimated"] >= 25
-    assert accepted["given"] >= 25  # the residuals contradict the sigma and widen the uncertainty
+    assert accepted["estimated"] >= 12
+    assert accepted["given"] >= 12  # the residuals contradict the sigma and widen the uncertainty
 
 
 def test_joint_test_equals_the_inverse_of_the_covariance(fit) -> None:
-    (robot, data, truth), *_ = simulate_printers(count=1)
+    (robot, data, truth), *_ = simulate_printers(1.0, 1)
     exact = FitOptions(sigma_uncertainty=0.0)
     estimated = identify(robot, data, LeastSquares(), options=exact)
     names = ("radius", "tower2.angle", "tower3.stop")
@@ -227,7 +233,7 @@ def test_answer_in_another_frame_has_the_same_chi_square_and_names_the_frame(fit
 
 def test_machine_that_reaches_nothing_is_compared_by_the_poses_of_the_stored_one() -> None:
     """A fit that failed may leave values with which no loop closes."""
-    (robot, data, _), *_ = simulate_printers(count=1)
+    (robot, data, _), *_ = simulate_printers(1.0, 1)
     fit = identify(robot, data, LeastSquares())
     values = robot.values.copy()
     values[robot.parameters.index("radius")] = 5.0
@@ -239,7 +245,7 @@ def test_machine_that_reaches_nothing_is_compared_by_the_poses_of_the_stored_one
 
 
 def test_values_that_cannot_be_compared_are_refused_or_undecided(tmp_path) -> None:
-    (robot, data, truth), *_ = simulate_printers(count=1)
+    (robot, data, truth), *_ = simulate_printers(1.0, 1)
     fit = identify(robot, data, LeastSquares())
     arm, tower = "arm1.length", "tower3.angle"
     with pytest.raises(EstimationError, match=r"stored value of arm1.length is .* keeps it at"):

@@ -81,13 +81,22 @@ def make_far_poses(robot, far, n):
     return geometry.apply_twist(np.broadcast_to(robot.home_state.T[0, 0], (n, 4, 4)), twist)
 
 
+SLOWEST = "solar-tracker"  # as long as all the others but the excavator, which is a chain as well
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list_robots_with_few_freedoms())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.evidence) if name == SLOWEST else name
+        for name in list_robots_with_few_freedoms()
+    ],
+)
 def test_projection_is_converged_only_where_the_distance_is_stationary(name):
     """The gradient by central differences of inverse solutions vanishes where a row is converged,
     for targets up to two sizes and 2 rad away from home.
     """
-    robot, n = load_robot(name), 20
+    robot, n = load_robot(name), 8
     target = np.concatenate([make_far_poses(robot, far, n // 2) for far in (0.05, 2.0)])
     sol = inverse(robot, target)
     done = sol.converged

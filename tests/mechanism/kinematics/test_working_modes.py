@@ -82,11 +82,11 @@ def measure_mobility_sign(robot: Mechanism, solution: Solution) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wide", WIDE)
+@pytest.mark.parametrize("wide", [1.0, pytest.param(2.5, marks=pytest.mark.evidence), 6.0])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide: float) -> None:
     robot = load_cached_robot(name)
-    result = inverse(robot, draw_targets(robot, wide))
+    result = inverse(robot, draw_targets(robot, wide, 15))
     gap = measure_gap(robot, forward(robot, result.q), result.T)
     assert gap[result.converged].max(initial=0.0) < ROUNDING
     other = result.status == Status.OTHER_MODE
@@ -103,7 +103,8 @@ def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_modes_are_those_of_complete_forward_solutions(name: str) -> None:
     robot = load_cached_robot(name)
-    values, n = robot.values[None], 60
+    # a tenth of the rows of the pentapod are refused, which needs more of them to count
+    values, n = robot.values[None], 60 if name == "pentapod" else 20
     for wide in WIDE:
         target = draw_targets(robot, wide, n)[None]
         state = inverse_trials(robot, values, target)
