@@ -50,7 +50,7 @@ def list_modules() -> dict[str, ast.Module]:
 def list_imports(tree: ast.Module, modules: Mapping[str, Any]) -> Iterator[str]:
     """Yield the modules that a module names: in imports at any depth, and in strings.
 
-    Imports for type checkers alone do not count.
+    Imports for type checkers alone do not count, nor does the name of the distribution in a string.
     """
     skipped: set[int] = set()
     for node in ast.walk(tree):
@@ -65,7 +65,7 @@ def list_imports(tree: ast.Module, modules: Mapping[str, Any]) -> Iterator[str]:
                 yield full if full in modules else node.module
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "." in node.value:
             yield node.value.partition(":")[0]
 
 
