@@ -63,8 +63,11 @@ def test_a_stated_value_is_finite(value):
         (lambda fit, data: lc.sample_workspace(lc.load_robot("five-bar"), -1), "-1 positions"),
         (lambda fit, data: lc.find_outliers(fit, hexapod_data(9)), "9 poses, .* made from 12"),
         (lambda fit, data: lc.examine_fit(fit, hexapod_data(9)), "9 poses, .* made from 12"),
-        (lambda fit, data: lc.compute_joint_region(fit, combinations=[[0.0] * 42]), "zeros"),
-        (lambda fit, data: lc.compute_joint_region(fit, combinations=[[np.inf] * 42]), "finite"),
+        (lambda fit, data: lc.compute_joint_region(fit, combinations=np.zeros((1, 42))), "zeros"),
+        (
+            lambda fit, data: lc.compute_joint_region(fit, combinations=np.full((1, 42), np.inf)),
+            "finite",
+        ),
         (
             lambda fit, data: lc.save_robot(fit.robot, "a.yaml", np.ones(1)),
             r"shape \(1,\); give one unc",

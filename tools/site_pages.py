@@ -104,7 +104,7 @@ def write_pages_of_the_code(app: Any) -> None:
     del app
     pages = {
         GENERATED / "api" / f"{name_page(package)}.rst": format_api_page(
-            heading, list_names(package)
+            heading, list_names()[package]
         )
         for package, heading in SECTIONS.items()
     }

@@ -165,3 +165,4 @@ from .studies.specification.study import Study as Study
 from .units import Dimension as Dimension
 
 __version__: str
+__all__: list[str]  # noqa: PYI035

@@ -3,6 +3,7 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,7 +108,8 @@ def test_one_entry_adds_a_metric_to_results_json_and_tables(validation, monkeypa
     expected = pytest.approx(np.quantile(validation.after.position, 0.95))
     assert validation.after.statistics("position").p95 == expected
     assert json.loads(to_json(validation))["after"]["position"]["p95"] == expected
-    titles = [column.title for column in view_error_statistics(validation)[0].columns]
+    table: Any = view_error_statistics(validation)[0]
+    titles = [column.title for column in table.columns]
     assert titles[-3:-1] == ["sd", "95 %"]
 
 

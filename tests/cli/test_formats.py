@@ -3,6 +3,7 @@
 
 import difflib
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,7 +206,8 @@ def test_page_and_commands_list_every_format(root) -> None:
     page = (root / "docs" / "formats.md").read_text()
     assert all(f"`{name}`" in page for name in FORMATS)
     for command, ability in (("import", "read"), ("export", "write")):
-        (option,) = [o for o in find_command(command).params if o.name == "format_name"]
+        found: Any = find_command(command)
+        (option,) = [o for o in found.params if o.name == "format_name"]
         assert set(option.type.choices) == {n for n, f in FORMATS.items() if getattr(f, ability)}
 
 

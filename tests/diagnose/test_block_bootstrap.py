@@ -17,6 +17,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.prior import prior_from
 from loopcal.estimate.resampling import Resamples, fit_resamples
+from loopcal.measure.readings import fill_in_reading_sigma
 from tests.diagnose.test_cluster_covariance import (
     EIGHT_TARGETS,
     KNOWN_POSE,
@@ -53,7 +54,7 @@ def draw_weights(count: int, poses: int, seed: int = 1) -> np.ndarray:
 def test_weighted_resamples_equal_their_own_fits(case) -> None:
     data = CASES[case]()
     fit = identify(hexapod(), data, lc.MAP())
-    data = lc.estimate.identification.fill_in_reading_sigma(hexapod(), data)
+    data = fill_in_reading_sigma(hexapod(), data)
     linear, weight = linearize_fit(fit, data), 0.5 + draw_weights(3, data.n_poses)
     p, U = len(fit.names), len(fit.nuisance)
     equations = np.repeat(linear.linearization.equations, 3)
@@ -136,7 +137,7 @@ def test_normal_errors_scatter_as_the_covariance_says(case, count) -> None:
     fit = identify(hexapod(), data, method, options=options)
     result = lc.bootstrap(fit, data, count, scheme="normal")
     assert result.failed == 0
-    stated = linearize_fit(fit, lc.estimate.identification.fill_in_reading_sigma(hexapod(), data))
+    stated = linearize_fit(fit, fill_in_reading_sigma(hexapod(), data))
     if case == "ridge":  # the covariance of the estimate alone, without its bias
         d, lam = stated.decomposition, stated.penalty
         part = d.noise_roots(lam)[0]

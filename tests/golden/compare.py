@@ -130,13 +130,13 @@ def _allowed(path: str, was: np.ndarray, largest: float, golden: Flat) -> np.nda
         return tolerance * np.abs(was)
     if parts[-1] == "p_value":
         degrees = golden.get(path.removesuffix("p_value") + "degrees", 1.0)
-        return TOLERANCE * np.sqrt(np.maximum(degrees, 1.0))
+        return np.asarray(TOLERANCE * np.sqrt(np.maximum(degrees, 1.0)))
     if parts[-1] == "condition":
-        return (TOLERANCE + ROUNDING * largest) * largest
+        return np.asarray((TOLERANCE + ROUNDING * largest) * largest)
     if path == "errors" and "singular_values" in golden:
         s = np.abs(golden["singular_values"])
         tolerance += ROUNDING * s[0] / s[golden["rank"] - 1]
-    return tolerance * largest
+    return np.asarray(tolerance * largest)
 
 
 def _round_solution(golden: Flat, at: str) -> float:

@@ -275,7 +275,7 @@ class PaperText:
         title, x, y, caption = (
             fill_template(text[key], **data) for key in ("title", "x", "y", "caption")
         )
-        log = text.get("log", "y") if log is None else log
+        log = str(text.get("log", "y")) if log is None else log
         name, lines = file_name or name, tuple(series)
         return Figure(name, title, x, y, caption, lines, levels or {}, log, joined)
 

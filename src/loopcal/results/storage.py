@@ -55,8 +55,10 @@ def _restore_value(hint: Any, value: Any) -> Any:
         return {key: _restore_value(arguments[1], entry) for key, entry in value.items()}
     if isinstance(hint, type) and issubclass(hint, Enum):
         return hint[value.upper()]
-    is_record = isinstance(hint, type) and dataclasses.is_dataclass(hint)
-    return restore(hint, value) if is_record else value
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        of_class: type[Any] = hint
+        return restore(of_class, value)
+    return value
 
 
 def store_arrays(result: Any, prefix: str) -> dict[str, np.ndarray]:

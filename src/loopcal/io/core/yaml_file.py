@@ -64,7 +64,8 @@ class YamlFile:
         for step in location:
             if has_child(node, step):
                 with suppress(AttributeError, KeyError, TypeError, IndexError):  # line unknown
-                    find = node.lc.key if isinstance(node, Mapping) else node.lc.item
+                    places: Any = node
+                    find = places.lc.key if isinstance(node, Mapping) else places.lc.item
                     line = int(find(step)[0])
                 node = node[step]
         return line + self.first_line
