@@ -10,17 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.apply.calibration_report import CalibrationReport
-from loopcal.apply.compensation import ROUNDING, Compensation
 from loopcal.apply.error_budget import Source
-from loopcal.apply.height_errors import HeightErrors
-from loopcal.apply.inspection import IdentifiabilityReport
-from loopcal.diagnose.parameter_subset import UsefulAccuracy
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import count_decimals, list_names
-from loopcal.mechanism.model import Mechanism
 from loopcal.report.validation_view import (
     READING_NOISE,
     describe_improvements,
@@ -43,12 +37,18 @@ from loopcal.results.tables import (
     units_of,
     word_column,
 )
-from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
+    from loopcal.apply.calibration_report import CalibrationReport
+    from loopcal.apply.compensation import Compensation
+    from loopcal.apply.height_errors import HeightErrors
+    from loopcal.apply.inspection import IdentifiabilityReport
     from loopcal.diagnose.fit_examination import ReadingError
+    from loopcal.diagnose.parameter_subset import UsefulAccuracy
     from loopcal.estimate.prior_conflict import PriorConflict
+    from loopcal.mechanism.model import Mechanism
+    from loopcal.typing import FloatArray
 
 
 # --- Errors of measured heights, as tables.
@@ -458,6 +458,8 @@ def _show(value: float | None, unit: Any) -> str:
 
 def view_compensation(result: Compensation) -> list[Block]:
     """Return the table of targets, the convergence of shifted commands, and the frame."""
+    from loopcal.apply.compensation import ROUNDING
+
     units = units_of(result.robot)
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     columns = [word_column("target"), word_column("status")]

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal import geometry
-from loopcal.apply.inspection import RobotInspection
 from loopcal.findings.wording import name_count
-from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import TRIANGLE_TERMS, WEIGHT, compute_range
 from loopcal.results.tables import (
     ABSENT,
@@ -29,7 +27,9 @@ from loopcal.results.tables import (
 from loopcal.units import Dimension, Unit
 
 if TYPE_CHECKING:
+    from loopcal.apply.inspection import RobotInspection
     from loopcal.mechanism.assembly import Actuator, Address
+    from loopcal.mechanism.model import Mechanism
 
 DIGITS = 9
 """Significant digits of nominal values."""

@@ -6,22 +6,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
-from loopcal.apply.run_comparison import RunComparison, RunSummary
 from loopcal.apply.validation import FEW_ROWS, ErrorChange, Validation
-from loopcal.diagnose.bootstrap import Bootstrap
-from loopcal.diagnose.intervals import Intervals
-from loopcal.diagnose.joint_regions import JointRegion, SimultaneousIntervals
-from loopcal.diagnose.posterior_sample import PosteriorSample
-from loopcal.diagnose.regularization_curves import RegularizationCurve, RegularizationCurves
 from loopcal.diagnose.row_errors import METRICS, SUMMARY, Statistics
-from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, sort_by_importance
 from loopcal.findings.wording import list_names
-from loopcal.mechanism.model import Mechanism
 from loopcal.results.tables import (
     ABSENT,
     ROUNDING,
@@ -35,8 +28,18 @@ from loopcal.results.tables import (
     units_of,
     word_column,
 )
-from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
+
+if TYPE_CHECKING:
+    from loopcal.apply.run_comparison import RunComparison, RunSummary
+    from loopcal.diagnose.bootstrap import Bootstrap
+    from loopcal.diagnose.intervals import Intervals
+    from loopcal.diagnose.joint_regions import JointRegion, SimultaneousIntervals
+    from loopcal.diagnose.posterior_sample import PosteriorSample
+    from loopcal.diagnose.regularization_curves import RegularizationCurve, RegularizationCurves
+    from loopcal.estimate.result import Identification
+    from loopcal.mechanism.model import Mechanism
+    from loopcal.typing import FloatArray
 
 CONFORMITY = "conformity."
 """Beginning of the codes of statements on limits, which follow the tables."""

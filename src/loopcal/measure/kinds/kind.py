@@ -629,13 +629,16 @@ class Kind(ABC):
     def _subtract(self, predicted: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the difference of columns (.., c), angles wrapped."""
         difference = predicted - measured
-        if not any(self._is_wrapped):
+        if not self._is_wrapped.any():
             return difference
         return np.where(self._is_wrapped, geometry.wrap_angle(difference), difference)
 
     @cached_property
-    def _is_wrapped(self) -> tuple[bool, ...]:
-        return tuple(self.wraps_angles and c.dimension is Dimension.ANGLE for c in self.columns)
+    def _is_wrapped(self) -> BoolArray:
+        is_angle = [c.dimension is Dimension.ANGLE for c in self.columns]
+        wrapped = np.array(is_angle, dtype=bool) & self.wraps_angles
+        wrapped.setflags(write=False)
+        return wrapped
 
     def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
         """Return derivatives (*shape, 6 + u): by the twist, then by each unknown setup item.
