@@ -53,7 +53,7 @@ def add_contents(app: Any, page: str, source: list[str]) -> None:
             "", [f"generated/api/{name}.rst" for name in map(name_page, SECTIONS)]
         )
     elif page == "docs/commands":
-        names = [match[2] for match in COMMAND_ROW.finditer(text)]
+        names = dict.fromkeys(match[2] for match in COMMAND_ROW.finditer(text))
         text = COMMAND_ROW.sub(r"| [\1](generated/commands/\2.rst) |", text)
         text += format_contents("", [f"generated/commands/{name}.rst" for name in names])
     elif page.startswith("docs/") and page.endswith("/README"):

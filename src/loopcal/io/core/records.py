@@ -212,8 +212,8 @@ def _is_mapping(annotation: Any) -> bool:
 def _fit(annotation: Any, node: Any) -> float:
     """Return how well the form of `node` fits an annotation (negative: not at all).
 
-    It chooses among the branches of a union: a `Literal` key that agrees counts most, then the
-    number of known keys or the length of a list.
+    It chooses among the branches of a union: a mapping that a branch cannot have counts most, then
+    a `Literal` key that agrees, then the number of known keys or the length of a list.
     """
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
@@ -228,7 +228,9 @@ def _fit(annotation: Any, node: Any) -> float:
         hints = get_field_types(annotation)
         tags = _list_tags(annotation)
         score = sum(10.0 if node[key] in tags[key] else -10.0 for key in tags if key in node)
-        return score + sum(1.0 if key in hints else -0.5 for key in node) + 0.1
+        score += sum(1.0 if key in hints else -0.5 for key in node) + 0.1
+        inner = [key for key, value in node.items() if key in hints and isinstance(value, dict)]
+        return score - 25.0 * sum(_fit(hints[key], {}) < 0.0 for key in inner)
     if isinstance(node, list):
         if origin not in (tuple, list):
             return -1.0

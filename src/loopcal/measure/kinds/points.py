@@ -171,9 +171,8 @@ class TargetKind(Kind):
 
         Returns
         -------
-        moving : (q, 3, 3 k), origin : (q, 3)
-            `moving p + origin` is the point in the base, with p the places of all targets.
-        points : (q, 3) in the base. columns : (q, g) that were measured.
+        moving : (q, 3, 3 k); `moving p + origin` is the point in the base, with p the places of all
+            targets. origin : (q, 3). points : (q, 3) in the base. columns : (q, g) measured.
         """
         k = len(self.targets)
         moving = (T[:, None, :3, None, :3] * np.eye(k)[:, None, :, None]).reshape(-1, 3, 3 * k)
