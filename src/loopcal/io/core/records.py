@@ -14,6 +14,7 @@ choose between records by their keys, and take longer to import than to read a r
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -220,11 +221,9 @@ def _fit(annotation: Any, node: Any) -> float:
         return _fit(arguments[0], node)
     if origin in (Union, types.UnionType):
         return max(_fit(a, node) for a in arguments)
-    if node is None or annotation is types.NoneType:
-        return 1.0 if node is None and annotation is types.NoneType else -1.0
     if isinstance(node, dict):
         if not _is_record(annotation):
-            return 0.05 if _is_mapping(annotation) else -1.0
+            return 0.05 if _is_mapping(annotation) else -math.inf
         hints = get_field_types(annotation)
         tags = _list_tags(annotation)
         score = sum(10.0 if node[key] in tags[key] else -10.0 for key in tags if key in node)
@@ -237,6 +236,8 @@ def _fit(annotation: Any, node: Any) -> float:
         inner = _fit(arguments[0], node[0]) if node and arguments else 0.0
         has_length = origin is list or arguments[-1] is Ellipsis or len(arguments) == len(node)
         return (2.0 if has_length else 0.5) + (0.5 if inner > 0 else -0.4)
+    if node is None or annotation is types.NoneType:
+        return 1.0 if node is None and annotation is types.NoneType else -1.0
     if isinstance(node, str):
         return 1.0 if annotation is str or (origin is Literal and node in arguments) else -1.0
     if isinstance(node, bool):
