@@ -132,7 +132,7 @@ def list_workers(driver: int) -> list[int]:
     """Return the worker processes of a driver, without what else Python starts."""
     children = _read_process(f"{driver}/task/{driver}/children").split()
     names = {int(child): _read_process(f"{int(child)}/cmdline") for child in children}
-    return [child for child, name in names.items() if b"spawn_main" in name]
+    return [child for child, name in names.items() if b"popen_loky" in name]
 
 
 def _read_process(name: str) -> bytes:
