@@ -16,11 +16,7 @@ FORBIDDEN_MODULES = {
     "telnetlib", "urllib", "webbrowser", "xmlrpc",
 }  # fmt: skip
 ALLOWED = {
-    "studies/execution/processes.py": {
-        "multiprocessing", "multiprocessing.connection", "multiprocessing.process",
-    },
-    "documents/printing.py": {"subprocess"},
-    "documents/view_writing.py": {"webbrowser"},
+    "documents.py": {"subprocess", "webbrowser"},
 }  # fmt: skip
 """The workers of a study are processes of this program; a report is printed by an installed
 browser, where --pdf asks for it; a view is opened in the user's browser.

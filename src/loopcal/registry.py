@@ -79,9 +79,8 @@ class Registry(Mapping[str, T]):
         name = self._aliases.get(name, name)
         if name in self._places or name in self._registered or name in self._offered:
             return name
-        raise UnknownNameError(
-            f"{name!r} is not a {self.noun}{suggest_names(name, self)}; known are {', '.join(self)}"
-        )
+        hint = suggest_names(str(name), self)
+        raise UnknownNameError(f"{name!r} is not a {self.noun}{hint}; known are {', '.join(self)}")
 
     def __getitem__(self, name: str) -> T:
         name = self.resolve(name)

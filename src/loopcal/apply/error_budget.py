@@ -94,7 +94,8 @@ class Source(NamedTuple):
     @property
     def words(self) -> str:
         """What people read."""
-        return SOURCE_WORDS.get(self.kind, self.kind).format(name=self.name)
+        template = SOURCE_WORDS.get(self.kind)
+        return self.kind if template is None else template.format(name=self.name)
 
 
 class CovarianceSplit(NamedTuple):
