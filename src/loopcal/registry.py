@@ -25,7 +25,9 @@ E = TypeVar("E")
 class UnknownNameError(DataError, KeyError):
     """A name that a registry does not have; the text lists those that it has."""
 
-    __str__ = Exception.__str__
+    def __str__(self) -> str:
+        """Return the text; a KeyError would put it in quotes."""
+        return Exception.__str__(self)
 
 
 class Registry(Mapping[str, T]):
@@ -47,7 +49,8 @@ class Registry(Mapping[str, T]):
         places: Mapping[str, str] | None = None,
         aliases: Mapping[str, str] | None = None,
     ) -> None:
-        self.noun, self.group = noun, group
+        self.noun: str = noun
+        self.group: str = group
         self._places, self._aliases = dict(places or {}), dict(aliases or {})
         self._registered: dict[str, T] = {}
 

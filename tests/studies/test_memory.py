@@ -19,7 +19,7 @@ from tests.studies.studies import make_study
 
 BLOCK = 50
 ALLOWED = 400_000
-"""Bytes, of statements that SQLite and Python keep, and of cycles that Python has not collected yet;
+"""Bytes, of statements that SQLite and Python keep, and of cycles that are not collected yet;
 the scores of 90,000 more trials would take 14 MB.
 """
 

@@ -14,9 +14,10 @@ is known, and that of Student's t for the effective degrees of freedom where it 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,7 +108,7 @@ class PoseUncertainty(TableResult):
     reference: Finding
     degrees: PoseDegrees
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("frame", "coverage_factor", "degrees", components=lambda _: COMPONENTS),
         Field("position", axes="pose", unit="m", key="position_rms"),
         Field("orientation", axes="pose", unit="rad", key="orientation_rms"),
@@ -115,7 +116,7 @@ class PoseUncertainty(TableResult):
         Field("expanded", axes="pose component", unit=TWIST_UNITS, key="expanded"),
         *fields(position_95="expanded_position", orientation_95="expanded_orientation"),
     )
-    LABELS = label_axes(component=COMPONENTS)
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=COMPONENTS)
 
     @property
     def frame(self) -> str:
@@ -369,7 +370,7 @@ class AccuracyMap(DrawnResult):
     uncertainty: PoseUncertainty
     measured: PoseUncertainty
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("names"),
         Field(
             "commanded",
@@ -383,8 +384,8 @@ class AccuracyMap(DrawnResult):
         *fields("position_ratio", "orientation_ratio"),
         *fields(extrapolated=lambda accuracy: int(accuracy.extrapolated.sum())),
     )
-    LABELS = label_axes(component=COMPONENTS, coordinate="names")
-    CAPTION = "Poses of the map"
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=COMPONENTS, coordinate="names")
+    CAPTION: ClassVar[str] = "Poses of the map"
 
     @property
     def position_ratio(self) -> FloatArray:
@@ -491,12 +492,12 @@ class AccuracySimulation(TableResult):
     trials: int
     failed: int
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("predicted", "predicted.sd", "pose component", TWIST_UNITS),
         Field("observed", axes="pose component", unit=TWIST_UNITS),
         Field("ratio", axes="pose component", unit="1"),
     )
-    LABELS = label_axes(component=COMPONENTS)
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=COMPONENTS)
 
     def page(self) -> list[Block]:
         """Return predicted and observed errors."""

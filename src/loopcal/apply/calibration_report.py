@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -115,7 +115,7 @@ class CalibrationReport(TableResult):
     comparison: ValueComparison | None
     provenance: Provenance
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("verdict", "headline", "states_expected_error", "findings", "recommendation"),
         *fields("next_step", passed=lambda report: not report.failures),
         *fields(reasons=lambda report: list(map(str, report.failures)), fit="identification"),

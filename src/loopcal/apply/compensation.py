@@ -10,9 +10,10 @@ part remains, and the result states it for each target. See docs/theory/accuracy
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -112,7 +113,7 @@ class Compensation(TableResult):
     uncertainty: PoseUncertainty | None
     findings: tuple[Finding, ...]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(robot="robot.name", mode="", labels="", actuators="robot.actuators.name"),
         Field("status", lambda result: [reach.value for reach in result.reach], "pose"),
         Field(
@@ -130,7 +131,7 @@ class Compensation(TableResult):
         *fields(reach=lambda result: [reach.value for reach in result.reach]),
         *fields(sentences=lambda result: list(map(str, result.findings)), findings=""),
     )
-    LABELS = label_axes(
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(
         pose="labels",
         actuator="robot.actuators.name",
         coordinate="robot.controlled",

@@ -26,7 +26,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.observations import Observations
 from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
@@ -85,7 +85,7 @@ class Conformity(Result):
     level: float = LEVEL
     count: int = 1
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("limit", "estimate", "low", "high", "expanded", "probability", "level"),
         *("guard_band", "acceptance_limit", "count"),
         decision="decision.value",

@@ -11,8 +11,9 @@ weights changed, not from the part of the source. See docs/theory/uncertainty.md
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -412,7 +413,7 @@ class ErrorBudget(DrawnResult):
     is_workspace: bool
     finding: Finding
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(
             position=lambda b: {"rms": b.position.rms, "variances": b.position._asdict()},
             orientation=lambda b: {"rms": b.orientation.rms, "variances": b.orientation._asdict()},
@@ -437,7 +438,7 @@ class ErrorBudget(DrawnResult):
             "square of the SI unit",
         ),
     )
-    LABELS = label_axes(source="lines.source.words", other="names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(source="lines.source.words", other="names")
 
     def __str__(self) -> str:
         return str(self.finding)

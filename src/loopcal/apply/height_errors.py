@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class HeightErrors(DrawnResult):
     is_held_out: BoolArray
     unit: Unit
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("poses", is_stored=True),
         Field("points", is_stored=True),
         Field("pose", "poses", "row"),

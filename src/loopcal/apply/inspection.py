@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 from loopcal.apply.calibration_findings import (
     is_readings_alone,
@@ -103,7 +103,7 @@ class IdentifiabilityReport:
             )
         ]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *within("analysis", [field for field in Identifiability.FIELDS if field.name != "scaling"]),
         *fields("summary", remedies="suggestions"),
         Field("useful", is_optional=True),
@@ -146,7 +146,7 @@ class RobotInspection:
     home_readings: FloatArray  # (a,) readings of the actuators at home [SI]
     findings: tuple[Finding, ...]  # notes of the robot file, and limits that home exceeds
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(name="robot.name", path="robot.record.path", freedoms="robot.freedoms"),
         *fields(controlled="robot.controlled", size="robot.size", home="robot.home"),
         *fields(tool="robot.tool", actuators=lambda inspection: inspection.list_actuators()),

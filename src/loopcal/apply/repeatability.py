@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +133,7 @@ class Repeatability(DrawnResult):
     variations: Mapping[tuple[str, str], float]
     findings: tuple[Finding, ...]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(standard=lambda _: "ISO 9283:1998", frame=""),
         *(
             Field(name, lambda result, name=name: result.poses.get(name), is_optional=True)

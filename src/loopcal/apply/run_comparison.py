@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -329,7 +329,7 @@ class PairComparison:
     cause_sd: FloatArray
     finding: Finding  # the result with its code
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("first", "second", "data", "shared", "names", "shift", "shift_sd", "significant"),
         *(
             "chi_square",
@@ -549,12 +549,12 @@ class RunComparison(DrawnResult):
     common_poses: int
     findings: tuple[Finding, ...]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(runs="", parameters="", units="units.symbol", pairs="", errors=""),
         *fields("common_poses", "moved", "findings"),
         Field("unit", "units.symbol", "parameter"),
     )
-    LABELS = label_axes(parameter="parameters")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="parameters")
 
     def list_fields(self) -> Iterator[Field]:
         """Yield the fields, among them the estimates and the shifts of each run in shown units."""

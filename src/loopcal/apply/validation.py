@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -374,7 +374,7 @@ class Validation(DrawnResult):
     without_blunders: Validation | None = None
     conformity: Mapping[str, Conformity] = field(default_factory=dict)
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("poses", "before", "after", "commanded_before", "commanded_after"),
         *fields("not_compensable", "noise_floor", failed="unreachable"),
         *fields("limit_position", "limit_angle", "conformity", "passed"),

@@ -15,9 +15,9 @@ See docs/theory/resampling.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -429,13 +429,13 @@ class Bootstrap(TableResult):
     failed: int
     scatter: BlockScatter
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(robot="fit.robot.name", scheme="", seed="", unit="blocks.unit"),
         *fields(blocks="blocks.count", resamples=lambda boot: len(boot.draws), failed=""),
         *fields(degrees="scatter.degrees", findings=""),
         Field("estimate", "draws", "draw parameter", units="fit.free_parameters.dimensions"),
     )
-    LABELS = label_axes(parameter="fit.names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="fit.names")
 
     def __repr__(self) -> str:
         """Return scheme, blocks and number of resamples."""

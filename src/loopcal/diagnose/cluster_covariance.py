@@ -18,7 +18,7 @@ the stated covariance with which C_robust is compared. See docs/theory/uncertain
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -40,7 +40,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.elimination import find_connected_groups, fold_at
 from loopcal.numerics.statistics import compute_chi_square_tail
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Divide poses into the units that may share an error: days, sessions, blocks or single poses.
@@ -157,7 +157,7 @@ class ClusterCheck:
     parameter: tuple[str, float]
     finding: Finding  # the result
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("unit", "clusters", "position", "orientation"),
         parameter=lambda check: dict(zip(("name", "ratio"), check.parameter, strict=True)),
         finding="finding",

@@ -16,7 +16,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class CrossValidation(TableResult):
     before_fold: FloatArray
     converged: bool
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("*", "score", "standard_error"),
         Field("mean_square_before", "before_fold", "fold", "sigma^2"),
         Field("mean_square", "fold", "fold", "sigma^2"),
@@ -332,7 +332,7 @@ class Candidate:
     validation: CrossValidation | None
     conditioning: Conditioning  # by all data, at the values before calibration
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("name"),
         Field("parameters", show=lambda names: str(len(names))),
         Field("score", unit="sigma^2", digits=4),
@@ -370,7 +370,7 @@ class ModelChoice(TableResult):
     best: Candidate
     robot: Mechanism
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(candidates="", chosen="chosen.name", best="best.name", finding=""),
         Field(
             "parameters", lambda choice: [len(c.parameters) for c in choice.candidates], "set", "1"
@@ -378,7 +378,7 @@ class ModelChoice(TableResult):
         *each("candidates", "set", Candidate.FIELDS, *SHOWN),
         Field("chosen", lambda choice: [c is choice.chosen for c in choice.candidates], "set"),
     )
-    LABELS = label_axes(set="candidates.name")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(set="candidates.name")
 
     def compare_sets(self) -> Table:
         """Return the table of the sets, in which the chosen one is marked."""

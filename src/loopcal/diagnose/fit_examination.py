@@ -6,7 +6,7 @@ expected gain.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import transmit_readings
 from loopcal.numerics.statistics import find_distinct
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.units import Dimension
@@ -54,7 +54,7 @@ class CorrelatedGroup:
     pair: tuple[str, str]
     correlation: float
 
-    FIELDS = fields("*", "finding")
+    FIELDS: ClassVar[tuple[Field, ...]] = fields("*", "finding")
 
     @property
     def finding(self) -> Finding:
@@ -108,7 +108,7 @@ class CalibrationGain:
     is_worthwhile: bool | None  # whether either becomes smaller; None where it cannot be predicted
     finding: Finding  # the expected errors, or the reason why there are none
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("position_before", "position_after", "angle_before", "angle_after", "finding"),
         calibrate="is_worthwhile",
     )
@@ -199,7 +199,7 @@ class FitExamination(Result):
     gain: CalibrationGain
     tails: HeavyTails
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("outliers", "lack_of_fit", "clusters", "correlated"),
         worth="gain",
         heavy_tails="tails",

@@ -6,8 +6,9 @@ Singular values are those of whitened rows in units of tolerance.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -125,7 +126,7 @@ class ParameterIdentifiability:
     # learned
     left: float
 
-    FIELDS = fields("*", "state")
+    FIELDS: ClassVar[tuple[Field, ...]] = fields("*", "state")
 
     @property
     def state(self) -> str:
@@ -161,7 +162,7 @@ class Identifiability(DrawnResult):
     indices: Observability
     parameters: tuple[ParameterIdentifiability, ...]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("n_parameters", "n_equations", "rank", "condition", "gap", "singular_values"),
         *fields("tolerance", "improved", "unidentifiable", "weak", "indices", "parameters"),
         *fields("findings", scaling=lambda _: SCALING),
@@ -169,7 +170,7 @@ class Identifiability(DrawnResult):
         Field("sd_over_tolerance", "parameters.left", "parameter", "1"),
         Field("singular_value", "singular_values", "direction", "sigma per tolerance"),
     )
-    LABELS = label_axes(parameter="free_parameters.names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="free_parameters.names")
 
     def page(self) -> list[Block]:
         """Return the findings and the parameters."""

@@ -14,8 +14,9 @@ weights v_i, and the linear density f there.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -122,12 +123,12 @@ class Intervals(TableResult):
     shift: FloatArray
     shift_error: FloatArray
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("level", "source", parameters=lambda intervals: intervals._list_rows()),
         *(Field(name, axes="parameter", unit="SI") for name in ("center", "sd", *ENDS)),
         Field("linear_is_off", "is_off", "parameter"),
     )
-    LABELS = label_axes(parameter="names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="names")
 
     def __repr__(self) -> str:
         """Return the number of parameters, and how many linear intervals are off."""

@@ -17,10 +17,10 @@ See docs/theory/resampling.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class JointRegion(TableResult):
     degrees: float
     square: float
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("*", "half_widths", "axes", "correlation"),
         *(
             Field(name, axes="quantity", unit="SI")
@@ -69,7 +69,7 @@ class JointRegion(TableResult):
         ),
         Field("covariance", axes=f"quantity {OTHER}", unit="SI times SI"),
     )
-    LABELS = label_axes(quantity="names", other="names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(quantity="names", other="names")
 
     def __repr__(self) -> str:
         return f"<JointRegion of {', '.join(self.names)}: {round_to_digits(100 * self.level, 4)} %>"
@@ -144,11 +144,11 @@ class SimultaneousIntervals(TableResult):
     factor: FloatArray
     single: FloatArray
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("*"),
         *(Field(name, axes="quantity", unit="SI") for name in ("center", "half_widths", "single")),
     )
-    LABELS = label_axes(quantity="names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(quantity="names")
 
     def __repr__(self) -> str:
         names = f"{len(self.names)} quantities at {round_to_digits(100 * self.level, 4)} %"

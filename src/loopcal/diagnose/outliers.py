@@ -18,10 +18,10 @@ geometry so far that right poses seem wrong. Blocks are then compared at a robus
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -384,12 +384,14 @@ class OutlierCheck(TableResult):
     scale: float
     summary: tuple[Finding, ...]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("outliers", undecided="ambiguous", settled="is_converged", level="level"),
         *fields("blocks", "scale", mean_leverage="mean_leverage", findings="findings"),
         Field("state", lambda check: list(map(check.judge, check.poses)), "poses"),
     )
-    LABELS = label_axes(poses=lambda check: [", ".join(poses) for poses in check.poses])
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(
+        poses=lambda check: [", ".join(poses) for poses in check.poses]
+    )
 
     @property
     def names(self) -> tuple[str, ...]:

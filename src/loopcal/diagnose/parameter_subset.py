@@ -12,7 +12,7 @@ docs/theory/observability.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from loopcal.measure.array_checks import check_type
 from loopcal.mechanism.assembly import LinearMap
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import NULL_COMPONENT
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -47,7 +47,7 @@ class MergedParameter:
     changes: FloatArray  # (k,) of each for one `unit` of it, to first order
     units: tuple[str, ...]  # (k,) symbols
 
-    FIELDS = fields("*", "finding")
+    FIELDS: ClassVar[tuple[Field, ...]] = fields("*", "finding")
 
     @property
     def finding(self) -> Finding:
@@ -77,7 +77,7 @@ class IdentifiableSubset(Result):
     condition: float
     robot: Mechanism
 
-    FIELDS = fields("kept", "dropped", "condition")
+    FIELDS: ClassVar[tuple[Field, ...]] = fields("kept", "dropped", "condition")
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -183,7 +183,7 @@ class AccurateCombination:
     # data do not determine it
     sd: float
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         "names", "coefficients", sd=lambda known: known.sd if np.isfinite(known.sd) else None
     )
 

@@ -10,7 +10,9 @@ See docs/theory/resampling.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -191,13 +193,13 @@ class PosteriorSample(TableResult):
     degrees: float
     tail_shape: float
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(robot="fit.robot.name", seed="", draws=lambda sample: len(sample.draws)),
         *fields("effective_size", "tail_shape", "rounds", "findings"),
         Field("weight", axes="draw", unit="1"),
         Field("estimate", "draws", "draw parameter", units="fit.free_parameters.dimensions"),
     )
-    LABELS = label_axes(parameter="fit.names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="fit.names")
 
     @property
     def effective_size(self) -> float:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -99,7 +99,7 @@ class RegularizationCurves(DrawnResult):
     truncation: RegularizationCurve
     nominal: tuple[float, float]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("*"),
         Field("regularization", lambda curves: curves.join("name"), "point"),
         Field("value", lambda curves: curves.join("values"), "point", "1"),

@@ -14,6 +14,7 @@ Regression Analysis.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.typing import IntArray
 
 # Singular values of the whiteners of repeats below this share of the largest belong to components
@@ -53,7 +54,7 @@ class LackOfFit:
     # the result of the test, and the repeatability where it contradicts the stated sigma
     findings: tuple[Finding, ...]
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("groups", "pure", "pure_degrees", "lack", "lack_degrees", "sigma_scale", "p_value"),
         *("findings",),
         explained="is_explained",

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_tail
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 
 # Share of the start's cost below which a gain is rounding: the last digits of a file.
 NO_GAIN = 1e-3
@@ -64,7 +64,9 @@ class StartCheck:
     p_value: float
     finding: Finding  # the result
 
-    FIELDS = fields(verdict="verdict.value", before="", after="", p_value="", finding="")
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
+        verdict="verdict.value", before="", after="", p_value="", finding=""
+    )
 
 
 @dataclass(frozen=True)

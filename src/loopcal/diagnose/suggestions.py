@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.units import Dimension
 
@@ -73,7 +74,9 @@ class MeasurementSuggestion(Result):
     combination: Combination
     measurements: tuple[FurtherMeasurement, ...]
 
-    FIELDS = fields(names="combination.names", cures="measurements", finding="finding")
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
+        names="combination.names", cures="measurements", finding="finding"
+    )
 
     @property
     def finding(self) -> Finding:

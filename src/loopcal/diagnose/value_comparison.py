@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -146,14 +146,14 @@ class ValueComparison(TableResult):
     sigma: float
     direction: tuple[str, ...]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("*", "rms", "agrees", finding="outcome"),
         Field("estimate_minus_given", "raw", "parameter", "SI"),
         Field("determined_part", "error", "parameter", "SI"),
         Field("determined_part_in_tolerances", "tolerances", "parameter", "tolerance"),
     )
-    LABELS = label_axes(parameter="names")
-    CAPTION = "Estimate minus given value"
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="names")
+    CAPTION: ClassVar[str] = "Estimate minus given value"
 
     def page(self) -> list[Block]:
         """Return the outcome of the test and the differences."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -65,13 +65,13 @@ class NuisanceEstimate(TableResult):
     display: tuple[tuple[float, str], ...]
     is_harmless: bool = False
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("unit", lambda setup: [symbol for _, symbol in setup.display], "parameter"),
         Field("nominal", lambda setup: setup.list_shown(setup.table.nominal), "parameter"),
         Field("estimate", lambda setup: setup.list_shown(setup.estimate), "parameter"),
         Field("sd", lambda setup: setup.list_shown(setup.sd), "parameter"),
     )
-    LABELS = label_axes(parameter="names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="names")
 
     def list_shown(self, values: FloatArray) -> FloatArray:
         """Return values (U,) [SI] in the units in which they are shown."""

@@ -9,12 +9,13 @@ robot's file.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray, IntArray
 
@@ -55,7 +56,7 @@ class Combination(Result):
     nuisance: tuple[str, ...] = ()
     direction: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("names", "changes", "units", "weights", "singular_value"),
         meaning=lambda combination: str(combination.meaning),
         nuisance="nuisance",

@@ -58,7 +58,9 @@ class PoseCoordinates:
     rows_of_readings = 0
 
     def __init__(self, free: FreeParameters, names: tuple[str, ...], readings: FloatArray) -> None:
-        self.free, self.names, self.readings = free, names, readings
+        self.free: FreeParameters = free
+        self.names: tuple[str, ...] = names
+        self.readings: FloatArray = readings
 
     def is_free(self, poses: IntArray) -> BoolArray:
         """Return which coordinates (n, k) of some poses may move."""
@@ -175,9 +177,10 @@ class ReadingCoordinates(PoseCoordinates):
 
     def __init__(self, free: FreeParameters, names: tuple[str, ...], scale: FloatArray) -> None:
         super().__init__(free, names, np.zeros((1, 0, 0)))
-        self.scale, self.count = scale, scale.shape[1]
+        self.scale: FloatArray = scale
+        self.count: int = scale.shape[1]
         strokes = [stroke_of(free.robot, a) for a in free.robot.actuators]
-        self.longest = LONGEST_STEP * np.array(strokes)
+        self.longest: FloatArray = LONGEST_STEP * np.array(strokes)
 
     def is_free(self, poses: IntArray) -> BoolArray:
         """Return which readings (n, actuators) are not exact."""
@@ -232,10 +235,12 @@ class TwistCoordinates(PoseCoordinates):
         drives = np.concatenate([g.actuator[g.actuator >= 0] for g in robot.program.groups])
         if len(drives) != len(robot.actuators):
             raise EstimationError(report_finding("poses.shared-actuators", robot=robot.name))
-        self.places = list(robot.program.freedoms)
-        self.count = len(self.places)
-        self.scale = np.array([1.0 / robot.size] * 3 + [1.0] * 3)[self.places]
-        self.longest = LONGEST_STEP * np.array([1.0] * 3 + [robot.size] * 3)[self.places]
+        self.places: list[int] = list(robot.program.freedoms)
+        self.count: int = len(self.places)
+        self.scale: FloatArray = np.array([1.0 / robot.size] * 3 + [1.0] * 3)[self.places]
+        self.longest: FloatArray = (
+            LONGEST_STEP * np.array([1.0] * 3 + [robot.size] * 3)[self.places]
+        )
 
     def close(
         self,

@@ -20,6 +20,7 @@ for the noise. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from loopcal.estimate.tolerance_components import ToleranceComponent, are_penali
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import compute_any_probability, compute_chi_square_tail
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray
 
 LEVEL = 0.01
@@ -89,7 +90,7 @@ class PriorConflict:
     components: tuple[ToleranceComponent, ...]
     component_rows: tuple[dict[str, object], ...]
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("statistic", "degrees", "p_value"),
         worst_direction="direction",
         worst_parameter="parameter",

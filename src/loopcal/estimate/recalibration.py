@@ -14,7 +14,7 @@ of that noise. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_averaged_tail
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
@@ -76,7 +76,7 @@ class Change(Result):
     moved: bool | None
     finding: Finding
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("subject", "names", "change", "chi_square", "degrees", "p_value", "moved"),
         sentence=lambda change: str(change.finding),
     )

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -366,7 +366,7 @@ class Identification(TableResult):
     poses: EstimatedPoses | None
     findings: tuple[Finding, ...]
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(robot="robot.name", method=lambda fit: repr(fit.method)),
         *fields(parameters=lambda fit: fit.list_parameters()),
         *fields(interval_note=lambda fit: fit.interval_note and str(fit.interval_note)),
@@ -401,7 +401,7 @@ class Identification(TableResult):
             "unit times unit of other",
         ),
     )
-    LABELS = label_axes(parameter="names", other="names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="names", other="names")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -8,11 +8,12 @@ each other: threads compute them in any order, with the same numbers to the last
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -59,7 +60,7 @@ class IdentifiedTrials(TableResult):
     linear_models: tuple[LinearModel, ...]
     method: Method
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("converged", axes="trial"),
         Field("iterations", axes="trial", unit="1"),
         Field("sum_of_squares", "cost", "trial", "1"),
@@ -70,7 +71,7 @@ class IdentifiedTrials(TableResult):
             units="free_parameters.dimensions",
         ),
     )
-    LABELS = label_axes(parameter="free_parameters.names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="free_parameters.names")
 
     def __repr__(self) -> str:
         """Return the number of trials and how many converged."""

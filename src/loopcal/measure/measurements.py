@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -127,7 +127,7 @@ class Measurements(TableResult):
     is_held_out: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
     base_observations: tuple[Observations, ...] = ()
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *(
             Field(name, lambda data, i=i: [row[i] for row in data.list_values()], "number")
             for i, name in enumerate(("kind", "pose", "component", "unit", "value"))
@@ -135,7 +135,7 @@ class Measurements(TableResult):
         Field("reading", "readings", "measured_pose actuator", "m or rad"),
         Field("held_out", "is_held_out", "measured_pose"),
     )
-    LABELS = label_axes(measured_pose="labels")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(measured_pose="labels")
 
     def __post_init__(self) -> None:
         readings = _check_readings(self.readings, self.reading_sigma is not None)

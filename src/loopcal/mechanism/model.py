@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -301,14 +301,14 @@ class Mechanism(DrawnResult):
     record: Any = None
     stages: tuple[Stage, ...] = ()
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("value", lambda robot: robot.list_shown(robot.values), "parameter"),
         Field("nominal", lambda robot: robot.list_shown(robot.parameters.nominal), "parameter"),
         Field("tolerance", lambda robot: robot.list_shown(robot.parameters.tolerance), "parameter"),
         Field("unit", lambda r: [r.units[d] for d in r.parameters.dimensions], "parameter"),
         Field("free", "parameters.free", "parameter"),
     )
-    LABELS = label_axes(parameter="parameters.names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="parameters.names")
 
     def list_shown(self, values: FloatArray) -> FloatArray:
         """Return values (p,) [SI] in the units of the robot's file."""

@@ -7,10 +7,10 @@ docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -450,7 +450,7 @@ class Solution(TableResult):
     iterations: IntArray
     state: State
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field(
             "status", lambda s: [Status(k).name.lower().replace("_", " ") for k in s.status], "pose"
         ),
@@ -460,7 +460,7 @@ class Solution(TableResult):
         Field("passive", axes="pose joint", unit="m or rad"),
         Field("T_base_platform", "T", "pose row column", "m"),
     )
-    LABELS = label_axes(axis=POSITION, joint="passive_names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(axis=POSITION, joint="passive_names")
 
     def __len__(self) -> int:
         return len(self.q)
@@ -627,7 +627,7 @@ class Jacobian(TableResult):
     reading_units: tuple[str, ...]
     solution: Solution
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("pose", lambda j: np.repeat(range(1, len(j.parameters) + 1), len(AXES)), "row"),
         Field("component", lambda j: AXES * len(j.parameters), "row"),
         Field("unit", lambda j: TWIST_UNITS * len(j.parameters), "row"),
@@ -644,7 +644,9 @@ class Jacobian(TableResult):
             units=lambda j: [f"unit per {unit}" for unit in j.reading_units],
         ),
     )
-    LABELS = label_axes(parameter="parameter_names", actuator="reading_names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(
+        parameter="parameter_names", actuator="reading_names"
+    )
 
     components = AXES
 

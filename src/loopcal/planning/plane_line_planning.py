@@ -9,10 +9,10 @@ and docs/theory/planning.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from loopcal.planning.design_space import D, PriorInformation, find_observable_s
 from loopcal.planning.exchange import MovedDesign, coordinate_exchange
 from loopcal.planning.path import check_paths, locate_home
 from loopcal.planning.result import Plan, PlannedPoses
+from loopcal.results.description import Field
 from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
@@ -372,8 +373,8 @@ class SurfacePlan(DrawnResult):
     sd_last: float
     is_converged: bool = True
 
-    FIELDS = Plan.FIELDS
-    LABELS = Plan.LABELS
+    FIELDS: ClassVar[tuple[Field, ...]] = Plan.FIELDS
+    LABELS: ClassVar[Mapping[str, Any]] = Plan.LABELS
 
     def list_roles(self) -> tuple[str, ...]:
         """Return the role of each point of a group: on both, on the line, in the plane."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -48,7 +48,7 @@ from loopcal.planning.pose_groups import (
     linearize_candidate_groups,
 )
 from loopcal.planning.prediction import DIMENSIONS, ExpectedErrors, Prediction, linearize_prediction
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 PREDICTED = 200  # poses of the workspace whose errors are predicted
@@ -379,7 +379,7 @@ class ErrorCurve:
             decided_by_equations=bool(self.enough == self.numbers[0]),
         )
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("target", "counted", "n_candidates", "numbers"),
         position="expected.position",
         orientation="expected.orientation",

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -114,7 +114,7 @@ class ErrorForecast:
     after: ExpectedErrors  # with the planned poses
     frame: Finding  # point, axes and frame of these errors
 
-    FIELDS = fields(before="", evenly_drawn="random", after="")
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(before="", evenly_drawn="random", after="")
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ class Plan(DrawnResult):
     notes: tuple[Finding, ...] = ()
     curve: ErrorCurve | None = None
 
-    FIELDS = (
+    FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(robot="robot.name", kinds="instrument.sensors.kind.name", n_poses=""),
         *fields(criterion="options.criterion", target="options.target", figures="quality.figures"),
         *fields(efficiency="quality.efficiency", n_candidates="quality.n_candidates"),
@@ -159,7 +159,7 @@ class Plan(DrawnResult):
         ),
         Field("reading", "poses.readings", "pose actuator", units="robot.actuators.dimension"),
     )
-    LABELS = label_axes(
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(
         pose="poses.labels", coordinate="robot.controlled", actuator="robot.actuators.name"
     )
 

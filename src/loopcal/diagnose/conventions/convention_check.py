@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -61,7 +61,7 @@ from loopcal.mechanism.over_constraint import fix_breaking_parameters
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
-from loopcal.results.description import fields
+from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class ConventionCheck(Result):
     alternatives: tuple[Interpretation, ...] = ()
     finding: Finding | None = None
 
-    FIELDS = fields(
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
         "misfit",
         interpretation="interpretation.finding",
         other_misfit="other_misfit",

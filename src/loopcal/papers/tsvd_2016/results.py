@@ -54,7 +54,7 @@ ROUNDING = 1e-10
 RIDGE_STEPS = (5, 10, 20, 50, 100)
 """Iterations of RE after which its curve over lambda is examined."""
 NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi [rad]")
-SIZES = {
+SIZES: dict[str, tuple[str, ...]] = {
     "3-PRS": ("platform_radius", "base_radius", "rod"),
     "RU-PUS-PRS": ("platform_radius", "base_radius", "rod", "post"),
 }
