@@ -23,7 +23,7 @@ from loopcal.apply.validation import validate
 from loopcal.diagnose.error_frames import fit_frames, fit_unfixed_frames
 from loopcal.diagnose.fit_examination import estimate_calibration_gain
 from loopcal.estimate.identification import identify
-from loopcal.estimate.posterior import MeasuredFrames, Posterior, compute_posterior
+from loopcal.estimate.posterior import FrameKnowledge, Posterior, compute_posterior
 from loopcal.estimate.trial_identification import (
     IdentifiedTrials,
     compute_trial_posterior,
@@ -325,7 +325,7 @@ def _find_covered(errors: Array, uncertainty: PoseUncertainty) -> list[float]:
     ]
 
 
-def _posterior_of(fits: IdentifiedTrials, trial: int, frames: MeasuredFrames | None) -> Posterior:
+def _posterior_of(fits: IdentifiedTrials, trial: int, frames: FrameKnowledge | None) -> Posterior:
     """Return the posterior of a machine; all machines have the instrument's frames in common."""
     free, chosen = fits.free_parameters, np.array([trial])
     identified = free.robot.with_values(fits.values[trial])

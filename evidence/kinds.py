@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.apply.validation import validate
-from loopcal.diagnose.frame_motions import find_frame_motions
+from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms
 from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import LoopcalError
 from loopcal.estimate.identification import identify
@@ -223,7 +223,7 @@ def recover_machine(case: Case, seed: int = SEED) -> Recovery:
     except LoopcalError as error:
         return Recovery(0, len(robot.parameters), np.nan, np.nan, np.nan, np.nan, (), 0, str(error))
     checked = validate(fit, others)
-    motions = find_frame_motions(fit.posterior)
+    motions = find_gauge_freedoms(fit.posterior)
     left = len(fit.names) - fit.rank - motions.count
     return Recovery(
         rank=fit.rank,

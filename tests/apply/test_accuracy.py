@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from loopcal import geometry, load_robot
 from loopcal.apply.accuracy import accuracy_map, pose_uncertainty, simulate_accuracy
-from loopcal.diagnose.frame_motions import find_frame_motions
+from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms
 from loopcal.errors import EstimationError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP, LeastSquares
@@ -152,7 +152,7 @@ def test_unknown_base_gives_six_rigid_motions_of_the_base_frame(fit):
     if fit.names[:3] != ("leg1.base.x", "leg1.base.y", "leg1.base.z"):
         pytest.fail("this test counts on the order of the hexapod's parameters")
     known = make_base_unobservable(fit)
-    motions = find_frame_motions(known)
+    motions = find_gauge_freedoms(known)
     assert (motions.count, motions.frames) == (6, ("base",))
     assert np.abs(motions.kept).max() < 1e-9
     assert np.isfinite(pose_uncertainty(known, TEST_POSES).sd).all()
@@ -161,7 +161,7 @@ def test_unknown_base_gives_six_rigid_motions_of_the_base_frame(fit):
 
 def test_unobservable_leg_length_keeps_infinite_uncertainty(fit):
     known = make_base_unobservable(fit, extra=fit.names.index("leg2.length"))
-    assert find_frame_motions(known).count == 6
+    assert find_gauge_freedoms(known).count == 6
     assert np.isinf(pose_uncertainty(known, TEST_POSES).sd).all()
 
 

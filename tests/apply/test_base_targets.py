@@ -16,7 +16,7 @@ from scipy.stats import chi2, kstest
 import loopcal as lc
 from loopcal.apply.verdict import Verdict
 from loopcal.diagnose.frame_drift import compare_shapes, estimate_frame_drifts, report_base_targets
-from loopcal.diagnose.frame_motions import interpret_fit
+from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.repeated_poses import check_lack_of_fit
 from loopcal.errors import DataError
 from loopcal.estimate.options import FitOptions

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 import loopcal as lc
 from loopcal.apply.inspection import analyze_identifiability
 from loopcal.apply.verdict import Verdict
-from loopcal.diagnose.frame_motions import find_frame_motions
+from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms
 from loopcal.errors import DataError, FileError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
@@ -124,7 +124,7 @@ def test_gauge_is_found_by_computation(robot):
     """Three motions of the plane; spools of unknown radius add the size of the machine."""
     _, readings = measure(*draw_machine(1), 40, 2)
     fit = identify(robot, make_data(robot, readings), LeastSquares())
-    motions = find_frame_motions(fit.posterior)
+    motions = find_gauge_freedoms(fit.posterior)
     assert (motions.count, motions.has_scale) == (3, False)
     cable = lc.load_robot("cable-4")
     poses = lc.sample_workspace(cable, 30, 1).coordinates

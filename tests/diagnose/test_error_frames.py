@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from loopcal import geometry, load_robot, pose_uncertainty
-from loopcal.diagnose import frame_motions
+from loopcal.diagnose import gauge_freedoms
 from loopcal.diagnose.error_frames import (
     choose_error_frame,
     fit_unfixed_frames,
@@ -18,12 +18,12 @@ from loopcal.diagnose.error_frames import (
     reference_poses,
 )
 from loopcal.diagnose.fit_examination import estimate_calibration_gain
-from loopcal.diagnose.frame_motions import probe_readings
+from loopcal.diagnose.gauge_freedoms import probe_readings
 from loopcal.errors import EstimationError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.posterior import MeasuredFrames, posterior_from_arrays
+from loopcal.estimate.posterior import FrameKnowledge, posterior_from_arrays
 from loopcal.estimate.prior import prior_from
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import frame_twists
@@ -66,7 +66,7 @@ def calibrate(measured_by, seed=3, name="hexapod-42"):
     return truth, identify(robot, data)
 
 
-def frames_of(fit: Identification) -> MeasuredFrames:
+def frames_of(fit: Identification) -> FrameKnowledge:
     """Return what the measurements of a fit say about its frames."""
     assert fit.posterior.frames is not None
     return fit.posterior.frames
@@ -86,7 +86,7 @@ def test_probed_poses_are_reached_from_home_without_following_a_path(name):
 
 
 def test_probed_poses_shrink_about_home_until_half_of_them_are_reached(monkeypatch):
-    monkeypatch.setattr(frame_motions, "SPREAD_LENGTH", 2.0)
+    monkeypatch.setattr(gauge_freedoms, "SPREAD_LENGTH", 2.0)
     robot = load_robot("hexapod-42")
     assert len(probe_readings(robot)) >= 12
 

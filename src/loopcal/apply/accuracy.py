@@ -33,7 +33,7 @@ from loopcal.diagnose.error_frames import (
     solve_home,
 )
 from loopcal.diagnose.fit_examination import ROUNDING
-from loopcal.diagnose.frame_motions import NO_MOTION, twist_weights
+from loopcal.diagnose.gauge_freedoms import NO_MOTION, twist_weights
 from loopcal.engine import State
 from loopcal.errors import EstimationError
 from loopcal.estimate.penalties import LeastSquares, Method

@@ -26,7 +26,7 @@ from loopcal.diagnose.conventions.convention_check import ConventionCheck, check
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
 from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets, report_moved_targets
-from loopcal.diagnose.frame_motions import interpret_fit
+from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.start_values import check_start_values
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_types, exclude_poses

@@ -11,7 +11,7 @@ from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation import FEW_ROWS, Validation
 from loopcal.apply.verdict import BASE_MOVED
 from loopcal.diagnose.conventions.convention_check import ConventionCheck
-from loopcal.diagnose.frame_motions import FrameMotions, find_frame_motions
+from loopcal.diagnose.gauge_freedoms import GaugeFreedoms, find_gauge_freedoms
 from loopcal.estimate.null_space import Combination
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
@@ -119,7 +119,7 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     if not fit.converged or not fit.unidentifiable:
         return []
 
-    freedoms = sort_open_freedoms(fit.posterior, fit.unidentifiable, len(fit.names) - fit.rank)
+    freedoms = sort_undetermined(fit.posterior, fit.unidentifiable, len(fit.names) - fit.rank)
     motions, count = freedoms.motions, freedoms.changing_count
     findings = [report_readings_gauge(motions, freedoms.count)] if is_readings_alone(data) else []
     if motions.count:
@@ -139,10 +139,10 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
 
 
 @dataclass(frozen=True)
-class OpenFreedoms:
+class UndeterminedCombinations:
     """The combinations that data do not determine."""
 
-    motions: FrameMotions  # of frames by these combinations
+    motions: GaugeFreedoms  # of frames by these combinations
     count: int  # of all
     changing: tuple[Combination, ...]  # combinations that may change poses
     names: tuple[str, ...]  # of the parameters in these
@@ -153,9 +153,9 @@ class OpenFreedoms:
         return self.count - self.motions.count
 
 
-def sort_open_freedoms(
+def sort_undetermined(
     posterior: Posterior, unidentifiable: tuple[Combination, ...], count: int
-) -> OpenFreedoms:
+) -> UndeterminedCombinations:
     """Separate the combinations that only move frames from those that change poses.
 
     A combination with a meaning, such as the place of a frame, changes no pose. Where all have one,
@@ -163,7 +163,7 @@ def sort_open_freedoms(
     """
     changing = tuple(c for c in unidentifiable if not c.meaning)
     names = dict.fromkeys(name for c in changing or unidentifiable for name in c.names)
-    return OpenFreedoms(find_frame_motions(posterior), count, changing, tuple(names))
+    return UndeterminedCombinations(find_gauge_freedoms(posterior), count, changing, tuple(names))
 
 
 # What redundant readings alone leave open, in one sentence.
@@ -174,7 +174,7 @@ def is_readings_alone(data: Measurements) -> bool:
     return all(isinstance(rows.kind, Closure) for rows in data.observations)
 
 
-def report_readings_gauge(motions: FrameMotions, count: int) -> Finding:
+def report_readings_gauge(motions: GaugeFreedoms, count: int) -> Finding:
     """Return what `count` open combinations are: the place of frames, the size, and others."""
     others = count - motions.count - motions.has_scale
     combinations = (

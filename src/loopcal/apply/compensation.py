@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.diagnose.error_frames import FITTED, fit_unfixed_frames
-from loopcal.diagnose.frame_motions import twist_weights
+from loopcal.diagnose.gauge_freedoms import twist_weights
 from loopcal.errors import DataError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification

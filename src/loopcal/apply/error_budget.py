@@ -35,7 +35,7 @@ from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.estimate.source_rows import fold_sources
-from loopcal.estimate.unfixed_motions import find_measured_frames
+from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.measurements import Measurements
@@ -572,7 +572,7 @@ def _halve(
             return None
         root, linearization, problem = halved
         if frame not in (FITTED, BASE, RELATIVE):
-            frames = find_measured_frames(
+            frames = find_frame_knowledge(
                 problem,
                 data,
                 linearization.deviation,

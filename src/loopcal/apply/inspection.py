@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from loopcal.apply.calibration_findings import (
     is_readings_alone,
     report_readings_gauge,
-    sort_open_freedoms,
+    sort_undetermined,
 )
 from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
 from loopcal.diagnose.parameter_subset import (
@@ -64,7 +64,7 @@ class IdentifiabilityReport:
         analysis = self.analysis
         if not analysis.unidentifiable:
             return []
-        freedoms = sort_open_freedoms(
+        freedoms = sort_undetermined(
             analysis.posterior, analysis.unidentifiable, analysis.n_parameters - analysis.rank
         )
         motions, changing = freedoms.motions, freedoms.changing

@@ -26,7 +26,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose.frame_motions import find_frame_motions, probe_readings, twist_weights
+from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms, probe_readings, twist_weights
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.posterior import InstrumentFrame, Posterior
 from loopcal.estimate.result import Identification
@@ -273,7 +273,7 @@ def list_unfixed_motions(posterior: Posterior) -> FloatArray:
     known = np.zeros((MOTIONS, 0)) if posterior.frames is None else posterior.frames.unfixed
     if posterior.determined.all():
         return known
-    moved = find_frame_motions(posterior).motions
+    moved = find_gauge_freedoms(posterior).motions
     u, s, _ = np.linalg.svd(np.concatenate([known, moved], axis=1), full_matrices=False)
     return u[:, s > FIT_TOLERANCE]
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from loopcal.diagnose.frame_motions import interpret_combinations
+from loopcal.diagnose.gauge_freedoms import interpret_combinations
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.estimate.null_space import Combination, describe_direction, describe_null_space
-from loopcal.estimate.pose_estimate import find_open_poses
+from loopcal.estimate.pose_estimate import find_unclosed_poses
 from loopcal.estimate.posterior import Posterior, compute_posterior
 from loopcal.estimate.tolerance_components import compute_symmetric_root
 from loopcal.findings import Finding, report_finding
@@ -343,9 +343,9 @@ def identifiability(
         )
     if not count:
         raise EstimationError(report_finding("fit.no-measured-value"))
-    open_poses = find_open_poses(robot, data)
-    if open_poses.are_most:
-        raise EstimationError(open_poses.report("fit.poses-open"))
+    unclosed = find_unclosed_poses(robot, data)
+    if unclosed.are_most:
+        raise EstimationError(unclosed.report("fit.poses-open"))
     factor, reached = collect_information(free, data)
     if not reached.all():
         names = tuple(data.labels[i] for i in np.flatnonzero(~reached))

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from loopcal.diagnose.frame_motions import probe_workspace
+from loopcal.diagnose.gauge_freedoms import probe_workspace
 from loopcal.diagnose.identifiable_parameters import (
     Identifiability,
     compute_remaining_sd,

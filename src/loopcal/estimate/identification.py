@@ -33,7 +33,7 @@ from loopcal.estimate.null_space import describe_null_space
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import LeastSquares, Method, adapt_method, describe_regularization
-from loopcal.estimate.pose_estimate import find_open_poses, predict_from_readings
+from loopcal.estimate.pose_estimate import find_unclosed_poses, predict_from_readings
 from loopcal.estimate.pose_linearization import PoseEstimates
 from loopcal.estimate.posterior import (
     VarianceSources,
@@ -242,9 +242,9 @@ def identify(
     fit, weights, weighted, options = fit_with_tolerances(problem, data, z, options, free, progress)
     if fit.status[0] == DescentStatus.BAD_START.value:
         check_start(problem, data, z, fit.cost)
-    open_poses = find_open_poses(robot.with_values(values), data)
-    if fit.status[0] != DescentStatus.CONVERGED.value and open_poses.are_most:
-        raise EstimationError(open_poses.report("fit.poses-open"))
+    unclosed = find_unclosed_poses(robot.with_values(values), data)
+    if fit.status[0] != DescentStatus.CONVERGED.value and unclosed.are_most:
+        raise EstimationError(unclosed.report("fit.poses-open"))
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
     result = add_factor_uncertainty(result, fit)
     if options.loss is not None:
@@ -252,8 +252,8 @@ def identify(
 
         result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
     findings = [*result.findings, *report_unknown_rows(options.prior)]
-    if open_poses.poses:
-        findings.append(open_poses.report("fit.poses-open-at-start"))
+    if unclosed.poses:
+        findings.append(unclosed.report("fit.poses-open-at-start"))
     rows = collect_used_rows(robot, data, options.prior)
     posterior = add_data(result.posterior, free, fit.decomposition, result.residual_test, rows)
     return replace(result, posterior=posterior, findings=tuple(findings))

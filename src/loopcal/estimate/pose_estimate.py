@@ -287,7 +287,7 @@ MOST = 0.5
 MM = 1e3
 
 
-class OpenPoses(NamedTuple):
+class UnclosedPoses(NamedTuple):
     """Poses at which the loops do not close with their readings.
 
     Attributes
@@ -316,20 +316,20 @@ class OpenPoses(NamedTuple):
         )
 
 
-def find_open_poses(robot: Mechanism, data: Measurements) -> OpenPoses:
+def find_unclosed_poses(robot: Mechanism, data: Measurements) -> UnclosedPoses:
     """Return the poses of measurements whose redundant readings do not close the loops of a robot.
 
     Poses with a missing reading are not tested, and robots with as many actuators as freedoms have
     none: a pose that they do not reach is refused by `check_start`.
     """
     if robot.program.sigma is None:
-        return OpenPoses((), np.zeros(0), data.n_poses)
+        return UnclosedPoses((), np.zeros(0), data.n_poses)
     used = np.flatnonzero(np.isfinite(data.readings).all(axis=1))
     if not len(used):
-        return OpenPoses((), np.zeros(0), 0)
+        return UnclosedPoses((), np.zeros(0), 0)
     solution = forward(robot, data.readings[used])
     is_open = np.flatnonzero(~solution.converged)
     gaps = solution.residual[is_open]
     order = np.argsort(-np.where(np.isfinite(gaps), gaps, np.inf), kind="stable")
     labels = tuple(data.labels[i] for i in used[is_open[order]])
-    return OpenPoses(labels, gaps[order], len(used))
+    return UnclosedPoses(labels, gaps[order], len(used))

@@ -317,7 +317,7 @@ class InstrumentFrame(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredFrames:
+class FrameKnowledge:
     """How the measurements of a fit determine the frames of the base and the platform.
 
     Attributes
@@ -335,7 +335,7 @@ class MeasuredFrames:
     def __repr__(self) -> str:
         """Return the number of motions and the names of the frames."""
         names = ", ".join(self.instruments) or "none"
-        return f"<MeasuredFrames: {self.unfixed.shape[1]} unfixed motions; instruments: {names}>"
+        return f"<FrameKnowledge: {self.unfixed.shape[1]} unfixed motions; instruments: {names}>"
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder, which `frames_from_arrays` reads."""
@@ -351,7 +351,7 @@ class MeasuredFrames:
         return {FRAME_PREFIX + name: array for name, array in content.items()}
 
 
-def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> MeasuredFrames | None:
+def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> FrameKnowledge | None:
     """Return the frames in the arrays of a run folder; None where it does not hold them."""
     names = ("unfixed", "readings", "names", "T", "by_parameters", "own")
     if any(FRAME_PREFIX + name not in arrays for name in names):
@@ -361,7 +361,7 @@ def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> MeasuredFrames | Non
         str(name): InstrumentFrame(*fields)
         for name, *fields in zip(labels.tolist(), *stacked, strict=True)
     }
-    return MeasuredFrames(unfixed, readings, frames)
+    return FrameKnowledge(unfixed, readings, frames)
 
 
 def intersect_motions(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -404,7 +404,7 @@ class Posterior:
     directions: FloatArray
     variance: FloatArray
     determined: BoolArray
-    frames: MeasuredFrames | None = None
+    frames: FrameKnowledge | None = None
     parts: tuple[CovariancePart, ...] = ()
     fitted_rows: FittedRows | None = None
     discrepancy: ModelDiscrepancy | None = None
@@ -499,7 +499,7 @@ def compute_posterior(
     decomposition: Decomposition,
     penalty: FloatArray,
     sources: VarianceSources = VarianceSources(1.0),  # noqa: B008
-    frames: MeasuredFrames | None = None,
+    frames: FrameKnowledge | None = None,
     degrees: float = np.inf,
 ) -> Posterior:
     """Return the posterior of trial 0 of a decomposition.

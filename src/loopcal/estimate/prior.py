@@ -46,7 +46,7 @@ class Prior:
     names : (p,) parameters. mean, unit : (p,) [SI]; `unit` makes columns comparable.
     rows : (r, p) B [1 / SI].
     unfixed : (12, k) motions of frames that the earlier measurements do not determine, see
-        `MeasuredFrames`; None where it is not known.
+        `FrameKnowledge`; None where it is not known.
     fitted_rows : the measured rows that it comes from; None where they are not known.
     noise_share : (r,) share of the variance of each row that the noise of the measured rows causes;
         the rest is known, such as tolerances. noise_degrees : degrees of freedom of that noise.

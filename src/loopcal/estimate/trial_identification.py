@@ -27,7 +27,7 @@ from loopcal.estimate.penalties import MAP, Method, adapt_method, fix_penalty
 from loopcal.estimate.pose_linearization import PoseSolution, linearize_rows
 from loopcal.estimate.posterior import Posterior, VarianceSources, compute_posterior
 from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
-from loopcal.estimate.unfixed_motions import find_measured_frames
+from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.simulation import Trials
 from loopcal.mechanism.model import Mechanism
@@ -386,7 +386,7 @@ def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) 
     z = free.deviation(fits.values[chosen])
     start = problem.start(z)
     linearization = problem.linearize(z, start)
-    frames = find_measured_frames(
+    frames = find_frame_knowledge(
         problem, data, z, linearization.next_start, linearization=linearization
     )
     prior = fits.prior_variance

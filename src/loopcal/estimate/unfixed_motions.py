@@ -26,7 +26,7 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.pose_linearization import LinearizedPoses, linearize_rows
-from loopcal.estimate.posterior import InstrumentFrame, MeasuredFrames, intersect_motions
+from loopcal.estimate.posterior import FrameKnowledge, InstrumentFrame, intersect_motions
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.problem import Problem
 from loopcal.measure.kinds import setup_parameters as setup
@@ -153,7 +153,7 @@ def unfixed_motions(factor: FloatArray, effect: float) -> FloatArray:
     return vt[s <= UNFIXED * effect].T
 
 
-def find_measured_frames(
+def find_frame_knowledge(
     problem: Problem,
     data: Measurements,
     deviation: FloatArray,
@@ -161,7 +161,7 @@ def find_measured_frames(
     prior: Prior | None = None,
     linearization: Linearization | None = None,
     noise: float = 1.0,
-) -> MeasuredFrames:
+) -> FrameKnowledge:
     """Return how the measurements of one machine determine frames, at deviation (1, p).
 
     Parameters
@@ -180,7 +180,7 @@ def describe_frames(
     prior: Prior | None = None,
     linearization: Linearization | None = None,
     noise: float = 1.0,
-) -> MeasuredFrames:
+) -> FrameKnowledge:
     """Return how the measurements of one machine determine frames.
 
     Parameters
@@ -195,7 +195,7 @@ def describe_frames(
         readings = readings[np.linspace(0, len(readings) - 1, MOST_READINGS).astype(int)]
     readings = readings[np.isfinite(readings).all(axis=1)]
     if unfixed is None:
-        return MeasuredFrames(np.zeros((MOTIONS, 0)), readings)
+        return FrameKnowledge(np.zeros((MOTIONS, 0)), readings)
     if prior is not None and prior.unfixed is not None:
         unfixed = intersect_motions(unfixed, prior.unfixed)
     is_known = np.isfinite(noise)  # not that of a fit that did not converge
@@ -205,7 +205,7 @@ def describe_frames(
     if np.linalg.norm(unfixed[:6]) > UNFIXED:
         # a stated frame is that of the base, which something else leaves open, such as an anchor
         frames = {name: frame for name, frame in frames.items() if frame.own.any()}
-    return MeasuredFrames(unfixed, readings, frames)
+    return FrameKnowledge(unfixed, readings, frames)
 
 
 def _describe_instruments(

@@ -33,14 +33,14 @@ from loopcal.mechanism.chains import (
     differentiate_platform_entries,
     name_platform_entries,
 )
-from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
-from loopcal.mechanism.model import Mechanism, ParameterUnits
-from loopcal.mechanism.open_closure import (
+from loopcal.mechanism.least_squares_closure import (
     differentiate_open,
     differentiate_unknowns,
-    fold_open_poses,
+    fold_unclosed_poses,
     list_unknown_joints,
 )
+from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
+from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
 from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
@@ -103,7 +103,7 @@ def fold_pose_rows(
     """
     e, tau, joints = driven or drive_joints(robot, values, q)
     inputs = columns.linearize(values, tau, q)
-    fold_poses = fold_open_poses if robot.program.may_stay_open else engine.fold_poses
+    fold_poses = fold_unclosed_poses if robot.program.may_stay_open else engine.fold_poses
     return fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 

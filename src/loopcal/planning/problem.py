@@ -14,7 +14,7 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.estimate.posterior import intersect_motions
 from loopcal.estimate.problem import problem_of
-from loopcal.estimate.unfixed_motions import find_measured_frames
+from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_closure
@@ -314,7 +314,7 @@ def _find_unfixed_motions(
         return motions
     problem = problem_of(free, measured)
     z = free.deviation(free.robot.values[None])
-    earlier = find_measured_frames(problem, measured, z, problem.start(z))
+    earlier = find_frame_knowledge(problem, measured, z, problem.start(z))
     return intersect_motions(motions, earlier.unfixed)
 
 

@@ -14,7 +14,7 @@ from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.verdict import Verdict
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.error_frames import FITTED, ReferencePoses, refer_errors
-from loopcal.diagnose.frame_motions import twist_weights
+from loopcal.diagnose.gauge_freedoms import twist_weights
 from loopcal.engine import State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters

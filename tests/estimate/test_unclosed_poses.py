@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose.frame_motions import find_frame_motions
+from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms
 from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import EstimationError, LoopcalError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.pose_estimate import find_open_poses
+from loopcal.estimate.pose_estimate import find_unclosed_poses
 from loopcal.estimate.result import Identification
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism.kinematics import forward_trials
@@ -45,7 +45,7 @@ def wrong(tmp_path, request):
 
 
 @pytest.mark.parametrize("wrong", WRONG, indirect=True)
-def test_identifiability_names_the_open_poses_and_their_gaps(wrong, data):
+def test_identifiability_names_the_unclosed_poses_and_their_gaps(wrong, data):
     with pytest.raises(EstimationError) as error:
         identifiability(wrong, data)
     assert error.value.code == "fit.poses-open"
@@ -75,8 +75,8 @@ def test_every_entry_point_answers_in_words(wrong, data, readings_alone, poses):
     few = data.take(np.arange(poses))
     if readings_alone:
         few = lc.Measurements(data.robot_name, few.readings, (), reading_sigma=few.reading_sigma)
-    open_poses = find_open_poses(wrong, few)
-    assert open_poses.are_most
+    unclosed = find_unclosed_poses(wrong, few)
+    assert unclosed.are_most
     for answer in (
         lambda: identify(wrong, few),
         lambda: identify(wrong, few, LeastSquares()),
@@ -90,12 +90,12 @@ def test_every_entry_point_answers_in_words(wrong, data, readings_alone, poses):
         assert isinstance(fit, Identification)
         assert fit.converged
         (note,) = [f for f in fit.findings if f.code == "fit.poses-open-at-start"]
-        assert note.data["poses"] == open_poses.poses
+        assert note.data["poses"] == unclosed.poses
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["spools ten times as wide"], indirect=True)
-def test_a_fit_that_does_not_converge_from_open_poses_is_refused(wrong, data):
+def test_a_fit_that_does_not_converge_from_unclosed_poses_is_refused(wrong, data):
     with pytest.raises(EstimationError) as error:
         identify(wrong, data)
     assert error.value.code == "fit.poses-open"
@@ -105,12 +105,12 @@ def test_a_fit_that_does_not_converge_from_open_poses_is_refused(wrong, data):
 def test_motions_of_frames_need_a_pose(wrong, data):
     posterior = identify(wrong, data).posterior
     unreachable = replace(posterior, robot=wrong.with_values(np.full_like(wrong.values, 5.0)))
-    assert find_frame_motions(unreachable).count == 0
+    assert find_gauge_freedoms(unreachable).count == 0
 
 
 def test_good_readings_are_not_open(data):
     robot = lc.load_robot("cable-4")
-    assert find_open_poses(robot, data).poses == ()
+    assert find_unclosed_poses(robot, data).poses == ()
     codes = [finding.code for finding in identify(robot, data).findings]
     assert "fit.poses-open-at-start" not in codes
 

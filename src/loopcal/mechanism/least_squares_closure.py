@@ -163,7 +163,7 @@ def list_unknown_joints(program: Program) -> list[tuple[int, int]]:
     ]
 
 
-def fold_open_poses(
+def fold_unclosed_poses(
     factor: FloatArray,
     program: Program,
     e: FloatArray,

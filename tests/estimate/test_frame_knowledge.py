@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.estimate.posterior import InstrumentFrame, MeasuredFrames, frames_from_arrays
+from loopcal.estimate.posterior import FrameKnowledge, InstrumentFrame, frames_from_arrays
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
@@ -15,7 +15,7 @@ def test_arrays_of_a_run_folder_return_the_frames(count):
         f"tracker{i}": InstrumentFrame(np.eye(4), rng.standard_normal((6, 5)), np.eye(6))
         for i in range(count)
     }
-    frames = MeasuredFrames(rng.standard_normal((12, 2)), rng.standard_normal((7, 3)), instruments)
+    frames = FrameKnowledge(rng.standard_normal((12, 2)), rng.standard_normal((7, 3)), instruments)
     restored = frames_from_arrays(frames.arrays())
     assert restored is not None
     assert np.array_equal(restored.unfixed, frames.unfixed)

@@ -43,7 +43,7 @@ SAME_MOTION = 1e-6  # relative difference below which two motions count as equal
 
 
 @dataclass(frozen=True, eq=False)
-class FrameMotions:
+class GaugeFreedoms:
     """The d unobservable directions, and the frames that their combinations move."""
 
     # (p, d) the directions without the combinations that move frames; columns are zero where
@@ -57,11 +57,11 @@ class FrameMotions:
     has_scale: bool = False  # whether a further combination enlarges all poses by one factor
 
 
-def find_frame_motions(posterior: Posterior) -> FrameMotions:
+def find_gauge_freedoms(posterior: Posterior) -> GaugeFreedoms:
     """Separate motions of frames from the directions that the data of a fit do not determine."""
     null = posterior.directions[:, ~posterior.determined]
     if null.shape[1] == 0:
-        return FrameMotions(null, (), 0, np.zeros((12, 0)))
+        return GaugeFreedoms(null, (), 0, np.zeros((12, 0)))
     robot, readings, values = (
         posterior.robot,
         probe_readings(posterior.robot),
@@ -71,7 +71,7 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
     D = differentiate_pose(robot, values[None], readings[None], state).parameters[0]
     usable = (state.status[0] == Status.CONVERGED) & np.isfinite(D).all(axis=(1, 2))
     if not usable.any():
-        return FrameMotions(null, (), 0, np.zeros((12, 0)))
+        return GaugeFreedoms(null, (), 0, np.zeros((12, 0)))
     twists = D[usable][:, :, posterior.places] * posterior.unit
     motions, base, platform = _weigh_motions(robot, state.T[0, usable], twists)
     total = float(np.linalg.norm(motions))
@@ -98,7 +98,7 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
     growth[:, 3:, 0] = state.T[0, usable, :3, 3]
     rest = _without_span([base, platform, growth.reshape(-1, 1)], moved)
     with_scale = np.linalg.svd(rest, compute_uv=False) <= SAME_MOTION * total
-    return FrameMotions(kept, frames, count, explained, bool(with_scale.sum() > gauge.shape[1]))
+    return GaugeFreedoms(kept, frames, count, explained, bool(with_scale.sum() > gauge.shape[1]))
 
 
 def twist_weights(robot: Mechanism) -> FloatArray:
