@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -159,3 +159,50 @@ def test_settings_may_stand_beside_the_name_of_their_method() -> None:
 def test_plain_options_that_do_not_fit_are_refused(plain, sentence) -> None:
     with pytest.raises(DataError, match=sentence):
         lc.FitOptions.from_dict(plain)
+
+
+@dataclass(frozen=True)
+class Doubled(lc.MAP):
+    """A method of another package: twice the tolerances."""
+
+    name: ClassVar[str] = "doubled"
+    inflation: Any = 2.0
+
+
+@dataclass(frozen=True)
+class KeepHalf:
+    """A rule of another package: truncation keeps half of the directions."""
+
+    name: ClassVar[str] = "half"
+
+    def __call__(self, decomposition):
+        return decomposition.rank // 2
+
+
+def test_a_method_and_a_rule_of_another_package_are_used_by_their_names(monkeypatch) -> None:
+    points = {
+        "loopcal.methods": [EntryPoint("doubled", f"{__name__}:Doubled", "loopcal.methods")],
+        "loopcal.rules": [EntryPoint("half", f"{__name__}:KeepHalf", "loopcal.rules")],
+    }
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points.get(group, []))
+    _list_entry_points.cache_clear()
+    try:
+        robot = lc.load_robot("linear-delta")
+        poses = lc.sample_workspace(robot, 20, seed=1).coordinates
+        sensor = lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-5)))
+        data = lc.simulate(robot, poses, lc.Instrument((sensor,)), seed=1)
+        for plain, method in (
+            ({"method": "doubled"}, lc.MAP(2.0)),
+            (
+                {"method": {"name": "truncated-svd", "k": {"name": "half"}}},
+                lc.TruncatedSVD(KeepHalf()),
+            ),
+        ):
+            options = lc.FitOptions.from_dict(plain)
+            assert options.to_dict()["method"] == plain["method"]
+            named, built = (
+                lc.identify(robot, data, options=o) for o in (options, lc.FitOptions(method))
+            )
+            assert named.estimate == pytest.approx(built.estimate, abs=0.0)
+    finally:
+        _list_entry_points.cache_clear()
