@@ -9,8 +9,7 @@ purpose.
 import lazy_loader
 
 from loopcal.results.presenters import name_presenters
-
-__version__ = "0.1.0.dev0"
+from loopcal.version import __version__ as __version__
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import loopcal
 from loopcal.engine import get_current_engine
 from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
@@ -32,6 +31,7 @@ from loopcal.studies.files.store import (
 )
 from loopcal.studies.specification.study import NUMERICS, Study, list_conflicts
 from loopcal.typing import Progress, report_no_progress
+from loopcal.version import __version__
 
 STUDY_FILE = "study.yaml"
 """Name of the study file in the folder."""
@@ -134,7 +134,7 @@ def load_specification(store: StudyStore) -> Study:
         return Study.from_json(store.header.specification)
     except ValueError:  # it has settings that this version does not know
         made_by = store.header.versions.get(PROGRAM, "")
-        code, known = "store.other-numbers", loopcal.__version__
+        code, known = "store.other-numbers", __version__
         finding = report_finding(code, part=PROGRAM, found=made_by, known=known)
         raise FileError(finding, store.path) from None
 
@@ -142,7 +142,7 @@ def load_specification(store: StudyStore) -> Study:
 def make_header(study: Study) -> StoreHeader:
     """Return what the store of a study says about it."""
     numerics, engine = str(NUMERICS), str(get_current_engine())
-    versions = {PROGRAM: loopcal.__version__, NUMERICS_PART: numerics, ENGINE: engine}
+    versions = {PROGRAM: __version__, NUMERICS_PART: numerics, ENGINE: engine}
     return StoreHeader(study.to_json(), tuple(c.name for c in study.columns), versions)
 
 
