@@ -14,7 +14,7 @@ from loopcal.estimate.information import observe_poses
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import WorkspaceSample, sample_workspace
-from loopcal.planning.design_space import D, PriorInformation
+from loopcal.planning.design_space import D, DesignProblem, PriorInformation
 from loopcal.planning.exchange import choose_design, coordinate_exchange
 
 Array = NDArray[np.float64]
@@ -75,7 +75,7 @@ def bench_certified_design() -> list[Metric]:
     stacked = rows.reshape(-1, rows.shape[-1])
     return measure_time(
         "plan.certified_design",
-        lambda: choose_design(rows, 20, D(), PriorInformation.none(len(free))),
+        lambda: choose_design(DesignProblem(rows, D(), PriorInformation.none(len(free))), 20),
         lambda: np.linalg.svd(stacked, full_matrices=False),
         limit=10.0,
         reference_name="svd",

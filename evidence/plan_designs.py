@@ -16,14 +16,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.planning.design_space import (
-    Criterion,
-    D,
-    I,
-    PriorInformation,
-    evaluate_criterion,
-    factor_design,
-)
+from loopcal.planning.design_space import Criterion, D, DesignProblem, I, PriorInformation
 from loopcal.planning.exchange import choose_design, fedorov_exchange
 
 CANDIDATES, POSES, STARTS, DRAWS, PREDICTED = 1000, 20, 20, 200, 200
@@ -46,24 +39,23 @@ def evaluate_design(case: Case, criterion_name: str) -> list[object]:
     criterion: Criterion = (
         D() if criterion_name == "D" else I(twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
     )
-    certified = choose_design(rows, POSES, criterion, prior)
-    space, relaxed = certified.design.space, certified.relaxed
+    problem = DesignProblem(rows, criterion, prior)
+    certified = choose_design(problem, POSES)
+    relaxed = certified.relaxed
     random = np.random.default_rng(0)
     even = [
-        relaxed.efficiency(
-            evaluate_criterion(criterion, factor_design(rows[chosen], prior, space), space.machine)
-        )
+        relaxed.efficiency(problem.evaluate(chosen))
         for chosen in (random.choice(CANDIDATES, POSES, replace=False) for _ in range(DRAWS))
     ]
     plain = [
         relaxed.efficiency(value)
-        for value in fedorov_exchange(rows, POSES, criterion, prior, starts=STARTS).values
+        for value in fedorov_exchange(problem, POSES, starts=STARTS).values
     ]
     return [
         case.robot,
         case.measured,
         criterion_name,
-        len(space),
+        len(problem.space),
         float(np.median(even)),
         float(np.median(plain)),
         max(plain),

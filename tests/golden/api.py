@@ -757,10 +757,9 @@ def report_fedorov(
     """Choose n units from candidates by exchange: their numbers and the criterion."""
     settings = lc.PlanOptions(n_candidates=candidates)
     problem = prepare_problem(machine, Instrument(tuple(sensors)), settings)
-    wanted = problem.build_criterion(criterion, "pose")
-    rows = problem.groups.rows
-    result = fedorov_exchange(rows, n, wanted, problem.prior, seed=1, starts=starts)
-    return {"chosen": result.chosen, "value": result.value, "candidates": len(rows)}
+    design = problem.pose_design(name=criterion)
+    result = fedorov_exchange(design, n, seed=1, starts=starts)
+    return {"chosen": result.chosen, "value": result.value, "candidates": len(design.rows)}
 
 
 def report_coordinate_exchange(

@@ -4,10 +4,40 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.planning.design_space import PriorInformation
+from loopcal.planning.design_space import A, Criterion, D, DesignProblem, I, PriorInformation
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
+L = np.random.default_rng(1).normal(size=(9, 4))
+CASES = {
+    f"{criterion.name}-nuisance{nuisance}-{'prior' if prior else 'none'}": (
+        criterion,
+        nuisance,
+        prior,
+    )
+    for criterion in (D(), A(), I(L, 3))
+    for nuisance in (0, 2)
+    for prior in (False, True)
+}
+"""Each criterion with and without nuisance parameters and tolerances."""
+
+
+def draw_rows(N: int = 12, r: int = 2, nuisance: int = 0, machine: int = 4, seed: int = 0) -> Array:
+    """Return rows (N, r, nuisance + machine) of normal numbers."""
+    return np.random.default_rng(seed).normal(size=(N, r, nuisance + machine))
+
+
+def make_problem(
+    rows: Array,
+    criterion: Criterion | None = None,
+    nuisance: int = 0,
+    prior: bool = False,
+    repeats: bool = False,
+) -> DesignProblem:
+    """Return a problem with or without the tolerances of the machine as the prior; by default D."""
+    make = PriorInformation.from_tolerances if prior else PriorInformation.none
+    start = make(rows.shape[2] - nuisance, nuisance)
+    return DesignProblem(rows, criterion or D(), start, repeats)
 
 
 def polynomial_rows(x: Array, degree: int) -> Array:
@@ -18,17 +48,6 @@ def polynomial_rows(x: Array, degree: int) -> Array:
 def make_grid(extra: float = 0.0) -> Array:
     """Return points of [-1, 1] in steps of 0.02, and +-extra."""
     return np.unique(np.concatenate([np.arange(-50, 51) / 50, [-extra, extra]]))
-
-
-def draw_rows(N: int = 12, r: int = 2, nuisance: int = 0, machine: int = 4, seed: int = 0) -> Array:
-    """Return rows (N, r, nuisance + machine) of normal numbers."""
-    return np.random.default_rng(seed).normal(size=(N, r, nuisance + machine))
-
-
-def make_prior(has_tolerances: bool, nuisance: int, machine: int = 4) -> PriorInformation:
-    """Return the tolerances of the machine parameters as the prior, or no prior."""
-    make = PriorInformation.from_tolerances if has_tolerances else PriorInformation.none
-    return make(machine, nuisance)
 
 
 def compute_covariance(rows: Array, start: Array, nuisance: int) -> Array:

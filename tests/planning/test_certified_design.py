@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Certified designs are near the efficiency bound and no worse than twenty exchange starts."""
+"""Certified designs are near the efficiency bound and no worse than twenty exchange starts, and
+have the smallest size that reaches a target.
+"""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,17 +12,16 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.planning.design_space import (
-    A,
-    D,
-    I,
-    PriorInformation,
-    compute_efficiency,
-    evaluate_criterion,
-    factor_design,
+from loopcal.planning.design_space import A, D, DesignProblem, I, PriorInformation
+from loopcal.planning.exchange import (
+    choose_design,
+    compute_design_curve,
+    fedorov_exchange,
+    find_smallest_design,
+    search_size,
 )
-from loopcal.planning.exchange import choose_design, fedorov_exchange
-from tests.planning.design_problems import Array, draw_rows
+from tests.findings.expectations import expect_refusal
+from tests.planning.design_problems import Array, draw_rows, make_problem, polynomial_rows
 
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 
@@ -34,113 +34,88 @@ def linearize_drawn_poses(robot: str, count: int, components: slice = slice(0, 6
 
 
 @pytest.mark.slow
-def test_efficiency_of_20_out_of_1000_hexapod_poses_exceeds_95_percent() -> None:
-    rows = linearize_drawn_poses("hexapod-42", 1000)
-    start = PriorInformation.none(rows.shape[2])
-    found = choose_design(rows, 20, D(), start)
+def test_efficiency_of_20_out_of_1000_hexapod_poses_exceeds_95_percent():
+    problem = make_problem(linearize_drawn_poses("hexapod-42", 1000))
+    found = choose_design(problem, 20)
     assert found.relaxed.converged
-    assert len(found.design.space) == 42
+    assert len(problem.space) == 42
     assert found.efficiency > 0.95  # 0.980 measured
-    even = np.arange(20)
-    random = evaluate_criterion(
-        D(), factor_design(rows[even], start, found.design.space), found.design.space.machine
-    )
-    assert found.relaxed.efficiency(random) < 0.5  # the first twenty drawn: 0.4 measured
+    # the first twenty drawn: 0.4 measured
+    assert found.relaxed.efficiency(problem.evaluate(np.arange(20))) < 0.5
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "components"), [("hexapod-42", slice(3, 6)), ("3-prs", slice(0, 6))]
 )
-def test_certified_design_is_no_worse_than_the_best_of_20_exchange_starts(
-    robot: str, components: slice
-) -> None:
-    rows = linearize_drawn_poses(robot, 120, components)
-    start = PriorInformation.none(rows.shape[2])
-    found = choose_design(rows, 20, D(), start)
-    best = fedorov_exchange(rows, 20, D(), start, starts=20)
-    assert found.design.value >= best.value - 1e-6 * len(
-        found.design.space
-    )  # to a millionth of the efficiency
+def test_certified_design_is_no_worse_than_the_best_of_20_exchange_starts(robot, components):
+    problem = make_problem(linearize_drawn_poses(robot, 120, components))
+    found, best = choose_design(problem, 20), fedorov_exchange(problem, 20, starts=20)
+    # to a millionth of the efficiency
+    assert found.design.value >= best.value - 1e-6 * len(problem.space)
     assert 0.9 < found.relaxed.efficiency(best.value) <= found.efficiency + 1e-6
 
 
-def test_tolerance_prior_changes_the_design_only_for_coarse_data() -> None:
-    cut, prior = PriorInformation.none(42), PriorInformation.from_tolerances(42)
-    kept = []
+def test_tolerance_prior_changes_the_design_only_for_coarse_data():
+    # position only: three directions that no pose shows
+    rows, kept = linearize_drawn_poses("hexapod-42", 150, slice(3, 6)), []
     for precision in (1.0, 1e3):
-        rows = precision * linearize_drawn_poses(
-            "hexapod-42", 150, slice(3, 6)
-        )  # position only: three directions that no pose shows
-        plain, bayes = (
-            choose_design(rows, 20, D(), start, perturbations=5) for start in (cut, prior)
-        )
-        space = plain.design.space
-        assert (len(space), len(bayes.design.space)) == (39, 42)
-        values = [
-            evaluate_criterion(D(), factor_design(rows[c.design.chosen], cut, space), space.machine)
-            for c in (plain, bayes)
-        ]
-        kept.append(compute_efficiency(D(), values[1], values[0], 39))
-    assert (
-        kept[0] < 0.9
-    )  # with coarse data other poses are better: what the tolerances say need not be measured
+        plain, bayes = (make_problem(precision * rows, prior=prior) for prior in (False, True))
+        assert (len(plain.space), len(bayes.space)) == (39, 42)
+        designs = [choose_design(problem, 20, perturbations=5).design for problem in (plain, bayes)]
+        value, other = (plain.evaluate(design.chosen) for design in designs)
+        kept.append(plain.compare(other, value))
+    # with coarse data other poses are better: what the tolerances say need not be measured
+    assert kept[0] < 0.9
     assert 0.98 < kept[1] < 1.02
 
 
 @pytest.mark.slow
-def test_design_by_criterion_i_predicts_better_than_by_criterion_d() -> None:
+def test_design_by_criterion_i_predicts_better_than_by_criterion_d():
     rows = draw_rows(N=60, machine=6, seed=2)
     L = np.random.default_rng(3).normal(size=(4, 6)) * np.array([9.0, 3.0, 1.0, 0.3, 0.1, 0.03])
-    start = PriorInformation.none(6)
-    wanted = I(L, 4)
-    for_I, for_D = (choose_design(rows, 8, criterion, start).design for criterion in (wanted, D()))
-    other = evaluate_criterion(
-        wanted, factor_design(rows[for_D.chosen], start, for_D.space), for_D.space.machine
-    )
-    assert for_I.value < other
+    wanted = make_problem(rows, I(L, 4))
+    other = choose_design(make_problem(rows), 8).design.chosen
+    assert choose_design(wanted, 8).design.value < wanted.evaluate(other)
 
 
 @pytest.mark.parametrize("criterion", [D(), A()], ids=["D", "A"])
-def test_efficiency_is_at_most_one_and_repeats_do_not_worsen_the_design(criterion: D | A) -> None:
-    rows = draw_rows(N=30)
+def test_efficiency_is_at_most_one_and_repeats_do_not_worsen_the_design(criterion):
     once, often = (
-        choose_design(rows, 7, criterion, PriorInformation.none(4), repeats=repeats)
+        choose_design(make_problem(draw_rows(N=30), criterion, repeats=repeats), 7)
         for repeats in (False, True)
     )
     assert 0.8 < once.efficiency <= 1.0 + 1e-9
     assert 0.8 < often.efficiency <= 1.0 + 1e-9
-    assert compute_efficiency(criterion, once.design.value, often.design.value, 4) <= 1.0 + 1e-9
+    problem = often.relaxed.candidates.problem
+    assert problem.compare(once.design.value, often.design.value) <= 1.0 + 1e-9
 
 
-def test_same_seed_gives_the_same_design() -> None:
-    rows = draw_rows(N=80, machine=6)
-    first, second = (
-        choose_design(rows, 9, D(), PriorInformation.none(6), seed=4) for _ in range(2)
-    )
+def test_same_seed_gives_the_same_design():
+    problem = make_problem(draw_rows(N=80, machine=6))
+    first, second = (choose_design(problem, 9, seed=4) for _ in range(2))
     np.testing.assert_array_equal(first.design.chosen, second.design.chosen)
 
 
-def test_design_of_all_candidates_has_efficiency_one() -> None:
-    found = choose_design(draw_rows(), 12, D(), PriorInformation.none(4))
+def test_design_of_all_candidates_has_efficiency_one():
+    found = choose_design(make_problem(draw_rows()), 12)
     np.testing.assert_array_equal(found.design.chosen, np.arange(12))
     assert found.efficiency == pytest.approx(1.0, abs=1e-9)
 
 
-def test_incomplete_first_design_is_completed() -> None:
-    rows = draw_rows(N=30)
-    found = choose_design(
-        rows,
-        7,
-        D(),
-        PriorInformation.none(4),
-        first=[np.array([3, 5]), np.array([], dtype=np.int64)],
-    )
-    assert len(found.design.chosen) == 7
+def test_incomplete_first_design_is_completed():
+    first = [np.array([3, 5]), np.array([], dtype=np.int64)]
+    assert len(choose_design(make_problem(draw_rows(N=30)), 7, first=first).design.chosen) == 7
+
+
+def test_candidates_without_information_leave_the_prior_unchanged():
+    found = choose_design(make_problem(np.zeros((6, 2, 3)), prior=True), 2)
+    assert found.efficiency == 1.0
+    assert found.design.value == pytest.approx(0.0, abs=1e-12)  # log det of the unit matrix
 
 
 @pytest.mark.evidence
-def test_evidence_certified_designs_are_no_worse_than_exchange(root: Path) -> None:
+def test_evidence_certified_designs_are_no_worse_than_exchange(root):
     path = root / "docs" / "evidence" / "plan_designs.json"
     if not path.is_file():
         pytest.skip("docs/evidence/plan_designs.json is made by `make evidence`")
@@ -154,7 +129,64 @@ def test_evidence_certified_designs_are_no_worse_than_exchange(root: Path) -> No
         assert row[:3] != ["hexapod-42", "full pose", "D"] or row[certified] >= 0.95
 
 
-def test_candidates_without_information_leave_the_prior_unchanged() -> None:
-    found = choose_design(np.zeros((6, 2, 3)), 2, D(), PriorInformation.from_tolerances(3))
-    assert found.efficiency == 1.0
-    assert found.design.value == pytest.approx(0.0, abs=1e-12)  # log det of the unit matrix
+@pytest.mark.parametrize("criterion", [D(), A()], ids=["D", "A"])
+def test_larger_designs_are_better_and_stay_within_their_bounds(criterion):
+    problem = make_problem(draw_rows(N=30), criterion)
+    found = compute_design_curve(problem, (12, 4, 6, 5, 9, 9), perturbations=2)
+    assert [len(made.design.chosen) for made in found] == [4, 5, 6, 9, 12]
+    sign = 1.0 if isinstance(criterion, D) else -1.0
+    values, bounds = (
+        sign * np.array(numbers)
+        for numbers in zip(*((m.design.value, m.relaxed.bound) for m in found), strict=True)
+    )
+    assert (np.diff(values) > 0.0).all()
+    assert (values <= bounds + 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    ("criterion", "target", "size"),
+    [
+        # With weights 1/4, 1/2, 1/4 of n points the sum of the variances is 8 / n.
+        (A(), 0.4 + 1e-9, 20),
+        (D(), np.log(4 / 27 * 30**3) - 1e-9, 30),  # ten points at each end and in the middle
+    ],
+    ids=["A", "D"],
+)
+def test_smallest_design_has_the_known_size(criterion, target, size):
+    rows = polynomial_rows(np.linspace(-1, 1, 21), 2)
+    problem = make_problem(rows, criterion, repeats=True)
+    found = find_smallest_design(problem, target, most=200, perturbations=2)
+    assert found.n == size
+    assert size - 1 <= found.at_least <= size  # the bound is computed to three parts in a thousand
+    assert found.certified.design.value == pytest.approx(target, rel=1e-8)
+
+
+def test_earlier_measurements_reduce_the_design_size():
+    rows, none = draw_rows(N=60), PriorInformation.none(4)
+    alone, helped = (
+        find_smallest_design(DesignProblem(rows, A(), start), 0.1, perturbations=2)
+        for start in (none, none.with_rows(rows[:10]))
+    )
+    assert alone.at_least <= alone.n
+    assert helped.n < alone.n
+
+
+@pytest.mark.parametrize(("target", "most"), [(0.001, 12), (0.2, 5)])
+def test_unreachable_target_is_refused_with_the_largest_possible_size(target, most):
+    with expect_refusal("plan.target-impossible", size=most, available=12, target=target):
+        find_smallest_design(make_problem(draw_rows(), A()), target, most)
+
+
+@pytest.mark.parametrize("growth", [0.1, 1.0, 5.0])
+def test_search_finds_the_smallest_size_in_few_evaluations(growth):
+    asked: list[int] = []
+
+    def value(n: int) -> float:
+        asked.append(n)
+        return float(n**-growth)
+
+    for right in (3, 4, 57, 1000):
+        asked.clear()
+        assert search_size(value, 3, 1000, 5, A(), right**-growth * (1 + 1e-12), 4) == right
+        assert len(asked) <= 25  # twice the halvings of a thousand, and a few
+    assert search_size(value, 3, 1000, 5, A(), 1001**-growth, 4) == 1001

@@ -18,7 +18,7 @@ from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.planning import exchange, path
 from loopcal.planning.constraints import PlanOptions
-from loopcal.planning.design_space import D, PriorInformation, factor_design
+from loopcal.planning.design_space import PriorInformation, factor_design, find_observable_space
 from loopcal.planning.exchange import choose_design
 from loopcal.planning.pose_groups import (
     MOST,
@@ -31,6 +31,7 @@ from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import find_sample_size, prepare_problem
 from loopcal.results.serialization import to_json
 from tests.findings.expectations import expect_refusal
+from tests.planning.design_problems import make_problem
 
 UM, URAD = 1e-6, 1e-6
 
@@ -77,17 +78,8 @@ def test_rows_of_pose_groups_equal_those_of_identification(name, kind, settings)
     data = lc.simulate(
         robot, sample_workspace(robot, 30, seed=2).coordinates, seen_by, seed=0, controller=robot
     )
-    rows = np.concatenate(
-        [
-            units.rows.reshape(-1, units.rows.shape[2]),
-            np.eye(units.rows.shape[2])[len(units.nuisance) :],
-        ]
-    )
-    ours = factor_design(
-        rows[None],
-        PriorInformation.none(len(free), len(units.nuisance)),
-        _keep_all_directions(free, units),
-    )
+    prior = PriorInformation.from_tolerances(len(free), len(units.nuisance))
+    ours = factor_design(units.rows, prior, find_observable_space(units.rows, prior))
     theirs = collect_information(free, data)[0][0, :-1, :-1]
     theirs = np.concatenate([theirs, np.eye(len(free))])
     # data of this seed have noise, so that the frames found from them differ by some 1e-4 from the
@@ -96,15 +88,6 @@ def test_rows_of_pose_groups_equal_those_of_identification(name, kind, settings)
         np.linalg.svd(ours, compute_uv=False),
         np.linalg.svd(theirs, compute_uv=False),
         rtol=2e-3 if settings else 1e-6,
-    )
-
-
-def _keep_all_directions(free, units):
-    """Return all directions of machine and nuisance parameters."""
-    from loopcal.planning.design_space import find_observable_space
-
-    return find_observable_space(
-        units.rows, PriorInformation.from_tolerances(len(free), len(units.nuisance))
     )
 
 
@@ -319,9 +302,7 @@ def test_candidate_pairs_are_distinct_and_better_than_random_pairs():
         assert (units.members[:, 0] < units.members[:, 1]).all()
         assert len(np.unique(units.members, axis=0)) == len(units.members)
     best = [
-        choose_design(
-            u.rows, 12, D(), PriorInformation.from_tolerances(len(free)), perturbations=5
-        ).design.value
+        choose_design(make_problem(u.rows, prior=True), 12, perturbations=5).design.value
         for u in (ours, drawn)
     ]
     assert best[0] > best[1]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from loopcal.planning.constraints import (
     Violation,
     build_checker,
     list_reasons,
-    mark_on_path,
 )
 from loopcal.planning.path import check_paths, interpolate_path, locate_home, measure_distance
 from loopcal.typing import BoolArray, FloatArray
@@ -54,7 +53,7 @@ class Candidates:
     coordinates: FloatArray  # (n, c) controlled coordinates [m, rad]
     solution: Solution  # their readings and poses
     is_uniform: BoolArray  # (n,) True for those drawn evenly from the workspace, which represent it
-    excluded: Mapping[Violation, int]  # violation -> number of poses that it excluded
+    excluded: Counter[Violation]  # violation -> number of poses that it excluded
     n_drawn: int  # number of poses before exclusion
     checker: ConstraintChecker  # the constraints
 
@@ -79,7 +78,20 @@ def draw_candidates(
     rng = np.random.default_rng(seed)
     checker, bounds = _build_home_checker(robot, constraints), workspace_ranges(robot)
     excluded: Counter[Violation] = Counter()
-    inside, n_drawn = _draw_inside(checker, rng, bounds, count - count // 2, excluded)
+    wanted, batches, kept, n_drawn = count - count // 2, [], 0, 0
+    while kept < wanted:
+        number = wanted if not kept else max(wanted - kept, wanted // 10, 1)
+        poses = round_coordinates(robot, draw_coordinates(rng, robot.controlled, bounds, number))
+        check = checker.check_poses(inverse(robot, poses))
+        excluded.update(check.count_violations())
+        batches.append(poses[check.allowed])
+        kept, n_drawn = kept + len(batches[-1]), n_drawn + len(poses)
+        if n_drawn >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * n_drawn:
+            counts = {"allowed": kept, "total": n_drawn, "reasons": list_reasons(excluded)}
+            raise MechanismError(
+                report_finding("plan.workspace-excluded", robot=robot.name, **counts)
+            )
+    inside = np.concatenate(batches)
     edge = _draw_boundary(checker, rng, bounds, count // 2, inside)
     poses = np.concatenate([inside, edge])
     uniform = np.arange(len(poses)) < len(inside)
@@ -95,16 +107,11 @@ def check_listed_poses(
     checker = _build_home_checker(robot, constraints)
     poses = np.unique(poses, axis=0)
     check = checker.check_poses(inverse(robot, poses))
-    excluded: Counter[Violation] = Counter(check.count_violations())
-    good = poses[check.allowed]
+    excluded, good = check.count_violations(), poses[check.allowed]
     if not len(good):
+        counts = {"total": len(poses), "reasons": list_reasons(excluded)}
         raise MechanismError(
-            report_finding(
-                "plan.listed-poses-excluded",
-                robot=robot.name,
-                total=len(poses),
-                reasons=list_reasons(excluded),
-            )
+            report_finding("plan.listed-poses-excluded", robot=robot.name, **counts)
         )
     return _keep_reachable(checker, good, np.ones(len(good), dtype=bool), excluded, len(poses))
 
@@ -113,9 +120,7 @@ def round_coordinates(
     robot: Mechanism, coordinates: FloatArray, towards: FloatArray | None = None
 ) -> FloatArray:
     """Round coordinates (n, c) to steps that a person can type: DIGITS of the robot's size and of a
-    radian, in its units.
-
-    towards : (c,) place towards which everything is rounded; default: to the nearest.
+    radian, in its units. `towards` (c,) is the place towards which everything is rounded.
     """
     steps = []
     for name in robot.controlled:
@@ -126,10 +131,8 @@ def round_coordinates(
     counts = coordinates / np.array(steps)
     if towards is None:
         return np.round(counts) * steps
-    slack = np.where(coordinates > towards, ROUNDING, -ROUNDING)
-    return (
-        np.where(coordinates > towards, np.floor(counts + slack), np.ceil(counts + slack)) * steps
-    )
+    is_above = coordinates > towards
+    return np.where(is_above, np.floor(counts + ROUNDING), np.ceil(counts - ROUNDING)) * steps
 
 
 def _build_home_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:
@@ -142,35 +145,6 @@ def _build_home_checker(robot: Mechanism, constraints: Constraints | None) -> Co
             report_finding("plan.home-excluded", robot=robot.name, reasons=reasons)
         )
     return checker
-
-
-def _draw_inside(
-    checker: ConstraintChecker,
-    rng: np.random.Generator,
-    bounds: Mapping[str, tuple[float, float]],
-    count: int,
-    excluded: Counter[Violation],
-) -> tuple[FloatArray, int]:
-    """Draw allowed poses evenly (count, c), count the excluded; return also the number drawn."""
-    robot, batches, kept, total = checker.robot, [], 0, 0
-    while kept < count:
-        number = count if not kept else max(count - kept, count // 10, 1)
-        poses = round_coordinates(robot, draw_coordinates(rng, robot.controlled, bounds, number))
-        check = checker.check_poses(inverse(robot, poses))
-        excluded.update(check.count_violations())
-        batches.append(poses[check.allowed])
-        kept, total = kept + len(batches[-1]), total + len(poses)
-        if total >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * total:
-            raise MechanismError(
-                report_finding(
-                    "plan.workspace-excluded",
-                    robot=robot.name,
-                    allowed=kept,
-                    total=total,
-                    reasons=list_reasons(dict(excluded.most_common())),
-                )
-            )
-    return np.concatenate(batches), total
 
 
 def _draw_boundary(
@@ -187,10 +161,8 @@ def _draw_boundary(
     poses = draw_coordinates(rng, names, bounds, count)
     end = rng.random((count, len(names))) < 0.5
     put = (rng.random((count, len(names))) < ON_BOUNDARY) & ~full
-    # at least one coordinate is at an end, unless none has an end
-    put[
-        np.arange(count), rng.choice(np.flatnonzero(~full), count) if not full.all() else 0
-    ] |= not full.all()
+    if not full.all():  # at least one coordinate is at an end, unless none has an end
+        put[np.arange(count), rng.choice(np.flatnonzero(~full), count)] = True
     poses = np.where(put, np.where(end, high, low), poses)
     median = np.median(inside, axis=0)[None]
     middle = inside[np.argmin(measure_distance(robot, inside, median))]
@@ -205,15 +177,11 @@ def _draw_boundary(
         share = (good[left] + bad[left]) / 2.0
         trial = interpolate_path(robot, anchor[left], poses[left], share)
         allowed = checker.check_poses(inverse(robot, trial)).allowed
-        good[left], bad[left] = (
-            np.where(allowed, share, good[left]),
-            np.where(allowed, bad[left], share),
-        )
+        good[left[allowed]], bad[left[~allowed]] = share[allowed], share[~allowed]
     moved = interpolate_path(robot, anchor, poses, good)
     edge = np.where(good[:, None] == 1.0, poses, moved)[good > 0.0]
     # towards the middle, so that rounding does not leave the allowed region
-    edge = round_coordinates(robot, edge, middle)
-    edge = np.unique(edge, axis=0)
+    edge = np.unique(round_coordinates(robot, edge, middle), axis=0)
     return edge[checker.check_poses(inverse(robot, edge)).allowed]
 
 
@@ -226,14 +194,12 @@ def _keep_reachable(
 ) -> Candidates:
     """Return the poses that an allowed straight path connects with home."""
     robot = checker.robot
-    home = np.broadcast_to(locate_home(robot), poses.shape)
-    path = check_paths(checker, home, poses)
+    path = check_paths(checker, np.broadcast_to(locate_home(robot), poses.shape), poses)
     counts = path.count_violations()
-    excluded.update(mark_on_path(counts))
+    excluded.update({replace(why, on_path=True): count for why, count in counts.items()})
     if not path.allowed.any():
         raise MechanismError(
             report_finding("plan.home-isolated", robot=robot.name, reasons=list_reasons(counts))
         )
     kept = poses[path.allowed]
-    counted = dict(excluded.most_common())
-    return Candidates(kept, inverse(robot, kept), uniform[path.allowed], counted, n_drawn, checker)
+    return Candidates(kept, inverse(robot, kept), uniform[path.allowed], excluded, n_drawn, checker)

@@ -8,8 +8,8 @@ Many poses are checked at once; a violation is a code with numbers. Margins are 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -40,10 +40,7 @@ class LineOfSight:
     cone : half the angle within which the target is visible [rad].
     nearest, farthest : allowed distance [m].
 
-    Raises
-    ------
-    DataError
-        A vector is not finite or has no length, or an angle or a distance is out of range.
+    Raises DataError where a vector is not finite or has no length, or a number is out of range.
     """
 
     station: FloatArray
@@ -105,10 +102,7 @@ class Constraints:
         stroke, of actuators that move a length [m] and of those that turn [rad]; also required on
         paths.
 
-    Raises
-    ------
-    DataError
-        A margin or the tilt is out of range.
+    Raises DataError where a margin or the tilt is out of range.
     """
 
     min_margin: float = NEAR_SHARE
@@ -146,12 +140,7 @@ class Violation:
 
     code: str  # of the reason; worded by `violation` of `phrases.toml`
     data: tuple[tuple[str, Any], ...] = ()  # names and numbers of the reason
-    # whether it occurs on the straight path from home, not at the pose itself
-    on_path: bool = False
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return code, path flag and numbers, for a finding."""
-        return {"code": self.code, "on_path": self.on_path, **dict(self.data)}
+    on_path: bool = False  # whether it occurs on the straight path from home, not at the pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +150,9 @@ class ConstraintCheck:
     allowed: BoolArray  # (n,)
     violations: NDArray[np.object_]  # (n,) the first `Violation` of each; None where allowed
 
-    def count_violations(self) -> dict[Violation, int]:
+    def count_violations(self) -> Counter[Violation]:
         """Return how often each violation was the first, most frequent first."""
-        return dict(Counter(self.violations[~self.allowed].tolist()).most_common())
+        return Counter(dict(Counter(self.violations[~self.allowed].tolist()).most_common()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,48 +181,36 @@ class ConstraintChecker:
         robot, required = self.robot, self.constraints
         for limit in evaluate_limits(robot, robot.values[None], solution.q[None], solution.state):
             slack = ROUNDING * max(abs(limit.low), abs(limit.high))
-            yield (
-                Violation("limit-exceeded", (("limit", limit.name),)),
-                ~(limit.margin[0] >= -slack),
-            )
+            name = ("limit", limit.name)
+            yield Violation("limit-exceeded", (name,)), ~(limit.margin[0] >= -slack)
             needed = required.stroke_margin_of(limit.dimension) if limit.is_stroke else 0.0
             if needed > 0.0:
-                shown = robot.to_quantity(needed, limit.dimension)
-                yield (
-                    Violation("near-stroke-end", (("limit", limit.name), ("needed", str(shown)))),
-                    ~(limit.margin[0] >= needed - slack),
-                )
-        near = analyze_singularity(robot, solution, self.medians)
+                shown = ("needed", str(robot.to_quantity(needed, limit.dimension)))
+                is_near = ~(limit.margin[0] >= needed - slack)
+                yield Violation("near-stroke-end", (name, shown)), is_near
+        near, least = analyze_singularity(robot, solution, self.medians), required.min_margin
         yield Violation("other-mode"), ~solution.converged
-        margin = required.min_margin
-        yield (
-            Violation("near-singularity", (("min_margin", margin),)),
-            ~((near.ratio >= margin) & (near.drive_ratio >= margin)),
-        )
+        is_near = ~((near.ratio >= least) & (near.drive_ratio >= least))
+        yield Violation("near-singularity", (("min_margin", least),)), is_near
         if required.max_tilt is not None:
             T = solution.T
             tilt = np.arctan2(np.hypot(T[:, 0, 2], T[:, 1, 2]), T[:, 2, 2])
-            yield (
-                Violation(
-                    "tilt-exceeded", (("max_tilt_deg", float(np.degrees(required.max_tilt))),)
-                ),
-                ~(tilt <= required.max_tilt * (1.0 + ROUNDING)),
-            )
+            largest = ("max_tilt_deg", float(np.degrees(required.max_tilt)))
+            is_tilted = ~(tilt <= required.max_tilt * (1.0 + ROUNDING))
+            yield Violation("tilt-exceeded", (largest,)), is_tilted
         if at_pose and required.sight is not None:
             yield from required.sight.find_violations(solution.T, robot.tool)
 
 
 def build_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:
-    """Return the checker of a robot's poses; None stands for the default constraints."""
+    """Return the checker of a robot's poses; None stands for the default constraints.
+
+    Raises DataError for a margin from the ends of strokes where there is no stroke, or as large as
+    half of one.
+    """
     required = constraints or Constraints()
-    _check_stroke_margins(robot, required)
-    return ConstraintChecker(robot, required, compute_median_margins(robot))
-
-
-def _check_stroke_margins(robot: Mechanism, constraints: Constraints) -> None:
-    """Raise DataError for a margin without a stroke, or as large as half of one."""
     for dimension in (Dimension.LENGTH, Dimension.ANGLE):
-        margin = constraints.stroke_margin_of(dimension)
+        margin = required.stroke_margin_of(dimension)
         if not margin > 0.0:
             continue
         strokes = {
@@ -255,20 +232,16 @@ def _check_stroke_margins(robot: Mechanism, constraints: Constraints) -> None:
                     stroke=robot.to_quantity(strokes[name], dimension),
                 )
             )
+    return ConstraintChecker(robot, required, compute_median_margins(robot))
 
 
-def list_reasons(counts: Mapping[Violation, int]) -> tuple[dict[str, Any], ...]:
-    """Return counted violations as data of a finding, in their order."""
-    return tuple({**violation.to_dict(), "count": count} for violation, count in counts.items())
+def list_reasons(counts: Counter[Violation]) -> tuple[dict[str, Any], ...]:
+    """Return counted violations as data of a finding, most frequent first."""
+    return tuple(
+        {"code": why.code, "on_path": why.on_path, **dict(why.data), "count": count}
+        for why, count in counts.most_common()
+    )
 
-
-def mark_on_path(counts: Mapping[Violation, int]) -> dict[Violation, int]:
-    """Return counted violations as violations on the path from home."""
-    return {replace(violation, on_path=True): count for violation, count in counts.items()}
-
-
-# Options of a plan: number of poses or accuracy goal, criterion, constraints, candidates,
-# seed.
 
 # Error that a plan makes small; that of a pose counts rotations times the robot's size.
 Target = Literal["pose", "position", "orientation"]
@@ -305,10 +278,7 @@ class PlanOptions:
         curve is always computed.
     seed : of all random choices.
 
-    Raises
-    ------
-    DataError
-        Both `n_poses` and `goal` are given, or `n_candidates` is not positive.
+    Raises DataError where both `n_poses` and `goal` are given, or `n_candidates` is not positive.
     """
 
     n_poses: int | None = None

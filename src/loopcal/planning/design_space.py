@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Information of designs: prior rows, observable directions, and the factor of a chosen design.
+"""Problems of optimal design: prior, observable directions, criteria, and the scores of designs.
 
 A **group** is what is measured together: one pose, or several poses that one row compares. Its rows
 [F | A] have the nuisance parameters of the instruments (F, to be eliminated) before the unknowns of
@@ -10,6 +10,7 @@ are removed once, by a stated tolerance, for all designs alike. See docs/theory/
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -20,6 +21,35 @@ from loopcal.findings import report_finding
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+# A design is singular where it determines a direction with less than this share of the mean
+# design's information, as a ratio of standard deviations.
+SINGULAR = 1e-6
+
+
+def factor_rows(rows: FloatArray) -> FloatArray:
+    """Return the triangular factor R of rows (m, c), at most (c, c): R'R is their information."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def factor_square(rows: FloatArray) -> FloatArray:
+    """Return the factor of rows (m, c) with rows of zeros below where m < c, (c, c)."""
+    R = factor_rows(rows)
+    return np.concatenate([R, np.zeros((R.shape[1] - len(R), R.shape[1]))])
+
+
+def divide_by_factor(rows: FloatArray, R: FloatArray) -> FloatArray:
+    """Return X R^-1 for rows X (..., q) and a nonsingular triangular factor R (q, q)."""
+    from scipy.linalg.blas import dtrsm  # pyright: ignore[reportAttributeAccessIssue]
+
+    flat = rows.reshape(-1, rows.shape[-1])
+    # R' is lower triangular, and both transposes are already in the order of BLAS
+    return np.asarray(dtrsm(1.0, R.T, flat.T, lower=1).T, dtype=np.float64).reshape(rows.shape)
+
+
+def is_allowed(rows: FloatArray) -> BoolArray:
+    """Return for rows (N, r, c) of N groups which groups (N,) contain no NaN."""
+    return np.asarray(np.isfinite(rows).all(axis=(1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +72,7 @@ class PriorInformation:
         return cls(np.eye(nuisance + machine)[nuisance:], nuisance)
 
     def with_rows(self, rows: ArrayLike) -> PriorInformation:
-        """Return this with more rows (..., o + p): measured poses, or tolerances of nuisance
-        parameters.
-        """
+        """Return this with more rows (..., o + p)."""
         added = np.asarray(rows, dtype=np.float64).reshape(-1, self.rows.shape[1])
         return PriorInformation(factor_rows(np.concatenate([self.rows, added])), self.n_nuisance)
 
@@ -73,51 +101,17 @@ class ObservableSpace:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Design:
-    """A chosen set of groups."""
-
-    chosen: IntArray  # (n,) indices of the candidates, ascending
-    value: float  # of the criterion
-    history: tuple[float, ...]  # values of the best start: after it began, and after each exchange
-    values: tuple[float, ...]  # final value of each start
-    space: ObservableSpace  # the directions in which the value counts
-    # whether no single exchange improves it; False where the exchanges ran out
-    is_converged: bool = True
-
-
-def factor_rows(rows: FloatArray) -> FloatArray:
-    """Return the triangular factor R of rows (m, c), at most (c, c): R'R is their information."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
-
-
-def divide_by_factor(rows: FloatArray, R: FloatArray) -> FloatArray:
-    """Return X R^-1 for rows X (..., q) and a nonsingular triangular factor R (q, q)."""
-    from scipy.linalg.blas import dtrsm  # pyright: ignore[reportAttributeAccessIssue]
-
-    flat = rows.reshape(-1, rows.shape[-1])
-    # R' is lower triangular, and both transposes are already in the order of BLAS
-    return np.asarray(dtrsm(1.0, R.T, flat.T, lower=1).T, dtype=np.float64).reshape(rows.shape)
-
-
-def is_allowed(rows: FloatArray) -> BoolArray:
-    """Return for rows (N, r, c) of N groups which groups (N,) contain no NaN."""
-    return np.asarray(np.isfinite(rows).all(axis=(1, 2)))
-
-
 def find_observable_space(
     rows: FloatArray, prior: PriorInformation, tolerance: float = RANK_TOLERANCE
 ) -> ObservableSpace:
-    """Return the directions that all groups and the prior determine together.
+    """Return the directions that all allowed groups (N, r, o + p) and the prior determine together.
 
-    The nuisance parameters are eliminated by `loopcal.numerics.elimination`. The remainder
-    of the machine's columns is cut at `tolerance` times its largest singular value.
-
-    rows : (N, r, o + p); NaN where a group is not allowed.
+    The remainder of the machine's columns, without the nuisance parameters, is cut at `tolerance`
+    times its largest singular value.
     """
     allowed = rows[is_allowed(rows)].reshape(-1, rows.shape[-1])
     o = prior.n_nuisance
-    R = _pad_factor(factor_rows(np.concatenate([prior.rows, allowed])))
+    R = factor_square(np.concatenate([prior.rows, allowed]))
     nuisance, rest = np.zeros((0, 0)), R
     if o:
         norm = np.linalg.norm(R[:o, :o], axis=0)
@@ -130,60 +124,12 @@ def find_observable_space(
 
 
 def factor_design(rows: FloatArray, prior: PriorInformation, space: ObservableSpace) -> FloatArray:
-    """Return the factor (q, q) of a design in the machine's observable directions.
-
-    The factor covers rows (n, r, o + p) and the prior; the nuisance parameters are eliminated.
+    """Return the factor (q, q) of rows (n, r, o + p) and the prior in the machine's observable
+    directions, the nuisance parameters eliminated.
     """
     stacked = np.concatenate([prior.rows, rows.reshape(-1, rows.shape[-1])])
-    R = _pad_factor(factor_rows(space.project(stacked)))
     o = space.nuisance.shape[1]
-    return R[o:, o:]
-
-
-def require_enough(
-    n: int, rows: FloatArray, prior: PriorInformation, space: ObservableSpace, repeats: bool = True
-) -> None:
-    """Refuse a number of groups that cannot determine all directions."""
-    count = int(is_allowed(rows).sum())
-    if count == 0:
-        raise EstimationError(report_finding("plan.no-candidate-allowed", total=len(rows)))
-    if len(space) == 0:
-        raise EstimationError(report_finding("plan.no-direction-observable"))
-    if n > count and not repeats:
-        raise EstimationError(
-            report_finding("plan.too-few-candidates", requested=n, what="poses", available=count)
-        )
-    needed = count_groups_needed(rows.shape[1], prior, space)
-    if n < needed:
-        raise EstimationError(
-            report_finding(
-                "plan.design-too-small",
-                requested=n,
-                equations=n * rows.shape[1],
-                unknowns=space.n_unknowns - _prior_rank(prior, space),
-                needed=needed,
-            )
-        )
-
-
-def count_groups_needed(equations: int, prior: PriorInformation, space: ObservableSpace) -> int:
-    """Return the smallest number of groups, of `equations` rows each, that can determine all
-    directions together with the prior.
-    """
-    return max(-(-(space.n_unknowns - _prior_rank(prior, space)) // equations), 1)
-
-
-def _prior_rank(prior: PriorInformation, space: ObservableSpace) -> int:
-    """Return how many directions, nuisance and machine together, the prior determines."""
-    if not prior.rows.any():
-        return 0
-    s = np.linalg.svd(space.project(prior.rows), compute_uv=False)
-    return int(are_nonzero(s).sum())
-
-
-def _pad_factor(R: FloatArray) -> FloatArray:
-    """Return a factor (m, c) of few rows with rows of zeros below, (c, c)."""
-    return np.concatenate([R, np.zeros((max(R.shape[1] - len(R), 0), R.shape[1]))])
+    return factor_square(space.project(stacked))[o:, o:]
 
 
 # Criteria of optimal design: scalar figures of the covariance C of the machine's unknowns.
@@ -191,9 +137,8 @@ def _pad_factor(R: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class D:
-    """Log determinant of the information on the machine.
-
-    A large value means a small volume of uncertainty. The best design does not depend on scaling.
+    """Log determinant of the information on the machine: large where the volume of uncertainty is
+    small. The best design does not depend on scaling.
     """
 
     name: ClassVar[str] = "D"
@@ -239,11 +184,10 @@ def is_full_rank(singular_values: np.ndarray) -> bool:
 
 
 def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatArray) -> float:
-    """Return the value of a criterion.
+    """Return the value of a criterion; -inf for D and inf for the others where R is singular.
 
     factor : (q, q) upper triangular R; R'R is the information on the observable directions.
     machine : (p, q) these directions, orthonormal in the machine's unknowns.
-    Returns value : -inf for D and inf for the others where R is singular.
     """
     s = np.linalg.svd(factor, compute_uv=False)
     if not is_full_rank(s):
@@ -260,24 +204,104 @@ def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatA
             return float((projected**2).sum() / criterion.count)
 
 
-def compute_efficiency(criterion: Criterion, value: float, best: float, n_directions: int) -> float:
-    """Return the efficiency of a value relative to the best possible one, 0 to 1.
+@dataclass(frozen=True, eq=False)
+class DesignProblem:
+    """Groups to choose from, and what makes a choice good."""
 
-    It is (ratio of determinants)^(1 / n_directions) for D, the ratio of variances for the others.
-    """
-    if isinstance(criterion, D):
-        return float(np.exp((value - best) / n_directions))
-    return float(best / value)
+    rows: FloatArray  # (N, r, o + p) whitened and in tolerances; NaN where a group is not allowed
+    criterion: Criterion
+    prior: PriorInformation
+    repeats: bool = False  # whether a group may be measured more than once
 
+    @cached_property
+    def space(self) -> ObservableSpace:
+        """The directions in which designs are compared."""
+        return find_observable_space(self.rows, self.prior)
 
-# Score of a design in scaled coordinates, and the change of score by every swap at once.
+    @cached_property
+    def allowed(self) -> IntArray:
+        """Indices of the groups that may be chosen."""
+        return np.flatnonzero(is_allowed(self.rows))
 
-# A design is singular where it determines a direction with less than this share of the mean
-# design's information, as a ratio of standard deviations.
-SINGULAR = 1e-6
-GAIN = 1e-7  # an exchange or a move must multiply the efficiency by more than 1 + this
-# Ridge that is added to a singular start, as a ratio of standard deviations to the mean design.
-RIDGE = 1e-3
+    def evaluate(self, chosen: IntArray) -> float:
+        """Return the criterion of a design (n,)."""
+        factor = factor_design(self.rows[chosen], self.prior, self.space)
+        return evaluate_criterion(self.criterion, factor, self.space.machine)
+
+    def compare(self, value: float, best: float) -> float:
+        """Return the efficiency of a value relative to the best possible one, 0 to 1: the ratio of
+        determinants to the power 1 / q for D, the ratio of variances for the others.
+        """
+        if isinstance(self.criterion, D):
+            return float(np.exp((value - best) / len(self.space)))
+        return float(best / value)
+
+    @cached_property
+    def n_unknowns(self) -> int:
+        """Number of directions that the prior does not determine."""
+        if not self.prior.rows.any():
+            return self.space.n_unknowns
+        s = np.linalg.svd(self.space.project(self.prior.rows), compute_uv=False)
+        return self.space.n_unknowns - int(are_nonzero(s).sum())
+
+    @property
+    def n_needed(self) -> int:
+        """Smallest number of groups that can determine all directions together with the prior."""
+        return max(-(-self.n_unknowns // self.rows.shape[1]), 1)
+
+    def require_enough(self, n: int) -> None:
+        """Refuse a number of groups that cannot determine all directions."""
+        count = len(self.allowed)
+        if count == 0:
+            raise EstimationError(report_finding("plan.no-candidate-allowed", total=len(self.rows)))
+        if len(self.space) == 0:
+            raise EstimationError(report_finding("plan.no-direction-observable"))
+        if n > count and not self.repeats:
+            counts = {"requested": n, "what": "poses", "available": count}
+            raise EstimationError(report_finding("plan.too-few-candidates", **counts))
+        if n < self.n_needed:
+            raise EstimationError(
+                report_finding(
+                    "plan.design-too-small",
+                    requested=n,
+                    equations=n * self.rows.shape[1],
+                    unknowns=self.n_unknowns,
+                    needed=self.n_needed,
+                )
+            )
+
+    def build_scoring(self, n: int) -> Scoring:
+        """Return the scoring whose mean design is the prior and all groups with the weight of n."""
+        criterion, space, prior = self.criterion, self.space, self.prior
+        if isinstance(criterion, E):
+            raise EstimationError("criterion E cannot be optimized; choose D, I or A")
+        rows, weight = self.rows[self.allowed], n / len(self.allowed)
+        o, p = space.nuisance.shape
+        blocks = np.zeros((o + len(space.machine), space.n_unknowns))
+        blocks[:o, :p], blocks[o:, p:] = space.nuisance, space.machine
+        stacked = np.concatenate([prior.rows, np.sqrt(weight) * rows.reshape(-1, rows.shape[-1])])
+        reference = factor_rows(stacked @ blocks)
+        transform = divide_by_factor(blocks, reference)
+        inner, prediction = reference[p:, p:], None
+        if not isinstance(criterion, D):
+            L = (
+                criterion.weights @ space.machine / np.sqrt(criterion.count)
+                if isinstance(criterion, I)
+                else np.eye(len(space))
+            )
+            prediction = factor_rows(divide_by_factor(L, inner))
+            if not prediction.any():
+                raise EstimationError(report_finding("plan.prediction-unobservable"))
+        offset = float(2.0 * np.log(np.abs(np.diagonal(inner))).sum())
+        return Scoring(space, transform, factor_rows(prior.rows @ transform), prediction, offset)
+
+    def scale_candidates(self, n: int) -> ScaledCandidates:
+        """Return the allowed groups scaled by the mean design of n of them."""
+        self.require_enough(n)
+        scoring = self.build_scoring(n)
+        return ScaledCandidates(
+            self, scoring, scoring.scale_rows(self.rows[self.allowed]), self.allowed
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,17 +330,12 @@ class Scoring:
         folded to Q.
         """
         scaled = rows @ self.transform
-        return (
-            scaled
-            if scaled.shape[-2] <= scaled.shape[-1]
-            else np.asarray(np.linalg.qr(scaled, mode="r"))
-        )
+        return scaled if scaled.shape[-2] <= scaled.shape[-1] else factor_rows(scaled)
 
     def factor(self, scaled: FloatArray) -> FloatArray:
-        """Return R (Q, Q) of the prior and scaled rows (..., Q), padded with rows of zeros."""
+        """Return R (Q, Q) of the prior and scaled rows (..., Q)."""
         columns = self.prior_rows.shape[1]
-        R = factor_rows(np.concatenate([self.prior_rows, scaled.reshape(-1, columns)]))
-        return np.concatenate([R, np.zeros((columns - len(R), columns))])
+        return factor_square(np.concatenate([self.prior_rows, scaled.reshape(-1, columns)]))
 
     def score(self, R: FloatArray) -> float:
         """Return the score of a factor; -inf where it is singular."""
@@ -347,51 +366,22 @@ def is_determined(R: FloatArray) -> bool:
     return bool(np.linalg.svd(R, compute_uv=False)[-1] > SINGULAR)
 
 
-def build_scoring(
-    rows: FloatArray,
-    weight: float,
-    criterion: Criterion,
-    prior: PriorInformation,
-    space: ObservableSpace,
-) -> Scoring:
-    """Return the scoring whose mean design is the prior and every group with the same weight.
-
-    rows : (N, r, o + p), finite. weight : of each group.
-    """
-    if isinstance(criterion, E):
-        raise EstimationError("criterion E cannot be optimized; choose D, I or A")
-    o, p = space.nuisance.shape
-    blocks = np.zeros((o + len(space.machine), space.n_unknowns))
-    blocks[:o, :p], blocks[o:, p:] = space.nuisance, space.machine
-    stacked = np.concatenate([prior.rows, np.sqrt(weight) * rows.reshape(-1, rows.shape[-1])])
-    reference = factor_rows(stacked @ blocks)
-    transform = divide_by_factor(blocks, reference)
-    inner, prediction = reference[p:, p:], None
-    if not isinstance(criterion, D):
-        L = (
-            criterion.weights @ space.machine / np.sqrt(criterion.count)
-            if isinstance(criterion, I)
-            else np.eye(len(space))
-        )
-        prediction = factor_rows(divide_by_factor(L, inner))
-        if not prediction.any():
-            raise EstimationError(report_finding("plan.prediction-unobservable"))
-    offset = float(2.0 * np.log(np.abs(np.diagonal(inner))).sum())
-    prior_rows = factor_rows(prior.rows @ transform)
-    return Scoring(space, transform, prior_rows, prediction, offset)
-
-
 @dataclass(frozen=True, eq=False)
 class ScaledCandidates:
     """The allowed groups of a problem in the coordinates of its scoring."""
 
+    problem: DesignProblem
     scoring: Scoring  # of designs
     rows: FloatArray  # (N, r, Q) scaled
     indices: IntArray  # (N,) of the groups among all
-    repeats: bool  # whether a group may be chosen more than once
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    @property
+    def repeats(self) -> bool:
+        """Whether a group may be chosen more than once."""
+        return self.problem.repeats
 
     def take(self, chosen: IntArray) -> ScaledCandidates:
         """Return some of the groups."""
@@ -406,15 +396,7 @@ class ScaledCandidates:
         return is_determined(self.factor(chosen))
 
 
-def scale_candidates(
-    rows: FloatArray, n: int, criterion: Criterion, prior: PriorInformation, repeats: bool
-) -> ScaledCandidates:
-    """Return the allowed groups scaled by the mean design of n of them."""
-    space = find_observable_space(rows, prior)
-    require_enough(n, rows, prior, space, repeats)
-    usable = np.flatnonzero(is_allowed(rows))
-    scoring = build_scoring(rows[usable], n / len(usable), criterion, prior, space)
-    return ScaledCandidates(scoring, scoring.scale_rows(rows[usable]), usable, repeats)
+# The change of score by every swap at once.
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,9 +420,8 @@ def compute_swap_terms(scoring: Scoring, R: FloatArray, scaled: FloatArray) -> S
         return _determinant_terms(Y, scoring.n_nuisance)
     P = scoring.predict(R)
     V = Y[:, :, scoring.n_nuisance :] @ P.T
-    base = _determinant_terms(Y, 0)
     gram = V @ V.swapaxes(1, 2)
-    return replace(base, V=V, gram=gram, trace=float((P**2).sum()))
+    return replace(_determinant_terms(Y, 0), V=V, gram=gram, trace=float((P**2).sum()))
 
 
 def _determinant_terms(Y: FloatArray, n_nuisance: int) -> SwapTerms:
@@ -463,8 +444,7 @@ def score_additions(terms: SwapTerms) -> FloatArray:
 
 
 def score_swaps(terms: SwapTerms, j: int) -> FloatArray:
-    """Return the change of score (N,) when each group replaces group j, which is in the design.
-
+    """Return the change of score (N,) when each group replaces group j, which is in the design;
     -inf where the new design is singular.
     """
     Y = terms.Y[j]

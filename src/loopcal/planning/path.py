@@ -15,6 +15,7 @@ plan. Where no straight path is allowed between two poses, the path goes via hom
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,7 @@ from loopcal.planning.constraints import (
     Constraints,
     Violation,
     build_checker,
+    list_reasons,
 )
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -87,48 +89,34 @@ def measure_distance(robot: Mechanism, start: FloatArray, end: FloatArray) -> Fl
 def check_paths(
     checker: ConstraintChecker, start: FloatArray, end: FloatArray, steps: int = STEPS
 ) -> ConstraintCheck:
-    """Check straight paths from start (n, c) to end (n, c), both ends included.
-
-    The line of sight is not required on a path.
+    """Check straight paths from start (n, c) to end (n, c), both ends included, but for the line of
+    sight.
 
     steps : of a path as long as the robot's size; longer paths get more, every path at least 4.
     """
     robot, n = checker.robot, len(start)
-    allowed, violations = np.ones(n, dtype=bool), np.full(n, None, dtype=object)
-    order = np.argsort(measure_distance(robot, start, end), kind="stable")
-    for first in range(0, n, AT_ONCE):
-        rows = order[first : first + AT_ONCE]
-        check = _check_similar_paths(checker, start[rows], end[rows], steps)
-        allowed[rows], violations[rows] = check.allowed, check.violations
-    return ConstraintCheck(allowed, violations)
-
-
-def _check_similar_paths(
-    checker: ConstraintChecker, start: FloatArray, end: FloatArray, steps: int
-) -> ConstraintCheck:
-    """Check paths of similar length, all in the same number of steps."""
-    robot = checker.robot
-    longest = float(measure_distance(robot, start, end).max(initial=0.0)) / robot.size
-    count = max(int(np.ceil(steps * longest)), 4)
-    solution = inverse(robot, start)
-    check = checker.check_poses(solution, at_pose=False)
-    violations = np.array(check.violations)
-    left = np.flatnonzero(check.allowed)
-    solution = solution.take(left)
-    for i in range(1, count + 1):
-        if not len(left):
-            break
-        point = interpolate_path(robot, start[left], end[left], i / count)
-        solution = inverse(robot, point, solution)
-        step = checker.check_poses(solution, at_pose=False)
-        violations[left] = step.violations
-        left, solution = left[step.allowed], solution.take(step.allowed)
-    if len(left):
-        scale = np.array(
-            [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
-        )
-        difference = np.abs(solution.q - inverse(robot, end[left]).q) / scale
-        violations[left[~(difference <= BRANCH).all(axis=1)]] = Violation("branch-changed")
+    violations = np.full(n, None, dtype=object)
+    distance = measure_distance(robot, start, end)
+    order = np.argsort(distance, kind="stable")
+    scale = np.array(
+        [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
+    )
+    for first in range(0, n, AT_ONCE):  # paths of similar length, in the same number of steps
+        left = order[first : first + AT_ONCE]
+        count = max(int(np.ceil(steps * (float(distance[left].max()) / robot.size))), 4)
+        solution = inverse(robot, start[left])
+        for i in range(count + 1):
+            if i:
+                point = interpolate_path(robot, start[left], end[left], i / count)
+                solution = inverse(robot, point, solution)
+            step = checker.check_poses(solution, at_pose=False)
+            violations[left] = step.violations
+            left, solution = left[step.allowed], solution.take(step.allowed)
+            if not len(left):
+                break
+        else:
+            difference = np.abs(solution.q - inverse(robot, end[left]).q) / scale
+            violations[left[~(difference <= BRANCH).all(axis=1)]] = Violation("branch-changed")
     allowed = np.array([violation is None for violation in violations], dtype=bool)
     return ConstraintCheck(allowed, violations)
 
@@ -153,10 +141,7 @@ class VisitingOrder:
 
 
 def order_poses(checker: ConstraintChecker, poses: FloatArray) -> VisitingOrder:
-    """Return a short order of poses (n, c) [m, rad] that straight paths connect with home.
-
-    See `draw_candidates` for these paths.
-    """
+    """Return a short order of poses (n, c) [m, rad] that straight paths connect with home."""
     robot, n = checker.robot, len(poses)
     home = np.broadcast_to(locate_home(robot), poses.shape)
     from_home = measure_distance(robot, home, poses)
@@ -193,7 +178,11 @@ def find_short_order(cost: FloatArray, from_home: FloatArray) -> tuple[IntArray,
     whole[1:, 1:], whole[0, 1:], whole[1:, 0] = cost, from_home, from_home
     best: tuple[IntArray, float, bool] | None = None
     for first in np.argsort(from_home, kind="stable")[:FIRST_POSES]:
-        tour, is_converged = _reverse_sections(whole, _visit_nearest(whole, int(first) + 1))
+        tour, left = [0, int(first) + 1], set(range(1, n + 1)) - {int(first) + 1}
+        while left:  # to the nearest pose left
+            tour.append(min(left, key=lambda i: (whole[tour[-1], i], i)))
+            left.remove(tour[-1])
+        tour, is_converged = _reverse_sections(whole, np.array(tour))
         length = float(whole[tour[:-1], tour[1:]].sum())
         if best is None or length < best[1] * (1.0 - LEAST_GAIN):
             best = (tour[1:] - 1, length, is_converged)
@@ -201,22 +190,10 @@ def find_short_order(cost: FloatArray, from_home: FloatArray) -> tuple[IntArray,
     return best
 
 
-def _visit_nearest(cost: FloatArray, first: int) -> IntArray:
-    """Return the tour from home (0) to `first` and then always to the nearest pose left."""
-    tour, left = [0, first], set(range(1, len(cost))) - {first}
-    while left:
-        tour.append(min(left, key=lambda i: (cost[tour[-1], i], i)))
-        left.remove(tour[-1])
-    return np.array(tour)
-
-
 def _reverse_sections(cost: FloatArray, tour: IntArray) -> tuple[IntArray, bool]:
     """Return the tour after reversing the section that shortens it most, until none does, and
-    whether none does.
-
-    The end is free, the beginning is not.
+    whether none does. The end is free, the beginning is not.
     """
-    tour = np.array(tour)
     m = len(tour)
     if m <= 2:
         return tour, True
@@ -237,9 +214,6 @@ def _reverse_sections(cost: FloatArray, tour: IntArray) -> tuple[IntArray, bool]
     return tour, False
 
 
-# Check a given order of stops: from home through all of them and back, straight in between.
-
-
 def check_route(robot: Mechanism, labels: tuple[str, ...], coordinates: FloatArray) -> FloatArray:
     """Return home (c,) [m, rad], after a check of the route from there through all stops and back.
 
@@ -254,7 +228,7 @@ def check_route(robot: Mechanism, labels: tuple[str, ...], coordinates: FloatArr
     if not check.allowed.all():
         i = int(np.flatnonzero(~check.allowed)[0])
         names = ("home", *labels, "home")
-        reasons = ({**check.violations[i].to_dict(), "count": 1},)
+        reasons = list_reasons(Counter([check.violations[i]]))
         raise MechanismError(
             report_finding("plan.route-blocked", first=names[i], last=names[i + 1], reasons=reasons)
         )

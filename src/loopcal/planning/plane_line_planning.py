@@ -9,10 +9,10 @@ and docs/theory/planning.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -37,12 +37,6 @@ from loopcal.results.description import Field
 from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
-if TYPE_CHECKING:
-    pass
-
-
-# Groups of poses whose points lie on a plane and on a line perpendicular to it, as candidates.
-
 AXIS = 3  # column of the axis in a design
 # Levels of every coordinate, in half ranges from the middle of the workspace.
 LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -52,28 +46,26 @@ SHORTEST = 0.25
 # Groups out of reach are drawn anew in a workspace smaller by this factor, so many times.
 SHRINKAGE, ROUNDS = 0.85, 12
 SURFACE = 5  # nuisance parameters of a group: two rotations, a height, two shifts
+SWEEPS = 3  # sweeps over all coordinates: one more gains a few per cent
+# Points of a group that give no information on the machine: k + 3 rows, less five nuisance
+# parameters of the surfaces.
+SPENT = 2
+DRAWN = 20  # groups drawn for each that is needed before the constraints are said to exclude all
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneLineGroups:
-    """All groups of one size: their designs, their points, and their rows.
+    """Groups of poses whose points lie on a plane and on a line perpendicular to it.
 
     A design of u groups is (u, c): fractions of the half ranges of the workspace, from -1 to 1,
     except for the axis, which is 0, 1 or 2.
-
-    robot : moves in x, y and z, and states a workspace.
-    points : k, at least 4. sigma : of a held coordinate [m].
-    axes : along which lines may run.
-    shortest : least length of a line, in half ranges; a line of no length is none.
-    Raises EstimationError: too few points for a plane, no axis, or a robot that cannot move in x,
-        y and z. Raises MechanismError: the robot states no range for a coordinate.
     """
 
-    robot: Mechanism
-    points: int
-    sigma: float
-    axes: tuple[str, ...] = POSITION
-    shortest: float = SHORTEST
+    robot: Mechanism  # moves in x, y and z, and states a workspace
+    points: int  # k of a group, at least 4
+    sigma: float  # of a held coordinate [m]
+    axes: tuple[str, ...] = POSITION  # along which lines may run
+    shortest: float = SHORTEST  # least length of a line, in half ranges
 
     def __post_init__(self) -> None:
         if self.points < 4:
@@ -106,36 +98,30 @@ class PlaneLineGroups:
         """The m controlled coordinates that do not place the point."""
         return tuple(name for name in self.robot.controlled if name not in POSITION)
 
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the c coordinates of a design."""
-        turns = self.orientation_names
-        names = [*(f"p0.{n}" for n in POSITION), "axis", *(f"p0.{n}" for n in turns)]
-        names += ["p1.along", *(f"p1.{n}" for n in turns)]
-        for i in range(2, self.points):
-            names += [f"p{i}.a", f"p{i}.b", *(f"p{i}.{n}" for n in turns)]
-        return tuple(names)
+    @property
+    def n_coordinates(self) -> int:
+        """Number c of coordinates of a design: the place of p0, the axis, the place of p1 along it,
+        two in the plane for each other point, and the orientation at each point.
+        """
+        return 5 + 2 * (self.points - 2) + self.points * len(self.orientation_names)
 
-    def list_levels(self, fractions: Sequence[float] = LEVELS) -> tuple[FloatArray, ...]:
+    def list_levels(self) -> tuple[FloatArray, ...]:
         """Return the levels to try, coordinate by coordinate."""
-        axis = np.array([POSITION.index(name) for name in self.axes], dtype=np.float64)
-        return tuple(
-            axis if name == "axis" else np.asarray(fractions, dtype=np.float64)
-            for name in self.names
-        )
+        levels = [np.array(LEVELS)] * self.n_coordinates
+        levels[AXIS] = np.array([POSITION.index(name) for name in self.axes], dtype=np.float64)
+        return tuple(levels)
 
     def draw(self, groups: int, seed: int | np.random.Generator = 0) -> FloatArray:
         """Draw a design (u, c): points and orientations anywhere in the workspace, each line along
-        any of the axes.
+        any of the axes and long enough.
 
-        Lines are drawn long enough. Groups with a pose out of reach are drawn anew, nearer and
-        nearer to the middle.
+        Groups with a pose out of reach are drawn anew, nearer and nearer to the middle.
         """
         rng = np.random.default_rng(seed)
-        design, left = np.zeros((groups, len(self.names))), np.arange(groups)
+        design, left = np.zeros((groups, self.n_coordinates)), np.arange(groups)
         for i in range(ROUNDS):
             half = SHRINKAGE**i
-            new = rng.uniform(-half, half, (len(left), len(self.names)))
+            new = rng.uniform(-half, half, (len(left), self.n_coordinates))
             new[:, AXIS] = rng.choice(self.list_levels()[AXIS], len(left))
             new[:, 4 + len(self.orientation_names)] = self._draw_line_ends(new, half, rng)
             design[left] = new
@@ -151,8 +137,7 @@ class PlaneLineGroups:
         points of designs (u, c).
         """
         u, k, m = len(design), self.points, len(self.orientation_names)
-        each = np.arange(u)
-        axis = self._axis(design)
+        each, axis = np.arange(u), list_axes(design)
         place = np.repeat(design[:, None, :3], k, axis=1)
         turn = np.empty((u, k, m))
         turn[:, 0] = design[:, 4 : 4 + m]
@@ -175,53 +160,41 @@ class PlaneLineGroups:
         return x
 
     def linearize(self, design: FloatArray, checker: ConstraintChecker | None = None) -> FloatArray:
-        """Return the rows of groups for the machine, the surfaces eliminated.
+        """Return the rows (u, k - 2, p) of groups (u, c) for the machine, the surfaces eliminated.
 
-        design : (u, c). checker : further constraints on the poses.
-        Returns rows : (u, k - 2, p) divided by sigma, by deviations in tolerances; NaN for a group
-            with a pose that is out of reach or not allowed, too short a line, or points that do
-            not determine the surfaces.
+        They are divided by sigma, by deviations in tolerances; NaN for a group with a pose that is
+        out of reach or not allowed, too short a line, or points that do not determine the surfaces.
+
+        checker : further constraints on the poses.
         """
         x = self.place_points(design)
         different, back = np.unique(x.reshape(-1, x.shape[2]), axis=0, return_inverse=True)
-        T, J, reached = self._linearize_points(different, checker)
-        back = back.reshape(x.shape[:2])
-        points = (T[:, :3, :3] @ self.robot.tool[:3, 3] + T[:, :3, 3])[back]
-        F, A = linearize_surfaces(points, J[back], self._axis(design))
-        rows, determined = eliminate_surfaces(F, A)
-        allowed = determined & reached[back].all(axis=1)
-        allowed &= self._line_length(design) >= self.shortest
-        return np.where(allowed[:, None, None], rows / self.sigma, np.nan)
-
-    def _axis(self, design: FloatArray) -> IntArray:
-        return np.rint(design[:, AXIS]).astype(np.int64)
+        origins, J, reached = self.linearize_points(different, checker)
+        back, axis = back.reshape(x.shape[:2]), list_axes(design)
+        F, A = linearize_surfaces(origins[back], J[back], axis)
+        done = eliminate_columns(np.concatenate([F, A], axis=2), SURFACE)
+        end, foot = design[:, 4 + len(self.orientation_names)], design[np.arange(len(design)), axis]
+        allowed = (done.rank == SURFACE) & reached[back].all(axis=1)
+        allowed &= np.abs(end - foot) >= self.shortest
+        return np.where(allowed[:, None, None], done.rest[:, SURFACE:] / self.sigma, np.nan)
 
     def _draw_line_ends(
         self, design: FloatArray, half: float, rng: np.random.Generator
     ) -> FloatArray:
         """Draw the ends of lines (u,), evenly from what is `shortest` or more from p_0 and within
-        `half` of the middle.
-
-        Where nothing is, because `half` is small, the line has its least length.
+        `half` of the middle; if nothing is, the line has its least length.
         """
-        foot, limit = (
-            design[np.arange(len(design)), self._axis(design)],
-            min(max(half, self.shortest), 1.0),
-        )
+        foot = design[np.arange(len(design)), list_axes(design)]
+        limit = min(max(half, self.shortest), 1.0)
         below = np.maximum(limit + foot - self.shortest, 0.0)
         above = np.maximum(limit - foot - self.shortest, 0.0)
         share = rng.uniform(0.0, 1.0, len(design)) * (below + above)
         return np.where(share < below, share - limit, limit - (below + above) + share)
 
-    def _line_length(self, design: FloatArray) -> FloatArray:
-        """Return the length (u,) of the lines in half ranges."""
-        end = design[:, 4 + len(self.orientation_names)]
-        return np.abs(end - design[np.arange(len(design)), self._axis(design)])
-
-    def _linearize_points(
+    def linearize_points(
         self, x: FloatArray, checker: ConstraintChecker | None = None
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return poses (n, 4, 4), derivatives (n, 3, p) of the origin of the tool by deviations in
+        """Return the origins (n, 3) of the tool [m], their derivatives (n, 3, p) by deviations in
         tolerances, and which rows of x (n, c) are reached and allowed.
         """
         robot, free, values = self.robot, self.free, self.robot.values[None]
@@ -237,19 +210,22 @@ class PlaneLineGroups:
         T = np.where(reached[:, None, None], solution.T, np.eye(4))
         D = np.where(reached[:, None, None], D * free.tolerance, 0.0)
         arm = T[:, :3, :3] @ robot.tool[:3, 3]
-        return T, D[:, 3:] - geometry.hat(arm) @ D[:, :3], reached
+        return arm + T[:, :3, 3], D[:, 3:] - geometry.hat(arm) @ D[:, :3], reached
+
+
+def list_axes(design: FloatArray) -> IntArray:
+    """Return the axes (u,) of the lines of a design: 0, 1 or 2."""
+    return np.rint(design[:, AXIS]).astype(np.int64)
 
 
 def linearize_surfaces(
     points: FloatArray, J: FloatArray, axis: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rows of groups by the parameters of the surfaces and of the machine.
+    """Return rows of groups: four of the line, then those of the plane.
 
-    The four rows of the line come first, then those of the plane.
-
-    points : (u, k, 3) [m]. J : (u, k, 3, p) their derivatives. axis : (u,) 0, 1 or 2, along which
-        the lines run.
-    Returns F : (u, k + 3, 5) by two rotations, height and two shifts. A : (u, k + 3, p).
+    points : (u, k, 3) [m]. J : (u, k, 3, p) their derivatives. axis : (u,) of the lines.
+    Returns F : (u, k + 3, 5) by two rotations, height and two shifts. A : (u, k + 3, p) by the
+        machine.
     """
     u, k = points.shape[:2]
     each = np.arange(u)
@@ -268,22 +244,11 @@ def linearize_surfaces(
     return F, A
 
 
-def eliminate_surfaces(F: FloatArray, A: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return rows A (u, m, p) projected onto the complement of F (u, m, 5), and where F has full
-    rank: (u, m - 5, p) and (u,).
-    """
-    done = eliminate_columns(np.concatenate([F, A], axis=2), SURFACE)
-    return done.rest[:, SURFACE:], done.rank == SURFACE
-
-
-# What an instrument measures at groups of points on planes and perpendicular lines: the kinds
-# `plane` and `line`, whose surfaces are unknown and shared by each group.
-
-
 def make_plane_line_instrument(
     robot: Mechanism, axis: IntArray, points: IntArray, make_noise: Callable[[str, int], Noise]
 ) -> Instrument:
-    """Return a plane and a line along each axis that is used, unknown in each group.
+    """Return an instrument that measures a plane and a line along each axis that is used, unknown
+    in each group.
 
     axis : (u,) 0, 1 or 2, along which the line of each group runs.
     points : (u, k) poses of each group: first the point on plane and line, then the other one on
@@ -310,19 +275,10 @@ def make_plane_line_instrument(
 
 
 def find_line_axes(robot: Mechanism, coordinates: FloatArray, groups: int) -> IntArray:
-    """Return the axes (u,) of the lines of points with coordinates (n, c) [m, rad], group
-    after group.
-    """
+    """Return the axes (u,) of the lines of points (n, c) [m, rad], group after group."""
     T = pose_from_coordinates(coordinates, robot.controlled, robot.home) @ robot.tool
     points = T[:, :3, 3].reshape(groups, -1, 3)
     return np.asarray(np.abs(points[:, 1] - points[:, 0]).argmax(axis=1))
-
-
-SWEEPS = 3  # sweeps over all coordinates: one more gains a few per cent
-# Points of a group that give no information on the machine: k + 3 rows, less five nuisance
-# parameters of the surfaces.
-SPENT = 2
-DRAWN = 20  # groups drawn for each that is needed before the constraints are said to exclude all
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,40 +353,23 @@ class SurfacePlan(DrawnResult):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Everything that the plan reports."""
-        u, k = self.poses.groups.shape
-        few = () if self.rank == self.possible else (self._report_few_groups(),)
-        exhausted = report_finding("plan.sweeps-exhausted", sweeps=SWEEPS)
-        return (
+        (u, k), rank = self.poses.groups.shape, self.rank
+        size = {"groups": u, "points": k}
+        sd: dict[str, Any] = {"sd_first": self.sd_first, "sd_last": self.sd_last}
+        via_home = int(self.poses.via_home.sum())
+        found = [
             report_finding(
-                "plan.surfaces",
-                robot=self.robot.name,
-                groups=u,
-                points=k,
-                poses=u * k,
-                via_home=int(self.poses.via_home.sum()),
+                "plan.surfaces", robot=self.robot.name, poses=u * k, via_home=via_home, **size
             ),
-            report_finding(
-                "plan.surface-information",
-                rank=self.rank,
-                sd_first=self.sd_first,
-                sd_last=self.sd_last,
-            ),
-            *few,
-            *(() if self.is_converged else (exhausted,)),
-            report_finding("plan.readings-are-measured"),
-        )
-
-    def _report_few_groups(self) -> Finding:
-        """Return that the groups give fewer equations than could be determined."""
-        u, k = self.poses.groups.shape
-        return report_finding(
-            "plan.few-groups",
-            groups=u,
-            points=k,
-            equations=self.rank,
-            rank=self.possible,
-            needed=-(-self.possible // (k - SPENT)),
-        )
+            report_finding("plan.surface-information", rank=rank, **sd),
+        ]
+        if rank != self.possible:
+            needed = -(-self.possible // (k - SPENT))
+            numbers = {"equations": rank, "rank": self.possible, "needed": needed}
+            found.append(report_finding("plan.few-groups", **size, **numbers))
+        if not self.is_converged:
+            found.append(report_finding("plan.sweeps-exhausted", sweeps=SWEEPS))
+        return (*found, report_finding("plan.readings-are-measured"))
 
     def __repr__(self) -> str:
         u, k = self.poses.groups.shape
@@ -502,7 +441,7 @@ def plan_surfaces(
         options,
         poses,
         positions,
-        np.rint(best.design[:, AXIS]).astype(np.int64),
+        list_axes(best.design),
         rank,
         possible,
         _rms_sd(rows[: options.groups], rank),
@@ -523,7 +462,7 @@ def improve_groups(
     0 sweeps they stay.
 
     is_complete : whether so many groups determine all that such groups can determine; otherwise the
-        tolerances take part. checker : further constraints on the poses.
+        tolerances take part.
     """
     count = len(groups.free)
     return coordinate_exchange(
@@ -560,9 +499,8 @@ def _arrange_points(
 def _draw_allowed(
     groups: PlaneLineGroups, checker: ConstraintChecker, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw groups that satisfy the constraints: at least `count`, and enough to find the rank.
-
-    Returns design : (u, c). rows : (u, k - 2, p).
+    """Draw groups (u, c) that satisfy the constraints: at least `count`, and enough to find the
+    rank. Returns also their rows (u, k - 2, p).
     """
     enough = max(count, -(-len(groups.free) // (groups.points - SPENT)))
     designs: list[FloatArray] = []

@@ -37,7 +37,6 @@ from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parame
 from loopcal.measure.observations import Observations
 from loopcal.measure.readings import list_sensed_joints, make_readings_kind, resolve_reading_sigma
 from loopcal.mechanism.kinematics import forward_trials
-from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.numerics.elimination import eliminate_columns, eliminate_from_factor
 from loopcal.planning.design_space import (
@@ -47,76 +46,6 @@ from loopcal.planning.design_space import (
     is_allowed,
 )
 from loopcal.typing import FloatArray, IntArray
-
-# Rows of pose groups of a machine with redundant actuators, whose readings are measurements,
-# too.
-
-
-def add_redundant_readings(instrument: Instrument, robot: Mechanism) -> Instrument | None:
-    """Return the instrument with the readings of redundant actuators as one more sensor.
-
-    None where the robot has none, or states no sigma of its readings.
-    """
-    if robot.program.sigma is None or resolve_reading_sigma(robot, None, 1) is None:
-        return None
-    readings = Sensor(make_readings_kind(robot), Gaussian(robot.stated_sigma))
-    return Instrument((*instrument.sensors, readings))
-
-
-def observe_groups(
-    free: FreeParameters, readings: FloatArray, joints: Iterable[str], size: int
-) -> ObservedPoses:
-    """Return poses of groups of `size` poses each, with their freedoms as further parameters.
-
-    readings : (N size, a) of the groups, one after the other. joints : names of joints that kinds
-        look at.
-    Returns Poses with p + size m columns: behind those of the machine are the m freedoms of the
-        first pose of the group, then of the second.
-    """
-    names = tuple(dict.fromkeys([*joints, *(a.name for a in free.robot.actuators)]))
-    values = free.robot.values[None]
-    coordinates = TwistCoordinates(free, names)
-    state = forward_trials(free.robot, values, readings[None])
-    begin, numbers = PoseStates(state, readings[None]), np.arange(len(readings))
-    closed = coordinates.close(values, numbers, begin, follow=True)
-    poses = coordinates.linearize(values, closed, numbers)
-    assert poses.by_coordinates is not None
-    place = np.arange(len(readings)) % size
-    slopes: Mapping[str, FloatArray] = {
-        name: _append_freedoms(
-            poses.joints_by_parameters[name], poses.joints_by_coordinates[name], place, size
-        )
-        for name in names
-    }
-    by_parameters = _append_freedoms(poses.by_parameters, poses.by_coordinates, place, size)
-    extended = replace(poses, by_parameters=by_parameters, joints_by_parameters=slopes)
-    return ObservedPoses(free, closed.q[0], extended)
-
-
-def _append_freedoms(
-    by_parameters: FloatArray, by_freedoms: FloatArray, place: np.ndarray, size: int
-) -> FloatArray:
-    """Return derivatives (1, n, .., p + size m): those by the m freedoms of a pose are at its place
-    (n,) in the group, and zero at the places of the others.
-    """
-    is_own = place[:, None] == np.arange(size)
-    own = is_own.reshape(1, len(place), *[1] * (by_freedoms.ndim - 3), size, 1)
-    spread = by_freedoms[..., None, :] * own
-    return np.concatenate([by_parameters, spread.reshape(*by_freedoms.shape[:-1], -1)], axis=-1)
-
-
-def eliminate_freedoms(rows: FloatArray, count: int) -> FloatArray:
-    """Return what is left of the rows (N, r, c) of groups without their last `count` columns.
-
-    (N, r - count, c - count) where the rows determine the freedoms of every pose, as redundant
-    readings do; else (N, r, c - count).
-    """
-    kept, freedoms = np.split(rows, [rows.shape[2] - count], axis=2)
-    nothing = np.zeros((*rows.shape[:2], 1))  # residuals, which a plan does not have
-    done = eliminate_columns(np.concatenate([freedoms, kept, nothing], axis=2), count)
-    first = count if done.is_observable.all() else 0
-    return done.rest[:, first:, :-1]
-
 
 BLOCK = 256  # groups whose rows are computed at once
 MOST = 5000  # largest number of candidate combinations: as many rows are computed in some seconds
@@ -137,16 +66,66 @@ class GroupRows:
     # on the choice of poses
     nuisance_prior: FloatArray
 
+    def fold(self) -> tuple[FloatArray, int]:
+        """Return the factor (1, p + 1, p + 1) of all that could be measured, without tolerances of
+        the machine and the nuisance parameters eliminated, and the number of its rows.
+        """
+        width = self.rows.shape[2]
+        allowed = self.rows[is_allowed(self.rows)].reshape(-1, width)
+        flat = np.concatenate([allowed, self.nuisance_prior])
+        factor = engine.fold(empty_factor(1, width), with_zeros(flat))
+        return eliminate_from_factor(factor, len(self.nuisance)), len(flat)
+
+
+def with_zeros(rows: FloatArray) -> FloatArray:
+    """Return rows (m, c) with residuals of zero, which a plan does not have, (1, m, c + 1)."""
+    return np.concatenate([rows, np.zeros((len(rows), 1))], axis=1)[None]
+
+
+def _observe_groups(
+    free: FreeParameters, readings: FloatArray, joints: Iterable[str], size: int
+) -> ObservedPoses:
+    """Return poses of groups of `size` poses each, for a machine with redundant actuators, whose
+    readings are measurements, too.
+
+    readings : (N size, a) of the groups, one after the other. joints : names of joints that kinds
+        look at.
+    The columns of the machine are followed by the m freedoms of the first pose of the group, then
+    of the second: p + size m in all.
+    """
+    names = tuple(dict.fromkeys([*joints, *(a.name for a in free.robot.actuators)]))
+    values = free.robot.values[None]
+    coordinates = TwistCoordinates(free, names)
+    state = forward_trials(free.robot, values, readings[None])
+    begin, numbers = PoseStates(state, readings[None]), np.arange(len(readings))
+    closed = coordinates.close(values, numbers, begin, follow=True)
+    poses = coordinates.linearize(values, closed, numbers)
+    assert poses.by_coordinates is not None
+    is_own = (numbers % size)[:, None] == np.arange(size)  # the place of each pose in its group
+
+    def append_freedoms(by_parameters: FloatArray, by_freedoms: FloatArray) -> FloatArray:
+        """Return derivatives (1, n, .., p + size m): those by the m freedoms of a pose are at its
+        place in the group, and zero at the places of the others.
+        """
+        own = is_own.reshape(1, len(readings), *[1] * (by_freedoms.ndim - 3), size, 1)
+        spread = by_freedoms[..., None, :] * own
+        return np.concatenate([by_parameters, spread.reshape(*by_freedoms.shape[:-1], -1)], axis=-1)
+
+    slopes: Mapping[str, FloatArray] = {
+        name: append_freedoms(poses.joints_by_parameters[name], poses.joints_by_coordinates[name])
+        for name in names
+    }
+    by_parameters = append_freedoms(poses.by_parameters, poses.by_coordinates)
+    extended = replace(poses, by_parameters=by_parameters, joints_by_parameters=slopes)
+    return ObservedPoses(free, closed.q[0], extended)
+
 
 def linearize_candidate_groups(
     free: FreeParameters, instrument: Instrument, readings: FloatArray, rng: np.random.Generator
 ) -> GroupRows:
-    """Return the rows of all groups that a plan may choose from.
+    """Return the rows of all groups that a plan may choose from, at readings (n, a) of all poses.
 
-    Where the instrument compares poses and there are too many combinations, half of the groups are
-    drawn and half are made of the most informative poses.
-
-    readings : (n, a) of the candidate poses [m, rad].
+    Of too many combinations, half are drawn and half made of the most informative poses.
     """
     n, k = len(readings), count_poses_per_group(instrument)
     most = MOST if k == 1 or comb(n, k) <= MOST else MOST // 2
@@ -193,12 +172,11 @@ def linearize_groups(
 def combine_prior(
     free: FreeParameters, groups: GroupRows, measured: FloatArray | None = None
 ) -> PriorInformation:
-    """Return the information before the first new pose: tolerances and earlier measurements.
+    """Return the information before the first new pose: stated tolerances of the robot and of the
+    instrument, and earlier measurements.
 
-    Only stated tolerances of the robot and of the instrument count.
-
-    measured : (p, p) factor of earlier measurements, their nuisance parameters eliminated (the
-        instrument was set up anew since).
+    measured : (p, p) factor of these, their nuisance parameters eliminated (the instrument was set
+        up anew since).
     """
     o = len(groups.nuisance)
     rows = free.prior_rows()
@@ -209,24 +187,14 @@ def combine_prior(
     return prior.with_rows(np.concatenate([np.zeros((len(measured), o)), measured], axis=1))
 
 
-def decompose_information(
-    free: FreeParameters, groups: GroupRows, measured: FloatArray | None = None
-) -> Decomposition:
-    """Return the decomposition of all that could be measured, without tolerances of the machine.
-
-    The nuisance parameters are eliminated.
-
-    measured : as for `combine_prior`.
+def decompose_information(groups: GroupRows, measured: FloatArray | None = None) -> Decomposition:
+    """Return the decomposition of all that could be measured and of earlier measurements, as for
+    `combine_prior`, without tolerances of the machine.
     """
-    o, p = len(groups.nuisance), len(free)
-    factor = empty_factor(1, o + p)
-    allowed = groups.rows[is_allowed(groups.rows)]
-    flat = np.concatenate([allowed.reshape(-1, o + p), groups.nuisance_prior])
-    factor = engine.fold(factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None])
-    factor = eliminate_from_factor(factor, o)
+    factor, count = groups.fold()
     if measured is not None:
-        factor = engine.fold(factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None])
-    return decompose(factor, np.full(1, len(flat)))
+        factor = engine.fold(factor, with_zeros(measured))
+    return decompose(factor, np.full(1, count))
 
 
 def find_group_motions(
@@ -238,21 +206,15 @@ def find_group_motions(
     """
     chosen = np.linspace(0, len(members) - 1, min(ENOUGH, len(members))).astype(int)
     groups = linearize_groups(free, instrument, readings, members[np.unique(chosen)], True)
-    o, width = len(groups.nuisance), groups.rows.shape[2]
-    allowed = groups.rows[is_allowed(groups.rows)].reshape(-1, width)
-    flat = np.concatenate([allowed, groups.nuisance_prior])
-    rows = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None]
-    factor = eliminate_from_factor(engine.fold(empty_factor(1, width), rows), o)
-    return unfixed_motions(factor, float(np.linalg.norm(allowed[:, o:])))
+    of_frames = groups.rows[is_allowed(groups.rows)][:, :, len(groups.nuisance) :]
+    return unfixed_motions(groups.fold()[0], float(np.linalg.norm(of_frames)))
 
 
 def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters:
     """Return the nuisance parameters of the instrument."""
     count = int(members.max()) + 1
-    of_poses = (
-        replace(sensor, rows=rows).assign_rows(count)
-        for sensor, rows in _assign_poses(mounted, members)
-    )
+    assigned = _assign_poses(mounted, members)
+    of_poses = (replace(sensor, rows=rows).assign_rows(count) for sensor, rows in assigned)
     sensors = (*of_poses, *_list_base_sensors(mounted))
     return collect_nuisance_parameters(sensors, tuple(str(i) for i in range(count)))
 
@@ -297,17 +259,29 @@ def _linearize_block(
     members: IntArray,
     by_frames: bool,
 ) -> FloatArray:
-    """Return the rows (b, r, o + p) of some groups."""
+    """Return the rows (b, r, o + p) of some groups.
+
+    Redundant readings with a stated sigma are measured, too. Where they determine the freedoms of
+    every pose, the rows are those that remain after elimination of the freedoms.
+    """
+    robot, size = free.robot, members.shape[1]
     joints = list_sensed_joints(sensor.kind for sensor in mounted.sensors)
-    size = members.shape[1]
-    redundant = None if by_frames else add_redundant_readings(mounted, free.robot)
-    if redundant is None:
+    is_redundant = (
+        not by_frames
+        and robot.program.sigma is not None
+        and resolve_reading_sigma(robot, None, 1) is not None
+    )
+    if is_redundant:
+        read = Sensor(make_readings_kind(robot), Gaussian(robot.stated_sigma))
+        mounted, places = (
+            Instrument((*mounted.sensors, read)),
+            np.arange(members.size).reshape(members.shape),
+        )
+        observed = _observe_groups(free, readings[members.ravel()], joints, size)
+    else:
         poses, places = np.unique(members, return_inverse=True)
         places = places.reshape(members.shape)
         observed = observe_poses(free, readings[poses], joints)
-    else:
-        mounted, places = redundant, np.arange(members.size).reshape(members.shape)
-        observed = observe_groups(free, readings[members.ravel()], joints, size)
     nuisance = _list_nuisance(mounted, places)
     observations, unusable = [], np.zeros(len(members), dtype=bool)
     for i, (sensor, rows) in enumerate(_assign_poses(mounted, places)):
@@ -325,20 +299,21 @@ def _linearize_block(
         observations.append(
             Observations.from_sigma(kind, rows, measured, sensor.noise.sigma, "", "")
         )
-    data = Measurements(free.robot.name, observed.readings, tuple(observations))
+    data = Measurements(robot.name, observed.readings, tuple(observations))
     columns = observed.by_frames() if by_frames else observed
     whitened = observe_rows(columns, data, nuisance, nuisance.values())[0, :, :-1]
     counts = [len(part) * len(part.kind.noise_columns) for part in observations]
     pieces = np.split(whitened, np.cumsum(counts)[:-1])
-    rows = np.concatenate(
-        [
-            piece.reshape(len(members), len(piece) // len(members), whitened.shape[1])
-            for piece in pieces
-        ],
-        axis=1,
-    )
+    by_group = (piece.reshape(len(members), -1, whitened.shape[1]) for piece in pieces)
+    rows = np.concatenate(list(by_group), axis=1)
     rows[unusable | ~observed.is_reached[places].all(axis=1)] = np.nan
-    return rows if redundant is None else eliminate_freedoms(rows, size * len(free.robot.freedoms))
+    if not is_redundant:
+        return rows
+    count = size * len(robot.freedoms)
+    kept, freedoms = np.split(rows, [rows.shape[2] - count], axis=2)
+    nothing = np.zeros((*rows.shape[:2], 1))  # residuals, which a plan does not have
+    done = eliminate_columns(np.concatenate([freedoms, kept, nothing], axis=2), count)
+    return done.rest[:, count if done.is_observable.all() else 0 :, :-1]
 
 
 def count_poses_per_group(instrument: Instrument) -> int:

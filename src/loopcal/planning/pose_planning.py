@@ -21,15 +21,14 @@ from loopcal.planning.constraints import N_POSES, PlanOptions
 from loopcal.planning.design_space import (
     A,
     Criterion,
+    D,
     E,
-    I,
     evaluate_criterion,
     factor_design,
     is_allowed,
 )
 from loopcal.planning.exchange import EXCHANGES, choose_design
 from loopcal.planning.path import order_poses
-from loopcal.planning.prediction import ExpectedErrors
 from loopcal.planning.problem import (
     PlanningProblem,
     compute_error_curve,
@@ -70,10 +69,6 @@ def plan(
     options : constraints, candidates, goal, earlier measurements, seed; see `PlanOptions`.
     progress : receives the steps that are done.
 
-    Returns
-    -------
-    Plan
-
     Raises
     ------
     EstimationError
@@ -92,22 +87,15 @@ def plan(
 
 def plan_poses(problem: PlanningProblem, progress: Progress = report_no_progress) -> Plan:
     """Plan the poses of a prepared problem; see `plan`."""
-    options = problem.options
-    if options.goal is not None:
-        return _plan_for_goal(problem, progress)
-    number = N_POSES if options.n_poses is None else options.n_poses
-    result = _plan_number(problem, number, progress)
-    if not options.curve:
-        return result
-    return replace(result, curve=compute_error_curve(problem, progress))
-
-
-def _plan_for_goal(problem: PlanningProblem, progress: Progress) -> Plan:
-    """Plan the smallest number of poses whose expected error reaches the goal."""
     options, k = problem.options, problem.poses_per_group
+    if options.goal is None:
+        number = N_POSES if options.n_poses is None else options.n_poses
+        result = _plan_number(problem, number, progress)
+        if not options.curve:
+            return result
+        return replace(result, curve=compute_error_curve(problem, progress))
     curve = find_sample_size(problem, progress)
     assert curve.enough is not None, "a goal was given"
-    assert options.goal is not None, "a goal was given"
     n = curve.enough
     # Validation poses are taken from the candidates, and D is not what the goal counts: both can
     # cost some more poses.
@@ -120,7 +108,7 @@ def _plan_for_goal(problem: PlanningProblem, progress: Progress) -> Plan:
         report_finding(
             "plan.goal-missed",
             number=n,
-            counted=problem.group_name,
+            counted=problem.counted,
             criterion=options.criterion,
             expected=curve.enough,
         )
@@ -129,82 +117,75 @@ def _plan_for_goal(problem: PlanningProblem, progress: Progress) -> Plan:
 
 def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> Plan:
     """Plan a number of poses."""
-    k, robot, options = problem.poses_per_group, problem.robot, problem.options
-    n_held_out = _require_numbers(problem, n_poses)
-    n = n_poses // k
-    problem.require_equations(n)
-    criterion = problem.build_criterion()
-    rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(1,)))
-    held_out = _draw_held_out(problem, n_held_out // k, rng)
-    rows, members = np.array(problem.groups.rows), problem.groups.members
-    rows[np.isin(members, members[held_out]).any(axis=1)] = np.nan
-    left = int(is_allowed(rows).sum())
-    if left < n:
-        raise EstimationError(
-            report_finding(
-                "plan.too-few-candidates", requested=n, what=problem.group_name, available=left
-            )
-        )
-    best = choose_design(
-        rows, n, criterion, problem.prior, options.seed, PERTURBATIONS, gap=GAP, progress=progress
+    k, robot, options, groups = (
+        problem.poses_per_group,
+        problem.robot,
+        problem.options,
+        problem.groups,
     )
-    chosen = best.design.chosen
-    after = problem.predict_errors(chosen)
-    assert after is not None, "the exchange determines every direction"
-    forecast = ErrorForecast(
-        before=problem.predict_errors(np.zeros(0, dtype=np.int64)),
-        random=_predict_random(problem, n, criterion, rng),
-        after=after,
-        frame=problem.prediction.frame.describe(axes=""),
-    )
-    factor = factor_design(rows[chosen], problem.prior, problem.space)
-    criteria: tuple[Criterion, ...] = (
-        problem.build_criterion("D"),
-        problem.build_criterion("I"),
-        A(),
-        E(),
-    )
-    quality = DesignQuality(
-        {c.name: evaluate_criterion(c, factor, problem.space.machine) for c in criteria},
-        min(best.efficiency, 1.0),
-        int(is_allowed(rows).sum()),
-    )
-    poses, is_order_short = _arrange_poses(problem, chosen, held_out)
-    notes = list(_collect_notes(problem))
-    if not best.design.is_converged:
-        counts = {"counted": problem.group_name, "exchanges": EXCHANGES * n}
-        notes.append(report_finding("plan.exchanges-exhausted", **counts))
-    if not is_order_short:
-        notes.append(report_finding("plan.order-exhausted"))
-    return Plan(robot, problem.instrument, options, poses, quality, forecast, tuple(notes))
-
-
-def _require_numbers(problem: PlanningProblem, n_poses: int) -> int:
-    """Return the number of poses to hold out; refuse impossible numbers."""
-    k, hold_out = problem.poses_per_group, problem.options.hold_out
     default = max(n_poses // FITTED_PER_HELD_OUT // k, -(-FEW_ROWS // k)) * k
-    n_held_out = default if hold_out is None else hold_out
+    n_held_out = default if options.hold_out is None else options.hold_out
     for use, number, least in (("for the fit", n_poses, 1), ("to hold out", n_held_out, 0)):
         if number < least or number % k:
             multiples = (
                 f", in multiples of {k} because the instrument compares {k} poses" if k > 1 else ""
             )
             raise EstimationError(f"{number} poses {use}; give {least} or more{multiples}")
-    return n_held_out
+    n = n_poses // k
+    problem.require_equations(n)
+    rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(1,)))
+    # groups whose poses were drawn evenly
+    is_uniform = problem.candidates.is_uniform[groups.members].all(axis=1)
+    uniform = np.flatnonzero(is_uniform & is_allowed(groups.rows))
+    held_out = _draw_held_out(problem, n_held_out // k, rng.permutation(uniform))
+    rows = np.array(groups.rows)
+    rows[np.isin(groups.members, groups.members[held_out]).any(axis=1)] = np.nan
+    design = problem.pose_design(rows)
+    left = len(design.allowed)
+    if left < n:
+        counts = {"requested": n, "what": problem.counted, "available": left}
+        raise EstimationError(report_finding("plan.too-few-candidates", **counts))
+    best = choose_design(design, n, options.seed, PERTURBATIONS, gap=GAP, progress=progress)
+    chosen = best.design.chosen
+    after = problem.predict_errors(chosen)
+    assert after is not None, "the exchange determines every direction"
+    by_error = problem.build_criterion("I")
+    random = None
+    if len(uniform) >= n:  # the median, by I, of some sets of evenly drawn groups
+        sets = [rng.choice(uniform, n, replace=False) for _ in range(DRAWS)]
+        values = [_evaluate(problem, by_error, drawn) for drawn in sets]
+        random = problem.predict_errors(sets[int(np.argsort(values)[DRAWS // 2])])
+    forecast = ErrorForecast(
+        before=problem.predict_errors(np.zeros(0, dtype=np.int64)),
+        random=random,
+        after=after,
+        frame=problem.prediction.frame.describe(axes=""),
+    )
+    criteria: tuple[Criterion, ...] = (D(), by_error, A(), E())
+    quality = DesignQuality(
+        {c.name: _evaluate(problem, c, chosen) for c in criteria}, min(best.efficiency, 1.0), left
+    )
+    poses, is_order_short = _arrange_poses(problem, chosen, held_out)
+    notes = _collect_notes(problem)
+    if not best.design.is_converged:
+        counts = {"counted": problem.counted, "exchanges": EXCHANGES * n}
+        notes.append(report_finding("plan.exchanges-exhausted", **counts))
+    if not is_order_short:
+        notes.append(report_finding("plan.order-exhausted"))
+    return Plan(robot, problem.instrument, options, poses, quality, forecast, tuple(notes))
 
 
-def _list_uniform_groups(problem: PlanningProblem) -> IntArray:
-    """Return the groups whose poses were drawn evenly."""
-    groups = problem.groups
-    uniform = problem.candidates.is_uniform[groups.members].all(axis=1)
-    return np.flatnonzero(uniform & is_allowed(groups.rows))
+def _evaluate(problem: PlanningProblem, criterion: Criterion, chosen: IntArray) -> float:
+    """Return a criterion of groups (n,) in the directions that all candidates determine."""
+    factor = factor_design(problem.groups.rows[chosen], problem.prior, problem.space)
+    return evaluate_criterion(criterion, factor, problem.space.machine)
 
 
-def _draw_held_out(problem: PlanningProblem, count: int, rng: np.random.Generator) -> IntArray:
-    """Draw groups (count,) for validation: of evenly drawn poses, no pose in two of them."""
+def _draw_held_out(problem: PlanningProblem, count: int, drawn: IntArray) -> IntArray:
+    """Return the first `count` of the drawn groups that have no pose in common."""
     chosen: list[int] = []
     used: set[int] = set()
-    for group in rng.permutation(_list_uniform_groups(problem)).tolist():
+    for group in drawn.tolist():
         if len(chosen) == count:
             break
         poses = problem.groups.members[group].tolist()
@@ -216,7 +197,7 @@ def _draw_held_out(problem: PlanningProblem, count: int, rng: np.random.Generato
             report_finding(
                 "plan.too-few-held-out",
                 requested=count,
-                counted=problem.group_name,
+                counted=problem.counted,
                 candidates=len(problem.candidates),
                 available=len(chosen),
             )
@@ -230,10 +211,9 @@ def _arrange_poses(
     """Return the poses of groups for the fit and for validation in the order of visiting, and
     whether the search for a short order came to its end.
     """
-    members = problem.groups.members
+    members, candidates = problem.groups.members, problem.candidates
     selected = members[np.concatenate([chosen, held_out])]
     poses = np.unique(selected)
-    candidates = problem.candidates
     visit = order_poses(candidates.checker, candidates.coordinates[poses])
     ordered = poses[visit.order]
     place = np.empty(len(candidates), dtype=np.int64)
@@ -255,40 +235,15 @@ def _round_readings(robot: Mechanism, readings: FloatArray) -> FloatArray:
     """Round readings (m, a) to DIGITS in the robot's units: a person can type them, and no
     instrument resolves the difference.
     """
-    factors = np.array(
-        [find_unit(robot.units[actuator.dimension]).factor_to_si for actuator in robot.actuators]
-    )
-    scale = np.array(
-        [
-            robot.size if actuator.dimension is Dimension.LENGTH else 1.0
-            for actuator in robot.actuators
-        ]
-    )
+    dimensions = [actuator.dimension for actuator in robot.actuators]
+    factors = np.array([find_unit(robot.units[d]).factor_to_si for d in dimensions])
+    scale = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions])
     steps = 10.0 ** (np.floor(np.log10(scale / factors)) - DIGITS)
     # + 0: no reading is -0
     return np.round(readings / factors / steps) * steps * factors + 0.0
 
 
-def _predict_random(
-    problem: PlanningProblem, n: int, criterion: Criterion, rng: np.random.Generator
-) -> ExpectedErrors | None:
-    """Return the errors of the median, by I, of some sets of n evenly drawn groups.
-
-    None where there are too few.
-    """
-    uniform = _list_uniform_groups(problem)
-    if len(uniform) < n:
-        return None
-    criterion = criterion if isinstance(criterion, I) else problem.build_criterion("I")
-    sets = [rng.choice(uniform, n, replace=False) for _ in range(DRAWS)]
-    values = []
-    for chosen in sets:
-        factor = factor_design(problem.groups.rows[chosen], problem.prior, problem.space)
-        values.append(evaluate_criterion(criterion, factor, problem.space.machine))
-    return problem.predict_errors(sets[int(np.argsort(values)[DRAWS // 2])])
-
-
-def _collect_notes(problem: PlanningProblem) -> tuple[Finding, ...]:
+def _collect_notes(problem: PlanningProblem) -> list[Finding]:
     """Return findings on what was assumed and excluded."""
     p, rank, assumed = len(problem.free), int(problem.observable.rank[0]), problem.free.assumed
     notes = [problem.candidates.report()]
@@ -302,4 +257,4 @@ def _collect_notes(problem: PlanningProblem) -> tuple[Finding, ...]:
         notes.append(report_finding("plan.frames-undetermined", frames=frames))
     if rank < p:
         notes.append(report_finding("plan.unobservable", count=p - rank, parameters=p))
-    return tuple(notes)
+    return notes

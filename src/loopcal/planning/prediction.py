@@ -37,8 +37,7 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 FRAMES = (FITTED, BASE, RELATIVE)  # frames in which a plan can state errors
-# Dimension of the error of each target.
-DIMENSIONS: dict[Target, Dimension] = {
+DIMENSIONS: dict[Target, Dimension] = {  # of the error of each target
     "pose": Dimension.LENGTH,
     "position": Dimension.LENGTH,
     "orientation": Dimension.ANGLE,
@@ -49,10 +48,8 @@ DIMENSIONS: dict[Target, Dimension] = {
 class Prediction:
     """Derivatives of the tool's pose at k poses of the workspace."""
 
-    # rotations, displacements: (k, 3, p) derivatives of its rotation [rad] and displacement [m]
-    # by the parameters in tolerances
-    rotations: FloatArray
-    displacements: FloatArray
+    rotations: FloatArray  # (k, 3, p) derivatives of its rotation [rad per tolerance]
+    displacements: FloatArray  # (k, 3, p) derivatives of its displacement [m per tolerance]
     size: float  # makes rotations comparable with displacements [m]
     frame: ErrorFrame  # in which errors are stated
 
@@ -78,12 +75,10 @@ class Prediction:
 def linearize_prediction(
     free: FreeParameters, solution: Solution, unfixed: FloatArray, frame: str = FITTED
 ) -> Prediction:
-    """Return how the tool's pose depends on the parameters, in a frame.
+    """Return how the tool's pose depends on the parameters, in a frame of FRAMES.
 
-    solution : the poses to predict.
-    unfixed : (12, k) motions of frames that the measurements will not determine.
-    frame : "fitted": after the best rigid fit of these motions over the poses to predict; "base":
-        in the base frame of the robot file; "relative": relative to the home pose.
+    solution : the poses to predict. unfixed : (12, k) motions of frames that the measurements will
+        not determine; "fitted" is after the best rigid fit of them over the poses to predict.
     """
     check_frame(frame, FRAMES)
     poses = observe_poses(free, solution.q)
@@ -107,13 +102,10 @@ def linearize_prediction(
 
 @dataclass(frozen=True, eq=False)
 class ExpectedErrors:
-    """Predicted errors of the tool, root mean square over the workspace.
+    """Predicted errors of the tool, root mean square over the workspace."""
 
-    position [m], orientation [rad].
-    """
-
-    position: float
-    orientation: float
+    position: float  # [m]
+    orientation: float  # [rad]
 
     def select(self, target: Target, size: float) -> float:
         """Return the error of a target [m, rad]; of a pose with rotations times `size` [m]."""

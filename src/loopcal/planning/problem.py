@@ -29,17 +29,19 @@ from loopcal.planning.constraints import N_POSES, Constraints, PlanOptions, Targ
 from loopcal.planning.design_space import (
     Criterion,
     D,
+    DesignProblem,
     I,
     ObservableSpace,
     PriorInformation,
     divide_by_factor,
     factor_design,
     factor_rows,
+    factor_square,
     find_observable_space,
     is_allowed,
     is_full_rank,
 )
-from loopcal.planning.exchange import DesignCurve, compute_design_curve, find_smallest_design
+from loopcal.planning.exchange import CertifiedDesign, compute_design_curve, find_smallest_design
 from loopcal.planning.pose_groups import (
     GroupRows,
     combine_prior,
@@ -81,9 +83,7 @@ class PlanningProblem:
         return self.free.robot
 
     def with_options(self, **changes: Any) -> PlanningProblem:
-        """Return the same problem with other options that do not concern candidates and data:
-        number of poses, goal, held-out poses, criterion, target, curve.
-        """
+        """Return the same problem with other options that do not concern candidates and data."""
         return replace(self, options=replace(self.options, **changes))
 
     @cached_property
@@ -97,7 +97,7 @@ class PlanningProblem:
         return self.groups.members.shape[1]
 
     @property
-    def group_name(self) -> str:
+    def counted(self) -> str:
         """Plural noun for the groups: poses, pairs or sets of k poses."""
         return name_groups(self.poses_per_group)
 
@@ -132,32 +132,32 @@ class PlanningProblem:
                 f"unknown criterion {name!r}; allowed are I (mean predicted variance of poses) "
                 "and D (volume of uncertainty of the parameters)"
             )
-        if target != "pose" and not self._sensitivity(target) > NO_MOTION * self._sensitivity(
-            "pose"
-        ):
+        rows, scale = getattr(self.prediction, target), 1.0
+        if target == "orientation":
+            scale = self.prediction.size
+        largest = float(np.abs(self.prediction.pose).max(initial=0.0))
+        if target != "pose" and not scale * np.abs(rows).max(initial=0.0) > NO_MOTION * largest:
             raise EstimationError(
                 report_finding("plan.target-unobservable", robot=self.robot.name, target=target)
             )
         # the triangular factor of the rows gives the same trace from fewer rows
-        return I(factor_rows(getattr(self.prediction, target)), len(self.prediction))
+        return I(factor_rows(rows), len(self.prediction))
 
-    def _sensitivity(self, target: Target) -> float:
-        """Return the largest effect of one tolerance on a target, rotations times size [m]."""
-        rows = getattr(self.prediction, target)
-        scale = self.prediction.size if target == "orientation" else 1.0
-        return float(np.abs(rows).max(initial=0.0)) * scale
+    def pose_design(self, rows: FloatArray | None = None, name: str | None = None) -> DesignProblem:
+        """Return the choice of groups by a criterion of this name; by default from all rows."""
+        rows = self.groups.rows if rows is None else rows
+        return DesignProblem(rows, self.build_criterion(name), self.prior)
 
     def predict_errors(self, chosen: IntArray) -> ExpectedErrors | None:
-        """Return the errors expected after measuring groups (n,), possibly none.
-
-        None where nothing bounds them.
+        """Return the errors expected after measuring groups (n,), possibly none; None where nothing
+        bounds them.
         """
         if len(chosen):
             factor = factor_design(self.groups.rows[chosen], self.prior, self.space)
         else:
             # no row of the prior has both nuisance and machine columns, see `combine_prior`
             rows = self.prior.rows[:, self.prior.n_nuisance :] @ self.space.machine
-            factor = factor_rows(np.concatenate([rows, np.zeros((rows.shape[1], rows.shape[1]))]))
+            factor = factor_square(rows)
         s = np.linalg.svd(factor, compute_uv=False)
         if not is_full_rank(s):
             return None
@@ -189,15 +189,11 @@ class PlanningProblem:
 def prepare_problem(
     robot: Mechanism, instrument: Instrument, options: PlanOptions | None = None
 ) -> PlanningProblem:
-    """Return the planning problem of a robot and an instrument.
+    """Return the planning problem of a robot, at its present values, and an instrument.
 
     Errors are predicted for PREDICTED poses drawn evenly from the workspace within the machine's
     own limits, wherever the constraints allow measuring. With allowed poses in the options, they
     are predicted for as many of these, drawn at random.
-
-    robot : at its present values, with its free parameters and tolerances.
-    instrument : what will measure, with its noise. options : constraints, candidates, measurements
-        made already (the instrument is taken to be set up anew after them), seed.
     """
     check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
     options = options or PlanOptions()
@@ -208,10 +204,13 @@ def prepare_problem(
     _require_plain_sensors(instrument)
     check_closure(robot, [sensor.kind for sensor in instrument.sensors], None, 1)
     rng = np.random.default_rng(options.seed)
-    candidates = _list_candidates(robot, options, rng)
-    mounted = instrument.with_tool(robot)
+    if options.allowed_poses is None:
+        candidates = draw_candidates(robot, options.constraints, options.n_candidates, rng)
+    else:
+        candidates = check_listed_poses(robot, options.allowed_poses, options.constraints)
+    mounted, measured = instrument.with_tool(robot), options.measured
     groups = linearize_candidate_groups(free, mounted, candidates.solution.q, rng)
-    observable = decompose_information(free, groups)
+    observable = decompose_information(groups)
     if not observable.singular_values.max(initial=0.0) > NO_INFORMATION:
         raise EstimationError(
             report_finding(
@@ -222,11 +221,15 @@ def prepare_problem(
                 poses=len(candidates),
             )
         )
-    earlier, n_equations, labels = _fold_measured(free, options.measured)
-    if earlier is not None:
-        observable = decompose_information(free, groups, earlier)
+    earlier, n_equations, labels = None, 0, ()
     to_predict = _select_predicted(candidates, options)
-    unfixed = _find_unfixed_motions(free, mounted, candidates, groups, options.measured)
+    unfixed = find_group_motions(free, mounted, candidates.solution.q, groups.members)
+    if measured is not None:
+        earlier, n_equations = _fold_measured(free, measured)
+        observable, labels = decompose_information(groups, earlier), measured.labels
+        problem, z = problem_of(free, measured), free.deviation(robot.values[None])
+        known = find_frame_knowledge(problem, measured, z, problem.start(z))
+        unfixed = intersect_motions(unfixed, known.unfixed)
     return PlanningProblem(
         free,
         mounted,
@@ -239,15 +242,6 @@ def prepare_problem(
         n_equations,
         tuple(dict.fromkeys([*labels, *options.used_names])),
     )
-
-
-def _list_candidates(
-    robot: Mechanism, options: PlanOptions, rng: np.random.Generator
-) -> Candidates:
-    """Return the allowed poses of the options, or poses drawn from the workspace."""
-    if options.allowed_poses is None:
-        return draw_candidates(robot, options.constraints, options.n_candidates, rng)
-    return check_listed_poses(robot, options.allowed_poses, options.constraints)
 
 
 def name_groups(poses_per_group: int) -> str:
@@ -277,14 +271,10 @@ def _require_plain_sensors(instrument: Instrument) -> None:
         )
 
 
-def _fold_measured(
-    free: FreeParameters, measured: Measurements | None
-) -> tuple[FloatArray | None, int, tuple[str, ...]]:
-    """Return the factor (p, p) of earlier measurements, the number of equations that they leave for
-    the robot, and the names of their poses.
+def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatArray, int]:
+    """Return the factor (p, p) of earlier measurements, and the number of equations that they leave
+    for the robot.
     """
-    if measured is None:
-        return None, 0, ()
     robot = free.robot
     check_actuators(measured, robot)
     if not any(rows.is_measured.any() for rows in measured.observations):
@@ -298,24 +288,7 @@ def _fold_measured(
     table = measured.nuisance_parameters.table
     nuisance = int((table.free & np.isnan(table.tolerance)).sum())
     n_equations = max(count_equations(robot, measured) - nuisance, 0)
-    return factor[0, :-1, :-1], n_equations, tuple(measured.labels)
-
-
-def _find_unfixed_motions(
-    free: FreeParameters,
-    mounted: Instrument,
-    candidates: Candidates,
-    groups: GroupRows,
-    measured: Measurements | None,
-) -> FloatArray:
-    """Return the motions (12, k) of frames that no measurement, earlier or new, determines."""
-    motions = find_group_motions(free, mounted, candidates.solution.q, groups.members)
-    if measured is None:
-        return motions
-    problem = problem_of(free, measured)
-    z = free.deviation(free.robot.values[None])
-    earlier = find_frame_knowledge(problem, measured, z, problem.start(z))
-    return intersect_motions(motions, earlier.unfixed)
+    return factor[0, :-1, :-1], n_equations
 
 
 def _select_predicted(candidates: Candidates, options: PlanOptions) -> Solution:
@@ -352,13 +325,8 @@ class ErrorCurve:
     goal: float | None = None  # requested error [m, rad], or None
     enough: int | None = None  # smallest of the numbers that reaches the goal
     at_least: int | None = None  # no smaller number of candidates reaches the goal
-    poses_per_group: int = 1  # 1 where each pose counts alone
+    counted: str = "poses"  # plural noun for what the numbers count
     n_candidates: int = 0  # number of candidate poses or pairs
-
-    @property
-    def counted(self) -> str:
-        """Plural noun for what the numbers count."""
-        return name_groups(self.poses_per_group)
 
     def report(self, robot: Mechanism) -> Finding:
         """Return the result of the curve: the number that reaches the goal, or all errors."""
@@ -396,22 +364,19 @@ def compute_error_curve(
     last = min(max(RANGE * requested // k, 2 * problem.min_groups), count)
     first = min(problem.min_groups, last)
     sizes = np.geomspace(first, last, SIZES).round().astype(int)
-    sizes = np.unique(np.append(sizes, min(max(requested // k, first), last))).tolist()
-    rows, criterion, prior = problem.groups.rows, problem.build_criterion("I"), problem.prior
-    designs = compute_design_curve(
-        rows, sizes, criterion, prior, options.seed, PERTURBATIONS, progress=progress
-    )
+    sizes = np.append(sizes, min(max(requested // k, first), last)).tolist()
+    design = problem.pose_design(name="I")
+    designs = compute_design_curve(design, sizes, options.seed, PERTURBATIONS, progress)
     return _convert_curve(problem, designs)
 
 
 def find_sample_size(
     problem: PlanningProblem, progress: Progress = report_no_progress
 ) -> ErrorCurve:
-    """Return the smallest number of poses that reaches the goal of the options.
-
-    The curve covers the expected errors from the smallest number to twice that one.
+    """Return the smallest number of poses that reaches the goal of the options, with the expected
+    errors from the smallest number to twice that one.
     """
-    options, robot, rows = problem.options, problem.robot, problem.groups.rows
+    options, robot = problem.options, problem.robot
     target, goal, dimension = options.target, options.goal, DIMENSIONS[options.target]
     assert goal is not None, "the caller has a goal"
     if not goal > 0.0 or not np.isfinite(goal):
@@ -419,51 +384,51 @@ def find_sample_size(
             f"the accuracy goal is {robot.to_quantity(goal, dimension)}; give a number above 0 "
             "with its unit, such as 20um"
         )
-    criterion, prior, count = problem.build_criterion("I"), problem.prior, problem.n_candidates
+    design, count = problem.pose_design(name="I"), problem.n_candidates
     most = min(MOST // problem.poses_per_group, count)
     problem.require_equations(most)
     try:
-        smallest = find_smallest_design(
-            rows, goal**2, criterion, prior, most, options.seed, PERTURBATIONS
-        )
+        smallest = find_smallest_design(design, goal**2, most, options.seed, PERTURBATIONS)
     except EstimationError:
-        best = compute_design_curve(rows, [most], criterion, prior, options.seed, 0)
+        (best,) = compute_design_curve(design, [most], options.seed, 0)
+        reached, bound = (np.sqrt(v) for v in (best.design.value, best.relaxed.bound))
         raise EstimationError(
             report_finding(
                 "plan.goal-unreachable",
                 target=target,
                 goal=robot.to_quantity(goal, dimension),
                 number=most,
-                counted=problem.group_name,
+                counted=problem.counted,
                 candidates=count,
-                best=robot.to_quantity(float(np.sqrt(best.values[0])), dimension),
-                bound=robot.to_quantity(float(np.sqrt(best.bounds[0])), dimension),
+                best=robot.to_quantity(float(reached), dimension),
+                bound=robot.to_quantity(float(bound), dimension),
             )
         ) from None
     n = max(smallest.n, problem.min_groups)
     others = np.geomspace(problem.min_groups, min(2 * n, count), SIZES - 1).round().astype(int)
-    sizes = np.unique(np.append(others, n)).tolist()
-    curve = compute_design_curve(
-        rows, sizes, criterion, prior, options.seed, PERTURBATIONS, progress=progress
-    )
-    if n == smallest.n:  # the design of the search, where that of the curve is less good
-        place = sizes.index(n)
-        designs = (*curve.designs[:place], smallest.certified, *curve.designs[place + 1 :])
-        better = np.minimum(curve.values, smallest.certified.design.value)
-        values = np.where(curve.sizes == n, better, curve.values)
-        curve = replace(curve, designs=designs, values=values)
-    return replace(_convert_curve(problem, curve), goal=goal, enough=n, at_least=smallest.at_least)
+    sizes = np.append(others, n).tolist()
+    curve = compute_design_curve(design, sizes, options.seed, PERTURBATIONS, progress)
+    # the design of the search, where that of the curve is less good
+    best = smallest.certified
+    is_better = [
+        len(made.design.chosen) == smallest.n and best.design.value <= made.design.value
+        for made in curve
+    ]
+    designs = [best if better else made for made, better in zip(curve, is_better, strict=True)]
+    made = _convert_curve(problem, designs)
+    return replace(made, goal=goal, enough=n, at_least=smallest.at_least)
 
 
-def _convert_curve(problem: PlanningProblem, curve: DesignCurve) -> ErrorCurve:
-    """Return a curve of variances as a curve of errors."""
-    expected = [problem.predict_errors(made.design.chosen) for made in curve.designs]
+def _convert_curve(problem: PlanningProblem, designs: list[CertifiedDesign]) -> ErrorCurve:
+    """Return designs by their mean variance as a curve of errors."""
+    expected = [problem.predict_errors(made.design.chosen) for made in designs]
+    bounds = np.array([made.relaxed.bound for made in designs])
     return ErrorCurve(
-        curve.sizes,
+        np.array([len(made.design.chosen) for made in designs], dtype=np.int64),
         tuple(errors for errors in expected if errors is not None),  # every design is determined
         problem.options.target,
-        np.sqrt(curve.values),
-        np.sqrt(np.maximum(curve.bounds, 0.0)),
-        poses_per_group=problem.poses_per_group,
+        np.sqrt([made.design.value for made in designs]),
+        np.sqrt(np.maximum(bounds, 0.0)),
+        counted=problem.counted,
         n_candidates=problem.n_candidates,
     )

@@ -5,14 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument
-from loopcal.measure.kinds.kind import Kind
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import inverse
@@ -24,9 +23,6 @@ from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import DrawnResult
 from loopcal.results.serialization import to_json
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-if TYPE_CHECKING:
-    pass
 
 WEAK = 0.5  # efficiency below which the certificate guarantees little
 
@@ -46,8 +42,7 @@ class PlannedPoses:
     held_out: BoolArray  # (m,) True for validation poses
     via_home: BoolArray  # (m,) True where the path goes via home before the pose
     groups: IntArray  # (u, k) indices of the poses that are measured together
-    # from home through all poses [m], rotations times the robot's size; None where it was not
-    # computed
+    # from home through all poses [m], rotations times the robot's size
     path_length: float | None = None
 
     def __len__(self) -> int:
@@ -60,11 +55,6 @@ class PlannedPoses:
     def uses(self) -> tuple[str, ...]:
         """(m,) "fit" or "held-out"."""
         return tuple("held-out" if is_held_out else "fit" for is_held_out in self.held_out)
-
-    def list_compared(self) -> list[list[str]]:
-        """Return the labels of the poses that are measured together; none for single poses."""
-        is_grouped = self.groups.shape[1] > 1
-        return [[self.labels[i] for i in group] for group in self.groups] if is_grouped else []
 
     def to_dicts(self, robot: Mechanism) -> list[dict[str, Any]]:
         """Return for each pose its name, use, command and readings, SI."""
@@ -148,7 +138,7 @@ class Plan(DrawnResult):
         *fields(expected=lambda plan: to_json(plan.errors)),
         *fields(path_length="poses.path_length", seed="options.seed"),
         *fields(poses=lambda plan: plan.poses.to_dicts(plan.robot)),
-        *fields(compared=lambda plan: plan.poses.list_compared(), curve=""),
+        *fields(compared=lambda plan: plan.list_compared(), curve=""),
         *fields(notes=lambda plan: list(map(str, plan.notes)), findings=""),
         Field("use", "poses.uses", "pose"),
         Field(
@@ -173,17 +163,45 @@ class Plan(DrawnResult):
         """Number of groups for the fit."""
         return int((~self.poses.held_out[self.poses.groups].any(axis=1)).sum())
 
+    def list_compared(self) -> list[list[str]]:
+        """Return the labels of the poses that are measured together; none for single poses."""
+        groups, labels = self.poses.groups, self.poses.labels
+        return [[labels[i] for i in group] for group in groups] if groups.shape[1] > 1 else []
+
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Everything that the plan reports: content, certificate, errors, curve and notes."""
+        poses, counted = self.poses, name_groups(self.poses.groups.shape[1])
         curve = () if self.curve is None else (self.curve.report(self.robot),)
-        assert self.poses.path_length is not None, "a plan has a path"
-        length = Quantity(self.poses.path_length, "m")
+        assert poses.path_length is not None, "a plan has a path"
+        efficiency = self.quality.efficiency
         return (
-            self._report_poses(),
-            report_finding("plan.path", length=length, via_home=int(self.poses.via_home.sum())),
-            self._report_certificate(),
-            self._report_errors(),
+            report_finding(
+                "plan.poses",
+                robot=self.robot.name,
+                poses=len(poses),
+                counted=counted,
+                fitted=self.n_groups,
+                held_out=len(poses.groups) - self.n_groups,
+                kinds=tuple(
+                    f"{kind.name} of targets on the base" if kind.is_of_base else kind.name
+                    for kind in (sensor.kind for sensor in self.instrument.sensors)
+                ),
+            ),
+            report_finding(
+                "plan.path",
+                length=Quantity(poses.path_length, "m"),
+                via_home=int(poses.via_home.sum()),
+            ),
+            report_finding(
+                "plan.weak-certificate" if efficiency < WEAK else "plan.certificate",
+                shortfall=round_shortfall(efficiency),
+                chosen=self.n_groups,
+                counted=counted,
+                candidates=self.quality.n_candidates,
+                criterion=self.options.criterion,
+            ),
+            self._report_errors(counted),
             *curve,
             *self.notes,
         )
@@ -198,53 +216,27 @@ class Plan(DrawnResult):
     def __str__(self) -> str:
         return "\n".join(str(finding) for finding in self.findings)
 
-    def _report_poses(self) -> Finding:
-        """Return how many poses or groups the plan has."""
-        groups = len(self.poses.groups)
-        return report_finding(
-            "plan.poses",
-            robot=self.robot.name,
-            poses=len(self.poses),
-            counted=name_groups(self.poses.groups.shape[1]),
-            fitted=self.n_groups,
-            held_out=groups - self.n_groups,
-            kinds=tuple(_name_kind(sensor.kind) for sensor in self.instrument.sensors),
-        )
-
-    def _report_certificate(self) -> Finding:
-        """Return how far the choice can be from the best possible one."""
-        efficiency = self.quality.efficiency
-        return report_finding(
-            "plan.weak-certificate" if efficiency < WEAK else "plan.certificate",
-            shortfall=round_shortfall(efficiency),
-            chosen=self.n_groups,
-            counted=name_groups(self.poses.groups.shape[1]),
-            candidates=self.quality.n_candidates,
-            criterion=self.options.criterion,
-        )
-
-    def _report_errors(self) -> Finding:
+    def _report_errors(self, counted: str) -> Finding:
         """Return the expected errors: before, with random poses, and after."""
-        before, random, after = (
-            None if errors is None else errors.to_quantities(self.robot)
-            for errors in (self.errors.before, self.errors.random, self.errors.after)
-        )
-        target, size = self.options.target, self.robot.size
-        share = (
-            None
-            if self.errors.random is None
-            else 1.0
-            - self.errors.after.select(target, size) / self.errors.random.select(target, size)
-        )
+        given, target, size = self.errors, self.options.target, self.robot.size
+        shown = {
+            name: None if errors is None else errors.to_quantities(self.robot)
+            for name, errors in (
+                ("before", given.before),
+                ("random", given.random),
+                ("after", given.after),
+            )
+        }
+        share = None
+        if given.random is not None:
+            share = 1.0 - given.after.select(target, size) / given.random.select(target, size)
         return report_finding(
             "plan.expected-errors",
-            before=before,
-            random=random,
-            after=after,
-            counted=name_groups(self.poses.groups.shape[1]),
+            **shown,
+            counted=counted,
             target=target,
             reduction=share,
-            **self.errors.frame.data,
+            **given.frame.data,
         )
 
 
@@ -259,8 +251,3 @@ def list_stops(plan: Plan) -> tuple[Stop, ...]:
         held_out = bool(poses.held_out[i])
         stops.append(Stop(label, False, held_out, poses.coordinates[i], poses.readings[i]))
     return tuple(stops)
-
-
-def _name_kind(kind: Kind) -> str:
-    """Return the name of a kind, with the base if its targets are there."""
-    return f"{kind.name} of targets on the base" if kind.is_of_base else kind.name
