@@ -86,8 +86,6 @@ def drive_sums(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenSum
 class PoseDrivenSensitivity(NamedTuple):
     """Derivatives by parameters (.., p) at constant pose, and by the platform's freedoms (.., m).
 
-    Attributes
-    ----------
     names : of the j passive joints.
     readings : (t, n, a, p) and (t, n, a, m). passive : (t, n, j, p) and (t, n, j, m).
     """
@@ -102,8 +100,6 @@ def solve_at_pose(
 ) -> tuple[State, FloatArray]:
     """Close every limb with the platform at T (t, n, 4, 4); return states and readings (t, n, a).
 
-    Parameters
-    ----------
     values : (t | 1, p). begin : (t, n), whose joints select the branch of each limb.
     """
     e, tau = robot.slots(values)
@@ -120,8 +116,6 @@ def differentiate_at_pose(
 
     With summed drives the derivatives are those of the driven joints in place of readings.
 
-    Parameters
-    ----------
     values : (t | 1, p). q : (t | 1, n, a) readings that close every limb; not used for sums.
     """
     t, n = state.T.shape[:2]
@@ -165,8 +159,6 @@ def solve_open_sums(
 ) -> State:
     """Return the states (t, n) at which the weighted sums of driven joints are given.
 
-    Parameters
-    ----------
     e : (t | 1, d) displacements. weights : (t | 1, a, J). sums : (t | 1, n, a).
     begin : (t | 1, n | 1) where Newton's method begins.
     """

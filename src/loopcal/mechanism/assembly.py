@@ -36,8 +36,6 @@ MOST_COPIES = 100
 class Link:
     """A link transform, from coordinates behind the link to those before it.
 
-    Attributes
-    ----------
     name : unique in its limb.
     transform : (4, 4) nominal [m]; the joint behind it moves along or about its z axis.
     """
@@ -50,8 +48,6 @@ class Link:
 class Joint:
     """A joint about (R) or along (P) the z axis of the link before it.
 
-    Attributes
-    ----------
     name : unique in its limb. kind : R or P. actuator : name of its drive, None if passive.
     pitch : advance per turn angle of a screw [m/rad], R only.
     start : first guess of the home position [m or rad]; it selects the working mode.
@@ -87,8 +83,6 @@ class Cone(NamedTuple):
 class Limb:
     """A serial chain from base to platform: link, joint, link, ..., link, ending, attachment.
 
-    Attributes
-    ----------
     links : one more than joints. ending : rigid, ball or distance. attachment : on the platform, in
         its frame.
     length : nominal length of the rod of a `distance` ending at joint value zero [m].
@@ -163,8 +157,6 @@ class SharedMap(Protocol):
 class Actuator:
     """A drive with a reading.
 
-    Attributes
-    ----------
     name : column of the readings. dimension : of the reading. stroke : allowed readings (low, high)
         [m or rad].
     terms : nominal transmission from reading to joint value, by name of the term; without terms
@@ -198,8 +190,6 @@ class Actuator:
 class Assembly:
     """A mechanism as the `expand` method of a family returns it.
 
-    Attributes
-    ----------
     name, source : for people. limbs, actuators : in the order of readings and tables.
     freedoms : those of the platform, of AXES in base axes. controlled : coordinates in which the
         machine is commanded.
@@ -268,8 +258,6 @@ class Assembly:
 class AttachedStage:
     """A stage of a chain: an assembly whose base is attached to the platform of another stage.
 
-    Attributes
-    ----------
     name : unique in the chain. on : name of that other stage, BASE for the base of the chain.
     mount : (4, 4) T_platform_base, from the base of this stage to the platform of the other [m].
     assembly : of this stage alone, with its own names.

@@ -46,8 +46,6 @@ class ChainState(State):
     T is the end platform in the base, `joints` those of all stages one after the other. Status and
     residual are the worst of the stages, the closure sign is the product of theirs.
 
-    Attributes
-    ----------
     poses : for each stage, its platform in its own base (t, n, 4, 4) [m].
     signs : for each stage, its closure sign (t, n).
     """

@@ -126,15 +126,11 @@ def build(
 ) -> Mechanism:
     """Compile a mechanism for the engine and find its home position.
 
-    Parameters
-    ----------
     assembly : as returned by the `expand` method of a family.
     units : display units of the file. record : the family record, kept for writing the file.
-
-    Raises
-    ------
-    MechanismError : duplicate or unknown names, loops that cannot be closed at home, wrong mobility
-        (names the freedoms that are too many or too few), coordinates that cannot be controlled.
+    Raises MechanismError: duplicate or unknown names, loops that cannot be closed at home, wrong
+        mobility (names the freedoms that are too many or too few), coordinates that cannot be
+        controlled.
     """
     check_assembly(assembly)
     if assembly.stages:
@@ -431,9 +427,7 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
 def _find_home(robot: Mechanism) -> State:
     """Return the closed state at the controlled coordinates of the home pose.
 
-    Raises
-    ------
-    MechanismError : too few controlled coordinates, or loops that cannot be closed.
+    Raises MechanismError: too few controlled coordinates, or loops that cannot be closed.
     """
     program, values = robot.program, robot.values[None]
     shared = program.shared_drive_count
@@ -463,10 +457,8 @@ def _find_home(robot: Mechanism) -> State:
 def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any) -> Mechanism:
     """Return the mechanism of a chain: its stages one by one, then their structures joined.
 
-    Raises
-    ------
-    MechanismError
-        A stage cannot be built (names it), or the actuators cannot set the controlled coordinates.
+    Raises MechanismError: a stage cannot be built (names it), or the actuators cannot set the
+        controlled coordinates.
     """
     stages = _build_stages(assembly.stages)
     table = ParameterTable(assembly.parameters, assembly.common_errors)

@@ -128,9 +128,8 @@ def differentiate_unknowns(
 
     Arguments are those of `loopcal.engine.differentiate`.
 
-    Returns
-    -------
-    (t, n, u, p + a), the freedoms of the platform, then the joints of `list_unknown_joints`.
+    Returns (t, n, u, p + a), the freedoms of the platform, then the joints of
+        `list_unknown_joints`.
     """
     t, n = state.T.shape[:2]
     joints = [

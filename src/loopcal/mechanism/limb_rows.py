@@ -108,8 +108,6 @@ def _select(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
 class LinearizedLimbs(NamedTuple):
     """Linearized closure of a block of t trials and n poses, limb by limb.
 
-    Attributes
-    ----------
     blocks : of the engine.
     displacements_by_parameter : (t, d, p). terms_by_parameter : (t, a, k, p).
     joints_by_term : k arrays (t, n, a). joints_by_reading : (t, n, a). With summed drives there
@@ -215,13 +213,9 @@ def follow_limb(
 ) -> tuple[list[FloatArray], FloatArray]:
     """Return the frames along limb k of a group.
 
-    Parameters
-    ----------
     displacements : (t, s) of this limb. joints : (t, n, J + 1) its joint values.
-
-    Returns
-    -------
-    frames : T_base_link behind each link 0..J, each (t, n | 1, 4, 4); the last one is the tip.
+    Returns frames : T_base_link behind each link 0..J, each (t, n | 1, 4, 4); the last one is the
+        tip.
     attachment : T_platform_attachment (t, 1, 4, 4).
     """
     move = np.zeros((len(displacements), len(group.joints) + 2, 6))

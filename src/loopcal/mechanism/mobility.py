@@ -59,10 +59,8 @@ MAIN_SHARE = 0.3
 def check_mobility(robot: Mechanism) -> None:
     """Refuse actuators that cannot move and hold the platform at home.
 
-    Raises
-    ------
-    MechanismError : the actuators leave the platform free to move, or the limbs constrain it too
-        much; names the freedoms.
+    Raises MechanismError: the actuators leave the platform free to move, or the limbs constrain it
+        too much; names the freedoms.
     """
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]

@@ -34,8 +34,6 @@ from loopcal.units import Dimension, Unit, find_unit
 class MovedSlots(NamedTuple):
     """Which slots of a mechanism some parameters move.
 
-    Attributes
-    ----------
     slots, columns : (z,) slots that may move, and by which of the parameters. A term of a summed
         drive is there once for each joint, because it moves all of them.
     terms : numbers of the transmission terms among them; of summed drives, counted through all
@@ -149,8 +147,6 @@ class SlotMap:
     `n_displacements` slots are e, the others the terms of the actuators, (a, k) row by row, with
     k = 18 where one is a triangle drive, 18 + J where one reads a sum of J joints, 8 elsewhere.
 
-    Attributes
-    ----------
     matrix : (s, p) M. shared : the shared maps, each with the positions of its inputs and of its
         outputs, which differ.
     nominal : (p,). n_displacements : length of e.
@@ -232,8 +228,6 @@ class SlotMap:
 class LimbMap(NamedTuple):
     """The parameters and readings in the equations of one limb.
 
-    Attributes
-    ----------
     displacements : those of the limb in e. parameters : those in its equations, as columns.
     is_plain : whether each of these parameters is exactly one displacement of the limb, in the same
         order and with coefficient 1.
@@ -253,8 +247,6 @@ class LimbMap(NamedTuple):
 class Stage:
     """A stage of a chain: a mechanism whose base is attached to the platform of another stage.
 
-    Attributes
-    ----------
     name : of the stage. parent : the stage that it is attached to, -1 for the base of the chain.
     mount : (4, 4) T_platform_base, from the base of this stage to the platform of its parent [m].
     robot : this stage alone; its values are the nominal ones.
@@ -422,9 +414,7 @@ class Mechanism(DrawnResult):
     def with_values(self, values: ArrayLike) -> Mechanism:
         """Return the same robot with other parameter values (p,) [SI].
 
-        Raises
-        ------
-        MechanismError : wrong number of values, or one that is not finite.
+        Raises MechanismError: wrong number of values, or one that is not finite.
         """
         new = np.array(values, dtype=float)
         if new.shape != (len(self.parameters),):

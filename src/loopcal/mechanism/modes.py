@@ -41,8 +41,6 @@ SCALES = (0.1, 1.0)
 class Modes(Result):
     """Solutions found from random starts.
 
-    Attributes
-    ----------
     solution : one row for each mode, ordered by the distance from home (of its pose, or for working
         modes of its readings). As `start=` of `forward` or `inverse` it selects the mode.
     hits : (modes,) starts that led to each mode. starts : number of starts.

@@ -90,13 +90,9 @@ def compare_coordinates(
 ) -> tuple[FloatArray, FloatArray]:
     """Return how far poses are from target coordinates, with the derivative in the twist.
 
-    Parameters
-    ----------
     T : (N, 4, 4). target : (N, c) coordinates. size : angles are multiplied by it [m].
-
-    Returns
-    -------
-    residual : (N, c) [m], present - target. columns : (N, c, 6) per twist (rotation, translation).
+    Returns residual : (N, c) [m], present - target. columns : (N, c, 6) per twist (rotation,
+        translation).
     """
     residual = np.zeros(target.shape)
     columns = np.zeros((*target.shape, 6))

@@ -110,8 +110,6 @@ def fold_pose_rows(
 class PassiveSensitivity(NamedTuple):
     """Derivatives of the passive joints.
 
-    Attributes
-    ----------
     names : of the j passive joints, as in `Solution.passive_names`.
     parameters : (t, n, j, p) change of each joint [m, rad] per unit of each parameter. readings :
         (t, n, j, a).

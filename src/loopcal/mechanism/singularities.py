@@ -51,8 +51,6 @@ SAMPLE_SIZE = 400
 class Singularity(Result):
     """Distance of n poses from singularities.
 
-    Attributes
-    ----------
     closure_sign : (n,) sign of the determinant of A; it changes only at a singularity. 0 if A is
         not square.
     margin : (n,) smallest singular value of A [m/m]; NaN where the pose was not reached.
@@ -152,8 +150,6 @@ def analyze_singularity(
 ) -> Singularity:
     """Return the distance of poses from singularities.
 
-    Parameters
-    ----------
     poses : a Solution, or poses (n, 4, 4) or controlled coordinates (n, c) for `inverse`.
     medians : of margin and drive margin, to compare with (default: over the workspace).
     """

@@ -189,9 +189,7 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
 
     With summed drives they are (a, 18 + J).
 
-    Raises
-    ------
-    MechanismError : unknown term, or a gain of zero.
+    Raises MechanismError: unknown term, or a gain of zero.
     """
     for actuator in actuators:
         wrong = sorted(set(actuator.terms) - set(ALL_TERMS))

@@ -30,8 +30,6 @@ MIN_REACHABLE_SHARE = 1e-2
 class Limit(NamedTuple):
     """A quantity that must stay between two bounds.
 
-    Attributes
-    ----------
     name : e.g. `stroke of q3`. dimension : length or angle. low, high : bounds [m or rad].
     value : (t, n) [m or rad]. is_stroke : whether it is the stroke of an actuator.
     """
@@ -122,8 +120,6 @@ def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[
 class WorkspaceSample(Result):
     """Positions drawn at random from a workspace.
 
-    Attributes
-    ----------
     coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses.
     reachable_share : share of the stated ranges that the machine reaches.
     rejected : number of rejected positions by reason, the most frequent first.
@@ -197,9 +193,7 @@ def resolve_poses(robot: Mechanism, poses: ArrayLike | int, seed: int) -> FloatA
 def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
     """Return the range of every controlled coordinate [m, rad]; phi is a full turn by default.
 
-    Raises
-    ------
-    MechanismError : the robot states no range for a coordinate.
+    Raises MechanismError: the robot states no range for a coordinate.
     """
     stated = dict(robot.assembly.workspace)
     if "theta" in stated:

@@ -90,8 +90,6 @@ def build_ups_leg(
 ) -> PlacedLimb:
     """Return a leg whose joints are all at zero in the home pose.
 
-    Parameters
-    ----------
     base, top : centers in base and platform frame [m]. home : (4, 4) T_base_platform of the home
         pose.
     axes : True for an upper joint of three axes, False for a ball.
@@ -114,9 +112,7 @@ def build_screw_leg(
 ) -> PlacedLimb:
     """Return a leg with a screw, in which the reading alone drives the slide.
 
-    Raises
-    ------
-    MechanismError : a joint axis lies along the leg at home.
+    Raises MechanismError: a joint axis lies along the leg at home.
     """
     s, length = _find_direction(name, base, top, home)
     lower = _normalize(name, screw.base_axis)
@@ -227,9 +223,7 @@ class Gough(RobotRecord):
     def expand(self) -> Assembly:
         """Return six legs in the stated form.
 
-        Raises
-        ------
-        MechanismError : another number of legs, or a model that this form cannot carry.
+        Raises MechanismError: another number of legs, or a model that this form cannot carry.
         """
         self._check()
         legs, actuators, errors = [], [], ErrorModel()

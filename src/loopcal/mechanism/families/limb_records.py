@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from loopcal.mechanism.transmission import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
-
-# Records of triangle drives: a linear actuator that turns a revolute joint through two
-# anchors.
 
 ON_AXIS = 1e-9
 """Distance of an anchor from the axis, as a share of the larger one, that is no lever."""
@@ -105,21 +102,22 @@ def place_triangle(
 ) -> Mapping[str, float]:
     """Return the terms of a triangle in the joint's own frame, by name.
 
-    Parameters
-    ----------
     name : of the actuator. rotation : (3, 3) R_placed_joint, whose third column is the joint's
         axis. start : angle of the joint near home [rad], which selects the side.
-
-    Raises
-    ------
-    MechanismError
-        An anchor on the axis, a start at a dead point, or a stroke that no angle reaches.
+    Raises MechanismError: an anchor on the axis, a start at a dead point, or a stroke that no angle
+        reaches.
     """
     triangle = drive.triangle
     points = np.array([triangle.foot, triangle.head]) @ rotation
     skew = rotation.T @ [triangle.skew.rx, triangle.skew.ry, triangle.skew.rz]
     terms = np.array([*points.ravel(), *skew[:2], 1.0, 0.0])
-    _refuse_anchors_on_axis(name, terms)
+    low, high = (float(end) for end in compute_range(terms))
+    # b of l^2 = a - b cos(theta - gamma) is twice the product of both levers
+    if not high**2 - low**2 > 4 * ON_AXIS * float((points**2).sum(axis=1).max()):
+        raise MechanismError(
+            f"the triangle of actuator {name!r} is degenerate: an anchor is on the axis of the "
+            "joint, so that the length is the same at every angle; state anchors beside the axis"
+        )
     sine, middle = find_side(start, terms)
     if abs(sine) < DEAD:
         raise MechanismError(
@@ -128,26 +126,6 @@ def place_triangle(
             "`start:` of the joint, or other anchors"
         )
     terms[-2:] = np.sign(sine), middle
-    _refuse_stroke(name, drive, terms)
-    return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))
-
-
-def _refuse_anchors_on_axis(name: str, terms: FloatArray) -> None:
-    """Refuse an anchor on the axis of the joint; terms : (10,)."""
-    # b of l^2 = a - b cos(theta - gamma) is twice the product of both levers
-    low, high = compute_range(terms)
-    scale = max(np.linalg.norm(terms[0:3]), np.linalg.norm(terms[3:6]))
-    if high**2 - low**2 > 4 * ON_AXIS * scale**2:
-        return
-    raise MechanismError(
-        f"the triangle of actuator {name!r} is degenerate: an anchor is on the axis of the joint, "
-        "so that the length is the same at every angle; state anchors beside the axis"
-    )
-
-
-def _refuse_stroke(name: str, drive: TriangleDrive, terms: FloatArray) -> None:
-    """Refuse a stroke with a length that no angle of the joint reaches."""
-    low, high = (float(end) for end in compute_range(terms))
     for reading in drive.stroke or ():
         length = drive.offset + drive.gain * reading
         if np.isfinite(length) and not low <= length <= high:
@@ -156,12 +134,7 @@ def _refuse_stroke(name: str, drive: TriangleDrive, terms: FloatArray) -> None:
                 f"no angle of its joint reaches: the anchors are {low * 1e3:.6g} to "
                 f"{high * 1e3:.6g} mm apart; correct the stroke or the anchors"
             )
-
-
-def list_triangle_parameters(drive: TriangleDrive) -> tuple[str, ...]:
-    """Return the names of all dimensions of a triangle."""
-    points = tuple(f"{point}.{axis}" for point in POINTS for axis in AXES[3:])
-    return (*points, *(f"{SKEW}.{axis}" for axis in AXES[:3]))
+    return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))
 
 
 def triangle_errors(
@@ -169,18 +142,16 @@ def triangle_errors(
 ) -> ErrorModel:
     """Return the unknown dimensions of a triangle, `q1.foot.x` and so on.
 
-    Parameters
-    ----------
     name, drive, rotation : as in `place_triangle`. other : terms of the drive beside the triangle.
-
-    Raises
-    ------
-    MechanismError
-        A dimension that a triangle does not have, or a skew about the joint's own axis.
+    Raises MechanismError: a dimension that a triangle does not have, or a skew about the joint's
+        own axis.
     """
+    known = (
+        *(f"{point}.{axis}" for point in POINTS for axis in AXES[3:]),
+        *(f"{SKEW}.{axis}" for axis in AXES[:3]),
+    )
     errors = []
     for term in _expand_unknowns(drive, rotation):
-        known = list_triangle_parameters(drive)
         if term not in known:
             allowed = (*other, *POINTS, SKEW, *known)
             raise MechanismError(
@@ -592,20 +563,6 @@ def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
 WEIGHT = "weight"
 
 
-class SummedDrive(Protocol):
-    """What a drive of a sum states beside its transmission."""
-
-    @property
-    def unknown(self) -> tuple[str, ...]:
-        """Names of the terms to identify."""
-        ...
-
-    @property
-    def weights(self) -> RatioTolerance | None:
-        """Tolerance of the weights."""
-        ...
-
-
 class SumError(MechanismError):
     """An impossible sum; `actuator` is the name under which a file states it."""
 
@@ -627,9 +584,7 @@ def list_readings(
     joints : driven joints by name, each with the name that the file states; a drive that copies of
     a limb have in common is one reading for each copy.
 
-    Raises
-    ------
-    SumError : a triangle drive, or a drive that is no sum and moves no joint.
+    Raises SumError: a triangle drive, or a drive that is no sum and moves no joint.
     """
     readings: dict[str, tuple[str, Mapping[str, float]]] = {}
     for key, drive in actuators.items():
@@ -659,15 +614,10 @@ def check_sums(
 ) -> None:
     """Refuse sums that are no readings of the driven joints.
 
-    Parameters
-    ----------
     sums : weights of all readings of a file by name; of a drive without a sum {joint: 1}.
     turning : whether each driven joint is rotary. known : driven joint -> its limb.
-
-    Raises
-    ------
-    SumError : an unknown joint, a sum of an angle and a length, weights that are all zero or not
-        finite, a joint in no sum, more readings than joints, or sums that depend on each other.
+    Raises SumError: an unknown joint, a sum of an angle and a length, weights that are all zero or
+        not finite, a joint in no sum, more readings than joints, or sums that depend on each other.
     """
     for name, weights in sums.items():
         _check_sum(name, weights, turning)
@@ -739,18 +689,17 @@ def weight_errors(
 ) -> ErrorModel:
     """Return the unknown weights of a sum, `q1.weight.m` and so on.
 
-    Parameters
-    ----------
     other : terms of the drive beside the weights.
-
-    Raises
-    ------
-    SumError : the weight of a joint that is not in the sum.
+    Raises SumError: the weight of a joint that is not in the sum.
     """
     unknown: tuple[str, ...] = getattr(drive, "unknown", ())
     tolerance: RatioTolerance | None = getattr(drive, "weights", None)
+    joints: list[str] = []
+    for term in unknown:
+        if is_weight(weights, term):  # `weight` means all of a sum
+            joints += weights if term == WEIGHT else [term.partition(".")[2]]
     errors = []
-    for joint in _expand_unknown_weights(unknown, weights):
+    for joint in joints:
         if joint not in weights:
             allowed = (*other, WEIGHT, *(f"{WEIGHT}.{known}" for known in weights))
             raise SumError(
@@ -764,14 +713,3 @@ def weight_errors(
         entry = LinearMap(parameter, address)
         errors.append(single_error(parameter, Dimension.RATIO, weights[joint], sd, entry))
     return join_errors(errors)
-
-
-def _expand_unknown_weights(
-    unknown: tuple[str, ...], weights: Mapping[str, float]
-) -> Iterator[str]:
-    """Yield the joints whose weights are unknown; `weight` means all of a sum."""
-    for term in unknown:
-        if weights and term == WEIGHT:
-            yield from weights
-        elif is_weight(weights, term):
-            yield term.partition(".")[2]

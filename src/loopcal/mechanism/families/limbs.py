@@ -156,9 +156,7 @@ def build_actuator(name: str, placed: PlacedDrive) -> Actuator:
 def drive_errors(name: str, placed: PlacedDrive) -> ErrorModel:
     """Return the unknown terms of a drive, `q1.offset` and so on.
 
-    Raises
-    ------
-    MechanismError : a term that the drive does not have, or a harmonic without a period.
+    Raises MechanismError: a term that the drive does not have, or a harmonic without a period.
     """
     drive = placed.drive
     known = _list_terms(drive, placed.dimension)
@@ -214,9 +212,7 @@ def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
 def is_always_positive(named: NamedParameter) -> bool:
     """Return whether only values above zero of a named parameter exist, if its nominal value is.
 
-    Raises
-    ------
-    MechanismError : the file says so, but the nominal value is not above zero.
+    Raises MechanismError: the file says so, but the nominal value is not above zero.
     """
     is_stated = isinstance(named, NamedLength) and named.positive
     nominal = get_quantity(named)[1]
@@ -233,9 +229,7 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
 
     A file states a lead per turn, the engine a pitch per radian.
 
-    Raises
-    ------
-    MechanismError : the axis `pitch`, for which a file states the lead.
+    Raises MechanismError: the axis `pitch`, for which a file states the lead.
     """
     if entry.axis == "pitch":
         raise MechanismError(
@@ -252,7 +246,13 @@ def check_units(named: NamedParameter, entry: MapEntry, drive: PlacedDrive | Non
 
     `drive` is the drive that the entry names. A ratio is a slope for an angle.
     """
-    (dimension, _), needed = get_quantity(named), _find_needed_dimension(entry.axis, drive)
+    (dimension, _), axis = get_quantity(named), entry.axis
+    if drive is None or axis not in ("offset", "backlash", "gain", "curve"):
+        needed = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
+    elif axis in ("gain", "curve"):  # per unit of the reading
+        needed = Dimension.LENGTH if isinstance(drive.drive, SpoolDrive) else Dimension.RATIO
+    else:
+        needed = drive.dimension
     what = f"parameter {named.name!r} is {ARTICLES[dimension]}"
     onto = f"{entry.axis} of {entry.limb!r} {ARTICLES[needed]}"
     if entry.arm is not None:
@@ -271,15 +271,6 @@ def check_units(named: NamedParameter, entry: MapEntry, drive: PlacedDrive | Non
             f"{what} and {onto}; state an `arm:` [length per radian], or the parameter as a length"
         )
     raise MechanismError(f"{what} and {onto}; state it as {ARTICLES[needed]}")
-
-
-def _find_needed_dimension(axis: str, drive: PlacedDrive | None) -> Dimension:
-    """Return the dimension of what an entry moves; gain and curve count per unit of the reading."""
-    if drive is None or axis not in ("offset", "backlash", "gain", "curve"):
-        return Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
-    if axis in ("gain", "curve"):
-        return Dimension.LENGTH if isinstance(drive.drive, SpoolDrive) else Dimension.RATIO
-    return drive.dimension
 
 
 @dataclass(frozen=True)
@@ -318,24 +309,17 @@ class Limbs(LimbsFile, RobotRecord):
         drives = self._place_drives(copies)
         errors = join_errors(
             (
-                *(_limb_errors(member) for member in copies),
+                *(
+                    (_shifts if isinstance(entry, Shifts) else _tilts)(member.placed, entry)
+                    for member in copies
+                    for entry in member.record.errors
+                ),
                 *(drive_errors(name, drive) for name, drive in drives.items()),
                 *(_named(named, members, drives) for named in self.parameters),
             )
         )
         if self.error_model == "complete":
             errors = self._complete(copies, drives).without_effects_of(errors) + errors
-        self._check(tuple(drives))
-        assembly = self.assemble(
-            (member.placed.limb for member in copies),
-            (build_actuator(name, drive) for name, drive in drives.items()),
-            errors,
-            freedoms=self.freedoms,
-            controlled=self.controlled,
-        )
-        return replace(assembly, closure=self.closure)
-
-    def _check(self, drives: tuple[str, ...]) -> None:
         idle = [
             name
             for name in self.actuators
@@ -346,6 +330,14 @@ class Limbs(LimbsFile, RobotRecord):
                 f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or "
                 "leave it out" + (f"; joints are driven by {', '.join(drives)}" if drives else "")
             )
+        assembly = self.assemble(
+            (member.placed.limb for member in copies),
+            (build_actuator(name, drive) for name, drive in drives.items()),
+            errors,
+            freedoms=self.freedoms,
+            controlled=self.controlled,
+        )
+        return replace(assembly, closure=self.closure)
 
     def _place_drives(self, copies: list[_Member]) -> dict[str, PlacedDrive]:
         """Return the drives by name, in the order of the readings, with their joints."""
@@ -497,14 +489,6 @@ def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlace
     return [JointPlacement(*step) for step in zip(joints, places, axes, strict=False)]
 
 
-def _limb_errors(member: _Member) -> ErrorModel:
-    """Return the unknowns that a limb's record names."""
-    return join_errors(
-        _shifts(member.placed, entry) if isinstance(entry, Shifts) else _tilts(member.placed, entry)
-        for entry in member.record.errors
-    )
-
-
 def _shifts(limb: PlacedLimb, entry: Shifts) -> ErrorModel:
     """Return the unknown lengths of a limb."""
     sd, errors = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}"), []
@@ -543,9 +527,7 @@ def _tilts(limb: PlacedLimb, entry: Tilts) -> ErrorModel:
 def _find_element(limb: PlacedLimb, name: str) -> str:
     """Return the link of a limb by name; a joint of several axes means its first.
 
-    Raises
-    ------
-    MechanismError : no such link; lists the existing ones.
+    Raises MechanismError: no such link; lists the existing ones.
     """
     for candidate in (name, f"{name}.1", f"{name}.turn"):
         if candidate in limb.elements:

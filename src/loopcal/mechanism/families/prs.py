@@ -149,8 +149,6 @@ def carriage_errors(
 
     They are a.. (all three axes), b.., q, l, thB.. and thC.., see the module.
 
-    Parameters
-    ----------
     foot, guide, joint : axes of b, thB and thC. The z coordinate of b has the same effect as q.
     """
     length, angle = spread.length, spread.angle

@@ -88,8 +88,6 @@ def place_limb(
 ) -> PlacedLimb:
     """Return a limb made of its joints, its tip and its attachment.
 
-    Parameters
-    ----------
     steps : the joints from base to tip; the first placement is in the base frame.
     tip : (4, 4) of the tip in the last carried frame [m]; its link is called `tip`, or `base` if
         the limb has no joints.
@@ -120,8 +118,6 @@ def place_limb_with_ball(
 ) -> PlacedLimb:
     """Return a limb that ends in a ball joint on the platform.
 
-    Parameters
-    ----------
     center : (3,) of the ball in the last carried frame [m]. attachment : (4, 4) in the platform.
     axes : None for a perfect ball. A ball of three rotary joints z, y, x through its center, with
         errors of their own, has the orientation (3, 3) at which they are all at zero.
@@ -142,9 +138,7 @@ def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
 
     The axes x, y and z give a cyclic permutation.
 
-    Raises
-    ------
-    MechanismError : the axis is zero.
+    Raises MechanismError: the axis is zero.
     """
     length = float(np.linalg.norm(axis))
     if not length > 0:
@@ -194,9 +188,7 @@ def map_slide_tilt(
     exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k if w' = -(P A_k)' w. The
     translation of what is placed off the slide is compensated to first order.
 
-    Raises
-    ------
-    MechanismError : the joint is not a slide.
+    Raises MechanismError: the joint is not a slide.
     """
     names = limb.elements
     place = names.index(element)
@@ -458,9 +450,7 @@ def standard_deviation(
 ) -> float | None:
     """Return the standard deviation of a tolerance [SI], None if none is stated.
 
-    Raises
-    ------
-    MechanismError : both or neither of sd and limits, or a value that is not positive.
+    Raises MechanismError: both or neither of sd and limits, or a value that is not positive.
     """
     if tolerance is None:
         return None
@@ -497,10 +487,8 @@ class CommonErrorRecord:
     def resolve(self, parameters: Sequence[Parameter]) -> CommonError:
         """Return the common error of the parameters that match.
 
-        Raises
-        ------
-        MechanismError : no or several dimensions, a single parameter, or parameters of another
-            dimension or without a tolerance of their own.
+        Raises MechanismError: no or several dimensions, a single parameter, or parameters of
+            another dimension or without a tolerance of their own.
         """
         stated = {d: getattr(self, d.value) for d in Dimension if getattr(self, d.value)}
         if len(stated) != 1:
@@ -632,14 +620,9 @@ class RobotRecord:
         """Return the expanded robot, with the parameters of `fixed` kept at their nominal values,
         the names of those that the controller stores, and the common errors of the others.
 
-        Parameters
-        ----------
         expanded : result of `expand`, where it is known.
-
-        Raises
-        ------
-        MechanismError
-            A name or pattern that matches no parameter, or a common error that cannot be.
+        Raises MechanismError: a name or pattern that matches no parameter, or a common error that
+            cannot be.
         """
         expanded = self.expand() if expanded is None else expanded
         names = [parameter.name for parameter in expanded.parameters]

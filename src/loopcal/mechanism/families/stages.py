@@ -23,7 +23,6 @@ from loopcal.mechanism.assembly import (
     Assembly,
     AttachedStage,
     Joint,
-    Limb,
     LinearMap,
     SharedMap,
 )
@@ -93,14 +92,9 @@ class StageMap:
 def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> list[str]:
     """Return what each stage is attached to: BASE, or an earlier stage.
 
-    Parameters
-    ----------
     parents : stated for each stage; None for the previous one.
-
-    Raises
-    ------
-    StageError
-        Duplicate or reserved names, a stage on an unknown or later one, or a cycle of stages.
+    Raises StageError: duplicate or reserved names, a stage on an unknown or later one, or a cycle
+        of stages.
     """
     if not names:
         raise StageError("there are no stages; list those of the chain, from the base on", 0)
@@ -160,15 +154,17 @@ def join_stages(
     """Return the assembly of a chain; its home is that of its stages, and is found when it is
     compiled.
 
-    Raises
-    ------
-    StageError : a stage without actuators, or an actuator of two stages.
+    Raises StageError: a stage without actuators, or an actuator of two stages.
     """
     _refuse_wrong_drives(stages)
     assemblies = [(stage.name, stage.assembly) for stage in stages]
     return Assembly(
         name,
-        tuple(_rename_limb(prefix, limb) for prefix, part in assemblies for limb in part.limbs),
+        tuple(
+            replace(limb, name=f"{prefix}.{limb.name}")
+            for prefix, part in assemblies
+            for limb in part.limbs
+        ),
         tuple(actuator for _, part in assemblies for actuator in part.actuators),
         AXES,
         controlled,
@@ -179,7 +175,13 @@ def join_stages(
             for parameter in part.parameters
         ),
         tuple(
-            _rename_map(prefix, part, entry) for prefix, part in assemblies for entry in part.maps
+            replace(
+                entry,
+                parameter=f"{prefix}.{entry.parameter}",
+                address=_rename_address(prefix, part, entry.address),
+            )
+            for prefix, part in assemblies
+            for entry in part.maps
         ),
         tuple(
             StageMap(
@@ -226,17 +228,6 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
                     i,
                 )
         owner |= dict.fromkeys(own, stage.name)
-
-
-def _rename_limb(prefix: str, limb: Limb) -> Limb:
-    """Return a limb with the name of its stage before its own."""
-    return replace(limb, name=f"{prefix}.{limb.name}")
-
-
-def _rename_map(prefix: str, part: Assembly, entry: LinearMap) -> LinearMap:
-    """Return a map with the names of the chain."""
-    address = _rename_address(prefix, part, entry.address)
-    return replace(entry, parameter=f"{prefix}.{entry.parameter}", address=address)
 
 
 def _rename_address(prefix: str, part: Assembly, address: Address) -> Address:
@@ -358,11 +349,9 @@ class PlacedStages(Stages):
     def expand(self) -> Assembly:
         """Return the assembly of all stages.
 
-        Raises
-        ------
-        StageError
-            Names that do not fit together, a stage without actuators, a drive of two stages.
-        MechanismError : a stage that cannot be expanded.
+        Raises StageError: names that do not fit together, a stage without actuators, a drive of two
+            stages.
+        Raises MechanismError: a stage that cannot be expanded.
         """
         if self.home != PoseRecord():
             raise MechanismError(

@@ -23,8 +23,6 @@ from loopcal.typing import FloatArray
 class GraphJoint:
     """A joint: the frame `T_a` of one body, moved by the joint, is the frame `T_b` of the other.
 
-    Attributes
-    ----------
     kind : R (rotary), P (slide) or S (ball joint). body_a, body_b : the bodies.
     T_a, T_b : (4, 4) frames in their bodies [m]. axis : (3,) unit vector in both; unused for S.
     origin_a, origin_b : names of the places in the source file that give these frames; empty where
@@ -120,8 +118,6 @@ STEEP = 0.2
 def choose_coordinates(T: FloatArray, twists: FloatArray) -> tuple[str, ...]:
     """Return coordinates of a platform that move independently, positions first.
 
-    Parameters
-    ----------
     T : (4, 4) of the platform at home. twists : (6, m) for the m motions of the mechanism,
         (rotation, translation) [rad, m].
     """

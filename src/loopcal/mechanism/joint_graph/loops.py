@@ -37,8 +37,6 @@ STEPS, LARGEST_STEP = 40, 0.6
 class Placement:
     """Places of a tree at n joint values.
 
-    Attributes
-    ----------
     T : (n, bodies, 4, 4) T_base_body [m]. axes, points : (n, j, 3) axis and a point of each joint.
     """
 
@@ -51,8 +49,6 @@ class Placement:
 class JointGraph:
     """A mechanism.
 
-    Attributes
-    ----------
     base : the root body. tree : joints, each after the one that carries its first body.
     closing : joints that close loops. motors : names of driven joints, all in the tree.
     """
@@ -284,8 +280,6 @@ IDLE = 1e-9
 class Freedoms:
     """What a mechanism can do at a pose.
 
-    Attributes
-    ----------
     mobility : freedoms of motors and platform. idle : motions in which only passive joints move.
     moved : joints that move in these. firmness : how well the motors hold the passive joints and
         move the platform [1]; zero at a singular pose.
@@ -303,9 +297,7 @@ def find_homes(graph: JointGraph) -> tuple[FloatArray, ...]:
 
     Poses of larger mobility, from which a link could move either way, are left out.
 
-    Raises
-    ------
-    MechanismError : the loops do not close; names the closure that remains open.
+    Raises MechanismError: the loops do not close; names the closure that remains open.
     """
     sizes = np.where(graph.turns, 1.0, graph.size)
     low, high = _list_limits(graph)
@@ -468,8 +460,6 @@ def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
 class Repair:
     """A mechanism whose loops close exactly.
 
-    Attributes
-    ----------
     graph : with closed loops. gap, angle : largest gap of a closure before the repair [m, rad].
     turn : largest rotation of an axis [rad].
     """
@@ -483,8 +473,6 @@ class Repair:
 def repair_rounded_loops(graph: JointGraph, rounding: tuple[float, float]) -> Repair:
     """Return a mechanism with loops that close; as it is where they do, or where no repair helps.
 
-    Parameters
-    ----------
     rounding : error of its lengths [m] and angles [rad] by the rounding of their numbers.
     """
     unchanged = Repair(graph)

@@ -38,8 +38,6 @@ from loopcal.typing import FloatArray
 class Block:
     """A block.
 
-    Attributes
-    ----------
     graph : its joints; its base is the body that carries them. platform : the body that carries
         what follows; empty where this is not decided.
     """
@@ -112,8 +110,6 @@ Path = tuple[GraphJoint, ...]
 class LimbPaths:
     """A mechanism as limbs.
 
-    Attributes
-    ----------
     graph : its base carries the limbs. home : joint values (j,). platform : its body.
     limbs : joints of each limb, each from the body before it. freedoms : of the platform, in base
         axes. motions : what motors and passive joints can do at home.
@@ -309,8 +305,6 @@ PARALLEL, ALONG = 1e-9, 1e-12
 class ClosedStage:
     """A stage with closed loops.
 
-    Attributes
-    ----------
     paths : its limbs, from a base frame of its own.
     mount : (4, 4) that frame in the body that carries the stage [m]; turned where the normal of
         the plane of the loops is not an axis of that body.
@@ -331,8 +325,6 @@ class ClosedStage:
 class SerialStage:
     """A driven joint in no loop.
 
-    Attributes
-    ----------
     start : its value at home [rad or m]. frame : (4, 4) of its platform in the body that carries
         what follows [m].
     """
@@ -351,8 +343,6 @@ class SerialStage:
 class StagePaths:
     """A mechanism as stages.
 
-    Attributes
-    ----------
     graph : what is between base and platform. home : joint values (j,). platform : its body.
     stages : from the base on. motions : what motors and passive joints can do at home.
     dangling : joints that were left out. outside : motors among them.
@@ -393,10 +383,8 @@ def find_stage_paths(
     `locate_frame` gives the frame (4, 4) of a body that is the platform of a stage,
     `measure_rounding` the rounding errors [m, rad] of numbers that describe some bodies.
 
-    Raises
-    ------
-    MechanismError : the loops do not close, a limb branches, no limbs join base and platform, or no
-        motor holds a joint between them; a finding with the joints.
+    Raises MechanismError: the loops do not close, a limb branches, no limbs join base and platform,
+        or no motor holds a joint between them; a finding with the joints.
     """
     kept = keep_path(whole, platform)
     repair = _repair_blocks(kept, find_blocks(kept, platform), measure_rounding)
@@ -598,9 +586,7 @@ class Bodies:
 def weld_bodies(base: str, welds: Sequence[Weld]) -> Bodies:
     """Return the rigid bodies that welds make.
 
-    Raises
-    ------
-    MechanismError : a weld joins two links that are one rigid body already.
+    Raises MechanismError: a weld joins two links that are one rigid body already.
     """
     bodies = Bodies({})
     for weld in welds:
@@ -620,10 +606,8 @@ def weld_bodies(base: str, welds: Sequence[Weld]) -> Bodies:
 def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, ...]) -> JointGraph:
     """Return the mechanism of joints between bodies.
 
-    Raises
-    ------
-    MechanismError : a joint joins a body to itself, two join the same points of two bodies, or a
-        loop has driven joints only.
+    Raises MechanismError: a joint joins a body to itself, two join the same points of two bodies,
+        or a loop has driven joints only.
     """
     for joint in joints:
         if joint.body_a == joint.body_b:
