@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Resident memory of fits of many machines at once, beyond their data and results."""
 
-import ctypes
 import gc
+import os
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from loopcal.io.robot.robot_file import load_robot
 FEW, MANY = 1_000, 10_000
 CLEAR = Path("/proc/self/clear_refs")
 """Writing 5 to this file resets the peak of the resident memory, on Linux."""
+RETURNED = dict.fromkeys(("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"), "16384")
+"""Settings with which glibc returns what is freed at once, so that it is not resident."""
 
 
 def bench_trial_memory() -> list[Metric]:
@@ -42,7 +45,10 @@ def bench_trial_memory() -> list[Metric]:
 def _run(count: int) -> float:
     """Return the memory [bytes] that a process measures for so many fits."""
     command = [sys.executable, "-m", "benchmarks.bench_trial_memory", str(count)]
-    process = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    environment = os.environ | RETURNED
+    process = subprocess.run(
+        command, cwd=ROOT, check=True, capture_output=True, text=True, env=environment
+    )
     return float(process.stdout)
 
 
@@ -50,10 +56,9 @@ def measure_memory(count: int) -> float:
     """Return the peak of the resident memory [bytes] during fits, without data and results."""
     robot = load_robot("hexapod-42")
     identify_trials(robot, simulate_hexapods(200), LeastSquares(), chord_start=True)
-    trials = simulate_hexapods(count)
+    with ProcessPoolExecutor(1) as pool:  # what the simulation frees is not resident here
+        trials = pool.submit(simulate_hexapods, count).result()
     gc.collect()
-    if hasattr(ctypes.CDLL(None), "malloc_trim"):  # what the simulation freed is not resident
-        ctypes.CDLL(None).malloc_trim(0)
     before = _read_status("VmRSS")
     CLEAR.write_text("5", encoding="ascii")
     result = identify_trials(robot, trials, LeastSquares(), chord_start=True)

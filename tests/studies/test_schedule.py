@@ -26,7 +26,7 @@ from loopcal.studies.specification.levels import (
     NoiseLevel,
     PosesLevel,
 )
-from loopcal.studies.specification.study import Study, compute_key, describe_block
+from loopcal.studies.specification.study import Study, compute_key, describe_cell
 from tests.studies.studies import make_study
 
 POSES = CellPoses([[0.1, 0.2]], [[0.3, 0.4]])
@@ -35,7 +35,7 @@ METHODS = {"LS": MethodLevel("least-squares"), "MAP": MethodLevel("map")}
 
 def list_missing(study: Study) -> Iterator[Iterator[MissingBlock]]:
     for cell in study.cells:
-        contents = [describe_block(study, cell, block) for block in range(study.blocks)]
+        contents = [describe_cell(study, cell) | {"block": block} for block in range(study.blocks)]
         yield iter([MissingBlock(compute_key(c), cell.number, c) for c in contents])
 
 

@@ -21,7 +21,7 @@ from loopcal.studies.specification.levels import (
     PosesLevel,
     Scores,
 )
-from loopcal.studies.specification.study import Study, list_varied_factors
+from loopcal.studies.specification.study import Study
 from tests.studies.studies import CAMERA, make_study, read_robot
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "studies").glob("*.yaml"))
@@ -90,7 +90,7 @@ def test_a_study_file_is_read_in_si(write):
     assert len(study.cells) == 2 * 2 * 2 * 2 * 2 * 2 * 2
     assert study.cells[1].levels["effects"] == "wrong"  # the last factor varies fastest
     assert study.cells[1].levels["robot"] == "linear-delta"
-    assert list_varied_factors(study)[0] == "robot"
+    assert study.varied_factors[0] == "robot"
     assert study.count_trials(5) == 20
     assert study.count_trials(6) == 10
 

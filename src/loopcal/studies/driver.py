@@ -6,13 +6,13 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
@@ -31,16 +31,8 @@ from loopcal.studies.simulation.block import (
 )
 from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
-from loopcal.studies.specification.study import (
-    Cell,
-    Study,
-    compute_key,
-    describe_block,
-    list_factors,
-)
+from loopcal.studies.specification.study import Cell, Study, compute_key, describe_cell
 from loopcal.typing import Progress, report_no_progress
-
-# --- The order of the work of a study: the poses of a cell, then its blocks.
 
 KEPT_POSES = 256
 """Poses that are kept, because later cells have the same ones, such as those of other methods."""
@@ -49,9 +41,8 @@ MOST_WAITING = 64
 """Cells that may wait for poses which they have in common."""
 
 
-@dataclass(frozen=True)
-class MissingBlock:
-    """A block to compute. `cell` : number of its cell. `content` : what determines its numbers."""
+class MissingBlock(NamedTuple):
+    """A block to compute, the number of its cell, and what determines its numbers."""
 
     key: str
     cell: int
@@ -63,12 +54,11 @@ Blocks = Iterator[MissingBlock]
 
 
 class Schedule(Iterator["BlockTask | PosesTask | None"]):
-    """Tasks, one by one; None while all that is left needs poses that a worker computes.
+    """Tasks, one by one: the poses of a cell, then its blocks; None while all that is left needs
+    poses that a worker computes.
 
-    Parameters
-    ----------
     cells : missing blocks of each cell. Few of them are taken ahead, so that memory does not grow
-        with the number of cells or blocks.
+    with the number of cells or blocks.
     """
 
     def __init__(self, cells: Iterable[Blocks]) -> None:
@@ -85,9 +75,8 @@ class Schedule(Iterator["BlockTask | PosesTask | None"]):
         while True:
             if self._current is not None:
                 blocks, poses = self._current
-                block = next(blocks, None)
-                if block is not None:
-                    return make_block_task(block.key, block.cell, block.content, poses)
+                if (block := next(blocks, None)) is not None:
+                    return make_block_task(*block, poses)
             self._current = None
             if not self._next and (task := self._look_ahead()) is not None:
                 return task
@@ -216,10 +205,8 @@ def run_blocks(
     progress: Progress = report_no_progress,
     threads: int = 1,
 ) -> RunReport:
-    """Compute and store the blocks of a study that are missing in its store.
-
-    Every block is stored as soon as it is there. Work that is stopped, in whatever way, loses only
-    the blocks in flight. `threads` compute a block, in each worker.
+    """Compute and store the blocks of a study that are missing in its store, each as soon as it is
+    there; `threads` compute a block, in each worker.
 
     Raises
     ------
@@ -227,8 +214,7 @@ def run_blocks(
         `compute_block`.
     """
     begin = time.perf_counter()
-    total = count_blocks(study, share)
-    before = count_stored(study, store, share)
+    total, before = count_blocks(study, share), count_stored(study, store, share)
     computed = trials = losses = 0
     seconds, given_up = 0.0, []
     progress(before, total, "computing blocks")
@@ -269,24 +255,21 @@ def count_stored(study: Study, store: StudyStore, share: Share = WHOLE) -> int:
 def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blocks]:
     """Yield, for one cell after the other, its blocks that are not stored."""
     blocks = share.select_blocks(study)
+
+    def list_blocks(cell: Cell) -> Blocks:
+        of_cell = describe_cell(study, cell)
+        for first in range(0, len(blocks), LISTED):
+            listed = blocks[first : first + LISTED]
+            stored = store.list_keys(cell.levels, listed)
+            contents = (of_cell | {"block": block} for block in listed)
+            for key, content in ((compute_key(content), content) for content in contents):
+                if key not in stored:
+                    yield MissingBlock(key, cell.number, content)
+
     for cell in share.select_cells(study):
         if store.count_blocks(cell.levels, blocks) < len(blocks):
-            yield _list_blocks(study, store, cell, blocks)
+            yield list_blocks(cell)
 
-
-def _list_blocks(study: Study, store: StudyStore, cell: Cell, blocks: range) -> Blocks:
-    """Yield the blocks of a cell that are not stored."""
-    for first in range(0, len(blocks), LISTED):
-        listed = blocks[first : first + LISTED]
-        stored = store.list_keys(cell.levels, listed)
-        for block in listed:
-            content = describe_block(study, cell, block)
-            key = compute_key(content)
-            if key not in stored:
-                yield MissingBlock(key, cell.number, content)
-
-
-# --- Estimate how long a study takes, by computing one block of some of its cells.
 
 MOST_BLOCKS = 4
 """Cells of which a block is computed at most; further cells are estimated from them."""
@@ -335,30 +318,31 @@ def estimate_time(
     ------
     LoopcalError : one of these cells cannot be computed; the text names it.
     """
-    chosen = _spread(study.cells, MOST_BLOCKS)
-    seconds, trials = [], 0
-    failures: dict[str, int] = {}
+    last = len(study.cells) - 1
+    chosen = range(last + 1)
+    if last >= MOST_BLOCKS:
+        chosen = [round(i * last / (MOST_BLOCKS - 1)) for i in range(MOST_BLOCKS)]
+    seconds, trials, planning = [], 0, 0.0
+    failures: Counter[str] = Counter()
     poses: dict[str, CellPoses] = {}
-    planning = 0.0
-    for i, cell in enumerate(chosen):
+    for i, number in enumerate(chosen):
         progress(i, len(chosen), "computing a block")
-        content = describe_block(study, cell, 0)
+        content = describe_cell(study, study.cells[number]) | {"block": 0}
         plan = make_poses_task(content)
         if plan.key not in poses:
             begin = time.perf_counter()
             poses[plan.key] = compute_poses(json.loads(plan.content))
             planning += time.perf_counter() - begin
-        task = make_block_task(compute_key(content), cell.number, content, poses[plan.key])
+        task = make_block_task(compute_key(content), number, content, poses[plan.key])
         begin = time.perf_counter()
         result = compute_block(task)
         seconds.append(time.perf_counter() - begin)
         trials += len(result.values)
-        for code in (OUTCOMES[int(number)] for number in result.values[:, 0] if number):
-            failures[code] = failures.get(code, 0) + 1
+        failures.update(OUTCOMES[int(outcome)] for outcome in result.values[:, 0] if outcome)
         if sum(seconds) + planning > LONGEST:
             break
     blocks = study.blocks * len(study.cells)
-    plans = len({make_poses_task(describe_block(study, cell, 0)).key for cell in study.cells})
+    plans = len({make_poses_task(describe_cell(study, cell)).key for cell in study.cells})
     each, each_plan = sum(seconds) / len(seconds), planning / len(poses)
     return TimeEstimate(
         cells=len(study.cells),
@@ -384,8 +368,7 @@ def view_estimate(
     """Return the page of an estimate."""
     cells = name_count(estimate.cells, "cell")
     lines: list[Block] = [f"{study.title}: {cells}, {estimate.trials} trials"]
-    for name in list_factors(study):
-        levels = dict.fromkeys(cell.levels[name] for cell in study.cells)
+    for name, levels in study.levels.items():
         separator = "; " if any("," in level for level in levels) else ", "
         lines.append(f"  {name:<12}{separator.join(levels)}")
     total = format_duration(estimate.seconds)
@@ -399,10 +382,3 @@ def view_estimate(
         times = "once" if estimate.plans == 1 else f"{estimate.plans} times"
         lines.append(f"This includes planning poses, {estimate.seconds_per_plan:.2g} s {times}")
     return [*lines, *explain_failures(estimate.failures, estimate.computed)]
-
-
-def _spread(cells: tuple[Cell, ...], count: int) -> list[Cell]:
-    """Return some cells, evenly spread, with the first and the last."""
-    if len(cells) <= count:
-        return list(cells)
-    return [cells[round(i * (len(cells) - 1) / (count - 1))] for i in range(count)]

@@ -11,6 +11,7 @@ from typing import Any
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.estimate.published_steps import identify_per_leg
 from loopcal.estimate.trial_identification import check_threads
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
@@ -24,8 +25,8 @@ from loopcal.studies.files.study_file import load_study
 from loopcal.studies.files.study_folder import StudySource, open_study, read_study
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.simulation.block import replay_trial
-from loopcal.studies.simulation.fits import refuse_per_leg
-from loopcal.studies.specification.levels import FACTORS
+from loopcal.studies.simulation.fits import choose_rule
+from loopcal.studies.specification.levels import FACTORS, PER_LEG
 from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
 
@@ -148,8 +149,9 @@ def calibrate_trial(
     """
     study = read_study(folder)
     simulated = replay_trial(study, cell, trial)
-    if simulated.method.method == "per-leg":
-        refuse_per_leg(simulated.method, simulated.robot, simulated.data)
+    if simulated.method.method == PER_LEG:  # the reason for which such a fit is refused
+        rule = choose_rule(simulated.method)
+        identify_per_leg(simulated.robot, simulated.data, rule.limit, rule.epsilon)
     levels, limits = study.cells[cell].levels, study.scores
     options = CalibrationOptions(
         fit=simulated.options, limit_position=limits.limit_position, limit_angle=limits.limit_angle

@@ -15,14 +15,14 @@ import json
 import os
 import re
 import sqlite3
-import struct
+import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,9 +30,6 @@ from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.replacement import lock, open_folder
 from loopcal.typing import FloatArray
-
-# --- On which file system a folder is: SQLite's write-ahead log needs memory that all its users
-# share, which network file systems do not have.
 
 MOUNTS = Path("/proc/self/mountinfo")
 """Where Linux lists what is mounted."""
@@ -52,46 +49,35 @@ NETWORK_IN_USER_SPACE = re.compile(
 )
 """File systems of user programs, but for those that are known to use a local disk."""
 
-STATFS = struct.Struct("=Ii5Q2iIIII16s")
-"""Beginning of a `statfs` of macOS: sizes and counts, number, owner, type, flags, subtype, name."""
-
-SIZE_OF_STATFS = 4096
-"""Bytes that it has at most."""
-
-LOCAL = 0x1000
-"""Flag of a local file system (MNT_LOCAL)."""
-
 _OCTAL = re.compile(r"\\([0-7]{3})")
+_MOUNT_OF_MACOS = re.compile(r".+? on (.+) \((\w+)(.*)\)")
 
 
 def find_network_file_system(folder: Path) -> str | None:
     """Return the type of the network file system that a folder is on, such as `nfs4`.
 
-    None where it is on a local disk, or where the system does not say it. Of a folder that does not
+    None on a local disk, or where the system does not say it. SQLite's write-ahead log needs memory
+    that all its users share, which network file systems do not have. Of a folder that does not
     exist, the place where it would be made counts.
     """
     path = folder.resolve()
-    if sys.platform == "win32":
-        return _find_network_drive(path)
+    if sys.platform == "win32":  # the letter of a network drive is resolved to its server
+        return "network drive" if path.anchor.startswith("\\\\") else None
     if sys.platform == "darwin":
-        return _find_network_of_macos(path)
-    if not MOUNTS.exists():
+        mounts = subprocess.run(["/sbin/mount"], capture_output=True, text=True, check=False).stdout
+    elif MOUNTS.exists():
+        mounts = MOUNTS.read_text("utf-8", errors="surrogateescape")
+    else:
         return None
-    kind = find_type(MOUNTS.read_text("utf-8", errors="surrogateescape"), path)
-    return kind if is_network(kind) else None
+    kind, is_network = find_type(mounts, path)
+    return kind if is_network else None
 
 
-def is_network(kind: str) -> bool:
-    """Return whether a type of file system is one of a network."""
-    return kind in NETWORK or NETWORK_IN_USER_SPACE.match(kind) is not None
+def find_type(mounts: str, path: Path) -> tuple[str, bool]:
+    """Return the type of the file system of an absolute path, and whether it is one of a network.
 
-
-def find_type(mounts: str, path: Path) -> str:
-    """Return the type of the file system of an absolute path; empty where there is none.
-
-    Parameters
-    ----------
-    mounts : text of the form of /proc/self/mountinfo; the last one of equal mounts counts.
+    mounts : text of /proc/self/mountinfo, or of the command `mount` of macOS; the last one of equal
+    mounts counts.
 
     Examples
     --------
@@ -99,46 +85,20 @@ def find_type(mounts: str, path: Path) -> str:
     >>> server = "2 1 0:40 / /srv rw shared:1 - nfs4 host:/b rw"
     >>> mounts = chr(10).join([disk, server])
     >>> find_type(mounts, Path("/srv/user/study")), find_type(mounts, Path("/tmp"))
-    ('nfs4', 'ext4')
+    (('nfs4', True), ('ext4', False))
     """
-    kind, depth = "", -1
+    found, depth = ("", False), -1
     for line in mounts.splitlines():
-        before, _, after = line.partition(" - ")
-        place = Path(_OCTAL.sub(lambda match: chr(int(match[1], 8)), before.split(" ")[4]))
+        if match := _MOUNT_OF_MACOS.fullmatch(line):
+            place, kind, is_local = Path(match[1]), match[2], ", local" in match[3]
+        else:
+            before, _, after = line.partition(" - ")
+            name = _OCTAL.sub(lambda octal: chr(int(octal[1], 8)), before.split(" ")[4])
+            place, kind, is_local = Path(name), after.split(" ")[0], True
         if path.is_relative_to(place) and len(place.parts) >= depth:
-            kind, depth = after.split(" ")[0], len(place.parts)
-    return kind
-
-
-def parse_statfs(content: bytes) -> tuple[str, bool]:
-    """Return the type of a file system, and whether it is a local one, of a `statfs` of macOS."""
-    *_, flags, _, name = STATFS.unpack_from(content)
-    return name.partition(b"\0")[0].decode("ascii", "replace"), bool(flags & LOCAL)
-
-
-def _find_network_of_macos(path: Path) -> str | None:
-    """Return the type of the file system of a path of macOS where it is one of a network."""
-    import ctypes
-
-    while not path.exists() and path != path.parent:
-        path = path.parent
-    library = ctypes.CDLL(None)
-    # the processors of Intel have an older function of the same name
-    function = getattr(library, "statfs$INODE64", None) or library.statfs
-    buffer = ctypes.create_string_buffer(SIZE_OF_STATFS)
-    if function(str(path).encode(sys.getfilesystemencoding(), "surrogateescape"), buffer) != 0:
-        return None
-    kind, is_local = parse_statfs(buffer.raw)
-    return kind if is_network(kind) or not is_local else None
-
-
-def _find_network_drive(path: Path) -> str | None:
-    """Return "network drive" for a path of Windows on one."""
-    import ctypes
-
-    remote = 4  # DRIVE_REMOTE
-    kind = ctypes.windll.kernel32.GetDriveTypeW(path.anchor)  # type: ignore[attr-defined]
-    return "network drive" if kind == remote or path.anchor.startswith("\\\\") else None
+            is_network = kind in NETWORK or NETWORK_IN_USER_SPACE.match(kind) is not None
+            found, depth = (kind, is_network or not is_local), len(place.parts)
+    return found
 
 
 NAME = "study.sqlite"
@@ -175,6 +135,9 @@ Levels = Mapping[str, str]
 """Factor -> name of its level: what a cell is called, whatever else a study contains."""
 
 
+OF_CELL = "FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?)"
+
+
 @dataclass(frozen=True)
 class StoreHeader:
     """What a store says about its study.
@@ -190,8 +153,7 @@ class StoreHeader:
     versions: Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class CellCount:
+class CellCount(NamedTuple):
     """How much of one cell is stored."""
 
     blocks: int
@@ -206,11 +168,15 @@ class StudyStore:
     path: Path
     connection: sqlite3.Connection
 
+    def ask(self, question: str, *values: Any) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows that answer a question of SQL."""
+        with _report_errors(self.path):
+            yield from self.connection.execute(question, values)
+
     @property
     def header(self) -> StoreHeader:
         """What the store says about its study."""
-        with _report_errors(self.path):
-            rows = dict(self.connection.execute("SELECT name, value FROM study"))
+        rows = dict(self.ask("SELECT name, value FROM study"))
         try:
             columns, versions = json.loads(rows["columns"]), json.loads(rows["versions"])
             if not isinstance(columns, list) or not isinstance(versions, dict):
@@ -237,12 +203,8 @@ class StudyStore:
     def add_block(
         self, key: str, levels: Levels, block: int, scores: FloatArray, seconds: float
     ) -> bool:
-        """Store a block, in one transaction, and return whether it is new.
-
-        Parameters
-        ----------
-        key : of the block. levels : of its cell. block : its number in the cell.
-        scores : (B, s). seconds : of its computation.
+        """Store a block in one transaction, with its number in its cell, its scores (B, s) and the
+        seconds of its computation; return whether it is new.
 
         Raises
         ------
@@ -251,47 +213,28 @@ class StudyStore:
         assert scores.shape == (len(scores), self.width), scores.shape
         content = np.ascontiguousarray(scores, dtype="<f8").tobytes()
         with _report_errors(self.path), self.connection:
-            row = (key, self._find_cell(levels), block, len(scores), content, seconds)
             done = self.connection.execute(
                 "INSERT INTO blocks VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (cell, block) DO NOTHING",
-                row,
+                (key, self._find_cell(levels), block, len(scores), content, seconds),
             )
         return done.rowcount == 1
 
-    def has_blocks(self) -> bool:
-        """Return whether any block is stored."""
-        with _report_errors(self.path):
-            return self.connection.execute("SELECT 1 FROM blocks LIMIT 1").fetchone() is not None
-
     def list_keys(self, levels: Levels, blocks: range) -> frozenset[str]:
         """Return the keys of the stored blocks of a cell with these numbers."""
-        question = (
-            "SELECT key FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?) "
-            "AND block >= ? AND block < ?"
-        )
-        row = (_name_cell(levels), blocks.start, blocks.stop)
-        with _report_errors(self.path):
-            return frozenset(key for (key,) in self.connection.execute(question, row))
+        question = f"SELECT key {OF_CELL} AND block >= ? AND block < ?"
+        rows = self.ask(question, _name_cell(levels), blocks.start, blocks.stop)
+        return frozenset(key for (key,) in rows)
 
     def count_cell(self, levels: Levels) -> CellCount:
         """Return how much of a cell is stored."""
-        question = (
-            "SELECT count(*), coalesce(sum(trials), 0), coalesce(sum(seconds), 0) FROM blocks "
-            "WHERE cell = (SELECT id FROM cells WHERE levels = ?)"
-        )
-        with _report_errors(self.path):
-            return CellCount(*self.connection.execute(question, (_name_cell(levels),)).fetchone())
+        sums = "SELECT count(*), coalesce(sum(trials), 0), coalesce(sum(seconds), 0)"
+        return CellCount(*next(self.ask(f"{sums} {OF_CELL}", _name_cell(levels))))
 
     def count_blocks(self, levels: Levels, blocks: range) -> int:
         """Return how many of these blocks of a cell are stored."""
-        question = (
-            "SELECT count(*) FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?) "
-            "AND block >= ? AND block < ? AND (block - ?) % ? = 0"
-        )
+        question = f"SELECT count(*) {OF_CELL} AND block >= ? AND block < ? AND (block - ?) % ? = 0"
         bounds = (blocks.start, blocks.stop, blocks.start, blocks.step)
-        with _report_errors(self.path):
-            row = self.connection.execute(question, (_name_cell(levels), *bounds)).fetchone()
-        return int(row[0])
+        return int(next(self.ask(question, _name_cell(levels), *bounds))[0])
 
     @contextmanager
     def keep_state(self) -> Iterator[None]:
@@ -305,56 +248,28 @@ class StudyStore:
 
     def read_blocks(self, levels: Levels) -> Iterator[tuple[int, FloatArray]]:
         """Yield the blocks of a cell with their numbers, in this order: (number, (B, s) scores)."""
-        question = (
-            "SELECT block, trials, scores FROM blocks "
-            "WHERE cell = (SELECT id FROM cells WHERE levels = ?) ORDER BY block"
-        )
-        with _report_errors(self.path):
-            for block, trials, content in self.connection.execute(question, (_name_cell(levels),)):
-                if len(content) != 8 * trials * self.width:
-                    raise FileError(report_finding("store.damaged"), self.path)
-                yield block, np.frombuffer(content, dtype="<f8").reshape(trials, self.width)
-
-    def read_scores(self, levels: Levels, columns: Sequence[int]) -> FloatArray:
-        """Return some columns of all trials of a cell: (trials, len(columns)), blocks in order.
-
-        Memory is that of the result and of one block.
-        """
-        with self.keep_state():
-            scores = np.empty((self.count_cell(levels).trials, len(columns)))
-            first = 0
-            for _, block in self.read_blocks(levels):
-                last = first + len(block)
-                scores[first:last] = block[:, columns]
-                first = last
-        return scores
+        question = f"SELECT block, trials, scores {OF_CELL} ORDER BY block"
+        for block, trials, content in self.ask(question, _name_cell(levels)):
+            if len(content) != 8 * trials * self.width:
+                raise FileError(report_finding("store.damaged"), self.path)
+            yield block, np.frombuffer(content, dtype="<f8").reshape(trials, self.width)
 
     def copy_blocks(self, other: StudyStore, levels: Levels) -> int:
         """Store the blocks of a cell of another store, and return how many are new."""
-        question = (
-            "SELECT key, block, trials, scores, seconds FROM blocks "
-            "WHERE cell = (SELECT id FROM cells WHERE levels = ?)"
-        )
+        question = f"SELECT key, block, trials, scores, seconds {OF_CELL}"
         with _report_errors(self.path), self.connection:
             cell = self._find_cell(levels)
             before = self.connection.total_changes
             self.connection.executemany(
                 "INSERT INTO blocks (key, block, trials, scores, seconds, cell) "
                 f"VALUES (?, ?, ?, ?, ?, {cell}) ON CONFLICT (cell, block) DO NOTHING",
-                other.read_rows(question, _name_cell(levels)),
+                other.ask(question, _name_cell(levels)),
             )
             return self.connection.total_changes - before
 
-    def read_rows(self, question: str, value: str) -> Iterator[tuple[Any, ...]]:
-        """Yield the rows that answer a question of SQL, which has one value to fill in."""
-        with _report_errors(self.path):
-            yield from self.connection.execute(question, (value,))
-
     def check_pages(self) -> None:
         """Read the whole store, and raise FileError where it is damaged."""
-        with _report_errors(self.path):
-            (answer,) = self.connection.execute("PRAGMA quick_check(1)").fetchone()
-        if answer != "ok":
+        if next(self.ask("PRAGMA quick_check(1)")) != ("ok",):
             raise FileError(report_finding("store.damaged"), self.path)
 
     def _find_cell(self, levels: Levels) -> int:
@@ -379,7 +294,7 @@ def make_store(folder: Path, header: StoreHeader) -> None:
     """
     path = folder / NAME
     refuse_network(folder)
-    with _report_errors(path), closing(_connect(path)) as connection:
+    with _report_errors(path), closing(sqlite3.connect(path, PATIENCE)) as connection:
         connection.executescript(TABLES)
         StudyStore(path, connection).set_header(header)
 
@@ -399,7 +314,7 @@ def open_store(folder: Path) -> Iterator[StudyStore]:
     try:
         if descriptor is not None and lock(descriptor) is False:
             raise FileError(report_finding("store.other-driver"), folder)
-        with _report_errors(path), closing(_connect(path)) as connection:
+        with _report_errors(path), closing(sqlite3.connect(path, PATIENCE)) as connection:
             _refuse_format(path, connection)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
@@ -426,7 +341,7 @@ def read_store(folder: Path) -> Iterator[StudyStore]:
     is_writable = os.access(path, os.W_OK) and os.access(folder, os.W_OK)
     mode = "immutable=1" if is_copy else "mode=rw" if is_writable else "mode=ro"
     address = f"{path.resolve().as_uri()}?{mode}"
-    with _report_errors(path), closing(_connect(address, uri=True)) as connection:
+    with _report_errors(path), closing(sqlite3.connect(address, PATIENCE, uri=True)) as connection:
         connection.execute("PRAGMA query_only = ON")
         _refuse_format(path, connection)
         yield StudyStore(path, connection)
@@ -448,11 +363,6 @@ def refuse_network(folder: Path) -> None:
     kind = find_network_file_system(folder)
     if kind is not None:
         raise FileError(report_finding("store.network-file-system", kind=kind), folder)
-
-
-def _connect(place: Path | str, uri: bool = False) -> sqlite3.Connection:
-    """Open an SQLite file."""
-    return sqlite3.connect(place, PATIENCE, uri=uri)
 
 
 def _find_store(folder: Path) -> Path:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
-from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,7 +78,7 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
             try:
                 yield store
             except LoopcalError:
-                is_used = store.has_blocks()
+                is_used = any(store.ask("SELECT 1 FROM blocks LIMIT 1"))
                 raise
     finally:
         if not is_used:
@@ -129,32 +128,15 @@ def load_specification(store: StudyStore) -> Study:
     ------
     FileError : another version made it, whose blocks or settings differ.
     """
-    _refuse_versions(store)
+    header, part, known = store.header, NUMERICS_PART, str(NUMERICS)
     try:
-        return Study.from_json(store.header.specification)
+        if header.versions.get(NUMERICS_PART, "") == str(NUMERICS):
+            return Study.from_json(header.specification)
     except ValueError:  # it has settings that this version does not know
-        made_by = store.header.versions.get(PROGRAM, "")
-        code, known = "store.other-numbers", __version__
-        finding = report_finding(code, part=PROGRAM, found=made_by, known=known)
-        raise FileError(finding, store.path) from None
-
-
-def make_header(study: Study) -> StoreHeader:
-    """Return what the store of a study says about it."""
-    numerics, engine = str(NUMERICS), str(get_current_engine())
-    versions = {PROGRAM: __version__, NUMERICS_PART: numerics, ENGINE: engine}
-    return StoreHeader(study.to_json(), tuple(c.name for c in study.columns), versions)
-
-
-def _refuse_versions(store: StudyStore) -> None:
-    """Raise FileError where blocks of this version would have other numbers."""
-    stored_numerics = store.header.versions.get(NUMERICS_PART, "")
-    if stored_numerics != str(NUMERICS):
-        code = "store.other-numbers"
-        finding = report_finding(
-            code, part=NUMERICS_PART, found=stored_numerics, known=str(NUMERICS)
-        )
-        raise FileError(finding, store.path)
+        part, known = PROGRAM, __version__
+    found = header.versions.get(part, "")
+    finding = report_finding("store.other-numbers", part=part, found=found, known=known)
+    raise FileError(finding, store.path)
 
 
 def _make_folder(folder: Path, source: StudySource) -> None:
@@ -162,16 +144,23 @@ def _make_folder(folder: Path, source: StudySource) -> None:
     refuse_network(folder)
     names = {STUDY_FILE, *(f"{NAME}{end}" for end in ("", "-journal", "-wal", "-shm"))}
     names |= {Path(name).parts[0] for name, _ in _list_files(source)}
-    remove_leftovers(resolve_folder(folder), lambda left: _has_only(left, names))
+
+    def is_ours(left: Path) -> bool:
+        return left.is_dir() and all(path.name in names for path in left.iterdir())
+
+    remove_leftovers(resolve_folder(folder), is_ours)
     _refuse_content(folder)
     files = {name: read_bytes(path, "file", YAML_SIZE) for name, path in _list_files(source)}
-
     with replace_folder(folder, check=_refuse_content) as temporary:
         for name, content in files.items():
             file = temporary / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
-        make_store(temporary, make_header(source.study))
+        study = source.study
+        engine = str(get_current_engine())
+        versions = {PROGRAM: __version__, NUMERICS_PART: str(NUMERICS), ENGINE: engine}
+        columns = tuple(column.name for column in study.columns)
+        make_store(temporary, StoreHeader(study.to_json(), columns, versions))
 
 
 def _refuse_content(folder: Path) -> None:
@@ -183,11 +172,6 @@ def _refuse_content(folder: Path) -> None:
     if target.is_dir() and any(target.iterdir()):
         code = "store.in-use" if (target / NAME).is_file() else "store.folder-of-others"
         raise FileError(report_finding(code), folder)
-
-
-def _has_only(folder: Path, names: AbstractSet[str]) -> bool:
-    """Return whether a folder contains nothing but these names."""
-    return folder.is_dir() and all(path.name in names for path in folder.iterdir())
 
 
 def _list_files(source: StudySource) -> Iterator[tuple[str, Path]]:
@@ -206,17 +190,11 @@ def _list_files(source: StudySource) -> Iterator[tuple[str, Path]]:
             yield name, path
 
 
-# --- Join the folders of jobs that each computed a share of one study.
-
-
 def merge_studies(
     part_folders: Sequence[Path], folder: Path, progress: Progress = report_no_progress
 ) -> int:
-    """Copy the blocks of several folders of one study into one folder, and return how many are new.
-
-    Parameters
-    ----------
-    part_folders : folders of jobs, complete or not. folder : to make, or one of the same study.
+    """Copy the blocks of several folders of one study, which jobs computed, into one folder that is
+    made or continued, and return how many are new.
 
     Raises
     ------

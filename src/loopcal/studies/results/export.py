@@ -14,7 +14,7 @@ from loopcal.io.core.text_file import replace_file
 from loopcal.studies.execution.executors import import_optional
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import iterate_trials
-from loopcal.studies.specification.study import Cell, Study, list_factors
+from loopcal.studies.specification.study import Cell, Study
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 TRIAL = "trial"
@@ -60,7 +60,7 @@ def _iterate_blocks(
 
 
 def _write_csv(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
-    names, count = list_factors(study), 0
+    names, count = tuple(study.levels), 0
     units = [f" [{c.unit}]" if c.unit != "1" else "" for c in study.columns]
     titles = [f"{c.name}{unit}" for c, unit in zip(study.columns, units, strict=True)]
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -78,7 +78,7 @@ def _write_csv(study: Study, store: StudyStore, path: Path, progress: Progress) 
 def _write_parquet(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
     arrow = import_optional("pyarrow", "tables")
     parquet = import_optional("pyarrow.parquet", "tables")
-    names, count = list_factors(study), 0
+    names, count = tuple(study.levels), 0
     word = arrow.dictionary(arrow.int32(), arrow.string())
     schema = arrow.schema(
         [

@@ -38,7 +38,7 @@ from loopcal.studies.results.study_result import (
 )
 from loopcal.studies.specification.levels import LevelChain, Question, list_chains
 from loopcal.studies.specification.scores import check_question
-from loopcal.studies.specification.study import Cell, Study, list_factors, list_varied_factors
+from loopcal.studies.specification.study import Cell, Study
 from loopcal.units import Unit, find_unit
 
 Certainty = Literal["certain", "between", "none", "unknown"]
@@ -212,7 +212,7 @@ def _answer(
 def _group_cells(study: Study, factor: str) -> Iterator[tuple[dict[str, str], dict[str, Cell]]]:
     """Yield the other varied levels, and level of the factor -> cell."""
     groups: dict[tuple[tuple[str, str], ...], dict[str, Cell]] = {}
-    varied = [name for name in list_varied_factors(study) if name != factor]
+    varied = [name for name in study.varied_factors if name != factor]
     for cell in study.cells:
         others = tuple((name, cell.levels[name]) for name in varied)
         groups.setdefault(others, {})[cell.levels[factor]] = cell
@@ -444,7 +444,7 @@ def write_summary(
 
 def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) -> Table:
     """Return a table of the varied factors, and of the medians or mean shares of some scores."""
-    factors = list_varied_factors(study) or list_factors(study)[:1]
+    factors = study.varied_factors or tuple(study.levels)[:1]
     units = {column.name: UNITS[column.unit] for column in study.columns}
     columns = [word_column(factor, wraps=True) for factor in factors]
     columns += [Column("trials"), Column("failed")]
@@ -466,7 +466,7 @@ def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) 
 
 def tabulate_all(study: Study, summary: StudySummary) -> Table:
     """Return a table of all factors and all scores in SI, with intervals, for programs."""
-    factors = list_factors(study)
+    factors = tuple(study.levels)
     columns = [word_column(factor) for factor in factors]
     columns += [Column(name) for name in ("trials", "failed", "converged")]
     suffixes = ("", " low", " high")

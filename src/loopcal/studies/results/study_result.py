@@ -20,7 +20,7 @@ from loopcal.studies.files.study_folder import load_specification, read_study
 from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.specification.levels import Question
 from loopcal.studies.specification.scores import ScoreColumn
-from loopcal.studies.specification.study import Cell, Study, list_factors, list_varied_factors
+from loopcal.studies.specification.study import Cell, Study
 from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class StudyResult(TableResult):
         StudyError : pandas is not installed.
         """
         pandas = import_optional("pandas", "tables")
-        study, names = self.study, list_factors(self.study)
+        study, names = self.study, tuple(self.study.levels)
         with read_store(self.folder) as store:
             read = [(cell, *read_trials(study, store, cell)) for cell in study.cells]
         counts = [len(trials) for _, trials, _ in read]
@@ -169,7 +169,7 @@ class StudyResult(TableResult):
         StudyError : xarray is not installed.
         """
         xarray = import_optional("xarray", "tables")
-        study, names = self.study, list_factors(self.study)
+        study, names = self.study, tuple(self.study.levels)
         levels = {n: list(dict.fromkeys(cell.levels[n] for cell in study.cells)) for n in names}
         shape = (*(len(level) for level in levels.values()), study.replicates)
         scores = np.full((*shape, len(study.columns)), np.nan)
@@ -472,7 +472,7 @@ def read_status(folder: Path) -> StudyStatus:
         sum(count.trials for count in counts),
         seconds,
         None if blocks == 0 else max(total - blocks, 0) * seconds / blocks,
-        list_varied_factors(study) or list_factors(study)[:1],
+        study.varied_factors or tuple(study.levels)[:1],
         cells,
     )
 

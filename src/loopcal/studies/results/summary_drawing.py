@@ -28,7 +28,7 @@ from loopcal.studies.results.questions import FRAMES, UNITS
 from loopcal.studies.results.study_result import CellSummary, Interval, StudySummary, find_columns
 from loopcal.studies.specification.levels import LevelChain, list_chains
 from loopcal.studies.specification.scores import BASE_COLUMNS, ScoreColumn, check_question
-from loopcal.studies.specification.study import Study, list_factors, list_varied_factors
+from loopcal.studies.specification.study import Study
 from loopcal.units import Unit
 
 if TYPE_CHECKING:
@@ -112,11 +112,11 @@ def choose_layout(study: Study, factor: str | None = None) -> Layout:
     ------
     DataError : an unknown factor.
     """
-    factors = list_factors(study)
+    factors = tuple(study.levels)
     if factor is not None and factor not in factors:
         hint = suggest_names(factor, factors)
         raise DataError(f"{factor!r} is not a factor{hint}; factors: {', '.join(factors)}")
-    varied = list_varied_factors(study)
+    varied = study.varied_factors
     lengths = {name: _count_ordered(study, name) for name in varied}
     axis = factor or max(varied, key=lengths.__getitem__, default=factors[0])
     along = _place_levels(list_chains(study, axis), axis)

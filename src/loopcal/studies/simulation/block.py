@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
@@ -43,7 +43,7 @@ from loopcal.studies.simulation.machines import (
 from loopcal.studies.simulation.preparation import PreparedCell, make_disturbance, prepare_cell
 from loopcal.studies.specification.levels import MethodLevel
 from loopcal.studies.specification.scores import list_columns
-from loopcal.studies.specification.study import Study, compute_key, describe_block, format_json
+from loopcal.studies.specification.study import Study, compute_key, describe_cell, format_json
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -52,179 +52,6 @@ HELD_OUT = 4
 
 PARTS = {"position": slice(3, 6), "orientation": slice(0, 3)}
 """Score -> its components of a twist."""
-
-
-@dataclass(frozen=True, eq=False)
-class CalibratedBlock:
-    """The calibrations of a block of trials, before they are scored."""
-
-    cell: PreparedCell
-    stream: BlockStream
-    trials: Trials
-    fits: FittedTrials
-
-
-def calibrate_block(content: Mapping[str, Any], threads: int = 1) -> CalibratedBlock:
-    """Simulate and calibrate the machines of the content of a task, by so many threads."""
-    cell = prepare_cell(content)
-    stream = make_stream(cell.seed, content["block"])
-    trials = simulate_block(cell, stream)
-    return CalibratedBlock(cell, stream, trials, fit_trials(cell, trials, threads))
-
-
-def compute_scores(content: Mapping[str, Any], threads: int = 1) -> FloatArray:
-    """Return the scores (B, s) of the content of a task."""
-    block = calibrate_block(content, threads)
-    cell, stream, trials, fits = block.cell, block.stream, block.trials, block.fits
-    scores = score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
-    for name in ("rank", "condition", "iterations", "noise_scale", "verdict"):
-        scores[name] = getattr(fits, name)
-    return np.stack([scores[column.name] for column in list_columns(cell.scores)], axis=1)
-
-
-def make_stream(seed: int, block: int) -> BlockStream:
-    """Return the random stream of a block.
-
-    It depends on the seed of the study and the number of the block only. All cells see the same
-    machines and the same noise as far as they have the same parameters, poses and columns, so that
-    differences between cells are paired.
-    """
-    digest = hashlib.sha256(f"loopcal study {seed}".encode()).digest()
-    return BlockStream(int.from_bytes(digest[:16], "little"), block)
-
-
-def simulate_block(cell: PreparedCell, stream: BlockStream) -> Trials:
-    """Draw the true machines of a block and measure them; with a verdict, also held-out poses."""
-    poses = cell.measured
-    if cell.scores.verdict:
-        poses = np.concatenate([poses, cell.validated])
-    truth = draw_machines(cell.robot, cell.errors, cell.trials, stream)
-    if cell.layout is not None:
-        return measure_held_points(cell.layout, truth, cell.instrument, stream)
-    disturbance = make_disturbance(cell.robot, truth, poses, cell.effects, stream)
-    trials = simulate_trials(
-        cell.robot, truth, poses, cell.instrument, stream, disturbance=disturbance
-    )
-    return hide_columns(trials, cell.unused)
-
-
-def score_poses(
-    cell: PreparedCell, trials: Trials, fits: FittedTrials, stream: BlockStream
-) -> dict[str, FloatArray]:
-    """Return the outcome, the errors of held-out poses before and after calibration, and how many
-    lie within their expanded uncertainty.
-    """
-    robot, held_out = cell.robot, cell.held_out
-    readings = _draw_true_readings(cell, len(trials), stream)
-    truth = forward_trials(robot, trials.truth, readings, held_out.state)
-    nominal = held_out.T[None], cell.reference.T[None]
-    reached = is_reached(truth) & fits.reached
-    scores: dict[str, FloatArray] = {
-        "outcome": np.where((fits.outcome == 0) & ~reached, NOT_REACHED, fits.outcome)
-    }
-    for when, (T, measured) in {"_before": nominal, "": (fits.T, fits.T_measured)}.items():
-        error = _tool_errors(robot, T, truth.T)
-        if not can_rotate(robot):
-            error[..., :3] = np.nan
-        if cell.scores.frame == "both":
-            for name, part in PARTS.items():
-                size = np.linalg.norm(error[..., part], axis=2)
-                scores[f"{name}_base{when}"] = compute_rms(size)
-        if cell.motions.shape[1]:
-            error = error - _fit_motions(cell, trials, T, measured)
-        for name, part in PARTS.items():
-            size = np.linalg.norm(error[..., part], axis=2)
-            scores[name + when] = compute_rms(size)
-            scores[f"{name}{when}_max"] = size.max(axis=1)
-            if not when:
-                limit = fits.expanded[..., 0 if name == "position" else 1]
-                scores[f"covered_{name}"] = compute_share(size, limit)
-    return scores
-
-
-def score_parameters(
-    cell: PreparedCell, trials: Trials, fits: FittedTrials
-) -> dict[str, FloatArray]:
-    """Return the errors of the free parameters, and how many lie in their intervals."""
-    free = select_free_parameters(cell.robot)
-    error = (fits.values - trials.truth)[:, free.places]
-    dimensions = [cell.robot.parameters.dimensions[i] for i in free.places]
-    is_length = np.array([d is Dimension.LENGTH for d in dimensions])
-    is_angle = np.array([d is Dimension.ANGLE for d in dimensions])
-    scaled = error / free.tolerance
-    return {
-        "parameters": compute_rms(scaled),
-        "parameters_max": np.abs(scaled).max(axis=1),
-        "lengths": compute_rms(error[:, is_length]),
-        "angles": compute_rms(error[:, is_angle]),
-        "covered_parameters": compute_share(np.abs(error), fits.half_width),
-    }
-
-
-def can_rotate(robot: Mechanism) -> bool:
-    """Return whether the platform has a rotation that an error could change."""
-    return any(freedom < 3 for freedom in robot.program.freedoms)
-
-
-def compute_rms(values: FloatArray) -> FloatArray:
-    """Return the root mean square (t,) of values (t, k); NaN of none."""
-    if not values.shape[1]:
-        return np.full(len(values), np.nan)
-    return np.sqrt(np.mean(values**2, axis=1))
-
-
-def compute_share(error: FloatArray, limit: FloatArray) -> FloatArray:
-    """Return the share (t,) of k errors up to their limits (t, k), which may be infinite; NaN where
-    an error or a limit does not exist.
-    """
-    is_undefined = np.isnan(error).any(axis=1) | np.isnan(limit).any(axis=1)
-    return np.where(is_undefined, np.nan, (error <= limit).mean(axis=1))
-
-
-def _draw_true_readings(cell: PreparedCell, trials: int, stream: BlockStream) -> FloatArray:
-    """Return true readings (t | 1, h, a) of the held-out poses: those that are shown, with errors
-    where the robot states a standard deviation of its readings.
-    """
-    shown, sigma = cell.held_out.q[None], cell.robot.stated_sigma
-    if not sigma.any():
-        return shown
-    streams = (make_random_stream(stream, trial, HELD_OUT) for trial in range(trials))
-    return shown + np.stack([s.standard_normal(shown.shape[1:]) for s in streams]) * sigma
-
-
-def _tool_errors(robot: Mechanism, T: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return errors (t, n, 6) of the tool at platform poses T (t | 1, n, 4, 4), in base axes."""
-    return geometry.pose_difference(
-        np.broadcast_to(T, truth.shape) @ robot.tool, truth @ robot.tool
-    )
-
-
-def _fit_motions(
-    cell: PreparedCell, trials: Trials, T: FloatArray, measured: FloatArray
-) -> FloatArray:
-    """Return the errors (t, h, 6) of the tool at platform poses T (t | 1, h, 4, 4) that motions of
-    frames explain: those that fit the errors of the measured poses (t | 1, n, 4, 4) best.
-    """
-    robot, n = cell.robot, len(cell.measured)
-    true, usable = trials.T[:, :n], trials.reached[:, :n]
-    if cell.layout is not None:  # the poses at the readings of the nominal robot
-        state = forward_trials(robot, trials.truth, cell.reference.q[None], cell.reference.state)
-        true, usable = state.T, state.status == Status.CONVERGED
-    poses, places = (np.broadcast_to(a, (len(true), *a.shape[1:])) for a in (measured, T))
-    errors = geometry.pose_difference(poses, true)
-    explained = []
-    for i, used in enumerate(usable & np.isfinite(poses).all(axis=(2, 3))):
-        if not used.any():  # a trial without a calibrated machine
-            explained.append(np.full((places.shape[1], 6), np.nan))
-            continue
-        motion = fit_frames(robot, poses[i, used], cell.motions)(errors[i, used][..., None])
-        arm = places[i, :, :3, :3] @ robot.tool[:3, 3]
-        twists = frame_twists(places[i], robot.size) @ motion
-        explained.append((geometry.transport_matrix(arm) @ twists)[..., 0])
-    return np.stack(explained)
-
-
-# --- The work of a study, for any worker: the poses of a cell, and blocks of its trials.
 
 
 @dataclass(frozen=True)
@@ -276,17 +103,18 @@ def compute_block(task: BlockTask, threads: int = 1) -> BlockResult:
     ------
     LoopcalError : the cell cannot be simulated at all, such as a kind that the robot does not have.
     """
-    content: Mapping[str, Any] = json.loads(task.content)
-    return BlockResult(task.key, compute_scores(content, threads))
+    content = json.loads(task.content)
+    cell, trials, fits = calibrate_block(content, threads)
+    stream = make_stream(cell.seed, content["block"])
+    scores = score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
+    for name in ("rank", "condition", "iterations", "noise_scale", "verdict"):
+        scores[name] = getattr(fits, name)
+    columns = [scores[column.name] for column in list_columns(cell.scores)]
+    return BlockResult(task.key, np.stack(columns, axis=1))
 
 
 def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> BlockResult | CellPoses:
-    """Compute a block or poses; a pure function of the task, whatever the number of threads.
-
-    Raises
-    ------
-    LoopcalError : as `compute_block`.
-    """
+    """Compute a block, see `compute_block`, or poses."""
     if isinstance(task, PosesTask):
         return compute_poses(json.loads(task.content))
     return compute_block(task, threads)
@@ -300,34 +128,158 @@ def make_poses_task(content: Mapping[str, Any]) -> PosesTask:
 
 def make_block_task(key: str, cell: int, content: Mapping[str, Any], poses: CellPoses) -> BlockTask:
     """Return the task of a block, from its description and its poses."""
-    complete = {**content, "measured": poses.measured, "held_out": poses.held_out}
+    complete = {**content, **vars(poses)}
     return BlockTask(key, cell, content["block"], format_json(complete))
 
 
 def list_tasks(
     study: Study, cells: Sequence[int] | None = None, blocks: Sequence[int] | None = None
 ) -> Iterator[BlockTask]:
-    """Yield the tasks of these blocks of these cells, of all by default.
-
-    The poses of a cell are drawn or planned when its first task is made. The driver of a study
-    leaves them to workers instead, see `loopcal.studies.driver`.
+    """Yield the tasks of these blocks of these cells, of all by default. The poses of a cell are
+    drawn or planned here; the driver of a study leaves them to workers.
     """
     for number in range(len(study.cells)) if cells is None else cells:
-        cell = study.cells[number]
-        poses: CellPoses | None = None
+        of_cell = describe_cell(study, study.cells[number])
+        poses = compute_poses(describe_poses(of_cell))
         for block in range(study.blocks) if blocks is None else blocks:
-            content = describe_block(study, cell, block)
-            poses = compute_poses(describe_poses(content)) if poses is None else poses
+            content = of_cell | {"block": block}
             yield make_block_task(compute_key(content), number, content, poses)
 
 
-# --- The calibrations of a cell in memory: the machines of `compute_block`, before they are
-# scored.
+def calibrate_block(
+    content: Mapping[str, Any], threads: int = 1
+) -> tuple[PreparedCell, Trials, FittedTrials]:
+    """Simulate and calibrate the machines of the content of a task, by so many threads."""
+    cell = prepare_cell(content)
+    trials = simulate_block(cell, make_stream(cell.seed, content["block"]))
+    return cell, trials, fit_trials(cell, trials, threads)
+
+
+def make_stream(seed: int, block: int) -> BlockStream:
+    """Return the random stream of a block.
+
+    It depends on the seed of the study and the number of the block only. All cells see the same
+    machines and the same noise as far as they have the same parameters, poses and columns, so that
+    differences between cells are paired.
+    """
+    digest = hashlib.sha256(f"loopcal study {seed}".encode()).digest()
+    return BlockStream(int.from_bytes(digest[:16], "little"), block)
+
+
+def simulate_block(cell: PreparedCell, stream: BlockStream) -> Trials:
+    """Draw the true machines of a block and measure them; with a verdict, also held-out poses."""
+    poses = cell.measured
+    if cell.scores.verdict:
+        poses = np.concatenate([poses, cell.validated])
+    truth = draw_machines(cell.robot, cell.errors, cell.trials, stream)
+    if cell.layout is not None:
+        return measure_held_points(cell.layout, truth, cell.instrument, stream)
+    disturbance = make_disturbance(cell.robot, truth, poses, cell.effects, stream)
+    trials = simulate_trials(
+        cell.robot, truth, poses, cell.instrument, stream, disturbance=disturbance
+    )
+    return hide_columns(trials, cell.unused)
+
+
+def score_poses(
+    cell: PreparedCell, trials: Trials, fits: FittedTrials, stream: BlockStream
+) -> dict[str, FloatArray]:
+    """Return the outcome, the errors of held-out poses before and after calibration, and how many
+    lie within their expanded uncertainty.
+    """
+    robot, held_out = cell.robot, cell.held_out
+    readings, sigma = held_out.q[None], robot.stated_sigma  # true ones are those that are shown,
+    if sigma.any():  # with errors where the robot states their standard deviation
+        streams = (make_random_stream(stream, trial, HELD_OUT) for trial in range(len(trials)))
+        drawn = np.stack([s.standard_normal(readings.shape[1:]) for s in streams])
+        readings = readings + drawn * sigma
+    truth = forward_trials(robot, trials.truth, readings, held_out.state)
+    nominal = held_out.T[None], cell.reference.T[None]
+    is_lost = (fits.outcome == 0) & ~(is_reached(truth) & fits.reached)
+    scores: dict[str, FloatArray] = {"outcome": np.where(is_lost, NOT_REACHED, fits.outcome)}
+    for when, (T, measured) in {"_before": nominal, "": (fits.T, fits.T_measured)}.items():
+        tools = np.broadcast_to(T, truth.T.shape) @ robot.tool
+        error = geometry.pose_difference(tools, truth.T @ robot.tool)
+        if all(freedom == 3 for freedom in robot.program.freedoms):  # the platform cannot rotate
+            error[..., :3] = np.nan
+        if cell.scores.frame == "both":
+            for name, part in PARTS.items():
+                size = np.linalg.norm(error[..., part], axis=2)
+                scores[f"{name}_base{when}"] = compute_rms(size)
+        if cell.motions.shape[1]:
+            error = error - _fit_motions(cell, trials, T, measured)
+        for name, part in PARTS.items():
+            size = np.linalg.norm(error[..., part], axis=2)
+            scores[name + when] = compute_rms(size)
+            scores[f"{name}{when}_max"] = size.max(axis=1)
+            if not when:
+                limit = fits.expanded[..., 0 if name == "position" else 1]
+                scores[f"covered_{name}"] = compute_share(size, limit)
+    return scores
+
+
+def score_parameters(
+    cell: PreparedCell, trials: Trials, fits: FittedTrials
+) -> dict[str, FloatArray]:
+    """Return the errors of the free parameters, and how many lie in their intervals."""
+    free = select_free_parameters(cell.robot)
+    error = (fits.values - trials.truth)[:, free.places]
+    dimensions = [cell.robot.parameters.dimensions[i] for i in free.places]
+    is_length = np.array([d is Dimension.LENGTH for d in dimensions])
+    is_angle = np.array([d is Dimension.ANGLE for d in dimensions])
+    scaled = error / free.tolerance
+    return {
+        "parameters": compute_rms(scaled),
+        "parameters_max": np.abs(scaled).max(axis=1),
+        "lengths": compute_rms(error[:, is_length]),
+        "angles": compute_rms(error[:, is_angle]),
+        "covered_parameters": compute_share(np.abs(error), fits.half_width),
+    }
+
+
+def compute_rms(values: FloatArray) -> FloatArray:
+    """Return the root mean square (t,) of values (t, k); NaN of none."""
+    if not values.shape[1]:
+        return np.full(len(values), np.nan)
+    return np.sqrt(np.mean(values**2, axis=1))
+
+
+def compute_share(error: FloatArray, limit: FloatArray) -> FloatArray:
+    """Return the share (t,) of k errors up to their limits (t, k), which may be infinite; NaN where
+    an error or a limit does not exist.
+    """
+    is_undefined = np.isnan(error).any(axis=1) | np.isnan(limit).any(axis=1)
+    return np.where(is_undefined, np.nan, (error <= limit).mean(axis=1))
+
+
+def _fit_motions(
+    cell: PreparedCell, trials: Trials, T: FloatArray, measured: FloatArray
+) -> FloatArray:
+    """Return the errors (t, h, 6) of the tool at platform poses T (t | 1, h, 4, 4) that motions of
+    frames explain: those that fit the errors of the measured poses (t | 1, n, 4, 4) best.
+    """
+    robot, n = cell.robot, len(cell.measured)
+    true, usable = trials.T[:, :n], trials.reached[:, :n]
+    if cell.layout is not None:  # the poses at the readings of the nominal robot
+        state = forward_trials(robot, trials.truth, cell.reference.q[None], cell.reference.state)
+        true, usable = state.T, state.status == Status.CONVERGED
+    poses, places = (np.broadcast_to(a, (len(true), *a.shape[1:])) for a in (measured, T))
+    errors = geometry.pose_difference(poses, true)
+    explained = []
+    for i, used in enumerate(usable & np.isfinite(poses).all(axis=(2, 3))):
+        if not used.any():  # a trial without a calibrated machine
+            explained.append(np.full((places.shape[1], 6), np.nan))
+            continue
+        motion = fit_frames(robot, poses[i, used], cell.motions)(errors[i, used][..., None])
+        arm = places[i, :, :3, :3] @ robot.tool[:3, 3]
+        twists = frame_twists(places[i], robot.size) @ motion
+        explained.append((geometry.transport_matrix(arm) @ twists)[..., 0])
+    return np.stack(explained)
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedCell:
-    """t calibrated machines.
+    """t calibrated machines, which are not scored.
 
     Attributes
     ----------
@@ -363,7 +315,21 @@ def calibrate_cells(study: Study, cells: Sequence[int] | None = None) -> Iterato
         study = replace(study, scores=replace(study.scores, held_out=1, frame="base"))
     for number, tasks in groupby(list_tasks(study, cells), lambda task: task.cell):
         blocks = [calibrate_block(json.loads(task.content)) for task in tasks]
-        yield _join_blocks(study.cells[number].levels, blocks, study.replicates)
+        prepared, trials, fits = zip(*blocks, strict=True)
+
+        def join(arrays: Iterable[np.ndarray]) -> np.ndarray:
+            return np.concatenate(list(arrays))[: study.replicates]
+
+        yield CalibratedCell(
+            study.cells[number].levels,
+            prepared[0].robot,
+            trials[0].readings,
+            join(t.truth for t in trials),
+            join(f.values for f in fits),
+            tuple(join(measured) for measured in zip(*(t.measured for t in trials), strict=True)),
+            join(f.outcome for f in fits),
+            np.nan_to_num(join(f.iterations for f in fits)).astype(np.int64),
+        )
 
 
 def find_cells(study: Study, **levels: str) -> tuple[int, ...]:
@@ -380,31 +346,6 @@ def set_size(study: Study, seed: int, trials: int) -> Study:
     block is the same for any number of trials.
     """
     return replace(study, seed=seed, replicates=trials, block=min(trials, study.block))
-
-
-def _join_blocks(
-    levels: Mapping[str, str], blocks: Sequence[CalibratedBlock], count: int
-) -> CalibratedCell:
-    """Return the first `count` trials of blocks."""
-    trials, fits = [block.trials for block in blocks], [block.fits for block in blocks]
-
-    def join(arrays: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate(arrays)[:count]
-
-    iterations = np.nan_to_num(join([f.iterations for f in fits]))
-    return CalibratedCell(
-        levels,
-        blocks[0].cell.robot,
-        trials[0].readings,
-        join([t.truth for t in trials]),
-        join([f.values for f in fits]),
-        tuple(join(measured) for measured in zip(*(t.measured for t in trials), strict=True)),
-        join([f.outcome for f in fits]),
-        iterations.astype(np.int64),
-    )
-
-
-# --- Repeat one trial of a study: its machine and its measurements, to the last bit.
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,7 +366,8 @@ class ReplayedTrial:
 
 
 def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
-    """Return a trial of a cell; trials of a cell are numbered from 0, over all of its blocks.
+    """Return a trial of a cell, to the last bit; trials of a cell are numbered from 0, over all of
+    its blocks.
 
     Raises
     ------

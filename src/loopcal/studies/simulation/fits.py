@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,7 @@ from loopcal.engine import State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.plane_line_products import Layout, PaperRows, Weights, identify_from_rows
+from loopcal.estimate.plane_line_products import PaperRows, identify_from_rows
 from loopcal.estimate.published_steps import (
     EPSILON,
     LIMIT,
@@ -35,133 +36,14 @@ from loopcal.estimate.trial_identification import IdentifiedTrials, identify_tri
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials
 from loopcal.mechanism.kinematics import forward_trials
-from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.states import Status
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.studies.simulation.machines import make_method
+from loopcal.studies.simulation.machines import make_fit_options
 from loopcal.studies.simulation.preparation import PreparedCell
-from loopcal.studies.specification.levels import MethodLevel
+from loopcal.studies.specification.levels import PER_LEG, MethodLevel
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-# --- Calibrate the trials of a block by the methods of published studies, without uncertainties.
-
-MOST_LEG_STEPS = 100
-"""Steps of a fit leg by leg at most, where epsilon ends them."""
-
-
-@dataclass(frozen=True, eq=False)
-class PublishedFits:
-    """Fits of t trials.
-
-    Attributes
-    ----------
-    values : (t, p of the robot) [SI], NaN where there are none. iterations : (t,).
-    is_converged, is_diverged, is_refused : (t,); none of them: out of steps.
-    rank : (t,), where the method has one.
-    """
-
-    values: FloatArray
-    iterations: IntArray
-    is_converged: BoolArray
-    is_diverged: BoolArray
-    is_refused: BoolArray
-    rank: IntArray | None = None
-
-
-def fit_published(
-    method: MethodLevel, robot: Mechanism, trials: Trials, layout: Layout | None
-) -> PublishedFits:
-    """Calibrate all trials; a trial that fails does not stop the others.
-
-    Raises
-    ------
-    DataError : products of points that are not held on planes and lines.
-    """
-    if method.is_of_products:
-        if layout is None:
-            raise DataError(
-                "products of points need 'choice: plane-line' of the poses; add it, or remove "
-                f"'rows: {method.rows}'"
-            )
-        return _fit_products(method, robot, trials, layout)
-    if method.method == "per-leg":
-        return _fit_per_leg(method, robot, trials)
-    raw = make_raw_problem(robot, trials)
-    steps = take_steps(raw, choose_penalty(method, raw.problem.parameters), choose_rule(method))
-    is_counted = method.epsilon is None and method.steps is not None
-    is_converged = ~steps.is_diverged if is_counted else steps.is_converged
-    nowhere = np.zeros(len(trials), dtype=bool)
-    return PublishedFits(steps.values, steps.count, is_converged, steps.is_diverged, nowhere)
-
-
-def _fit_products(
-    method: MethodLevel, robot: Mechanism, trials: Trials, layout: Layout
-) -> PublishedFits:
-    """Calibrate all trials from products of points, with the library's descent."""
-    free, sd = select_free_parameters(robot), np.zeros(len(robot.parameters))
-    sd[free.places] = free.tolerance
-    sigma = float(trials.instrument.sensors[0].noise.sigma[0])
-    weights: Weights = "full" if method.rows == "products" else "printed"
-    assert trials.recorded is not None
-    rows = PaperRows(layout, trials.recorded, sd, sigma, weights)
-    fit = identify_from_rows(rows, make_method(method))
-    nowhere = np.zeros(len(trials), dtype=bool)
-    return PublishedFits(
-        rows.values(fit.deviation),
-        fit.iterations,
-        fit.status == DescentStatus.CONVERGED,
-        nowhere,
-        nowhere,
-        fit.decomposition.rank,
-    )
-
-
-def choose_penalty(method: MethodLevel, parameters: int) -> FloatArray:
-    """Return the penalty (1, p) of each direction."""
-    if method.method == "ridge":
-        return penalize_ridge(np.array([method.lam]), parameters)
-    if method.method == "truncated-svd":
-        return penalize_truncated(np.array([method.keep]), parameters)
-    return penalize_none(parameters)
-
-
-def choose_rule(method: MethodLevel) -> StepRule:
-    """Return when the steps of raw fits end."""
-    if method.steps is None:
-        return StepRule(EPSILON if method.epsilon is None else method.epsilon, LIMIT)
-    return StepRule(method.epsilon or 0.0, method.steps)
-
-
-def refuse_per_leg(method: MethodLevel, robot: Mechanism, data: Measurements) -> None:
-    """Raise the reason for which the fit of a trial leg by leg is refused; nothing without one.
-
-    Raises
-    ------
-    EstimationError, DataError : see `identify_per_leg`.
-    """
-    rule = choose_rule(method)
-    identify_per_leg(robot, data, rule.limit if method.steps else MOST_LEG_STEPS, rule.epsilon)
-
-
-def _fit_per_leg(method: MethodLevel, robot: Mechanism, trials: Trials) -> PublishedFits:
-    """Calibrate the trials one by one, leg by leg."""
-    rule, t = choose_rule(method), len(trials)
-    values = np.full((t, len(robot.parameters)), np.nan)
-    iterations, converged = np.zeros(t, dtype=np.int64), np.zeros(t, dtype=bool)
-    refused = np.zeros(t, dtype=bool)
-    for i in range(t):
-        steps = rule.limit if method.steps else MOST_LEG_STEPS
-        try:
-            fit = identify_per_leg(robot, trials.trial(i), steps, rule.epsilon)
-        except (EstimationError, DataError):
-            refused[i] = True
-            continue
-        values[i], converged[i] = fit.robot.values, fit.is_converged
-        iterations[i] = len(fit.estimate_history) - 1
-    return PublishedFits(values, iterations, converged, np.zeros(t, dtype=bool), refused)
-
 
 OUTCOMES: tuple[str, ...] = (
     "study.converged",
@@ -230,7 +112,7 @@ def fit_trials(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTr
     """Calibrate all trials; threads compute those that are one batch."""
     options, scores = cell.fit_options, cell.scores
     if cell.method.is_published:
-        return describe_published(cell, fit_published(cell.method, cell.robot, trials, cell.layout))
+        return fit_published(cell, trials)
     is_batch = options.loss is None and options.noise == "given" and cell.layout is None
     if is_batch and not scores.verdict and scores.intervals == "stated":
         return fit_together(cell, trials, threads)
@@ -263,30 +145,94 @@ def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> Fitted
     )
 
 
-def describe_published(cell: PreparedCell, fits: PublishedFits) -> FittedTrials:
-    """Return fits of a published method, whose intervals do not exist."""
-    t, free = len(fits.values), select_free_parameters(cell.robot)
-    is_known = np.asarray(np.isfinite(fits.values).all(axis=1))
-    values = np.where(is_known[:, None], fits.values, cell.robot.values)
-    state, measured = solve_cell_poses(cell, values)
-    outcome = np.where(fits.is_converged, 0, EXHAUSTED)
-    outcome = np.where(fits.is_diverged, DIVERGED, np.where(fits.is_refused, REFUSED, outcome))
+MOST_LEG_STEPS = 100
+"""Steps of a fit leg by leg at most, where epsilon ends them."""
+
+
+def choose_rule(method: MethodLevel) -> StepRule:
+    """Return when the steps of raw fits, or of fits leg by leg, end."""
+    if method.steps is not None:
+        return StepRule(method.epsilon or 0.0, method.steps)
+    epsilon = EPSILON if method.epsilon is None else method.epsilon
+    return StepRule(epsilon, MOST_LEG_STEPS if method.method == PER_LEG else LIMIT)
+
+
+def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
+    """Calibrate all trials by a method of published studies, whose intervals do not exist; a trial
+    that fails does not stop the others.
+
+    Raises
+    ------
+    DataError : products of points that are not held on planes and lines.
+    """
+    method, robot, t = cell.method, cell.robot, len(trials)
+    rank = nothing = np.full(t, np.nan)
+    if method.is_of_products:
+        values, outcome, iterations, rank = _fit_products(cell, trials)
+    elif method.method == PER_LEG:
+        values = np.full((t, len(robot.parameters)), np.nan)
+        outcome, iterations = np.full(t, REFUSED), np.zeros(t, dtype=np.int64)
+        rule = choose_rule(method)
+        for i in range(t):
+            with suppress(EstimationError, DataError):
+                fit = identify_per_leg(robot, trials.trial(i), rule.limit, rule.epsilon)
+                values[i], outcome[i] = fit.robot.values, 0 if fit.is_converged else EXHAUSTED
+                iterations[i] = len(fit.estimate_history) - 1
+    else:
+        raw = make_raw_problem(robot, trials)
+        p, penalty = raw.problem.parameters, penalize_none(raw.problem.parameters)
+        if method.method == "ridge":
+            penalty = penalize_ridge(np.array([method.lam]), p)
+        elif method.method == "truncated-svd":
+            penalty = penalize_truncated(np.array([method.keep]), p)
+        steps = take_steps(raw, penalty, choose_rule(method))
+        is_counted = method.epsilon is None and method.steps is not None
+        outcome = np.where(steps.is_converged | is_counted, 0, EXHAUSTED)
+        outcome = np.where(steps.is_diverged, DIVERGED, outcome)
+        values, iterations = steps.values, steps.count
+    is_known = np.asarray(np.isfinite(values).all(axis=1))
+    state, measured = solve_cell_poses(cell, np.where(is_known[:, None], values, robot.values))
     lost = ~is_known[:, None, None, None]
-    nothing = np.full(t, np.nan)
     return FittedTrials(
-        values=fits.values,
+        values=values,
         outcome=outcome,
         T=np.where(lost, np.nan, state.T),
         reached=is_reached(state),
         T_measured=np.where(lost, np.nan, measured.T),
-        half_width=np.full((t, len(free)), np.nan),
+        half_width=np.full((t, len(select_free_parameters(robot))), np.nan),
         expanded=np.full((*state.T.shape[:2], 2), np.nan),
-        rank=nothing if fits.rank is None else fits.rank.astype(float),
+        rank=rank,
         condition=nothing,
-        iterations=fits.iterations.astype(float),
+        iterations=iterations.astype(float),
         noise_scale=nothing,
         verdict=nothing,
     )
+
+
+def _fit_products(
+    cell: PreparedCell, trials: Trials
+) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
+    """Return values, outcomes, iterations and ranks of fits to products of points, with the
+    library's descent.
+    """
+    method, robot = cell.method, cell.robot
+    if cell.layout is None:
+        raise DataError(
+            "products of points need 'choice: plane-line' of the poses; add it, or remove "
+            f"'rows: {method.rows}'"
+        )
+    free, sd = select_free_parameters(robot), np.zeros(len(robot.parameters))
+    sd[free.places] = free.tolerance
+    sigma = float(trials.instrument.sensors[0].noise.sigma[0])
+    weights = "full" if method.rows == "products" else "printed"
+    chosen = make_fit_options(method).method
+    assert trials.recorded is not None
+    assert chosen is not None
+    rows = PaperRows(cell.layout, trials.recorded, sd, sigma, weights)
+    fit = identify_from_rows(rows, chosen)
+    outcome = np.where(fit.status == DescentStatus.CONVERGED, 0, EXHAUSTED)
+    rank = fit.decomposition.rank.astype(float)
+    return rows.values(fit.deviation), outcome, fit.iterations, rank
 
 
 def compute_noise(chi_square: ArrayLike, degrees: ArrayLike) -> FloatArray:
@@ -297,7 +243,7 @@ def compute_noise(chi_square: ArrayLike, degrees: ArrayLike) -> FloatArray:
 
 def solve_cell_poses(cell: PreparedCell, values: FloatArray) -> tuple[State, State]:
     """Return the states of machines (t, p) at the readings of the held-out poses, and at those of
-    the measured poses, of which there are none where no frame is fitted.
+    the measured poses, see `PreparedCell.reference`.
     """
     held_out, commanded = cell.held_out, cell.reference
     return (
@@ -317,7 +263,6 @@ def _expand_errors(
     """Return what 95 % of the errors of held-out poses do not exceed (t, h, 2) [m], [rad], as
     `pose_uncertainty` does for one machine.
 
-    state, measured : of `solve_cell_poses`.
     """
     robot, free = cell.robot, fits.free_parameters
     unit = free.tolerance * fits.decomposition.scale
@@ -327,44 +272,26 @@ def _expand_errors(
     if cell.motions.shape[1]:
         by_measured = differentiate_pose(robot, fits.values, cell.reference.q[None], measured)
         reference = by_measured.parameters[..., free.places] * unit
-        D = np.stack(
-            [
-                _refer_to_fitted(cell, *of_trial)
-                for of_trial in zip(D, state.T, reference, measured.T, strict=True)
-            ]
-        )
+        related = []  # after the best rigid fit of frames over the measured poses
+        for D_i, T, error, reached in zip(D, state.T, reference, measured.T, strict=True):
+            usable = np.isfinite(error).all(axis=(1, 2))
+            poses = ReferencePoses(reached[usable], error[usable], "measured")
+            related.append(refer_errors(robot, FITTED, poses, cell.motions).relate(D_i, T))
+        D = np.stack(related)
     t, n = state.T.shape[:2]
     H = transport(robot, state.T.reshape(-1, 4, 4), "base", "tool").reshape(t, n, 6, 6)
-    directions, variance = _list_knowledge(fits)
+    knowledge = []  # as in the posterior of each trial
+    for i in range(t):
+        one = np.array([i])
+        prior = None if fits.prior_variance is None else fits.prior_variance[one]
+        knowledge.append(fits.decomposition.take(one).knowledge(fits.penalty[one], 1.0, prior))
+    directions, variance = (np.stack([part[j] for part in knowledge]) for j in (0, 1))
     others = (H @ (slopes.readings * robot.stated_sigma),) if robot.stated_sigma.any() else ()
     covariance = combine_errors(robot, H @ D, directions, variance, size, others)
     covariance[state.status != Status.CONVERGED] = np.nan
     flat, is_known = covariance.reshape(-1, 6, 6), np.full(t * n, np.inf)
     lengths = [expand_length(flat[:, part, part], is_known) for part in (slice(3, 6), slice(0, 3))]
     return np.stack(lengths, axis=-1).reshape(t, n, 2)
-
-
-def _refer_to_fitted(
-    cell: PreparedCell, D: FloatArray, T: FloatArray, reference: FloatArray, measured: FloatArray
-) -> FloatArray:
-    """Return errors D (h, 6, p) of poses T (h, 4, 4) by the parameters, after the best rigid fit of
-    frames over measured poses (n, 4, 4) with errors `reference` (n, 6, p).
-    """
-    usable = np.isfinite(reference).all(axis=(1, 2))
-    poses = ReferencePoses(measured[usable], reference[usable], "measured")
-    return refer_errors(cell.robot, FITTED, poses, cell.motions).relate(D, T)
-
-
-def _list_knowledge(fits: IdentifiedTrials) -> tuple[FloatArray, FloatArray]:
-    """Return directions (t, p, p) and their variances (t, p), as in the posterior of each trial."""
-    knowledge = []
-    for i in range(len(fits.values)):
-        chosen = np.array([i])
-        prior = None if fits.prior_variance is None else fits.prior_variance[chosen]
-        knowledge.append(
-            fits.decomposition.take(chosen).knowledge(fits.penalty[chosen], 1.0, prior)
-        )
-    return np.stack([part[0] for part in knowledge]), np.stack([part[1] for part in knowledge])
 
 
 def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
@@ -391,8 +318,7 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
             single.append(_fit_one(cell, state_times(trials.trial(i))))
         except (EstimationError, DataError):
             single.append(nothing)
-    names = [entry.name for entry in fields(FittedTrials)]
-    return FittedTrials(**{name: np.stack([getattr(f, name) for f in single]) for name in names})
+    return FittedTrials(**{n: np.stack([getattr(f, n) for f in single]) for n in vars(nothing)})
 
 
 def state_times(data: Measurements) -> Measurements:

@@ -16,7 +16,7 @@ from msgspec import convert
 from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.estimate.options import FitOptions
-from loopcal.estimate.penalties import MAP, LeastSquares, Method
+from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.plane_line_products import Layout
 from loopcal.estimate.tolerance_components import InflatedTolerances
 from loopcal.io.core.yaml_file import parse_yaml
@@ -353,13 +353,6 @@ def is_planned(level: PosesLevel) -> bool:
 
 
 # --- The estimation method of a cell.
-
-
-def make_method(level: MethodLevel) -> Method:
-    """Return the method of a level; the default is that of `identify`."""
-    if level.has_steps:  # fitted in fits.py
-        return LeastSquares()
-    return make_fit_options(level).method or MAP(InflatedTolerances())
 
 
 def make_fit_options(level: MethodLevel) -> FitOptions:

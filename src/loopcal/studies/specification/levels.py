@@ -7,7 +7,7 @@ are in SI; the reader of study files converts them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import (
     TYPE_CHECKING,
@@ -41,17 +41,36 @@ FACTORS: Mapping[str, str] = {
 }
 """Key of a factor in a study file -> its name in cells and tables."""
 
-MOST_POSES = 10_000
-"""Largest number of measured or held-out poses of a trial."""
-
-MOST_STEPS = 1_000_000
-"""Largest number of steps of a raw fit."""
-
-MOST_SWEEPS, FEWEST_POINTS = 100, 4
-"""Largest number of sweeps of an exchange; smallest number of points of a plane with its line."""
-
 PER_LEG = "per-leg"
 """Method of a level beside those of `loopcal.estimate.methods`."""
+
+FEWEST_POINTS = 4
+"""Smallest number of points of a plane with its line."""
+
+Limit = tuple[Callable[[Any], bool], str]
+"""Whether a value is allowed, and which values are, in words."""
+
+POSITIVE: Limit = (lambda value: value > 0, "above 0")
+NOT_NEGATIVE: Limit = (lambda value: value >= 0, "0 or more")
+
+
+def whole_numbers(least: int, most: int, words: str = "{} to {}") -> Limit:
+    """Return the limit of a number from `least` to `most`."""
+    return (lambda value: least <= value <= most, words.format(least, most))
+
+
+class Limited:
+    """Base of records whose settings have limits; the reader of records adds the line."""
+
+    LIMITS: ClassVar[Mapping[str, Limit]] = {}
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a setting beyond its limit; None has none."""
+        for key, (is_allowed, words) in self.LIMITS.items():
+            value = getattr(self, key)
+            if value is not None and not is_allowed(value):
+                shown = f"{value:g}" if isinstance(value, float) else str(value)
+                raise ValueError(f"{key} is {shown}; it must be {words}")
 
 
 @dataclass(frozen=True)
@@ -63,7 +82,7 @@ class Robot:
 
 
 @dataclass(frozen=True)
-class InstrumentLevel:
+class InstrumentLevel(Limited):
     """An instrument, as the command line and `build_instrument` describe it.
 
     Parameters
@@ -77,6 +96,10 @@ class InstrumentLevel:
         same as without it, so that two such instruments are compared on the same measurements.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "sigma_position": (lambda value: value > 0.0, "above 0 m"),
+        "sigma_angle": (lambda value: value > 0.0, "above 0 rad"),
+    }
     kinds: tuple[str, ...] = ("pose",)
     components: tuple[str, ...] = ()
     orientation: str | None = None
@@ -86,24 +109,18 @@ class InstrumentLevel:
     distribution: Distribution = "normal"
     unused: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        _require(self.sigma_position > 0.0, "sigma_position", self.sigma_position, "above 0 m")
-        _require(self.sigma_angle > 0.0, "sigma_angle", self.sigma_angle, "above 0 rad")
-
 
 @dataclass(frozen=True)
-class NoiseLevel:
+class NoiseLevel(Limited):
     """A factor on all sigmas of the instrument, which the fit knows."""
 
     PLAIN: ClassVar[str] = "factor"
+    LIMITS: ClassVar[Mapping[str, Limit]] = {"factor": POSITIVE}
     factor: float = 1.0
-
-    def __post_init__(self) -> None:
-        _require(self.factor > 0.0, "factor", self.factor, "above 0")
 
 
 @dataclass(frozen=True)
-class PosesLevel:
+class PosesLevel(Limited):
     """The measured poses.
 
     Parameters
@@ -120,6 +137,11 @@ class PosesLevel:
     """
 
     PLAIN: ClassVar[str] = "count"
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "count": whole_numbers(1, 10_000, "from {} to {}"),
+        "seed": NOT_NEGATIVE,
+        "sweeps": whole_numbers(0, 100),
+    }
     count: int = 40
     choice: Literal["random", "planned", "plane-line"] = "random"
     groups: int = 10
@@ -130,9 +152,7 @@ class PosesLevel:
     coordinates: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        _require(1 <= self.count <= MOST_POSES, "count", self.count, f"from 1 to {MOST_POSES}")
-        _require(self.seed is None or self.seed >= 0, "seed", self.seed, "0 or more")
-        _require(0 <= self.sweeps <= MOST_SWEEPS, "sweeps", self.sweeps, f"0 to {MOST_SWEEPS}")
+        super().__post_init__()
         if self.choice == "plane-line":
             whole = self.groups >= 1 and self.count % self.groups == 0
             if not whole or self.count < FEWEST_POINTS * self.groups:
@@ -148,7 +168,7 @@ class PosesLevel:
 
 
 @dataclass(frozen=True)
-class ErrorsLevel:
+class ErrorsLevel(Limited):
     """The errors of the true machines, and the tolerances that the fit states for them.
 
     Parameters
@@ -165,6 +185,11 @@ class ErrorsLevel:
     """
 
     PLAIN: ClassVar[str] = "tolerance_factor"
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "tolerance_factor": POSITIVE,
+        "error_factor": NOT_NEGATIVE,
+        "smallest": (lambda value: 0 <= value < 1, "0 or more, and less than 1"),
+    }
     tolerance_factor: float = 1.0
     error_factor: float = 1.0
     distribution: Distribution = "normal"
@@ -173,9 +198,7 @@ class ErrorsLevel:
     deviations: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _require(self.tolerance_factor > 0, "tolerance_factor", self.tolerance_factor, "above 0")
-        _require(self.error_factor >= 0, "error_factor", self.error_factor, "0 or more")
-        _require(0 <= self.smallest < 1, "smallest", self.smallest, "0 or more, and less than 1")
+        super().__post_init__()
         if self.smallest and self.distribution != "uniform":
             raise ValueError("smallest belongs to uniform errors; add 'distribution: uniform'")
         is_drawn = self.error_factor != 1.0 or self.distribution != "normal"
@@ -187,7 +210,7 @@ class ErrorsLevel:
 
 
 @dataclass(frozen=True)
-class MethodLevel:
+class MethodLevel(Limited):
     """How the parameters are estimated.
 
     Parameters
@@ -207,6 +230,12 @@ class MethodLevel:
     """
 
     PLAIN: ClassVar[str] = "method"
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "lam": NOT_NEGATIVE,
+        "keep": NOT_NEGATIVE,
+        "epsilon": POSITIVE,
+        "steps": whole_numbers(1, 1_000_000),
+    }
     method: Annotated[str, METHODS, PER_LEG] = "auto"
     lam: float | None = None
     keep: int | None = None
@@ -241,15 +270,14 @@ class MethodLevel:
                 hint = suggest_names(value, allowed)
                 raise ValueError(f"{key} is {value!r}{hint}; it must be {' or '.join(allowed)}")
         self._check_published()
-        stated = {"lam": self.lam, "keep": self.keep}
-        for key, value in stated.items():
+        for key in ("lam", "keep"):
             method = SETTINGS[key][0]
-            if value is not None and self.method != method:
+            if getattr(self, key) is not None and self.method != method:
                 raise ValueError(
                     f"{key} belongs to the method {method}, not to {self.method}; remove it, or "
                     "change the method"
                 )
-            _require(value is None or value >= 0, key, value, "0 or more")
+        super().__post_init__()
 
     def _check_published(self) -> None:
         """Refuse settings that methods of published studies do not have, or alone have."""
@@ -273,23 +301,20 @@ class MethodLevel:
             raise ValueError(
                 f"{self.method} needs weighted rows; remove {what}, or take another method"
             )
-        _require(self.epsilon is None or self.epsilon > 0, "epsilon", self.epsilon, "above 0")
-        most = f"1 to {MOST_STEPS}"
-        _require(self.steps is None or 1 <= self.steps <= MOST_STEPS, "steps", self.steps, most)
 
 
 @dataclass(frozen=True)
-class Outliers:
+class Outliers(Limited):
     """`share` of the rows lie `size` sigmas off, in a random direction.
 
     It is rounded to whole rows; where that is none, one row is off in as many of the trials.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "share": (lambda value: 0.0 <= value <= 1.0, "from 0 to 1")
+    }
     share: float = 0.05
     size: float = 20.0
-
-    def __post_init__(self) -> None:
-        _require(0.0 <= self.share <= 1.0, "share", self.share, "from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -317,7 +342,7 @@ class Backlash:
 
 
 @dataclass(frozen=True)
-class EffectsLevel:
+class EffectsLevel(Limited):
     """What happens although the fit does not know of it. The defaults change nothing.
 
     Parameters
@@ -328,6 +353,11 @@ class EffectsLevel:
         jump : its displacement half-way. thermal, backlash : of the machine.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "noise": NOT_NEGATIVE,
+        "degrees": (lambda value: value > 2.0, "above 2, so that a sigma exists"),
+        "correlation": (lambda value: abs(value) < 1.0, "between -1 and 1"),
+    }
     noise: float = 1.0
     degrees: float | None = None
     correlation: float = 0.0
@@ -337,15 +367,9 @@ class EffectsLevel:
     thermal: ThermalGrowth | None = None
     backlash: Backlash | None = None
 
-    def __post_init__(self) -> None:
-        _require(self.noise >= 0.0, "noise", self.noise, "0 or more")
-        has_variance = self.degrees is None or self.degrees > 2.0
-        _require(has_variance, "degrees", self.degrees, "above 2, so that a sigma exists")
-        _require(abs(self.correlation) < 1.0, "correlation", self.correlation, "between -1 and 1")
-
 
 @dataclass(frozen=True)
-class Scores:
+class Scores(Limited):
     """What is computed of every trial.
 
     Parameters
@@ -361,6 +385,7 @@ class Scores:
         adjusted ones. limit_position, limit_angle : limits of the verdict.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {"held_out": whole_numbers(1, 10_000)}
     held_out: int = 20
     frame: Literal["fitted", "base", "both"] = "fitted"
     intervals: Literal["stated", "adjusted"] = "stated"
@@ -374,13 +399,13 @@ class Scores:
         return "base" if self.frame == "base" else "fitted"
 
     def __post_init__(self) -> None:
-        _require(1 <= self.held_out <= MOST_POSES, "held_out", self.held_out, f"1 to {MOST_POSES}")
+        super().__post_init__()
         if (self.limit_position or self.limit_angle) and not self.verdict:
             raise ValueError("a limit needs 'verdict: true'; add it, or remove the limit")
 
 
 @dataclass(frozen=True)
-class Question:
+class Question(Limited):
     """A question that the summary answers: which is the smallest or the largest level of a factor
     with which a score stays within a limit on a share of the machines.
 
@@ -391,24 +416,14 @@ class Question:
     wanted : "smallest" or "largest" level that reaches it.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "share": (lambda value: 0.0 < value < 1.0, "between 0 and 1")
+    }
     factor: str
     score: str
     limit: str | float
     share: float = 0.95
     wanted: Literal["smallest", "largest"] = "smallest"
-
-    def __post_init__(self) -> None:
-        _require(0.0 < self.share < 1.0, "share", self.share, "between 0 and 1")
-
-
-def _require(is_allowed: bool, key: str, value: object, allowed: str) -> None:
-    """Raise ValueError with what is allowed; the reader of records adds the line."""
-    if not is_allowed:
-        shown = f"{value:g}" if isinstance(value, float) else str(value)
-        raise ValueError(f"{key} is {shown}; it must be {allowed}")
-
-
-# --- The order of the levels of a factor: levels that differ in numbers only, from small to large.
 
 
 @dataclass(frozen=True)
@@ -437,50 +452,37 @@ def list_chains(study: Study, factor: str) -> tuple[LevelChain, ...]:
     Levels whose words differ are in different chains. Levels whose numbers do not increase together
     have no order: each is a chain of its own.
     """
-    levels = _levels_of(study, factor)
+    levels = study.levels[factor]
+    record = type(next(iter(levels.values())))
     records = {name: _flatten(level) for name, level in levels.items()}
-    names = list(dict.fromkeys(key for record in records.values() for key in record))
+    names = list(dict.fromkeys(key for settings in records.values() for key in settings))
     numbers = [n for n in names if all(_is_number(r.get(n)) for r in records.values())]
     words = [name for name in names if name not in numbers]
-    groups: dict[str, list[str]] = {}
-    for name, settings in records.items():
-        groups.setdefault(repr([settings.get(word) for word in words]), []).append(name)
     differing = [w for w in words if len({repr(r.get(w)) for r in records.values()}) > 1]
-    record = type(next(iter(levels.values())))
-    plain, units = getattr(record, "PLAIN", ""), _list_units(record)
+    groups: dict[str, dict[str, dict[str, Any]]] = {}
+    for name, settings in records.items():
+        alike = repr([settings.get(word) for word in words])
+        groups.setdefault(alike, {})[name] = settings
+    units, ratio = _list_units(record), SI_SYMBOLS[Dimension.RATIO]
     chains: list[LevelChain] = []
     for group in groups.values():
-        first = records[group[0]]
-        label = ", ".join(f"{_say(word)} {_say_value(first.get(word))}" for word in differing)
-        chains += _order({name: records[name] for name in group}, numbers, plain, label, units)
+        first = next(iter(group.values()))
+        values = {word: first.get(word) for word in differing}
+        label = ", ".join(
+            f"{_say(word)} {' '.join(map(str, v)) if isinstance(v, tuple) else v}"
+            for word, v in values.items()
+        )
+        varied = [n for n in numbers if len({r[n] for r in group.values()}) > 1]
+        plain = getattr(record, "PLAIN", "")
+        varied = varied or [plain] * (plain in numbers)
+        ordered = sorted(group, key=lambda name, of=group: tuple(of[name][n] for n in varied))
+        columns = [[float(group[name][n]) for name in ordered] for n in varied]
+        if columns and all(column == sorted(column) for column in columns):
+            unit, column = units.get(varied[0], ratio), tuple(columns[0])
+            chains.append(LevelChain(label, _say(varied[0]), unit, tuple(ordered), column))
+        else:
+            chains += [LevelChain(label or name, "", ratio, (name,), (None,)) for name in group]
     return tuple(chains)
-
-
-def _order(
-    records: Mapping[str, Mapping[str, Any]],
-    numbers: list[str],
-    plain: str,
-    label: str,
-    units: Mapping[str, str],
-) -> list[LevelChain]:
-    """Return one chain of levels that have an order, else a chain for each level."""
-    varied = [n for n in numbers if len({r[n] for r in records.values()}) > 1]
-    if not varied and plain in numbers:
-        varied = [plain]
-    ordered = sorted(records, key=lambda name: tuple(records[name][n] for n in varied))
-    columns = [[float(records[name][n]) for name in ordered] for n in varied]
-    has_order = bool(columns) and all(column == sorted(column) for column in columns)
-    if not has_order:
-        ratio = SI_SYMBOLS[Dimension.RATIO]
-        return [LevelChain(label or name, "", ratio, (name,), (None,)) for name in records]
-    unit = units.get(varied[0], SI_SYMBOLS[Dimension.RATIO])
-    return [LevelChain(label, _say(varied[0]), unit, tuple(ordered), tuple(columns[0]))]
-
-
-def _levels_of(study: Study, factor: str) -> Mapping[str, Any]:
-    """Return name -> level of a factor, by its name in tables."""
-    keys = {name: key for key, name in FACTORS.items()}
-    return getattr(study, keys[factor])
 
 
 def _flatten(level: Any, prefix: str = "") -> dict[str, Any]:
@@ -495,10 +497,6 @@ def _flatten(level: Any, prefix: str = "") -> dict[str, Any]:
     return settings
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _list_units(record: type, prefix: str = "") -> dict[str, str]:
     """Return setting -> SI symbol of the numbers of a record with a dimension."""
     units: dict[str, str] = {}
@@ -511,9 +509,9 @@ def _list_units(record: type, prefix: str = "") -> dict[str, str]:
     return units
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _say(setting: str) -> str:
     return setting.replace("_", " ").replace(".", " ")
-
-
-def _say_value(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -32,8 +32,6 @@ from loopcal.studies.specification.levels import (
 )
 from loopcal.studies.specification.scores import ScoreColumn, list_columns
 
-# --- The cells of a study: all combinations of the levels of its factors.
-
 
 @dataclass(frozen=True)
 class Cell:
@@ -52,32 +50,6 @@ class Cell:
         return ", ".join(f"{factor} {level}" for factor, level in self.levels.items())
 
 
-def list_cells(study: Study) -> tuple[Cell, ...]:
-    """Return the product of the levels of all factors; the last factor varies fastest."""
-    names = list_factors(study)
-    keys = {name: key for key, name in FACTORS.items()}
-    levels = itertools.product(*(getattr(study, keys[name]) for name in names))
-    return tuple(Cell(i, dict(zip(names, chosen, strict=True))) for i, chosen in enumerate(levels))
-
-
-def list_factors(study: Study) -> tuple[str, ...]:
-    """Return the names of all factors: those of the file in its order, then the others."""
-    return tuple(dict.fromkeys((*study.order, *FACTORS.values())))
-
-
-def list_varied_factors(study: Study) -> tuple[str, ...]:
-    """Return the names of the factors that have more than one level."""
-    keys = {name: key for key, name in FACTORS.items()}
-    return tuple(name for name in list_factors(study) if len(getattr(study, keys[name])) > 1)
-
-
-def select_levels(study: Study, cell: Cell) -> dict[str, Any]:
-    """Return the levels of a cell by the name of their factor."""
-    return {name: getattr(study, key)[cell.levels[name]] for key, name in FACTORS.items()}
-
-
-# --- Keys of blocks: a hash of everything that determines their numbers, and of nothing else.
-
 NUMERICS = 2
 """Version of the numbers of a block; another one makes all blocks anew.
 
@@ -86,15 +58,14 @@ standard deviations, and the iterations are fewer.
 """
 
 
-def describe_block(study: Study, cell: Cell, block: int) -> dict[str, Any]:
-    """Return everything that determines the numbers of a block, as plain values."""
-    levels = select_levels(study, cell)
+def describe_cell(study: Study, cell: Cell) -> dict[str, Any]:
+    """Return what determines the numbers of all blocks of a cell, as plain values."""
+    levels: dict[str, Any] = {n: of_factor[cell.levels[n]] for n, of_factor in study.levels.items()}
     robot = levels.pop("robot")
     levels["poses"] = replace(levels["poses"], file=None)  # its poses count, not its name
     return {
         "numerics": NUMERICS,
         "seed": study.seed,
-        "block": block,
         "trials": study.block,
         "robot": robot.text,
         **{name: describe_record(level) for name, level in levels.items()},
@@ -159,15 +130,28 @@ class Study(Result):
         """Return title, size and factors as HTML."""
         from loopcal.results.notebook import render_html
 
-        levels = {n: dict.fromkeys(c.levels[n] for c in self.cells) for n in self.order}
-        factors = [f"{name}: {', '.join(names)}" for name, names in levels.items()]
+        factors = [f"{name}: {', '.join(self.levels[name])}" for name in self.order]
         size = f"{len(self.cells)} cells of {self.replicates} trials, seed {self.seed}"
         return render_html(["\n".join([f"{self.title}: {size}", *factors])])
 
     @cached_property
+    def levels(self) -> dict[str, Mapping[str, Any]]:
+        """Name of each factor -> its levels by their names: factors of the file in its order, then
+        the others.
+        """
+        levels = {name: getattr(self, key) for key, name in FACTORS.items()}
+        return {name: levels[name] for name in dict.fromkeys((*self.order, *levels))}
+
+    @property
+    def varied_factors(self) -> tuple[str, ...]:
+        """Names of the factors that have more than one level."""
+        return tuple(name for name, levels in self.levels.items() if len(levels) > 1)
+
+    @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """Return all combinations of levels, in the order of the file."""
-        return list_cells(self)
+        """All combinations of levels; the last factor of the file varies fastest."""
+        chosen = enumerate(itertools.product(*self.levels.values()))
+        return tuple(Cell(i, dict(zip(self.levels, names, strict=True))) for i, names in chosen)
 
     @property
     def columns(self) -> tuple[ScoreColumn, ...]:
@@ -185,7 +169,7 @@ class Study(Result):
 
     def compute_key(self, cell: Cell, block: int) -> str:
         """Return the key of a block."""
-        return compute_key(describe_block(self, cell, block))
+        return compute_key(describe_cell(self, cell) | {"block": block})
 
     def to_json(self) -> str:
         """Return the study as JSON, which `from_json` reads."""
@@ -197,31 +181,22 @@ class Study(Result):
         return msgspec.json.decode(text, type=cls)
 
 
-# --- Which changes to a study keep its finished blocks valid, and which do not.
-
 FREE = frozenset({"title", "order", "questions"})
 """Keys that change no number."""
 
 NAMES_OF_FILES = {"robots": "source", "poses": "file"}
-"""Factor -> setting that says where a level was read; its content counts, not its name."""
+"""Factor -> setting that says where a level was read."""
 
 LONGEST = 40
 """Characters of a value that is shown."""
 
 
 def list_conflicts(old: str, new: str) -> tuple[str, ...]:
-    """Return the changes by which finished blocks of a study would not belong to it any more.
+    """Return the changes of a study (as JSON) by which its finished blocks would not belong to it
+    any more, such as `errors/wide/error_factor: 2 -> 3`.
 
     More replicates, further levels, other names of files with the same content, and another title,
     order or question are none.
-
-    Parameters
-    ----------
-    old, new : studies as JSON (`Study.to_json`).
-
-    Returns
-    -------
-    Texts such as `errors/wide/error_factor: 2 -> 3`; empty where the study may be continued.
     """
     return tuple(_compare(json.loads(old), json.loads(new)))
 
@@ -239,16 +214,13 @@ def _compare(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
             for level in before:
                 if level not in after:
                     yield f"{key}/{level}: removed"
-                else:
-                    values = (_drop_file_name(key, levels[level]) for levels in (before, after))
-                    yield from _compare_values(f"{key}/{level}", *values)
+                    continue
+                file = {NAMES_OF_FILES.get(key): None}  # its content counts
+                yield from _compare_values(
+                    f"{key}/{level}", before[level] | file, after[level] | file
+                )
         else:
             yield from _compare_values(key, before, after)
-
-
-def _drop_file_name(factor: str, level: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a level without the name of the file in which they were read."""
-    return {key: value for key, value in level.items() if key != NAMES_OF_FILES.get(factor)}
 
 
 def _compare_values(path: str, old: Any, new: Any) -> Iterator[str]:
