@@ -5,8 +5,6 @@ Angles count as lengths at 200 mm per radian, in rows and columns. Ranks come fr
 values of the stacked matrix, never from its normal equations. A rank without a gap below it fails.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,37 +31,27 @@ def random_coordinates(robot: Mechanism, n: int, seed: int) -> Array:
 
 def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
     """Return platform twists per parameter (n, 6, p), all lengths [m / m]."""
-    return scale_angles(
-        robot,
-        differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).parameters[
-            0
-        ],
-    )
+    D = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
+    return scale_angles(robot, D.parameters[0])
 
 
 def scale_angles(robot: Mechanism, D: Array) -> Array:
     """Return a sensitivity (.., 6, p) with angles as lengths."""
-    columns = np.array(
-        [
-            1.0 if d is Dimension.LENGTH else 1 / METERS_PER_RADIAN
-            for d in robot.parameters.dimensions
-        ]
-    )
-    return D * np.array([METERS_PER_RADIAN] * 3 + [1.0] * 3)[:, None] * columns
+    return D * np.array([METERS_PER_RADIAN] * 3 + [1.0] * 3)[:, None] * scale_parameters(robot)
+
+
+def scale_parameters(robot: Mechanism) -> Array:
+    """Return (p,) 1 for lengths, and the radians per meter for angles."""
+    is_length = [d is Dimension.LENGTH for d in robot.parameters.dimensions]
+    return np.where(is_length, 1.0, 1 / METERS_PER_RADIAN)
 
 
 def perturb(robot: Mechanism, size: float, seed: int) -> Mechanism:
     """Change parameters at random by `size` [m], angles by size / 200 mm [rad], so that no axes
     stay parallel.
     """
-    rng = np.random.default_rng(seed)
-    scale = np.array(
-        [
-            1.0 if d is Dimension.LENGTH else 1 / METERS_PER_RADIAN
-            for d in robot.parameters.dimensions
-        ]
-    )
-    return robot.with_values(robot.values + size * scale * rng.standard_normal(len(robot.values)))
+    errors = np.random.default_rng(seed).standard_normal(len(robot.values))
+    return robot.with_values(robot.values + size * scale_parameters(robot) * errors)
 
 
 def solve_random_poses(robot: Mechanism, n: int = 80, seed: int = 3) -> Solution:
@@ -117,33 +105,6 @@ def rank(rows: Array, tolerance: float = 1e-12, gap: float = 1e3) -> int:
             f"no gap: {s[kept - 1] / s[0]:.1e} and {s[kept] / s[0]:.1e}"
         )
     return kept
-
-
-def ranks_by_measurement(
-    robot: Mechanism, kinds: Sequence[str], seed: int = 3, n: int = 80, **limits: float
-) -> list[int]:
-    """Return ranks for several measurements with known frames."""
-    solution = solve_random_poses(robot, n, seed)
-    D = scaled_sensitivity(robot, solution)
-    return [rank(select_measured_rows(D, solution.T, kind), **limits) for kind in kinds]
-
-
-FRAMES = ((True, False), (False, True), (True, True))
-"""Unknown: base, tool, both."""
-
-
-def ranks_with_unknown_frames(
-    robot: Mechanism, kind: str, frames: Sequence[tuple[bool, bool]] = FRAMES, n: int = 80
-) -> list[int]:
-    """Return ranks with unknown frames: rank of all columns less the rank of the frame columns."""
-    solution = solve_random_poses(robot, n)
-    D, result = scaled_sensitivity(robot, solution), []
-    for base, tool in frames:
-        F = select_measured_rows(frame_columns(solution.T, base, tool), solution.T, kind)
-        result.append(
-            rank(np.concatenate([select_measured_rows(D, solution.T, kind), F], axis=2)) - rank(F)
-        )
-    return result
 
 
 def null_vector(rows: Array) -> Array:

@@ -23,8 +23,6 @@ from tests.mechanism.families.ranks import (
     null_vector,
     perturb,
     rank,
-    ranks_by_measurement,
-    ranks_with_unknown_frames,
     scaled_sensitivity,
     select_measured_rows,
     solve_random_poses,
@@ -50,7 +48,6 @@ RU_PUS_PRS = RuPusPrs(
     home=PoseRecord(z=0.6),
     workspace=Workspace(**TILTS),
 )
-MEASUREMENTS = ("full", "5-dof", "positions", "orientation")
 EX, EY, EZ = np.eye(3)
 
 
@@ -60,7 +57,8 @@ def build_cached_robot(record: ThreePrs | RuPusPrs) -> Mechanism:
 
 
 # --- the error models by hand
-# ----------------------------------------------------------------------------------------
+
+
 def rotation_about_z(angle: float) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -101,18 +99,10 @@ def guide_derivatives(w: Array, R: Array, q: float, Z: Array, tags: dict[str, st
 
 def parameter_names(i: int, joint: str) -> dict[str, str]:
     """Return the paper's names of the parameters of chain i."""
-    keys = (
-        "ax",
-        "ay",
-        "az",
-        "bx",
-        "by",
-        "q",
-        "l",
-        "thBx",
-        "thBy",
+    keys = [
+        *["ax", "ay", "az", "bx", "by", "q", "l", "thBx", "thBy"],
         *(f"thC{axis}" for axis in joint),
-    )
+    ]
     return {key: f"{key[:-1]}{i}{key[-1]}" if key[-1] in "xyz" else f"{key}{i}" for key in keys}
 
 
@@ -191,7 +181,8 @@ def test_sensitivities_equal_the_error_model_derived_by_hand(case: str) -> None:
 
 
 # --- the closure by hand, at any parameters
-# --------------------------------------------------------------------------
+
+
 def cross_matrix(w: Array | Complex) -> Complex:
     return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]], dtype=complex)
 
@@ -323,58 +314,17 @@ def test_hand_derivation_and_complex_steps_agree_at_nominal_parameters(case: str
 def test_parameter_names_of_3_prs_and_ru_pus_prs() -> None:
     names = build_cached_robot(THREE_PRS).parameters.names
     assert len(names) == 33
-    assert names[:11] == (
-        "a1x",
-        "a1y",
-        "a1z",
-        "b1x",
-        "b1y",
-        "q1",
-        "l1",
-        "thB1x",
-        "thB1y",
-        "thC1x",
-        "thC1z",
+    assert names[:11] == tuple(
+        ["a1x", "a1y", "a1z", "b1x", "b1y", "q1", "l1", "thB1x", "thB1y", "thC1x", "thC1z"]
     )
     names = build_cached_robot(RU_PUS_PRS).parameters.names
     assert len(names) == 25
-    assert set(build_cached_robot(MODELS["RU-PUS-PRS, 27"][0]).parameters.names) - set(
-        names
-    ) == set(LEFT_OUT)
+    more = build_cached_robot(MODELS["RU-PUS-PRS, 27"][0]).parameters.names
+    assert set(more) - set(names) == set(LEFT_OUT)
     assert names[-5:] == ("r", "thOx", "thU1y", "thU2x", "thU2z")
 
 
 # --- identifiability
-# ------------------------------------------------------------------------------------------
-def test_ranks_of_the_3_prs_by_measurement() -> None:
-    assert ranks_by_measurement(build_cached_robot(THREE_PRS), MEASUREMENTS) == [33, 32, 30, 27]
-
-
-def test_each_unknown_frame_lowers_the_rank_of_the_3_prs_by_six() -> None:
-    assert ranks_with_unknown_frames(build_cached_robot(THREE_PRS), "full") == [27, 27, 21]
-    # the frame's own turn about the normal hides nothing new: 32 - 6
-    assert ranks_with_unknown_frames(build_cached_robot(THREE_PRS), "5-dof", [(True, False)]) == [
-        26
-    ]
-
-
-def test_unknown_frame_lowers_the_rank_of_the_ru_pus_prs_by_motions_it_can_follow() -> None:
-    """An unknown frame lowers the rank by the number of its motions that parameters can reproduce.
-
-    Base, 5 (20): all moves and turns but the one about z, for the twenty-five leave out the post's
-    thOz and thU1z; its other motions the post's angles and length follow, for its end N stands
-    still in all poses. The 27 lose all 6 (20 of 26). Tool, 3 (22): the turns, by a1 a2 thU2; a move
-    would shift the universal joint on the platform, which has no parameter. Both, 8 (17): the sum.
-    Without torsion one less where the tool is known, none where its turn about the normal is lost.
-    """
-    machine = build_cached_robot(RU_PUS_PRS)
-    assert ranks_with_unknown_frames(machine, "full") == [20, 22, 17]
-    assert ranks_with_unknown_frames(machine, "5-dof") == [19, 22, 17]
-    assert ranks_with_unknown_frames(build_cached_robot(MODELS["RU-PUS-PRS, 27"][0]), "full") == [
-        20,
-        23,
-        17,
-    ]
 
 
 def test_null_vector_of_the_3_prs_without_torsion_rotates_three_balls() -> None:
@@ -434,7 +384,6 @@ def test_twenty_seven_parameters_of_the_ru_pus_prs_have_rank_26() -> None:
     pivot, first = D[..., names.index("thOz")], D[..., names.index("thU1z")]
     np.testing.assert_allclose(pivot, first, rtol=0, atol=1e-14 * np.abs(D).max())
     # leaving out thOz alone keeps 26; the declared twenty-five leave out thU1z as well
-    assert ranks_by_measurement(build_cached_robot(RU_PUS_PRS), ("full", "5-dof")) == [25, 24]
 
 
 def test_null_vector_of_the_ru_pus_prs_without_torsion_rotates_two_balls() -> None:

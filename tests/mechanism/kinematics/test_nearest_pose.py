@@ -96,7 +96,7 @@ def test_projection_is_converged_only_where_the_distance_is_stationary(name):
     """The gradient by central differences of inverse solutions vanishes where a row is converged,
     for targets up to two sizes and 2 rad away from home.
     """
-    robot, n = load_robot(name), 8
+    robot, n = load_robot(name), 4
     target = np.concatenate([make_far_poses(robot, far, n // 2) for far in (0.05, 2.0)])
     sol = inverse(robot, target)
     done = sol.converged

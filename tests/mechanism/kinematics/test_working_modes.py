@@ -86,7 +86,7 @@ def measure_mobility_sign(robot: Mechanism, solution: Solution) -> Array:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide: float) -> None:
     robot = load_cached_robot(name)
-    result = inverse(robot, draw_targets(robot, wide, 15))
+    result = inverse(robot, draw_targets(robot, wide, 8))
     gap = measure_gap(robot, forward(robot, result.q), result.T)
     assert gap[result.converged].max(initial=0.0) < ROUNDING
     other = result.status == Status.OTHER_MODE
@@ -104,7 +104,7 @@ def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide:
 def test_modes_are_those_of_complete_forward_solutions(name: str) -> None:
     robot = load_cached_robot(name)
     # a tenth of the rows of the pentapod are refused, which needs more of them to count
-    values, n = robot.values[None], 60 if name == "pentapod" else 20
+    values, n = robot.values[None], 60 if name == "pentapod" else 9
     for wide in WIDE:
         target = draw_targets(robot, wide, n)[None]
         state = inverse_trials(robot, values, target)
