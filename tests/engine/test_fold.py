@@ -26,9 +26,8 @@ def test_folding_blocks_gives_the_factor_of_all_rows(engine, rows, cuts):
     assert_array_equal(factor, np.triu(factor))
     scale = np.linalg.norm(rows, axis=1, keepdims=True)
     whole = np.linalg.qr(rows, mode="r")
-    assert_allclose(
-        np.abs(factor / scale), np.abs(whole / scale), atol=1e-14
-    )  # columns of length one, 40 rows
+    # columns of length one, 40 rows
+    assert_allclose(np.abs(factor / scale), np.abs(whole / scale), atol=1e-14)
 
 
 def test_rows_of_zeros_equal_missing_rows(engine, rows):

@@ -87,27 +87,24 @@ def test_platform_moves_in_its_freedoms_only(engine, case):
 def test_converged_state_is_a_fixed_point(engine, case):
     state = engine.solve(case.program, case.e, case.q, case.home)
     again = engine.solve(case.program, case.e, case.q, state)
-    assert_allclose(
-        again.T, state.T, atol=2e-14
-    )  # [1] and [m]: rounding times the condition of these robots
+    # [1] and [m]: rounding times the condition of these robots
+    assert_allclose(again.T, state.T, atol=2e-14)
     assert again.iterations.max() <= 2
 
 
 def test_solving_for_a_pose_recovers_the_actuated_joints(engine):
     for robot in (zoo.mixed_hexapod(), zoo.hexapod()):
         one = make_case(robot)
-        one = replace(
-            one, q=one.home_q + 0.1 * (one.q - one.home_q)
-        )  # near enough for the working mode of home
+        # near enough for the working mode of home
+        one = replace(one, q=one.home_q + 0.1 * (one.q - one.home_q))
         state = engine.solve(one.program, one.e, one.q, one.home)
         task = pose_demand(state.T.reshape(-1, 4, 4), one.program.size)
         back = engine.solve(
             one.program, one.e, np.broadcast_to(one.home_q, one.q.shape), one.home, task, free=True
         )
         assert_array_equal(back.status, CONVERGED)
-        assert_allclose(
-            actuated_joint_values(one.program, back), one.q, atol=1e-13
-        )  # [m, rad] rounding times a condition near 10
+        # [m, rad] rounding times a condition near 10
+        assert_allclose(actuated_joint_values(one.program, back), one.q, atol=1e-13)
         assert_allclose(back.T, state.T, atol=1e-14)
 
 

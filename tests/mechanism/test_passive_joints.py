@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
@@ -82,7 +82,7 @@ def test_passive_joint_derivatives_do_not_depend_on_row_blocks():
     single = forward(robot, q[0, 600:601])
     alone = differentiate_passive_joints(robot, values, q[:, 600:601], single.state)
     # numpy's matmul rounds a batch by its size; a turn per meter is about 10
-    np.testing.assert_allclose(whole.parameters[:, 600:601], alone.parameters, rtol=0, atol=1e-11)
+    assert_allclose(whole.parameters[:, 600:601], alone.parameters, rtol=0, atol=1e-11)
     assert make_solution(robot, state, q[0]).passive_names == whole.names
 
 

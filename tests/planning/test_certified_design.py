@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
@@ -94,12 +95,12 @@ def test_efficiency_is_at_most_one_and_repeats_do_not_worsen_the_design(criterio
 def test_same_seed_gives_the_same_design():
     problem = make_problem(draw_rows(N=80, machine=6))
     first, second = (choose_design(problem, 9, seed=4) for _ in range(2))
-    np.testing.assert_array_equal(first.design.chosen, second.design.chosen)
+    assert_array_equal(first.design.chosen, second.design.chosen)
 
 
 def test_design_of_all_candidates_has_efficiency_one():
     found = choose_design(make_problem(draw_rows()), 12)
-    np.testing.assert_array_equal(found.design.chosen, np.arange(12))
+    assert_array_equal(found.design.chosen, np.arange(12))
     assert found.efficiency == pytest.approx(1.0, abs=1e-9)
 
 

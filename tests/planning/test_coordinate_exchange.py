@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -33,14 +34,14 @@ def parabola(_: Places, x: Array) -> Array:
 def test_every_start_converges_to_the_known_design_of_a_parabola(criterion, best, seed):
     begin = np.random.default_rng(seed).uniform(-1, 1, (12, 1))
     found = coordinate_exchange(parabola, begin, LEVELS, criterion, NONE)
-    np.testing.assert_allclose(np.sort(found.design[:, 0]), best, atol=1e-12)
-    np.testing.assert_array_equal(found.rows, parabola(np.arange(12), found.design))
+    assert_allclose(np.sort(found.design[:, 0]), best, atol=1e-12)
+    assert_array_equal(found.rows, parabola(np.arange(12), found.design))
 
 
 def test_points_that_start_at_one_place_are_separated():
     found = coordinate_exchange(parabola, np.zeros((6, 1)), LEVELS, D(), NONE)
     assert found.history[0] == -np.inf
-    np.testing.assert_allclose(np.sort(found.design[:, 0]), [-1, -1, 0, 0, 1, 1], atol=1e-12)
+    assert_allclose(np.sort(found.design[:, 0]), [-1, -1, 0, 0, 1, 1], atol=1e-12)
 
 
 def test_forbidden_levels_are_never_chosen():
@@ -71,7 +72,7 @@ def test_rows_of_all_levels_of_a_coordinate_are_evaluated_in_one_call():
 def test_coordinate_without_levels_is_not_changed():
     begin = np.random.default_rng(0).uniform(-1, 1, (6, 2))
     found = coordinate_exchange(parabola, begin, [*LEVELS, np.zeros(0)], D(), NONE)
-    np.testing.assert_array_equal(found.design[:, 1], begin[:, 1])
+    assert_array_equal(found.design[:, 1], begin[:, 1])
 
 
 def test_forbidden_first_design_and_too_few_points_are_refused():
@@ -116,7 +117,6 @@ def test_exchange_of_hexapod_poses_halves_the_parameter_uncertainty():
         for rows in (linearize(np.arange(20), drawn[:20]), found.rows)
     )
     assert (np.diff(found.history) >= 0.0).all()
-    assert (
-        np.sqrt(before / after) > 2.0
-    )  # rms standard deviation of the parameters; 2.8 to 3.0 with 100 poses
+    # rms standard deviation of the parameters; 2.8 to 3.0 with 100 poses
+    assert np.sqrt(before / after) > 2.0
     assert inverse(free.robot, found.design).converged.all()

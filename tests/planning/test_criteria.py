@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from loopcal.planning.design_space import A, D, E, I, PriorInformation, factor_design
 from tests.findings.expectations import expect_refusal
@@ -37,16 +38,16 @@ def test_directions_confounded_with_nuisance_parameters_are_excluded():
     space = problem.space
     assert len(space) == 3
     assert space.singular_values[3] < 1e-13 * space.singular_values[0]
-    np.testing.assert_allclose(space.machine.T @ np.array([0.0, 1.0, 2.0, 0.0]), 0.0, atol=CLOSE)
+    assert_allclose(space.machine.T @ np.array([0.0, 1.0, 2.0, 0.0]), 0.0, atol=CLOSE)
     # With parameter 1 fixed instead, 0, 2 and 3 stand for z0, z2 - 2 z1 and z3, which no choice of
     # the frame changes.
     expected = compute_covariance(np.delete(rows[:6], 3, axis=2), np.zeros((0, 5)), 2)
     determined = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, -2.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(determined @ space.machine @ space.machine.T, determined, atol=1e-12)
+    assert_allclose(determined @ space.machine @ space.machine.T, determined, atol=1e-12)
     factor = factor_design(rows[:6], problem.prior, space)
     C = space.machine @ np.linalg.inv(factor.T @ factor) @ space.machine.T
     # relative: rounding times a condition of 10^3
-    np.testing.assert_allclose(determined @ C @ determined.T, expected, rtol=1e-8)
+    assert_allclose(determined @ C @ determined.T, expected, rtol=1e-8)
 
 
 def test_earlier_rows_count_the_same_as_rows_of_the_design():
@@ -57,7 +58,7 @@ def test_earlier_rows_count_the_same_as_rows_of_the_design():
         np.abs(factor_design(given, start, space))
         for given, start in ((rows[3:6], before), (rows[:6], none))
     )
-    np.testing.assert_allclose(found, known, rtol=CLOSE, atol=CLOSE)
+    assert_allclose(found, known, rtol=CLOSE, atol=CLOSE)
 
 
 @pytest.mark.parametrize("criterion", [D(), A(), I(np.eye(4)), E()], ids=lambda c: c.name)

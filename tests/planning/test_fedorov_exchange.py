@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import EstimationError
 from loopcal.planning.design_space import D, DesignProblem, E, PriorInformation
@@ -41,7 +42,7 @@ ENDS = PriorInformation.none(3).with_rows(
 )
 def test_designs_of_polynomials_are_the_known_ones(x, problem, points):
     found = fedorov_exchange(problem, len(points), starts=3)
-    np.testing.assert_allclose(x[found.chosen], points, atol=1e-12)
+    assert_allclose(x[found.chosen], points, atol=1e-12)
     if len(points) == 6:  # det of weights 1/3 each, times 6^3
         assert found.value == pytest.approx(np.log(4 / 27 * 6**3), abs=1e-10)
 
@@ -70,7 +71,7 @@ def test_history_increases_and_ends_at_the_value():
 def test_same_seed_gives_the_same_design_and_the_same_first_starts():
     problem = make_problem(draw_rows(N=40))
     few, again, more = (fedorov_exchange(problem, 6, seed=5, starts=k) for k in (3, 3, 6))
-    np.testing.assert_array_equal(few.chosen, again.chosen)
+    assert_array_equal(few.chosen, again.chosen)
     assert more.values[:3] == few.values
 
 

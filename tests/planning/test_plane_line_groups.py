@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import loopcal as lc
 from loopcal.errors import EstimationError
@@ -39,10 +40,9 @@ def test_points_lie_on_a_plane_and_a_perpendicular_line_in_the_workspace(robot) 
     for x, axis in zip(at, design[:, 3].astype(int), strict=True):
         lever = x - x[0]
         along = np.eye(3)[axis]
-        np.testing.assert_allclose(
-            lever[2:] @ along, 0.0, atol=1e-9
-        )  # [m], end of the inverse kinematics
-        np.testing.assert_allclose(np.cross(lever[1], along), 0.0, atol=1e-9)
+        # [m], end of the inverse kinematics
+        assert_allclose(lever[2:] @ along, 0.0, atol=1e-9)
+        assert_allclose(np.cross(lever[1], along), 0.0, atol=1e-9)
     low, high = np.array([robot.assembly.workspace[name] for name in "xyz"]).T
     assert (at > low - 1e-9).all()
     assert (at < high + 1e-9).all()
@@ -55,8 +55,8 @@ def test_tool_point_lies_on_plane_and_line(robot) -> None:
     planned = PlaneLineGroups(replace(robot, assembly=assembly), 5, MM, ("z",))
     lever = compute_tool_origins(planned, planned.draw(3, 0))
     lever = lever - lever[:, :1]
-    np.testing.assert_allclose(lever[:, 2:, 2], 0.0, atol=1e-9)  # [m]
-    np.testing.assert_allclose(lever[:, 1, :2], 0.0, atol=1e-9)
+    assert_allclose(lever[:, 2:, 2], 0.0, atol=1e-9)  # [m]
+    assert_allclose(lever[:, 1, :2], 0.0, atol=1e-9)
 
 
 def test_derivatives_of_points_agree_with_the_forward_kinematics(robot) -> None:
@@ -72,9 +72,8 @@ def test_derivatives_of_points_agree_with_the_forward_kinematics(robot) -> None:
             for s in (1.0, -1.0)
         ]
         by_hand = (ends[0] - ends[1]) / 2e-6 * planned.free.tolerance[place]
-        np.testing.assert_allclose(
-            J[:, :, place], by_hand, atol=1e-11
-        )  # [m per tolerance], central differences of 1e-3
+        # [m per tolerance], central differences of 1e-3
+        assert_allclose(J[:, :, place], by_hand, atol=1e-11)
 
 
 def test_derivatives_by_surfaces_agree_with_small_rotations(robot) -> None:
@@ -95,10 +94,9 @@ def test_derivatives_by_surfaces_agree_with_small_rotations(robot) -> None:
             (lever @ new - lever @ old) / turn
             for new, old in zip(turned, (n, t_1, t_2), strict=True)
         ]
-        np.testing.assert_allclose(
-            F[g, :4, 0], [*moved[1][:2], *moved[2][:2]], atol=1e-9
-        )  # [m per rad]
-        np.testing.assert_allclose(F[g, 4:, 0], moved[0][[0, 2, 3, 4, 5]], atol=1e-9)
+        # [m per rad]
+        assert_allclose(F[g, :4, 0], [*moved[1][:2], *moved[2][:2]], atol=1e-9)
+        assert_allclose(F[g, 4:, 0], moved[0][[0, 2, 3, 4, 5]], atol=1e-9)
 
 
 def test_rank_is_33_of_42_for_1_to_30_groups(robot) -> None:
@@ -168,4 +166,4 @@ def test_one_sweep_of_coordinate_exchange_reduces_the_sd_threefold(robot) -> Non
         return float(np.sqrt(np.mean(s**-2.0)))
 
     assert sd(planned.linearize(first)) > 3.0 * sd(found.rows)
-    np.testing.assert_array_equal(planned.linearize(found.design), found.rows)
+    assert_array_equal(planned.linearize(found.design), found.rows)

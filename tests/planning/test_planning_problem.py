@@ -58,9 +58,10 @@ def test_prediction_poses_are_spread_over_a_long_list_of_poses():
     free = select_free_parameters(robot)
     twists = observe_poses(free, lc.inverse(robot, listed[200:]).q).twists[0, :, 3:]
     # the instrument determines all nine parameters: nothing is projected out of the prediction
+    # [m] per tolerance
     found = [
         np.abs(made.prediction.displacements - one).max(axis=(1, 2)).min() < 1e-9 for one in twists
-    ]  # [m] per tolerance
+    ]
     assert len(made.prediction) == 200
     # the last 60 of the list: with 200 of 260 drawn, 46 of them expected with a standard deviation
     # of 2.9
@@ -128,6 +129,5 @@ def test_planned_readings_are_rounded_to_a_nanometer_in_files_in_meters(tmp_path
     options = replace(FEW, n_poses=4, hold_out=0)
     found = lc.plan(robot, build_instrument("position"), options=options)
     exact = lc.inverse(found.robot, found.poses.coordinates).q
-    assert (
-        np.abs(found.poses.readings - exact).max() <= 0.51e-9
-    )  # [m], half of the last decimal place, a nanometre
+    # [m], half of the last decimal place, a nanometre
+    assert np.abs(found.poses.readings - exact).max() <= 0.51e-9

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.planning.design_space import A, D, DesignProblem, I
 from loopcal.planning.relaxation import relax_design
@@ -45,11 +46,11 @@ def test_weights_and_values_for_a_parabola_are_the_known_ones(criterion, nuisanc
     assert found.efficiency(known) == pytest.approx(1.0, abs=2 * GAP)
     # the optimum is flat about 0
     masses = [found.weights[abs(x - at) < 0.15].sum() / n for at in (-1.0, 0.0, 1.0)]
-    np.testing.assert_allclose(masses, shares, atol=2e-3)
+    assert_allclose(masses, shares, atol=2e-3)
     if problem.criterion == D() and not nuisance:
         # variance of the prediction at most p, the equivalence theorem of Kiefer and Wolfowitz
         assert (n * found.slopes).max() == pytest.approx(3.0, rel=1e-5)
-        np.testing.assert_allclose(n * found.slopes[found.weights > 0.1], 3.0, rtol=1e-3)
+        assert_allclose(n * found.slopes[found.weights > 0.1], 3.0, rtol=1e-3)
 
 
 def test_points_for_a_cubic_are_the_known_ones():
@@ -90,7 +91,7 @@ def test_bound_holds_for_an_early_stop():
 def test_relaxed_design_of_all_candidates_has_unit_weights():
     found = relax_design(make_problem(draw_rows(), A()), 12)
     assert found.value == found.bound
-    np.testing.assert_array_equal(found.weights, 1.0)
+    assert_array_equal(found.weights, 1.0)
 
 
 def test_forbidden_candidates_have_zero_weight():

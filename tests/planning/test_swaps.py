@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from loopcal.planning.design_space import (
     A,
@@ -40,10 +41,10 @@ def test_gain_of_every_swap_and_addition_equals_that_of_the_new_design(criterion
     for j, out in enumerate(chosen):
         designs = [np.concatenate([np.delete(chosen, j), [k]]) for k in range(len(X))]
         anew = [score(design) - score(chosen) for design in designs]
-        np.testing.assert_allclose(score_swaps(terms, out), anew, atol=1e-9)
+        assert_allclose(score_swaps(terms, out), anew, atol=1e-9)
     terms = compute_swap_terms(scoring, scoring.factor(X[:4]), X)
     anew = [score([0, 1, 2, 3, k]) - score([0, 1, 2, 3]) for k in range(len(X))]
-    np.testing.assert_allclose(score_additions(terms), anew, atol=1e-9)
+    assert_allclose(score_additions(terms), anew, atol=1e-9)
 
 
 @pytest.mark.parametrize("criterion", [D(), A(), I(L, 3)], ids=lambda criterion: criterion.name)
@@ -53,7 +54,7 @@ def test_swap_is_exact_if_the_design_without_the_candidate_is_singular(criterion
     gains = score_swaps(compute_swap_terms(scoring, R, X), 0)
     anew = [scoring.score(scoring.factor(X[[k, 1]])) - scoring.score(R) for k in range(2, len(X))]
     # in logs: rounding times the condition of two units, 10
-    np.testing.assert_allclose(gains[2:], anew, atol=1e-8)
+    assert_allclose(gains[2:], anew, atol=1e-8)
     assert gains[1] < -15.0  # the same unit twice leaves two directions open, to rounding
 
 
@@ -72,7 +73,7 @@ def test_derivatives_by_weights_agree_with_finite_differences(criterion, nuisanc
         return np.array([(function(w + e) - function(w - e)) / (2 * h) for e in h * np.eye(len(w))])
 
     found, curve = differentiate_score(scoring, X, w)
-    np.testing.assert_allclose(found, difference(score), atol=1e-6)  # h^2
+    assert_allclose(found, difference(score), atol=1e-6)  # h^2
     # h^2 times a third derivative of about 100
-    np.testing.assert_allclose(curve, difference(slope), atol=1e-5)
+    assert_allclose(curve, difference(slope), atol=1e-5)
     assert np.linalg.eigvalsh(curve)[-1] < 1e-9  # concave, to rounding

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from loopcal.engine import CONVERGED, NOT_FINITE, Engine, Program, Slot, State, Target, TwistRows
 from loopcal.errors import MissingPackageError
@@ -204,7 +205,7 @@ def test_nothing_is_solved_for_no_trials_no_poses_and_no_rows():
     ).T.shape == (2, 0, 4, 4)
     assert NATIVE.fold(np.zeros((0, 3, 3)), np.zeros((0, 5, 3))).shape == (0, 3, 3)
     R = np.triu(np.random.default_rng(1).normal(size=(2, 3, 3)))
-    np.testing.assert_array_equal(NATIVE.fold(R, np.zeros((2, 0, 3))), R)
+    assert_array_equal(NATIVE.fold(R, np.zeros((2, 0, 3))), R)
     assert NATIVE.fold(np.zeros((2, 0, 0)), np.zeros((2, 4, 0))).shape == (2, 0, 0)
 
 

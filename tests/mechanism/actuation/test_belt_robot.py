@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 import loopcal as lc
@@ -47,7 +48,7 @@ def test_inverse_kinematics_are_distances_from_the_anchors(machine):
     robot, x, readings = machine
     solution = lc.inverse(robot, x)
     assert solution.converged.all()
-    np.testing.assert_allclose(solution.q, readings, atol=1e-9 * SIZE, rtol=0)
+    assert_allclose(solution.q, readings, atol=1e-9 * SIZE, rtol=0)
 
 
 def test_forward_kinematics_are_intersections_of_circles(machine):
@@ -55,9 +56,9 @@ def test_forward_kinematics_are_intersections_of_circles(machine):
     solution = lc.forward(robot, readings)
     assert solution.converged.all()
     T = solution.T
-    np.testing.assert_allclose(intersect_circles(robot.values, readings), x, atol=1e-9)
-    np.testing.assert_allclose(T[:, :2, 3], x, atol=1e-9 * SIZE, rtol=0)
-    np.testing.assert_allclose(T[:, :3, :3], np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-12)
+    assert_allclose(intersect_circles(robot.values, readings), x, atol=1e-9)
+    assert_allclose(T[:, :2, 3], x, atol=1e-9 * SIZE, rtol=0)
+    assert_allclose(T[:, :3, :3], np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-12)
 
 
 def test_contradicting_readings_lead_to_their_least_squares_position(machine):
@@ -70,7 +71,7 @@ def test_contradicting_readings_lead_to_their_least_squares_position(machine):
             return compute_readings(robot.values, p) - q
 
         best = least_squares(gap, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        np.testing.assert_allclose(position, best.x, atol=1e-8 * SIZE)  # [m] of scipy's minimum
+        assert_allclose(position, best.x, atol=1e-8 * SIZE)  # [m] of scipy's minimum
 
 
 @pytest.mark.slow
@@ -84,12 +85,12 @@ def test_sensitivities_agree_with_automatic_derivatives(machine):
     found = differentiate_at_pose(robot, robot.values[None], readings[None], state)
     by_values = jax.jacobian(compute)(robot.values, x)
     by_position = jax.vmap(jax.jacobian(compute, argnums=1), (None, 0))(robot.values, x)
-    np.testing.assert_allclose(found.readings[0][0], by_values, atol=1e-11)
-    np.testing.assert_allclose(found.readings[1][0], by_position, atol=1e-11)
+    assert_allclose(found.readings[0][0], by_values, atol=1e-11)
+    assert_allclose(found.readings[1][0], by_position, atol=1e-11)
     # the pose at given readings, by least squares of equal weights: x' = -(J'J)^-1 J' dq/dp
     D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
     expected = -np.linalg.pinv(np.asarray(by_position)) @ np.asarray(by_values)
-    np.testing.assert_allclose(D[:, 3:5], expected, atol=1e-10)
+    assert_allclose(D[:, 3:5], expected, atol=1e-10)
 
 
 def test_sensitivities_agree_with_finite_differences(machine):
@@ -100,4 +101,4 @@ def test_sensitivities_agree_with_finite_differences(machine):
     for i, step in enumerate(h * np.eye(12)):
         ends = [lc.forward(robot.with_values(robot.values + s), readings).T for s in (step, -step)]
         slope = (ends[0] - ends[1])[:, :2, 3] / (2 * h)
-        np.testing.assert_allclose(D[:, 3:5, i], slope, atol=1e-6)  # second order at closed loops
+        assert_allclose(D[:, 3:5, i], slope, atol=1e-6)  # second order at closed loops

@@ -39,9 +39,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         (THIRD, "q3: {triangle: {foot: [1, 0, 0], head: [0, 1, 0]}}", "beside sums", 10),
     ],
 )  # fmt: skip
-def test_impossible_sums_are_refused_in_one_sentence(
-    tmp_path: Path, old: str, new: str, sentence: str, line: int | None
-) -> None:
+def test_impossible_sums_are_refused_in_one_sentence(tmp_path, old, new, sentence, line):
     assert load_text(tmp_path, PLATE).has_open_sums
     assert old in PLATE
     with pytest.raises((FileError, MechanismError), match=sentence) as error:

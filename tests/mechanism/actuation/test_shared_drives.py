@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.optimize import root
 
@@ -74,13 +75,13 @@ def test_orientation_that_follows_the_position_is_found(tmp_path: Path) -> None:
     known = [solve_four_bar(float(angle)) for angle in angles]
     solution = forward(robot, angles[:, None])
     assert solution.converged.all()
-    np.testing.assert_allclose(solution.T[:, :2, 3], [pin for pin, _ in known], atol=1e-12)
+    assert_allclose(solution.T[:, :2, 3], [pin for pin, _ in known], atol=1e-12)
     yaw = read_coordinates(solution.T, ("yaw",))[:, 0]
-    np.testing.assert_allclose(yaw, [y for _, y in known], atol=1e-9)
+    assert_allclose(yaw, [y for _, y in known], atol=1e-9)
     for target in (solution.T, solution.T[:, :1, 3]):
         back = inverse(robot, target)
         assert back.converged.all()
-        np.testing.assert_allclose(back.q[:, 0], angles, rtol=0, atol=1e-11)
+        assert_allclose(back.q[:, 0], angles, rtol=0, atol=1e-11)
 
 
 def test_poses_out_of_reach_are_marked_and_cost_no_exception(tmp_path: Path) -> None:
@@ -101,10 +102,10 @@ def test_repeated_equations_of_a_spatial_parallelogram_are_no_obstacle(tmp_path:
     robot, plane = load_text(tmp_path, text), load_text(tmp_path, FOUR_BAR)
     angles = np.deg2rad(np.linspace(31, 79, 7))[:, None]
     T = forward(plane, angles).T
-    np.testing.assert_allclose(forward(robot, angles).T, T, atol=1e-12)
+    assert_allclose(forward(robot, angles).T, T, atol=1e-12)
     back = inverse(robot, T)
     assert back.converged.all()
-    np.testing.assert_allclose(back.q, angles, rtol=0, atol=1e-11)
+    assert_allclose(back.q, angles, rtol=0, atol=1e-11)
 
 
 def test_calibration_of_a_coupler_whose_orientation_follows(tmp_path: Path) -> None:
@@ -161,9 +162,9 @@ def test_palletizer_agrees_with_a_constraint_solver() -> None:
     assert isinstance(state, ChainState)
     wrist = state.poses[1][0]  # platform of the arm in its own base
     known = np.array([solve_palletizer(robot, robot.values, row[1:3]) for row in q])
-    np.testing.assert_allclose(wrist[:, [0, 2], 3], known[:, :2], atol=1e-9 * robot.size)
+    assert_allclose(wrist[:, [0, 2], 3], known[:, :2], atol=1e-9 * robot.size)
     # a rotation about -y by the angle moves x towards z
-    np.testing.assert_allclose(wrist[:, 2, 0], np.sin(known[:, 2]), rtol=0, atol=1e-9)
+    assert_allclose(wrist[:, 2, 0], np.sin(known[:, 2]), rtol=0, atol=1e-9)
     # the wrist stays level but for the errors
     assert 1e-6 < np.abs(known[:, 2]).max() < 0.02
 
@@ -171,12 +172,10 @@ def test_palletizer_agrees_with_a_constraint_solver() -> None:
 def test_nominal_palletizer_stays_level() -> None:
     robot = load_cached_robot("palletizer")
     sample = sample_workspace(robot, 50, seed=2)
-    np.testing.assert_allclose(
-        sample.solution.T[:, 2, :3], np.tile([0, 0, 1.0], (50, 1)), atol=1e-9
-    )
+    assert_allclose(sample.solution.T[:, 2, :3], np.tile([0, 0, 1.0], (50, 1)), atol=1e-9)
     back = forward(robot, inverse(robot, sample.solution.T).q)
     assert back.converged.all()
-    np.testing.assert_allclose(back.T, sample.solution.T, rtol=0, atol=1e-9 * robot.size)
+    assert_allclose(back.T, sample.solution.T, rtol=0, atol=1e-9 * robot.size)
 
 
 def test_sensitivities_of_a_shared_drive_are_derivatives(tmp_path: Path) -> None:

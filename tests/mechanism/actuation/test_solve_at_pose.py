@@ -87,8 +87,7 @@ def test_derivatives_by_pose_and_by_readings_agree():
     values, _, state, q = solve_example_pose(robot)
     result = differentiate_at_pose(robot, values, q, state)
     by_reading = differentiate_passive_joints(robot, values, q, state)
-    turned = (
-        by_reading.readings[0, 0] @ result.readings[1][0, 0]
-    )  # passive by readings, readings by pose
+    # passive by readings, readings by pose
+    turned = by_reading.readings[0, 0] @ result.readings[1][0, 0]
     assert_allclose(turned, result.passive[1][0, 0], atol=1e-9)  # [rad/m]
     assert inverse(robot, np.zeros((1, 3))).converged.all()

@@ -82,9 +82,8 @@ def test_planar_hexapods_have_equal_counts_of_modes_above_and_below_the_base(
     at = inverse(machine, np.array(coordinates))
     result = find_assembly_modes(machine, at.q[0])
     assert (len(result), int((result.solution.T[:, 2, 3] > 0).sum())) == (modes, above)
-    assert (
-        np.abs(result.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9
-    )  # the original pose is among them
+    # the original pose is among them
+    assert np.abs(result.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9
 
 
 @pytest.mark.parametrize(

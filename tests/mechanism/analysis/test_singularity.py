@@ -24,16 +24,14 @@ def test_singularity_margin_of_a_hexapod_is_that_of_its_plucker_lines():
     u = p + T[:, None, :3, 3] - zoo.HEXAPOD_BASE * zoo.MM
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     lines = np.concatenate([np.cross(p, u) / robot.size, u], axis=-1)
-    assert_allclose(
-        result.margin, np.linalg.svd(lines, compute_uv=False)[:, -1], atol=1e-14
-    )  # [m/m] rounding
+    # [m/m] rounding
+    assert_allclose(result.margin, np.linalg.svd(lines, compute_uv=False)[:, -1], atol=1e-14)
     assert (
         result.closure_sign
         == np.sign(np.linalg.det(lines)) * result.closure_sign[0] * np.sign(np.linalg.det(lines))[0]
     ).all()
-    assert_allclose(
-        result.drive_margin, 1.0, atol=1e-14
-    )  # a rod pushes along itself, whatever the pose
+    # a rod pushes along itself, whatever the pose
+    assert_allclose(result.drive_margin, 1.0, atol=1e-14)
 
 
 def test_hexapod_rotated_by_90_degrees_is_singular():

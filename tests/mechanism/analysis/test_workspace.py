@@ -23,9 +23,8 @@ def test_samples_are_within_ranges_and_strokes_and_round_trip():
     low, high = np.array([robot.assembly.workspace[name] for name in robot.controlled]).T
     assert ((result.coordinates >= low) & (result.coordinates <= high)).all()
     assert np.abs(result.solution.q).max() <= 0.075
-    assert_allclose(
-        forward(robot, result.solution.q).T, result.solution.T, atol=1e-12
-    )  # [1, m]: rounding over Newton
+    # [1, m]: rounding over Newton
+    assert_allclose(forward(robot, result.solution.q).T, result.solution.T, atol=1e-12)
     assert 0.95 < result.reachable_share < 1.0
     assert all(name.startswith("stroke of q") for name in result.rejected)
 

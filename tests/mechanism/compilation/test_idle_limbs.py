@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -78,7 +79,7 @@ def test_the_wrist_of_a_probe_passes_its_singularity(machines: tuple[Mechanism, 
     target[:, 2], target[:, 4] = 0.6, np.linspace(-0.3, 0.3, 9)
     solution = inverse(probed, target)
     assert solution.converged.all()  # those below -5 degrees were in another mode
-    np.testing.assert_allclose(solution.q, inverse(plain, target).q, atol=1e-12)  # [m] rounding
+    assert_allclose(solution.q, inverse(plain, target).q, atol=1e-12)  # [m] rounding
     back = forward(probed, solution.q)
     assert back.converged.all()
     assert np.abs(geometry.pose_difference(back.T, solution.T)).max() < 1e-9
@@ -86,9 +87,7 @@ def test_the_wrist_of_a_probe_passes_its_singularity(machines: tuple[Mechanism, 
     assert middle.min() < -0.1 < 0.1 < middle.max()
 
 
-def test_modes_of_the_actuated_loops_are_those_without_the_probe(
-    machines: tuple[Mechanism, Mechanism],
-) -> None:
+def test_modes_of_the_actuated_loops_are_those_without_the_probe(machines):
     plain, probed = machines
     target = draw_poses(40)
     expected, solution = inverse(plain, target), inverse(probed, target)

@@ -58,9 +58,7 @@ def name_axis(turns: bool, name: str) -> dict:
     return {"turns": turns, "name": name, "vector": ()}
 
 
-def test_second_limb_of_an_exechon_head_repeats_a_translation_and_a_rotation(
-    tmp_path: Path,
-) -> None:
+def test_second_limb_of_an_exechon_head_repeats_a_translation_and_a_rotation(tmp_path):
     data = get_data(load_text(tmp_path, EXECHON))
     assert (data["count"], data["tolerance"], data["freedoms"]) == (2, 1e-9, ())
     # both limbs are in the plane y = 0 and turn about x and y only
@@ -114,9 +112,7 @@ def test_loops_stay_closed_with_other_values_exactly_of_parameters_that_are_not_
 
 
 @BOTH
-def test_errors_that_open_the_loops_are_neither_drawn_nor_identified(
-    text: str, tmp_path: Path
-) -> None:
+def test_errors_that_open_the_loops_are_neither_drawn_nor_identified(text, tmp_path):
     robot = load_text(tmp_path, text)
     with pytest.raises(MechanismError) as refusal:
         sample_truth(robot, 1, 0)
@@ -165,9 +161,7 @@ def test_engines_agree_on_the_least_squares_closure(text: str, tmp_path: Path) -
 
 
 @BOTH
-def test_forward_kinematics_of_open_loops_returns_commanded_coordinates(
-    text: str, tmp_path: Path
-) -> None:
+def test_forward_kinematics_of_open_loops_returns_commanded_coordinates(text, tmp_path):
     robot = load_text(tmp_path, close_by_least_squares(text))
     true = robot.with_values(draw(robot, 1)[0][0])
     ranges = np.array(list(robot.assembly.workspace.values()))
@@ -202,9 +196,7 @@ def test_derivatives_of_open_loops_agree_with_differences(text: str, tmp_path: P
 
 
 @BOTH
-def test_derivatives_of_passive_joints_of_open_loops_agree_with_differences(
-    text: str, tmp_path: Path
-) -> None:
+def test_derivatives_of_passive_joints_of_open_loops_agree_with_differences(text, tmp_path):
     robot = load_text(tmp_path, close_by_least_squares(text))
     values, q = draw(robot, 2)
     state = forward_trials(robot, values, q)
@@ -250,9 +242,7 @@ def insert_line(text: str, added: dict) -> str:
 
 
 @BOTH
-def test_lines_that_free_joints_make_the_file_one_of_exact_constraint(
-    text: str, tmp_path: Path
-) -> None:
+def test_lines_that_free_joints_make_the_file_one_of_exact_constraint(text, tmp_path):
     robot = load_text(tmp_path, text)
     finding = propose_added_joints(robot)
     assert finding is not None

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import list_shipped_robots
@@ -29,7 +30,7 @@ def test_shipped_robot_closes_at_the_home_pose_of_its_file(name: str) -> None:
     tilt = geometry.log_so3(machine.home[:3, :3] @ home[:3, :3].T)
     if "phi" in machine.controlled and abs(tilt).max() < 1e-12:  # phi is anything at zero tilt
         read = [np.delete(r, machine.controlled.index("phi")) for r in read]
-    np.testing.assert_allclose(*read, atol=1e-12)
+    assert_allclose(*read, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -43,29 +44,21 @@ def test_shipped_robot_file_states_source_workspace_strokes_and_tolerances(name:
     assert np.isfinite(machine.parameters.tolerance).all()
 
 
+@pytest.mark.parametrize("errors", [0.0, 1.0], ids=["nominal", "with errors"])
 @pytest.mark.parametrize("name", ROBOTS)
-def test_forward_kinematics_inverts_inverse_kinematics_in_the_workspace(name: str) -> None:
-    machine = load_cached_robot(name)
-    wanted = random_coordinates(machine, 1000, seed=11)
+def test_forward_kinematics_inverts_inverse_kinematics_in_the_workspace(name, errors):
+    nominal = load_cached_robot(name)
+    drawn = np.random.default_rng(2).standard_normal(len(nominal.parameters))
+    machine = nominal.with_values(nominal.values + errors * drawn * nominal.parameters.tolerance)
+    wanted = random_coordinates(machine, 1000 if not errors else 100, seed=11)
     solution = inverse(machine, wanted)
     back = forward(machine, solution.q)
     good = solution.converged & back.converged
     assert good.mean() >= 0.999
     # [m, rad] Newton stops below 1e-13 of the size; the rest is the condition of the mechanism
-    np.testing.assert_allclose(back.T[good], solution.T[good], atol=1e-9)
+    assert_allclose(back.T[good], solution.T[good], atol=1e-9)
     residual = compare_coordinates(back.T[good], wanted[good], machine.controlled, machine.size)[0]
-    np.testing.assert_allclose(residual, 0.0, atol=1e-9 * machine.size)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
-def test_random_rows_converge_or_state_why_not(name: str) -> None:
-    machine = load_cached_robot(name)
-    solution = inverse(machine, random_coordinates(machine, 2_000, seed=12))
-    back = forward(machine, solution.q)
-    assert (solution.converged & back.converged).mean() >= 0.999
-    for row in np.flatnonzero(~back.converged)[:5]:
-        assert back.explain(int(row))
+    assert_allclose(residual, 0.0, atol=1e-9 * machine.size)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -116,25 +117,25 @@ def assert_same_kinematics(three: Mechanism, six: Mechanism, atol: float) -> Non
     """Assert equal readings, poses and common derivatives [m, m/m, m/rad]."""
     xyz = random_coordinates(three, 200, seed=5)
     q = inverse(three, xyz).q
-    np.testing.assert_allclose(inverse(six, xyz).q, q, rtol=0, atol=atol)
+    assert_allclose(inverse(six, xyz).q, q, rtol=0, atol=atol)
     pose = forward(six, q)
-    np.testing.assert_allclose(pose.T, forward(three, q).T, rtol=0, atol=atol)
+    assert_allclose(pose.T, forward(three, q).T, rtol=0, atol=atol)
     (D, J), (E, K) = position_derivatives(three, q), position_derivatives(six, q)
-    np.testing.assert_allclose(K, J, rtol=0, atol=atol)
+    assert_allclose(K, J, rtol=0, atol=atol)
     # in the six a rod's length is one of two, and its height does not depend on radius and rod: the
     # firmware's offset stop + sqrt(arm^2 - radius^2) does
     index, other = three.parameters.index, six.parameters.index
     common = np.zeros_like(E[..., 0])
     for k in (1, 2, 3):
         offset = E[..., other(f"q{k}.offset")]
-        np.testing.assert_allclose(offset, D[..., index(f"tower{k}.stop")], rtol=0, atol=atol)
+        assert_allclose(offset, D[..., index(f"tower{k}.stop")], rtol=0, atol=atol)
         both = E[..., other(f"left{k}.length")] + E[..., other(f"right{k}.length")]
-        np.testing.assert_allclose(
+        assert_allclose(
             both + ARM / DROP * offset, D[..., index(f"arm{k}.length")], rtol=0, atol=atol
         )
         common += offset
     outwards = E[..., other("radius")] - RADIUS / DROP * common
-    np.testing.assert_allclose(outwards, D[..., index("radius")], rtol=0, atol=atol)
+    assert_allclose(outwards, D[..., index("radius")], rtol=0, atol=atol)
 
 
 def test_uneven_rods_tilt_the_platform_but_reach_the_position() -> None:
@@ -142,16 +143,16 @@ def test_uneven_rods_tilt_the_platform_but_reach_the_position() -> None:
     xyz = random_coordinates(machine, 500, seed=6)
     solution = inverse(machine, xyz)
     assert solution.converged.all()
-    np.testing.assert_allclose(solution.T[:, :3, 3], xyz, rtol=0, atol=1e-12)  # [m]
+    assert_allclose(solution.T[:, :3, 3], xyz, rtol=0, atol=1e-12)  # [m]
     tilt = np.linalg.norm(geometry.log_so3(solution.T[:, :3, :3]), axis=1)
     assert 1e-4 < np.median(tilt) < 0.1
     # both rods of a carriage at one height
     group, joints = machine.program.groups[0], solution.state.joints[0]
     for a in range(3):
         pair = joints[0][:, group.actuator[0] == a, 0]
-        np.testing.assert_array_equal(pair[:, 0], pair[:, 1])
+        assert_array_equal(pair[:, 0], pair[:, 1])
     back = forward(machine, solution.q)
-    np.testing.assert_allclose(back.T, solution.T, rtol=0, atol=1e-12)
+    assert_allclose(back.T, solution.T, rtol=0, atol=1e-12)
 
 
 def test_row_of_inverse_kinematics_does_not_depend_on_other_rows() -> None:
@@ -160,15 +161,15 @@ def test_row_of_inverse_kinematics_does_not_depend_on_other_rows() -> None:
     together = inverse(machine, xyz)
     for row in (0, 17, 39):
         alone = inverse(machine, xyz[row : row + 1])
-        np.testing.assert_array_equal(alone.q[0], together.q[row])
-        np.testing.assert_array_equal(alone.T[0], together.T[row])
+        assert_array_equal(alone.q[0], together.q[row])
+        assert_array_equal(alone.T[0], together.T[row])
 
 
 def test_reachable_pose_of_an_uneven_delta_is_kept() -> None:
     machine = build_uneven_delta()
     solution = inverse(machine, random_coordinates(machine, 20, seed=8))
     again = inverse(machine, solution.T)
-    np.testing.assert_allclose(again.T, solution.T, rtol=0, atol=1e-10)
+    assert_allclose(again.T, solution.T, rtol=0, atol=1e-10)
 
 
 def test_unreachable_position_is_marked() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from loopcal import geometry as rigid
@@ -84,7 +85,7 @@ def test_sensitivities_equal_those_of_the_leg_equation(record: Gough) -> None:
             G[leg, 7 * leg : 7 * leg + 7] = np.concatenate([u, -u @ R, [1.0]])
         expected = np.linalg.solve(J, G)
         # [m/m, rad/m] rounding times the condition of J, about 1e2
-        np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        assert_allclose(result, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_rod_legs_and_chain_legs_agree_in_poses_and_sensitivities() -> None:
@@ -93,23 +94,21 @@ def test_rod_legs_and_chain_legs_agree_in_poses_and_sensitivities() -> None:
         with_published_errors(build_cached_robot(CHAIN)),
     )
     assert rod.parameters.names == chain.parameters.names
-    np.testing.assert_array_equal(rod.parameters.nominal, chain.parameters.nominal)
+    assert_array_equal(rod.parameters.nominal, chain.parameters.nominal)
     one = solve_random_poses(rod)
     two = inverse(chain, one.T)
     assert two.converged.all()
-    np.testing.assert_allclose(two.q, one.q, rtol=0, atol=1e-12)  # [m]
+    assert_allclose(two.q, one.q, rtol=0, atol=1e-12)  # [m]
     solution, back = forward(rod, one.q), forward(chain, one.q)
-    np.testing.assert_allclose(back.T, solution.T, rtol=0, atol=1e-12)  # [m, 1]
+    assert_allclose(back.T, solution.T, rtol=0, atol=1e-12)  # [m, 1]
     assert max(solution.residual.max(), back.residual.max()) < 1e-12  # [m]
     D = [
         differentiate_pose(machine, machine.values[None], one.q[None], result.state)
         for machine, result in ((rod, solution), (chain, back))
     ]
     size = np.abs(D[0].parameters).max()  # [rad/m] about 10
-    np.testing.assert_allclose(
-        D[1].parameters, D[0].parameters, rtol=0, atol=1e-12 * max(size, 1.0)
-    )
-    np.testing.assert_allclose(D[1].readings, D[0].readings, rtol=0, atol=1e-12 * max(size, 1.0))
+    assert_allclose(D[1].parameters, D[0].parameters, rtol=0, atol=1e-12 * max(size, 1.0))
+    assert_allclose(D[1].readings, D[0].readings, rtol=0, atol=1e-12 * max(size, 1.0))
 
 
 COMPLETE_AXES = replace(CHAIN, error_model="complete", spherical="axes")
@@ -148,9 +147,7 @@ def test_complete_model_spans_the_sensitivities_of_the_ideal_model() -> None:
         ),
     ],
 )
-def test_unsupported_options_of_a_hexapod_are_refused_with_the_alternative(
-    record: Gough, sentence: str
-) -> None:
+def test_unsupported_options_of_a_hexapod_are_refused_with_the_alternative(record, sentence):
     with pytest.raises(MechanismError, match=sentence):
         record.expand()
 
@@ -220,9 +217,7 @@ def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Arr
     return build(record.expand())
 
 
-def test_screw_legs_agree_with_strut_lengths_and_poses_of_genhexkins(
-    genhexkins: tuple[dict[str, Array], Array, Array],
-) -> None:
+def test_screw_legs_agree_with_strut_lengths_and_poses_of_genhexkins(genhexkins):
     geometry, T, struts = genhexkins
     patterns, place = np.unique(is_folded(geometry, T), axis=0, return_inverse=True)
     checked = 0
@@ -238,13 +233,12 @@ def test_screw_legs_agree_with_strut_lengths_and_poses_of_genhexkins(
             start = inverse(machine, pose, start)
         assert start is not None
         assert start.converged.all()
-        np.testing.assert_allclose(start.T, T[rows], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(start.q, struts[rows], rtol=0, atol=1e-9)  # printed to 1e-12
+        assert_allclose(start.T, T[rows], rtol=0, atol=1e-12)
+        assert_allclose(start.q, struts[rows], rtol=0, atol=1e-9)  # printed to 1e-12
         back = forward(machine, struts[rows])
         assert back.converged.all()
-        np.testing.assert_allclose(
-            back.T, T[rows], rtol=0, atol=1e-7
-        )  # printed poses are exact to 1e-10
+        # printed poses are exact to 1e-10
+        assert_allclose(back.T, T[rows], rtol=0, atol=1e-7)
         checked += len(rows)
     assert checked == 200
 
@@ -256,7 +250,7 @@ def test_screw_without_lead_equals_a_plain_leg() -> None:
         build_cached_robot(CHAIN),
     )
     one = solve_random_poses(plain, 20)
-    np.testing.assert_allclose(inverse(machine, one.T).q, one.q, rtol=0, atol=1e-12)  # [m]
+    assert_allclose(inverse(machine, one.T).q, one.q, rtol=0, atol=1e-12)  # [m]
 
 
 def test_screw_adds_its_lead_for_each_turn_of_the_upper_joint() -> None:
@@ -277,9 +271,7 @@ def test_screw_adds_its_lead_for_each_turn_of_the_upper_joint() -> None:
         s, upper = v / length[:, None], T[:3, :3] @ high
         across = np.cross(s, low)  # with low's part across s, a right-handed frame about s
         a = np.arctan2(across @ upper, s * (s @ low)[:, None] @ -upper + low @ upper)
-        np.testing.assert_allclose(
-            q, length + lead * a / (2 * np.pi) - ROD.lengths, rtol=0, atol=1e-12
-        )  # [m]
+        assert_allclose(q, length + lead * a / (2 * np.pi) - ROD.lengths, rtol=0, atol=1e-12)
 
 
 def to_array(listed: tuple[tuple[float, float, float], ...]) -> Array:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from loopcal.errors import LoopcalError, MechanismError
 from loopcal.io.robot.robot_file import load_robot
@@ -88,14 +89,14 @@ def test_tripod_described_by_limbs_equals_the_3_prs(tmp_path: Path) -> None:
         written, written.values[None], solution.q[None], solution.state
     ).parameters[0]
     other = inverse(twin, np.stack([solution.T[:, 2, 3], *_tilt(solution.T)], axis=1))
-    np.testing.assert_allclose(other.T, solution.T, atol=1e-12)  # [m, 1]
+    assert_allclose(other.T, solution.T, atol=1e-12)  # [m, 1]
     E = differentiate_pose(twin, twin.values[None], other.q[None], other.state).parameters[0]
     assert len(written.parameters) == len(twin.parameters) == 33
     for i, parameter in enumerate(written.parameters.entries):
         start, _, rest = parameter.name.partition(".")
         name = f"q{start[-1]}" if rest == "offset" else NAMES[rest].format(start[-1])
         j = twin.parameters.index(name)
-        np.testing.assert_allclose(D[..., i], E[..., j], rtol=0, atol=1e-12 * np.abs(E).max())
+        assert_allclose(D[..., i], E[..., j], rtol=0, atol=1e-12 * np.abs(E).max())
         assert parameter.nominal == pytest.approx(twin.parameters.nominal[j], abs=1e-15)
         assert parameter.dimension is twin.parameters.dimensions[j]
 
@@ -182,8 +183,8 @@ def test_copies_of_a_limb_are_rotated_and_numbered() -> None:
     assert [a.name for a in machine.actuators] == ["q1", "q2"]
     assert machine.parameters.names == ("rod1.length", "rod2.length", "q1.offset", "q2.offset")
     first, second = (limb.links[0].transform for limb in machine.assembly.limbs)
-    np.testing.assert_allclose(first[:3, [2, 3]].T, [[0, 1, 0], [0.3, 0, 0]], atol=1e-15)
-    np.testing.assert_allclose(second[:3, [2, 3]].T, [[-1, 0, 0], [0, 0.3, 0]], atol=1e-15)
+    assert_allclose(first[:3, [2, 3]].T, [[0, 1, 0], [0.3, 0, 0]], atol=1e-15)
+    assert_allclose(second[:3, [2, 3]].T, [[-1, 0, 0], [0, 0.3, 0]], atol=1e-15)
 
 
 def test_spool_length_includes_radius_and_buildup() -> None:
@@ -199,14 +200,12 @@ def test_spool_length_includes_radius_and_buildup() -> None:
     plain = build(SLIDER.expand())
     xy = np.array([[-0.02, -0.08], [-0.06, -0.01]])
     angle, slide = inverse(machine, xy).q, inverse(plain, xy).q
-    np.testing.assert_allclose(
-        0.05 + 0.02 * angle + 0.001 * angle**2 / (4 * np.pi), slide, rtol=0, atol=1e-12
-    )  # [m]
+    assert_allclose(0.05 + 0.02 * angle + 0.001 * angle**2 / (4 * np.pi), slide, rtol=0, atol=1e-12)
     values = machine.values.copy()
     values[machine.parameters.index("q1.buildup")] += 0.0005
     thicker = inverse(machine.with_values(values), xy).q
     left = 0.05 + 0.02 * thicker[:, 0] + 0.0015 * thicker[:, 0] ** 2 / (4 * np.pi)
-    np.testing.assert_allclose(left, slide[:, 0], rtol=0, atol=1e-12)  # [m]
+    assert_allclose(left, slide[:, 0], rtol=0, atol=1e-12)  # [m]
 
 
 def test_named_parameter_changes_all_elements_of_its_maps() -> None:
@@ -221,7 +220,7 @@ def test_named_parameter_changes_all_elements_of_its_maps() -> None:
     values[machine.parameters.index("radius")] = 0.31
     wider = change_limb(chain=(replace(SLIDER.limbs[0].chain[0], at=(0.31, 0.0, 0.0)),))
     xy = np.array([[-0.02, -0.08], [-0.06, -0.01]])
-    np.testing.assert_allclose(
+    assert_allclose(
         inverse(machine.with_values(values), xy).q, inverse(build(wider.expand()), xy).q, atol=1e-12
     )
     solution = inverse(machine, xy)
@@ -230,9 +229,7 @@ def test_named_parameter_changes_all_elements_of_its_maps() -> None:
     ).parameters[0, :, 3:5]
     # the whole machine turned by da moves the point by da z x (x, y)
     expected = np.stack([-xy[:, 1], xy[:, 0]], axis=1)
-    np.testing.assert_allclose(
-        D[..., machine.parameters.index("turn")], expected, rtol=0, atol=1e-12
-    )
+    assert_allclose(D[..., machine.parameters.index("turn")], expected, rtol=0, atol=1e-12)
 
 
 def test_universal_joint_and_slide_equal_a_rod() -> None:
@@ -257,10 +254,8 @@ def test_universal_joint_and_slide_equal_a_rod() -> None:
     angle = 2 * np.pi / 3 * np.arange(3)
     feet = 0.3 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     distance = np.linalg.norm(xyz[:, None] - feet, axis=2)
-    np.testing.assert_allclose(inverse(machine, xyz).q, distance, rtol=0, atol=1e-12)  # [m]
-    np.testing.assert_allclose(
-        forward(machine, distance).T[:, :3, 3], xyz, rtol=0, atol=1e-12
-    )  # [m]
+    assert_allclose(inverse(machine, xyz).q, distance, rtol=0, atol=1e-12)  # [m]
+    assert_allclose(forward(machine, distance).T[:, :3, 3], xyz, rtol=0, atol=1e-12)
 
 
 def test_exceeded_joint_limits_and_cones_are_reported() -> None:

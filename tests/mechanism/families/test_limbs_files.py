@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from loopcal.errors import LoopcalError
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
@@ -98,9 +99,7 @@ FREEDOMS = {
 
 
 @pytest.mark.parametrize("case", FREEDOMS)
-def test_missing_or_duplicate_freedoms_and_coordinates_are_refused(
-    tmp_path: Path, case: str
-) -> None:
+def test_missing_or_duplicate_freedoms_and_coordinates_are_refused(tmp_path, case):
     change, sentence = FREEDOMS[case]
     assert sentence in read_refusal(tmp_path, "five-bar", change)
 
@@ -137,9 +136,7 @@ INVALID_VALUES = {
 
 
 @pytest.mark.parametrize("case", INVALID_VALUES)
-def test_invalid_lengths_ranges_and_actuators_are_refused_in_one_sentence(
-    tmp_path: Path, case: str
-) -> None:
+def test_invalid_lengths_ranges_and_actuators_are_refused_in_one_sentence(tmp_path, case):
     change, sentence = INVALID_VALUES[case]
     assert sentence in read_refusal(tmp_path, "rotary-delta", change)
 
@@ -254,5 +251,5 @@ def test_mapped_lead_is_the_advance_per_turn(tmp_path: Path) -> None:
     stated = load_changed_robot(tmp_path, "rotary-delta", ("axis: y,", "axis: y, lead: 3,"))
     xyz = np.array([[0.05, -0.08, -0.45], [-0.1, 0.02, -0.5]])
     solution, twin = inverse(machine.with_values(values), xyz), inverse(stated, xyz)
-    np.testing.assert_allclose(solution.q, twin.q, rtol=0, atol=1e-12)  # [rad]
+    assert_allclose(solution.q, twin.q, rtol=0, atol=1e-12)  # [rad]
     assert abs(solution.q - inverse(machine, xyz).q).max() > 1e-5

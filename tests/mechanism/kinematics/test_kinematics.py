@@ -77,12 +77,6 @@ def test_forward_after_inverse_is_exact_to_rounding_times_the_condition(name):
     ).all()
 
 
-@pytest.mark.parametrize("name", ["delta"])
-def test_forward_started_from_an_inverse_solution_keeps_its_mode(name):
-    robot, sol, _ = sample_inverse(name, 20)
-    assert_array_equal(forward(robot, sol.q, start=sol).status, Status.CONVERGED)
-
-
 @pytest.mark.parametrize("name", ["hexapod", "delta"])
 def test_rows_solved_from_home_return_or_are_marked_as_another_mode(name):
     robot, sol, inside = sample_inverse(name, 100_000)

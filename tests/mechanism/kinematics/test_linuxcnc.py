@@ -61,9 +61,8 @@ def test_poses_of_genhexkins_lengths_agree_with_genhexkins(hexapod):
     assert_allclose(geometry.pose_difference(sol.T, poses), 0.0, atol=1e-10)
     theirs = forward(robot, lengths)
     assert_array_equal(theirs.status, Status.CONVERGED)
-    assert_allclose(
-        geometry.pose_difference(theirs.T, result), 0.0, atol=1e-7
-    )  # its own iteration stops there
+    # its own iteration stops there
+    assert_allclose(geometry.pose_difference(theirs.T, result), 0.0, atol=1e-7)
 
 
 def test_carriages_and_poses_agree_with_lineardeltakins(oracle_folder):

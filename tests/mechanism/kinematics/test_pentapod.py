@@ -8,6 +8,7 @@ spindle itself could change the side, so the closed form is the mode of home eve
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -59,8 +60,8 @@ def test_readings_and_pose_are_those_of_the_closed_form(robot: Mechanism) -> Non
     solution = inverse(robot, target)
     T, q = solve_closed_form(target)
     assert solution.converged.all()
-    np.testing.assert_allclose(solution.q, q, atol=1e-9)
-    np.testing.assert_allclose(solution.T, T, atol=1e-9)
+    assert_allclose(solution.q, q, atol=1e-9)
+    assert_allclose(solution.T, T, atol=1e-9)
     back = forward(robot, solution.q)
     assert np.abs(back.T - solution.T).max() < 1e-9
 
@@ -73,8 +74,8 @@ def test_distant_poses_are_in_the_mode_of_home_or_marked(robot: Mechanism) -> No
     good = solution.converged
     assert solution.status[0] == Status.OTHER_MODE  # was CONVERGED, 114 mm from the closed form
     assert good.sum() > 4
-    np.testing.assert_allclose(solution.q[good], q[good], atol=1e-9)
-    np.testing.assert_allclose(solution.T[good], T[good], atol=1e-9)
+    assert_allclose(solution.q[good], q[good], atol=1e-9)
+    assert_allclose(solution.T[good], T[good], atol=1e-9)
     assert compensate(robot, target[:1]).reach == (Reach.OTHER_MODE,)
 
 
@@ -88,4 +89,4 @@ def test_sensitivities_are_finite_differences(robot: Mechanism) -> None:
             values[j] += sign * step
             ends.append(forward(robot.with_values(values), q).T)
         slope = geometry.pose_difference(*ends) / (2 * step)
-        np.testing.assert_allclose(exact.parameters[..., j], slope, atol=1e-7)
+        assert_allclose(exact.parameters[..., j], slope, atol=1e-7)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -67,9 +68,7 @@ def has_returned(there: Solution, back: Solution) -> NDArray[np.bool_]:
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [ROWS, pytest.param(MANY_ROWS, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize("name", ROBOTS)
-def test_rows_within_the_strokes_return_to_their_mode_or_state_why_not(
-    name: str, rows: int
-) -> None:
+def test_rows_within_the_strokes_return_to_their_mode_or_state_why_not(name, rows):
     machine, total, home = load_cached_robot(name), 0, 0
     for solution in generate_reachable_rows(machine, 20, rows):
         back = forward(machine, solution.q)
@@ -80,7 +79,7 @@ def test_rows_within_the_strokes_return_to_their_mode_or_state_why_not(
             # another true mode: the loops are closed there by the same readings
             other = back.take(elsewhere)
             again = inverse(machine, other.T, start=other)
-            np.testing.assert_allclose(again.q, solution.q[elsewhere], rtol=0, atol=1e-8)
+            assert_allclose(again.q, solution.q[elsewhere], rtol=0, atol=1e-8)
         for row in np.flatnonzero(~back.converged):
             assert back.explain(int(row)).code == Status(int(back.status[row])).code
     assert total == rows
@@ -132,7 +131,7 @@ def test_inverse_of_many_machines_with_one_start_equals_that_of_each_machine(nam
         alone = inverse_trials(robot, values[i : i + 1], target[i : i + 1], start)
         both = compute_readings(robot, values, together)[i]
         expected = compute_readings(robot, values[i : i + 1], alone)[0]
-        np.testing.assert_allclose(both, expected, rtol=0, atol=1e-12)
+        assert_allclose(both, expected, rtol=0, atol=1e-12)
         assert np.abs(both - compute_readings(robot, robot.values[None], start)[0]).max() > 1e-5
 
 

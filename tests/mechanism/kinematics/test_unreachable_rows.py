@@ -60,9 +60,7 @@ def count_calls(monkeypatch: pytest.MonkeyPatch, owner: object, name: str) -> li
     return calls
 
 
-def test_targets_beyond_the_sphere_take_a_single_evaluation(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_targets_beyond_the_sphere_take_a_single_evaluation(monkeypatch):
     robot = load_cached_robot("arm-6r")
     target = sample_workspace(robot, 3, seed=1).coordinates
     far = target + np.array([8.0, 0, 0, 0, 0, 0])
@@ -82,9 +80,7 @@ NEAR_BASE = {"excavator": [0.3, 0.2, 0.5, 1.0], "tricept": [0.1, 0.1, -1.5, 0.0,
 
 
 @pytest.mark.parametrize("name", NEAR_BASE)
-def test_a_row_out_of_reach_takes_at_most_ten_times_the_evaluations(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_out_of_reach_takes_at_most_ten_times_the_evaluations(name, monkeypatch):
     robot = load_cached_robot(name)
     target = sample_workspace(robot, 1, seed=1).coordinates
     calls = count_calls(monkeypatch, chain_inverse._Rows, "evaluate")
@@ -95,9 +91,7 @@ def test_a_row_out_of_reach_takes_at_most_ten_times_the_evaluations(
     assert reached < len(calls) <= 10 * reached
 
 
-def test_a_hexapod_turned_around_is_solved_once_at_its_pose(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_hexapod_turned_around_is_solved_once_at_its_pose(monkeypatch):
     robot = load_cached_robot("hexapod-42")
     T = robot.home[None].repeat(3, axis=0)
     T[:, :3, :3] = (

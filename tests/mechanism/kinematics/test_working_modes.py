@@ -7,6 +7,7 @@ A new file in src/loopcal/robots is included automatically.
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -127,7 +128,7 @@ def test_modes_are_those_of_complete_forward_solutions(name: str) -> None:
             # a few that return by a jump are refused, see test_pentapod
             refused = (is_other & expected).sum()
             assert refused <= (0.1 * is_other.size if name == "pentapod" else 0)
-            np.testing.assert_array_equal(judged.closure_sign, closed.closure_sign)
+            assert_array_equal(judged.closure_sign, closed.closure_sign)
 
 
 def test_the_test_of_modes_ends_long_before_rounding() -> None:
@@ -260,9 +261,7 @@ def test_paths_are_followed_beyond_a_singularity() -> None:
     crossings = [step for step, finding in path.warnings if finding.code.endswith("crosses")]
     assert crossings
     assert path.solution.closed.all()
-    np.testing.assert_array_equal(
-        np.flatnonzero(path.solution.status == Status.OTHER_MODE), crossings
-    )
+    assert_array_equal(np.flatnonzero(path.solution.status == Status.OTHER_MODE), crossings)
 
 
 def test_one_start_for_each_row_is_compared_row_by_row() -> None:

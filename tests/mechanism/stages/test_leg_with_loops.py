@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, root_scalar
 from scipy.spatial.transform import Rotation
@@ -127,11 +128,11 @@ def test_a_leg_with_closed_knee_and_ankle_agrees_with_its_equations(leg: Mechani
     for q, T in zip(solution.q, forward(leg, solution.q).T, strict=True):
         rotation, position = walk(q)
         # [1, m] 1e-9 of a size of 0.6 m
-        np.testing.assert_allclose(T[:3, :3], rotation, rtol=0, atol=6e-10)
-        np.testing.assert_allclose(T[:3, 3], position, rtol=0, atol=6e-10)
+        assert_allclose(T[:3, :3], rotation, rtol=0, atol=6e-10)
+        assert_allclose(T[:3, 3], position, rtol=0, atol=6e-10)
     again = inverse(leg, solution.T)
     assert again.converged.all()
-    np.testing.assert_allclose(again.q, solution.q, rtol=0, atol=1e-9)
+    assert_allclose(again.q, solution.q, rtol=0, atol=1e-9)
 
 
 def test_a_leg_with_closed_knee_and_ankle_is_calibrated(leg: Mechanism) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
@@ -93,9 +94,7 @@ def test_angle_of_a_skew_triangle_is_the_root_of_its_distance(tmp_path: Path) ->
             xtol=1e-14,
         )
         T = forward(robot.with_values(values), [[reading]]).T[0]
-        np.testing.assert_allclose(
-            T[:3, :3], Rotation.from_euler("y", angle).as_matrix(), atol=1e-12
-        )
+        assert_allclose(T[:3, :3], Rotation.from_euler("y", angle).as_matrix(), atol=1e-12)
 
 
 def test_solar_tracker_agrees_with_the_law_of_cosines() -> None:
@@ -113,9 +112,9 @@ def test_solar_tracker_agrees_with_the_law_of_cosines() -> None:
     pitch = foot - head + opening
     turns = Rotation.from_euler("ZY", np.column_stack([yaw, pitch]))
     T = forward(robot, q).T
-    np.testing.assert_allclose(T[:, :3, :3], turns.as_matrix(), rtol=0, atol=1e-12)
+    assert_allclose(T[:, :3, :3], turns.as_matrix(), rtol=0, atol=1e-12)
     center = np.array([0, 0, 2.3]) + turns.apply([0, 0, 0.15])
-    np.testing.assert_allclose(T[:, :3, 3], center, rtol=0, atol=1e-9 * robot.size)
+    assert_allclose(T[:, :3, 3], center, rtol=0, atol=1e-9 * robot.size)
 
 
 def test_length_and_angle_are_inverse_on_both_sides_of_the_dead_points() -> None:
@@ -126,7 +125,7 @@ def test_length_and_angle_are_inverse_on_both_sides_of_the_dead_points() -> None
         low, high = compute_range(triangle)
         length = low + (high - low) * rng.uniform(0.01, 0.99, 50)
         angle = compute_angle(length, triangle)
-        np.testing.assert_allclose(compute_length(angle, triangle), length, rtol=1e-13)
+        assert_allclose(compute_length(angle, triangle), length, rtol=1e-13)
         # the arm of the force has the sign of the side: the length grows with the angle, or falls
         arm, _ = differentiate_length(angle, triangle)
         assert (np.sign(arm) == side).all()
@@ -192,8 +191,8 @@ def test_poses_and_pins_are_differentiated_by_every_dimension_of_a_triangle(tmp_
         atol_reason="[rad] rounding",
     )  # fmt: skip
     # the platform turns about y as the pin does
-    np.testing.assert_allclose(known.parameters[0, :, 1], pins.parameters[0, :, 0], atol=1e-12)
-    np.testing.assert_allclose(known.readings[0, :, 1], pins.readings[0, :, 0], atol=1e-12)
+    assert_allclose(known.parameters[0, :, 1], pins.parameters[0, :, 0], atol=1e-12)
+    assert_allclose(known.readings[0, :, 1], pins.readings[0, :, 0], atol=1e-12)
 
 
 # --- what can be determined
@@ -264,9 +263,9 @@ def test_triangles_drive_the_first_joints_of_a_planar_machine(tmp_path: Path) ->
     assert pushed.converged.all()
     head = Rotation.from_rotvec([[0, 0, a] for a in turned.q.ravel()]).apply([-0.04, 0.11, 0])
     lengths = np.linalg.norm(head - [-0.25, 0.06, 0], axis=1).reshape(-1, 3)
-    np.testing.assert_allclose(pushed.q, lengths, rtol=0, atol=1e-12)
+    assert_allclose(pushed.q, lengths, rtol=0, atol=1e-12)
     back = forward(robot, pushed.q)
-    np.testing.assert_allclose(back.T, pushed.T, rtol=0, atol=1e-9 * robot.size)
+    assert_allclose(back.T, pushed.T, rtol=0, atol=1e-9 * robot.size)
     assert "ram2.foot.x" in robot.parameters.names
     result = identifiability(robot, measure(robot, poses))
     assert result.rank == len(robot.parameters)
@@ -280,9 +279,10 @@ def test_a_complete_model_contains_three_dimensions_of_each_triangle(tmp_path: P
     unnamed = unnamed.replace("    length: {sd: 0.2}\n", "")
     named, found = load_text(tmp_path, complete), load_text(tmp_path, unnamed)
     motors = load_text(tmp_path, use_angle_drives(complete))
+    # the head is 40 mm and 110 mm from the pin in x and y
     assert set(found.parameters.names) - set(motors.parameters.names) == {
         f"ram{i}.{name}" for i in (1, 2, 3) for name in ("foot.x", "foot.y", "head.y")
-    }  # the head is 40 mm and 110 mm from the pin in x and y
+    }
     assert len(named.parameters) == len(found.parameters) + 3  # and head.x, which the file names
     poses = np.random.default_rng(3).uniform(-1, 1, (60, 3)) * [0.06, 0.06, 0.2]
     ranks = [identifiability(robot, measure(robot, poses)).rank for robot in (motors, found, named)]
@@ -298,7 +298,7 @@ def test_anchors_in_pictures_are_as_far_apart_as_the_readings_say(tmp_path: Path
         for i, anchors in enumerate(located):
             distance = np.linalg.norm(np.diff(anchors.points[:, :, :], axis=1)[:, 0], axis=1)
             own = q[:, [a.name for a in robot.actuators].index(anchors.actuator)]
-            np.testing.assert_allclose(distance, offsets[i] + gains[i] * own, atol=1e-12)
+            assert_allclose(distance, offsets[i] + gains[i] * own, atol=1e-12)
 
 
 def sample_or_home(robot: Mechanism) -> Array:
@@ -326,9 +326,7 @@ def sample_or_home(robot: Mechanism) -> Array:
         ("gain: 0.98", "gain: 0.98\n        reads: angle", "reads"),
     ],
 )
-def test_impossible_triangles_are_refused_in_one_sentence(
-    tmp_path: Path, old: str, new: str, sentence: str
-) -> None:
+def test_impossible_triangles_are_refused_in_one_sentence(tmp_path, old, new, sentence):
     text = LINK.replace("skew: {rx: 2, rz: -3}", "skew: {}") if "foot: [0," in new else LINK
     assert old in text
     with pytest.raises((FileError, MechanismError), match=sentence) as error:
