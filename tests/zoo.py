@@ -71,23 +71,8 @@ HEXAPOD_ERRORS = np.array(
     ]
 )
 
-# Nategh & Agheli (2009), Tables 1 and 2, as in the public repository
+# Nategh & Agheli (2009), Table 2, as in the public repository
 # tabathaviso/hexapod-parallel-manipulator (calibration.m) [mm]: rows x, y, z; columns legs 1 to 6.
-NATEGH_BASE = np.array(
-    [
-        (305.4001, -56.4357, -248.9644, -248.9644, -56.4357, 305.4001),
-        (111.1565, 320.0625, 208.9060, -208.9060, -320.0625, -111.1565),
-        (0, 0, 0, 0, 0, 0),
-    ]
-).T
-NATEGH_PLATFORM = np.array(
-    [
-        (92.1597, 27.055, -119.2146, -119.2146, 27.055, 92.1597),
-        (84.4488, 122.037, 37.58822, -37.5882, -122.037, -84.4488),
-        (0, 0, 0, 0, 0, 0),
-    ]
-).T
-NATEGH_LENGTH = 604.8652
 NATEGH_TRUE_BASE = np.array(
     [
         (305.2599, -55.2814, -244.7954, -252.5755, -53.9678, 302.4266),
@@ -128,16 +113,6 @@ def hexapod_truth() -> Array:
     """Return the true values of `hexapod` (42,): Table 2 plus Table 3."""
     return hexapod().values + gough_values(
         HEXAPOD_ERRORS[:, :3] * MM, HEXAPOD_ERRORS[:, 4:] * MM, HEXAPOD_ERRORS[:, 3] * MM
-    )
-
-
-@cache
-def nategh() -> Mechanism:
-    """The hexapod of Nategh and Agheli at its nominal values; the lengths are those at reading
-    zero.
-    """
-    return gough(
-        "nategh", NATEGH_BASE * MM, NATEGH_PLATFORM * MM, NATEGH_LENGTH * MM, 0.8, (-0.4, 0.8)
     )
 
 

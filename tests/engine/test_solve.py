@@ -193,34 +193,21 @@ def test_row_equals_the_same_row_solved_alone_bit_for_bit(engine, case):
         assert_same(take_rows(together, [0], [r]), alone)
 
 
-def test_row_order_does_not_change_the_solution_bit_for_bit(engine, case):
-    order = np.array([3, 1, 4, 0, 2])
+@pytest.mark.parametrize(
+    ("name", "n", "rows"),
+    [
+        ("mixed_hexapod", 6000, (0, 2999, 3000, 5999)),  # NumPy solves two parts of 3000 rows
+        ("excavator", 10, range(10)),  # eight equations and more
+        ("arm-6r", 10, range(10)),
+    ],
+)
+def test_rows_of_large_batches_and_limbs_equal_single_rows_bit_for_bit(engine, name, n, rows):
+    robot = zoo.mixed_hexapod() if name == "mixed_hexapod" else load_robot(name)
+    case = make_case(robot, n=n)
     together = engine.solve(case.program, case.e, case.q, case.home)
-    assert_same(
-        take_rows(together, [0], order),
-        engine.solve(case.program, case.e, case.q[:, order], case.home),
-    )
-
-
-def test_rows_of_a_large_batch_equal_single_rows_bit_for_bit(engine):
-    case = make_case(zoo.mixed_hexapod(), n=6000)
-    together = engine.solve(case.program, case.e, case.q, case.home)
-    for r in (0, 2999, 3000, 5999):  # NumPy solves two parts of 3000 rows
-        assert_same(
-            take_rows(together, [0], [r]),
-            engine.solve(case.program, case.e, case.q[:, [r]], case.home),
-        )
-
-
-@pytest.mark.parametrize("name", ["excavator", "arm-6r"])
-def test_rows_with_eight_and_more_equations_equal_single_rows_bit_for_bit(engine, name):
-    case = make_case(load_robot(name), t=1, n=10)
-    together = engine.solve(case.program, case.e, case.q, case.home)
-    for r in range(10):
-        assert_same(
-            take_rows(together, [0], [r]),
-            engine.solve(case.program, case.e, case.q[:, [r]], case.home),
-        )
+    for r in rows:
+        alone = engine.solve(case.program, case.e, case.q[:, [r]], case.home)
+        assert_same(take_rows(together, [0], [r]), alone)
 
 
 def test_rows_not_finite_are_marked_and_do_not_change_other_rows(engine, case):

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of poses by parameters and readings: values, batches, and ranks with 42 and 33
-parameters.
-"""
+"""Derivatives of poses by parameters and readings: values and batches."""
 
 from dataclasses import replace
 
@@ -19,8 +17,6 @@ from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian, compile_quickly
 from tests.mechanism.kinematics.test_kinematics import sample_inverse
-
-RANK = 1e-10  # relative; the smallest true singular values are above 1e-6, null ones below 1e-13
 
 
 def hexapod_closure(jnp, values, q, T, twist):
@@ -174,69 +170,3 @@ def test_failed_rows_have_nan_derivatives_and_do_not_change_other_rows():
     result = differentiate_pose(robot, values, q, forward_trials(robot, values, q))
     assert np.isnan(result.parameters[0, 1]).all()
     assert np.isfinite(result.parameters[0, [0, 2]]).all()
-
-
-# --- identifiability: an unknown frame is six additional columns
-# -----------------------------------------
-
-
-def scaled_sensitivities(name, n=40):
-    """Return sensitivities of n poses, angles in sizes of the robot, with columns of the unknown
-    base and tool frames, and the poses.
-    """
-    robot, sol, _ = sample_inverse(name, n)
-    state = forward_trials(robot, perturb_values(robot, 1e-4), sol.q[None], start=sol.state)
-    D = differentiate_pose(robot, perturb_values(robot, 1e-4), sol.q[None], state).parameters[0]
-    T, eye, zero = state.T[0], np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3, 3))
-    base = np.concatenate(
-        [
-            np.concatenate([eye, zero], axis=2),
-            np.concatenate([-geometry.hat(T[:, :3, 3]), eye], axis=2),
-        ],
-        axis=1,
-    )
-    R = T[:, :3, :3]
-    tool = np.concatenate(
-        [np.concatenate([R, zero], axis=2), np.concatenate([zero, R], axis=2)], axis=1
-    )
-    rows = np.array([robot.size] * 3 + [1.0] * 3)[:, None]
-    columns = np.array(
-        [1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions]
-    )
-    return D * rows * columns / robot.size, base * rows / robot.size, tool * rows / robot.size, T
-
-
-def rank_without(matrix, *unknown):
-    """Return rank and singular values of the parameters after projecting out `unknown`."""
-    flat = matrix.reshape(-1, matrix.shape[-1])
-    if unknown:
-        basis, _ = np.linalg.qr(np.concatenate([u.reshape(len(flat), -1) for u in unknown], axis=1))
-        flat = flat - basis @ (basis.T @ flat)
-    s = np.linalg.svd(flat, compute_uv=False)
-    return int((s > RANK * s[0]).sum()), s / s[0]
-
-
-@pytest.mark.parametrize(("name", "count"), [("hexapod", 42), ("nategh", 42), ("three_prs", 33)])
-def test_each_unknown_frame_lowers_the_rank_by_six(name, count):
-    D, base, tool, _ = scaled_sensitivities(name)
-    assert D.shape[-1] == count
-    for unknown, rank in (
-        ((), count),
-        ((base,), count - 6),
-        ((tool,), count - 6),
-        ((base, tool), count - 12),
-    ):
-        result, s = rank_without(D, *unknown)
-        assert result == rank
-        assert (s[rank:] < 1e-13).all()  # null to rounding; from J'J it would be 1e-7
-        assert s[rank - 1] > 1e-7
-
-
-@pytest.mark.parametrize(("name", "count"), [("hexapod", 42), ("three_prs", 33)])
-def test_rank_drops_by_one_without_torsion_and_by_three_without_orientation(name, count):
-    D, _, _, T = scaled_sensitivities(name)
-    normal = T[:, :3, 2]
-    across = np.linalg.svd(normal[:, None, :])[2][:, 1:]
-    tilt = np.einsum("nij,njp->nip", across, D[:, :3])
-    assert rank_without(np.concatenate([tilt, D[:, 3:]], axis=1))[0] == count - 1
-    assert rank_without(D[:, 3:])[0] == count - 3
