@@ -60,7 +60,7 @@ def test_excluded_candidates_are_counted_by_reason(constrained):
 def test_many_candidates_lie_at_the_boundary_of_the_workspace(name):
     found = draw_candidates(load_robot(name), None, 60, seed=1)
     low, high = np.array(list(workspace_ranges(found.checker.robot).values())).T
-    # [m, rad]
+    # within a micrometer or a microradian
     at_end = np.isclose(found.coordinates, low, atol=1e-6) | np.isclose(
         found.coordinates, high, atol=1e-6
     )

@@ -72,12 +72,7 @@ def test_dietmaier_hexapod_has_forty_assembly_modes(seed):
     ("robot", "coordinates", "modes", "above"),
     [
         ("hexapod-42", (0.013, -0.007, 0.205, 0.05, -0.08, 0.11), 8, 4),
-        (
-            partial(zoo.load_cached_robot, "hexapod-nategh-agheli"),
-            (0.03, -0.02, 0.8, 0.1, -0.05, 0.15),
-            16,
-            8,
-        ),
+        ("hexapod-nategh-agheli", (0.03, -0.02, 0.8, 0.1, -0.05, 0.15), 16, 8),
     ],
 )
 def test_planar_hexapods_have_equal_counts_of_modes_above_and_below_the_base(
