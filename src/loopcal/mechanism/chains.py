@@ -8,7 +8,7 @@ omega = R_s omega_s, v = R_s v_s + omega x (p_end - p_s). Derivation: docs/theor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -68,7 +68,7 @@ def join_stage_states(robot: Mechanism, states: Sequence[State]) -> ChainState:
     for state in states[1:]:
         status = np.where(rank(state.status) > rank(status), state.status, status)
     return ChainState(
-        locate_platforms(robot, poses)[-1],
+        locate_stage_bases(robot.stages, poses)[1][-1],
         tuple(joints for state in states for joints in state.joints),
         status.astype(np.int8),
         np.maximum.reduce([state.residual for state in states]),
@@ -91,7 +91,7 @@ def split_stage_states(robot: Mechanism, state: State) -> list[State]:
 
 
 def locate_stage_bases(
-    robot: Mechanism, poses: Sequence[FloatArray]
+    stages: Sequence[Stage], poses: Sequence[FloatArray]
 ) -> tuple[list[FloatArray], list[FloatArray]]:
     """Return the bases and the platforms of all stages in the base of the chain.
 
@@ -100,22 +100,17 @@ def locate_stage_bases(
     """
     bases: list[FloatArray] = []
     platforms: list[FloatArray] = []
-    for stage, pose in zip(robot.stages, poses, strict=True):
+    for stage, pose in zip(stages, poses, strict=True):
         base = stage.mount if stage.parent < 0 else platforms[stage.parent] @ stage.mount
         bases.append(base)
         platforms.append(base @ pose)
     return bases, platforms
 
 
-def locate_platforms(robot: Mechanism, poses: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return the platforms of all stages in the base of the chain, each (.., 4, 4)."""
-    return locate_stage_bases(robot, poses)[1]
-
-
 def get_platforms(robot: Mechanism, state: State) -> list[FloatArray]:
     """Return the platforms of all stages in the base at a state (t, n), each (t, n, 4, 4)."""
     assert isinstance(state, ChainState)
-    return locate_platforms(robot, state.poses)
+    return locate_stage_bases(robot.stages, state.poses)[1]
 
 
 def select_readings(q: FloatArray, stage: Stage, count: int) -> FloatArray:
@@ -129,25 +124,12 @@ def select_readings(q: FloatArray, stage: Stage, count: int) -> FloatArray:
     return np.concatenate([own, q[..., count:][..., stage.actuators]], axis=-1)
 
 
-def compute_stage_limb_frames(
-    robot: Mechanism,
-    values: FloatArray,
-    state: State,
-    compute: Callable[[Mechanism, FloatArray, State], tuple[FloatArray, ...]],
-) -> tuple[FloatArray, ...]:
-    """Return the frames along the limbs of all stages in the base of the chain.
-
-    compute : the same function of a stage in its own base.
-    """
-    assert isinstance(state, ChainState)
-    bases, _ = locate_stage_bases(robot, state.poses)
-    return tuple(
-        (base if base.ndim == 2 else base[:, :, None]) @ frames
-        for stage, base, own in zip(
-            robot.stages, bases, split_stage_states(robot, state), strict=True
-        )
-        for frames in compute(stage.robot, values[:, stage.parameters], own)
-    )
+def each_stage(
+    robot: Mechanism, values: FloatArray, state: State
+) -> Iterator[tuple[Stage, FloatArray, State]]:
+    """Yield the stages of a chain with their own values and states."""
+    for stage, own in zip(robot.stages, split_stage_states(robot, state), strict=True):
+        yield stage, values[:, stage.parameters], own
 
 
 def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
@@ -175,7 +157,7 @@ def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int
     in base axes, at the origin of platform `end`.
     """
     assert isinstance(state, ChainState)
-    bases, platforms = locate_stage_bases(robot, state.poses)
+    bases, platforms = locate_stage_bases(robot.stages, state.poses)
     transports = []
     for i in list_carrying_stages(robot, end):
         rotation = bases[i][..., :3, :3]
@@ -211,20 +193,6 @@ def solve_stages(
     return join_stage_states(robot, states)
 
 
-def multiply_signs(
-    robot: Mechanism,
-    values: FloatArray,
-    state: State,
-    compute: Callable[[Mechanism, FloatArray, State], NDArray[np.int8]],
-) -> NDArray[np.int8]:
-    """Return the product of the closure signs of all stages (t, n); `compute` is that of one."""
-    signs = [
-        compute(stage.robot, values[:, stage.parameters], own)
-        for stage, own in zip(robot.stages, split_stage_states(robot, state), strict=True)
-    ]
-    return np.multiply.reduce(signs).astype(np.int8)
-
-
 def judge_stage_modes(
     robot: Mechanism,
     state: State,
@@ -246,22 +214,40 @@ def judge_stage_modes(
     return replace(state, closure_sign=whole.closure_sign, signs=whole.signs), is_other
 
 
-def differentiate_end(
+def differentiate_platform(
     robot: Mechanism,
     values: FloatArray,
     q: FloatArray,
     state: State,
     differentiate: PoseDerivative,
     columns: ParameterUnits | None = None,
+    end: int = -1,
 ) -> Derivatives:
-    """Return the derivatives of the twist of the end platform, (t, n, 6, p) and (t, n, 6, a).
+    """Return the derivatives of the twist of the platform of a stage (default: the end), by the
+    parameters, all in SI or those of `columns`, and the readings: (t, n, 6, p) and (t, n, 6, a).
 
-    `columns` : the parameters and their units; all parameters in SI without it.
+    Only the stages that carry the platform are differentiated.
     """
-    chosen = robot.all_parameters if columns is None else columns
-    return _differentiate_platform(
-        robot, values, q, state, differentiate, chosen, len(robot.stages) - 1
-    )
+    columns = columns or robot.all_parameters
+    count, states = len(robot.actuators), split_stage_states(robot, state)
+    whole = _make_zeros(robot, state, 6, len(columns.places))
+    for i, transport in transport_to_end(robot, state, end):
+        stage = robot.stages[i]
+        first, last = stage.parameters.start, stage.parameters.stop
+        place = np.flatnonzero((columns.places >= first) & (columns.places < last))
+        own_columns = ParameterUnits(
+            stage.robot.slots, columns.places[place] - first, columns.units[place]
+        )
+        own = differentiate(
+            stage.robot,
+            values[:, stage.parameters],
+            select_readings(q, stage, count),
+            states[i],
+            own_columns,
+        )
+        whole.parameters[..., place] = np.matmul(transport, own.parameters)
+        whole.readings[..., stage.actuators] = np.matmul(transport, own.readings)
+    return whole
 
 
 def differentiate_joints(
@@ -274,10 +260,8 @@ def differentiate_joints(
     """Return the derivatives of the passive joints of all stages, (t, n, j, p) and (t, n, j, a)."""
     count = len(robot.actuators)
     own = [
-        differentiate(
-            stage.robot, values[:, stage.parameters], select_readings(q, stage, count), part
-        )
-        for stage, part in zip(robot.stages, split_stage_states(robot, state), strict=True)
+        differentiate(stage.robot, of_stage, select_readings(q, stage, count), part)
+        for stage, of_stage, part in each_stage(robot, values, state)
     ]
     rows = sum(part.parameters.shape[2] for part in own)
     whole = _make_zeros(robot, state, rows, len(robot.parameters))
@@ -317,43 +301,9 @@ def differentiate_platform_entries(
     A column r of the rotation moves by omega x r, the origin by v.
     """
     i = [stage.name for stage in robot.stages].index(name)
-    twist = _differentiate_platform(robot, values, q, state, differentiate, robot.all_parameters, i)
+    twist = differentiate_platform(robot, values, q, state, differentiate, end=i)
     slope = geometry.differentiate_entries(get_platforms(robot, state)[i])
     return Derivatives(*(slope @ part for part in twist))
-
-
-def _differentiate_platform(
-    robot: Mechanism,
-    values: FloatArray,
-    q: FloatArray,
-    state: State,
-    differentiate: PoseDerivative,
-    columns: ParameterUnits,
-    end: int,
-) -> Derivatives:
-    """Return the derivatives of the twist of platform `end` by these parameters and the readings.
-
-    Only the stages that carry the platform are differentiated.
-    """
-    count, states = len(robot.actuators), split_stage_states(robot, state)
-    whole = _make_zeros(robot, state, 6, len(columns.places))
-    for i, transport in transport_to_end(robot, state, end):
-        stage = robot.stages[i]
-        first, last = stage.parameters.start, stage.parameters.stop
-        place = np.flatnonzero((columns.places >= first) & (columns.places < last))
-        own_columns = ParameterUnits(
-            stage.robot.slots, columns.places[place] - first, columns.units[place]
-        )
-        own = differentiate(
-            stage.robot,
-            values[:, stage.parameters],
-            select_readings(q, stage, count),
-            states[i],
-            own_columns,
-        )
-        whole.parameters[..., place] = np.matmul(transport, own.parameters)
-        whole.readings[..., stage.actuators] = np.matmul(transport, own.readings)
-    return whole
 
 
 def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> Derivatives:

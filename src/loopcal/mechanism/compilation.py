@@ -25,9 +25,10 @@ from loopcal.mechanism.assembly import (
 )
 from loopcal.mechanism.chains import (
     ChainState,
-    differentiate_end,
+    differentiate_platform,
     find_carrying_actuators,
     join_stage_states,
+    locate_stage_bases,
     solve_serial,
 )
 from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials, inverse_trials
@@ -97,22 +98,15 @@ def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[
     table = robot.parameters
     is_large = ~(np.abs(values) <= LARGEST)
     for i in np.flatnonzero(is_large | (table.positive & ~(values > 0.0))):
-        p, value = table.entries[i], float(values[i])
-        number = robot.to_quantity(value, p.dimension)
+        p = table.entries[i]
+        code, bound = "mechanism.value-not-positive", {"nominal": p.nominal}
         if is_large[i]:
-            limit = robot.to_quantity(LARGEST, p.dimension)
-            yield (
-                p.name,
-                report_finding("mechanism.value-too-large", name=p.name, value=number, limit=limit),
-            )
-        else:
-            nominal = robot.to_quantity(p.nominal, p.dimension)
-            yield (
-                p.name,
-                report_finding(
-                    "mechanism.value-not-positive", name=p.name, value=number, nominal=nominal
-                ),
-            )
+            code, bound = "mechanism.value-too-large", {"limit": LARGEST}
+        numbers = {"value": float(values[i]), **bound}
+        shown: dict[str, Any] = {
+            name: robot.to_quantity(number, p.dimension) for name, number in numbers.items()
+        }
+        yield p.name, report_finding(code, name=p.name, **shown)
 
 
 DEFAULT_SIZE = 1.0
@@ -521,12 +515,7 @@ def _compute_chain_size(stages: Sequence[Stage]) -> float:
     It is the root mean square distance of the end platform from the bases of the stages at home, or
     the size of the largest stage with a loop, if that is larger.
     """
-    bases: list[FloatArray] = []
-    platforms: list[FloatArray] = []
-    for stage in stages:
-        base = stage.mount if stage.parent < 0 else platforms[stage.parent] @ stage.mount
-        bases.append(base)
-        platforms.append(base @ stage.robot.home)
+    bases, platforms = locate_stage_bases(stages, [stage.robot.home for stage in stages])
     arms = np.array([platforms[-1][:3, 3] - base[:3, 3] for base in bases])
     reach = float(np.sqrt((arms**2).sum() / len(arms)))
     loops = [stage.robot.size for stage in stages if not stage.robot.is_serial]
@@ -594,7 +583,7 @@ def _check_chain(robot: Mechanism, home: ChainState) -> None:
     values = robot.values[None]
     _, tau = robot.slots(values)
     q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.frequency)
-    D = differentiate_end(robot, values, q, home, differentiate_pose).readings[0, 0]
+    D = differentiate_platform(robot, values, q, home, differentiate_pose).readings[0, 0]
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
     scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)
     freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))

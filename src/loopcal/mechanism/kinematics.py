@@ -22,8 +22,9 @@ from loopcal import engine
 from loopcal.engine import Program, State
 from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums, solve_open_sums
 from loopcal.mechanism.chains import (
-    compute_stage_limb_frames,
-    multiply_signs,
+    ChainState,
+    each_stage,
+    locate_stage_bases,
     solve_readings,
     solve_serial,
     solve_stages,
@@ -369,7 +370,9 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
     stages.
     """
     if robot.stages:
-        return multiply_signs(robot, values, state, compute_closure_sign)
+        stages = each_stage(robot, values, state)
+        signs = [compute_closure_sign(stage.robot, own, part) for stage, own, part in stages]
+        return np.multiply.reduce(signs).astype(np.int8)
     if robot.is_serial:
         return np.ones(state.status.shape, np.int8)
     if not is_square(robot):
@@ -459,7 +462,15 @@ def compute_limb_frames(
     each link 0..J (the last one is the tip), then the attachment.
     """
     if robot.stages:
-        return compute_stage_limb_frames(robot, values, state, compute_limb_frames)
+        assert isinstance(state, ChainState)
+        bases, _ = locate_stage_bases(robot.stages, state.poses)
+        return tuple(
+            (base if base.ndim == 2 else base[:, :, None]) @ frames
+            for base, (stage, own, part) in zip(
+                bases, each_stage(robot, values, state), strict=True
+            )
+            for frames in compute_limb_frames(stage.robot, own, part)
+        )
     e, _ = robot.slots(values)
     frames: dict[int, FloatArray] = {}
     for group, joints in zip(robot.program.groups, state.joints, strict=True):

@@ -18,7 +18,7 @@ docs/theory/over-constraint.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,7 +75,10 @@ class _Rows:
                 gap = (np.linalg.norm(gap, axis=1) - length)[:, None]
             elif group.ending == "rigid":
                 R = end[:, :3, :3] @ tip[:, :3, :3].swapaxes(1, 2)
-                gap = np.concatenate([2 * self.program.size * _find_gibbs(R), gap], axis=1)
+                v = [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]]
+                # tan(a / 2) along the axis of a rotation by a
+                gibbs = np.stack(v, axis=1) / (1 + np.trace(R, axis1=1, axis2=2))[:, None]
+                gap = np.concatenate([2 * self.program.size * gibbs, gap], axis=1)
             out.append(gap)
         return np.stack(out, axis=1)
 
@@ -100,14 +103,6 @@ class _Rows:
             if index < len(group.slots):
                 e[:, group.columns.start + index : group.columns.stop : len(group.slots)] += change
         return replace(self, e=e)
-
-
-def _find_gibbs(R: FloatArray) -> FloatArray:
-    """Return tan(a / 2) along the axis (N, 3) of rotations (N, 3, 3) by a."""
-    v = np.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
-    )
-    return v / (1 + np.trace(R, axis1=1, axis2=2))[:, None]
 
 
 def differentiate_open(
@@ -225,31 +220,6 @@ def _map_inputs(
     return _InputMap(displacements, joints)
 
 
-@dataclass(frozen=True, eq=False)
-class _Places:
-    """Where the rows of one limb have their unknowns.
-
-    columns : of its freedoms and unknown joints among all `total` unknowns. joints : the numbers
-    of these joints in the limb.
-    """
-
-    columns: IntArray
-    joints: list[int]
-    total: int
-
-    def spread(
-        self, A: FloatArray, E: FloatArray, Q: FloatArray, *, moved: FloatArray
-    ) -> FloatArray:
-        """Return rows by all unknowns and all inputs, (N, r, total + p + a).
-
-        A, E, Q : (N, r, ..) by freedoms, slots and joints. moved : of `_InputMap.select`.
-        """
-        out = np.zeros((*A.shape[:2], self.total + moved.shape[2]))
-        out[:, :, self.columns] = np.concatenate([A, Q[..., self.joints]], axis=2)
-        out[:, :, self.total :] = np.concatenate([E, Q], axis=2) @ moved
-        return out
-
-
 def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> FloatArray:
     """Return the unknowns by parameters and readings (N, u, p + a)."""
     m, N, width = len(program.freedoms), len(rows.T), inputs.joints.shape[2]
@@ -263,15 +233,21 @@ def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> Flo
         group, own = program.groups[number], unknown[number]
         exact = _correct_slopes(program, number, block, residuals[number])
         for k in range(len(group.limbs)):
-            places = _Places(np.array([*range(m), *range(first, first + len(own))]), own, total)
+            columns = [*range(m), *range(first, first + len(own))]  # freedoms and unknown joints
             first += len(own)
             moved, chosen = inputs.select(program, number, k), list(group.rows)
-            slopes = places.spread(
-                *(a[:, k, chosen] for a in (block.A, block.E, block.Q)), moved=moved
-            )
-            J.append(slopes[..., :total])
-            dr.append(places.spread(*(a[:, k, chosen] for a in exact), moved=moved))
-            bent[:, places.columns] += places.spread(*(a[:, k] for a in bends[number]), moved=moved)
+
+            def spread(slopes: Iterable[FloatArray]) -> FloatArray:
+                """Return rows by freedoms, slots and joints as rows by all unknowns and inputs."""
+                A, E, Q = slopes
+                out = np.zeros((*A.shape[:2], total + width))
+                out[:, :, columns] = np.concatenate([A, Q[..., own]], axis=2)  # noqa: B023
+                out[:, :, total:] = np.concatenate([E, Q], axis=2) @ moved  # noqa: B023
+                return out
+
+            J.append(spread(a[:, k, chosen] for a in (block.A, block.E, block.Q))[..., :total])
+            dr.append(spread(a[:, k, chosen] for a in exact))
+            bent[:, columns] += spread(a[:, k] for a in bends[number])
     return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), bent)
 
 

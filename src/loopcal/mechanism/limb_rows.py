@@ -16,8 +16,9 @@ import numpy as np
 from loopcal import engine, geometry
 from loopcal.engine import LENGTH, PITCH, Block, Group, State
 from loopcal.mechanism.model import Columns, LimbMap, Mechanism
-from loopcal.mechanism.states import driven_values, select_block
+from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import FloatArray
 
 BLOCK_ROWS = 1024
@@ -68,7 +69,8 @@ def linearize_limbs(
         for j in range(0, n, poses):
             rows = slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
             chosen_values, chosen_q = _select(values, rows[:1]), _select(q, rows)
-            yield rows, _linearize_block(robot, chosen_values, chosen_q, select_block(state, rows))
+            block = map_arrays(lambda a, rows=rows: a[rows], state)
+            yield rows, _linearize_block(robot, chosen_values, chosen_q, block)
 
 
 def _linearize_block(
@@ -88,10 +90,9 @@ def _linearize_block(
             (),
             np.ones((1, 1, robot.program.n_joints)),
         )
-    joints = joints_from_readings(q, tau, slots.frequency)
     return LinearizedLimbs(
         robot,
-        engine.linearize(robot.program, e, joints, state),
+        engine.linearize(robot.program, e, joints_from_readings(q, tau, slots.frequency), state),
         J[:, :d],
         J[:, d:].reshape(len(J), *slots.terms.shape, -1),
         term_derivatives(q, tau, slots.frequency),

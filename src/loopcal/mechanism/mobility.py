@@ -103,7 +103,11 @@ def check_mobility(robot: Mechanism) -> None:
             f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
             f"{movable}"
         )
-    _check_controlled(robot, movable, scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0])
+    # freedoms per actuated joint (m, a), and the controlled coordinates by them
+    D = scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0]
+    rates = np.linalg.svd(_differentiate_controlled(robot, robot.home) @ D, compute_uv=False)
+    if count_rank(rates) < movable:
+        raise MechanismError(_word_dependent(robot, movable))
     if robot.has_open_sums:
         _check_open_sums(robot, scale)
 
@@ -120,17 +124,6 @@ def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
             "can move while all sums are constant; correct the weights of `sum:`, or state another "
             "`home:`"
         )
-
-
-def _check_controlled(robot: Mechanism, movable: int, D: FloatArray) -> None:
-    """Refuse controlled coordinates that the actuators cannot set independently.
-
-    D : (m, a) freedoms per actuated joint.
-    """
-    columns = _differentiate_controlled(robot, robot.home)
-    s = np.linalg.svd(columns @ D, compute_uv=False)
-    if count_rank(s) < movable:
-        raise MechanismError(_word_dependent(robot, movable))
 
 
 def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
@@ -244,21 +237,16 @@ def check_assembly(assembly: Assembly, *, is_stage: bool = False) -> None:
 
     A stage that is a serial joint needs no controlled coordinates, because its joint is commanded.
     """
-    _check_size(assembly)
-    _check_names(assembly)
-    for limb in assembly.limbs:
-        _check_limb(limb)
-    _check_freedoms(assembly, is_stage)
-    _check_ranges(assembly)
-
-
-def _check_size(assembly: Assembly) -> None:
-    """Refuse more limbs, joints, actuators or parameters than a mechanism may have."""
     refuse_more(MOST_LIMBS, len(assembly.limbs), f"{assembly.name} has", "limbs")
     for limb in assembly.limbs:
         refuse_more(MOST_JOINTS, len(limb.joints), f"limb {limb.name!r} has", "joints")
     refuse_more(MOST_ACTUATORS, len(assembly.actuators), f"{assembly.name} has", "actuators")
     refuse_more(MOST_PARAMETERS, len(assembly.parameters), f"{assembly.name} has", "parameters")
+    _check_names(assembly)
+    for limb in assembly.limbs:
+        _check_limb(limb)
+    _check_freedoms(assembly, is_stage)
+    _check_ranges(assembly)
 
 
 def _check_names(assembly: Assembly) -> None:

@@ -47,32 +47,6 @@ class MovedSlots(NamedTuple):
     pattern: MapPattern
 
 
-def find_moved_slots(
-    touches: BoolArray, n_displacements: int, n_terms: int, n_summed: int = 0
-) -> MovedSlots:
-    """Return the slots that p parameters move.
-
-    touches : (s, p) which of the slots each may move. n_terms : of the transmission of an actuator.
-    n_summed : joints whose values are in sums.
-    """
-    slot, column = np.nonzero(touches)
-    cut = int(np.searchsorted(slot, n_displacements))
-    joint, term = np.divmod(slot[cut:] - n_displacements, n_terms)
-    if n_summed:
-        term = np.tile(slot[cut:] - n_displacements, n_summed)
-        joint = np.repeat(np.arange(n_summed), len(slot) - cut)
-        slot, column = (
-            np.concatenate([part[:cut], np.tile(part[cut:], n_summed)]) for part in (slot, column)
-        )
-    terms, function = np.unique(term, return_inverse=True)
-    pattern = MapPattern(
-        touches.shape[1],
-        np.column_stack([slot[:cut], column[:cut]]),
-        np.column_stack([joint, function, column[cut:]]),
-    )
-    return MovedSlots(slot, column, tuple(terms.tolist()), pattern)
-
-
 @dataclass(frozen=True, eq=False)
 class ParameterUnits:
     """Some parameters of a mechanism, each with the unit of its column.
@@ -204,11 +178,28 @@ class SlotMap:
         """
         key = places.tobytes()
         if key not in self._moved:
-            touches, count = self.touches[:, places], self.terms.shape[1]
-            weights = select_weights(self.terms)
-            joints = 0 if weights is None else weights.shape[-1]
-            self._moved[key] = find_moved_slots(touches, self.n_displacements, count, joints)
+            self._moved[key] = self._find_moved(self.touches[:, places])
         return self._moved[key]
+
+    def _find_moved(self, touches: BoolArray) -> MovedSlots:
+        """Return the slots that p parameters move, which may touch slots (s, p)."""
+        slot, column = np.nonzero(touches)
+        cut = int(np.searchsorted(slot, self.n_displacements))
+        joint, term = np.divmod(slot[cut:] - self.n_displacements, self.terms.shape[1])
+        if (weights := select_weights(self.terms)) is not None:  # once for each joint in sums
+            n = weights.shape[-1]
+            term = np.tile(slot[cut:] - self.n_displacements, n)
+            joint = np.repeat(np.arange(n), len(slot) - cut)
+            slot, column = (
+                np.concatenate([part[:cut], np.tile(part[cut:], n)]) for part in (slot, column)
+            )
+        terms, function = np.unique(term, return_inverse=True)
+        pattern = MapPattern(
+            touches.shape[1],
+            np.column_stack([slot[:cut], column[:cut]]),
+            np.column_stack([joint, function, column[cut:]]),
+        )
+        return MovedSlots(slot, column, tuple(terms.tolist()), pattern)
 
     @cached_property
     def _moved(self) -> dict[bytes, MovedSlots]:

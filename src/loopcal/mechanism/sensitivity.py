@@ -28,8 +28,8 @@ from loopcal.mechanism.actuation import (
     drive_joints,
 )
 from loopcal.mechanism.chains import (
-    differentiate_end,
     differentiate_joints,
+    differentiate_platform,
     differentiate_platform_entries,
     name_platform_entries,
 )
@@ -63,7 +63,7 @@ def differentiate_pose(
     states have infinities or NaN.
     """
     if robot.stages:
-        return differentiate_end(robot, values, q, state, differentiate_pose, columns)
+        return differentiate_platform(robot, values, q, state, differentiate_pose, columns)
     if robot.has_open_sums:
         derivatives = differentiate_open_sums(robot, values, q, state, columns)
     else:

@@ -69,11 +69,6 @@ def without_poses(state: State, trials: int) -> State:
     return map_arrays(lambda a: np.zeros((trials, 0, *a.shape[2:]), a.dtype), state)
 
 
-def select_block(state: State, rows: tuple[slice, slice]) -> State:
-    """Return a block of trials and poses of a state (t, n)."""
-    return map_arrays(lambda a: a[rows], state)
-
-
 def join_states(*states: State) -> State:
     """Return states (t, n_i) one after the other, (t, sum n_i)."""
     return map_arrays(lambda *arrays: np.concatenate(arrays, axis=1), *states)

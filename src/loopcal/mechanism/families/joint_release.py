@@ -86,7 +86,9 @@ def propose_added_joints(robot: Mechanism) -> Finding | None:
     proposals = []
     for chosen in _choose_sets(list(_list_candidates(robot, record)))[:TRIED]:
         if _is_verified(robot, record, chosen):
-            proposals.append(tuple(_describe(added) for added in chosen))
+            proposals.append(
+                tuple({"limb": a.limb, "joint": a.joint, "line": a.line} for a in chosen)
+            )
         if len(proposals) == SHOWN:
             break
     if not proposals:
@@ -94,16 +96,12 @@ def propose_added_joints(robot: Mechanism) -> Finding | None:
     return report_finding("mechanism.joints-to-free", proposals=tuple(proposals))
 
 
-def _describe(added: AddedJoint) -> dict[str, str]:
-    """Return an added joint for a finding."""
-    return {"limb": added.limb, "joint": added.joint, "line": added.line}
-
-
 def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
     """Yield the joints that can be added, joint by joint, rotations before slides."""
     stress = find_self_stress(robot)  # (r, limbs, 6)
     frames = compute_limb_frames(robot, robot.values[None], robot.home_state)
-    values = _list_joint_values(robot)
+    pairs = zip(robot.program.groups, robot.home_state.joints, strict=True)
+    values = {i: own[0, 0, k] for group, own in pairs for k, i in enumerate(group.limbs)}
     numbers = {limb.name: i for i, limb in enumerate(robot.assembly.limbs)}
     center, scale = robot.home[:3, 3], 1 / robot.twist_scale
     for limb in record.limbs:
@@ -127,12 +125,6 @@ def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
                     # wrenches are those by freedoms over `scale`
                     works.append(stress[:, i] @ (twist / scale))
                 yield AddedJoint(limb.name, name, place, added, np.array(works).T)
-
-
-def _list_joint_values(robot: Mechanism) -> dict[int, FloatArray]:
-    """Return the joint values (J + 1,) of each limb at home."""
-    pairs = zip(robot.program.groups, robot.home_state.joints, strict=True)
-    return {i: own[0, 0, k] for group, own in pairs for k, i in enumerate(group.limbs)}
 
 
 def _follow_joint(

@@ -310,7 +310,9 @@ class Limbs(LimbsFile, RobotRecord):
         errors = join_errors(
             (
                 *(
-                    (_shifts if isinstance(entry, Shifts) else _tilts)(member.placed, entry)
+                    _shifts(member.placed, entry)
+                    if isinstance(entry, Shifts)
+                    else _tilts(member.placed, entry)
                     for member in copies
                     for entry in member.record.errors
                 ),

@@ -302,7 +302,9 @@ def find_homes(graph: JointGraph) -> tuple[FloatArray, ...]:
     sizes = np.where(graph.turns, 1.0, graph.size)
     low, high = _list_limits(graph)
     rest = np.clip(np.zeros(len(low)), low, high)
-    starts = np.stack([rest + _draw(graph, seed) * sizes for seed in range(STARTS)])
+    spreads = [0.0, *[SPREAD] * (STARTS - 1)]  # of the starts from zero: the first is there
+    drawn = [np.random.default_rng(i).uniform(-s, s, len(rest)) for i, s in enumerate(spreads)]
+    starts = np.stack([rest + shift * sizes for shift in drawn])
     closed = [q for q in graph.close(starts) if np.isfinite(q).all()]
     if not closed:
         raise MechanismError(_describe_gap(graph, starts))
@@ -392,12 +394,6 @@ def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
     rank = sum({"R": 5, "P": 5, "S": 3}[joint.kind] for joint in graph.closing)
     s = np.linalg.svd(rows, compute_uv=False) if rows.size else np.zeros(0)
     return rank - int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum())
-
-
-def _draw(graph: JointGraph, seed: int) -> FloatArray:
-    """Return the differences of a start from zero (j,) [rad, sizes]; none for the first seed."""
-    spread = 0.0 if seed == 0 else SPREAD
-    return np.random.default_rng(seed).uniform(-spread, spread, len(graph.tree))
 
 
 def _list_limits(graph: JointGraph) -> tuple[FloatArray, FloatArray]:

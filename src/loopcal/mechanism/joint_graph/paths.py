@@ -94,12 +94,6 @@ def select_joints(graph: JointGraph, joints: Collection[GraphJoint]) -> JointGra
     )
 
 
-def keep_path(graph: JointGraph, platform: str) -> JointGraph:
-    """Return the mechanism without the joints that move nothing between base and platform."""
-    blocks = find_blocks(graph, platform)
-    return select_joints(graph, {joint for block in blocks for joint in block.graph.joints})
-
-
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""
 
@@ -386,7 +380,8 @@ def find_stage_paths(
     Raises MechanismError: the loops do not close, a limb branches, no limbs join base and platform,
         or no motor holds a joint between them; a finding with the joints.
     """
-    kept = keep_path(whole, platform)
+    path = find_blocks(whole, platform)  # without joints that move nothing in between
+    kept = select_joints(whole, {joint for block in path for joint in block.graph.joints})
     repair = _repair_blocks(kept, find_blocks(kept, platform), measure_rounding)
     graph = repair.graph
     blocks = find_blocks(graph, platform)
