@@ -32,8 +32,8 @@ from loopcal.planning.constraints import ConstraintChecker, Constraints, build_c
 from loopcal.planning.design_space import D, PriorInformation, find_observable_space, is_allowed
 from loopcal.planning.exchange import MovedDesign, coordinate_exchange
 from loopcal.planning.path import check_paths, locate_home
-from loopcal.planning.result import Plan, PlannedPoses
-from loopcal.results.description import Field
+from loopcal.planning.result import POSE_FIELDS, Plan, PlannedPoses
+from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
@@ -329,7 +329,13 @@ class SurfacePlan(DrawnResult):
     sd_last: float
     is_converged: bool = True
 
-    FIELDS: ClassVar[tuple[Field, ...]] = Plan.FIELDS
+    FIELDS: ClassVar[tuple[Field, ...]] = (
+        *fields(robot="robot.name", groups=lambda plan: len(plan.poses.groups)),
+        *fields(points=lambda plan: plan.poses.groups.shape[1], rank="", possible_rank="possible"),
+        *fields("sd_first", "sd_last", sigma="options.sigma", seed="options.seed"),
+        *fields(poses=lambda plan: plan.list_poses(), findings=""),
+        *POSE_FIELDS,
+    )
     LABELS: ClassVar[Mapping[str, Any]] = Plan.LABELS
 
     def list_roles(self) -> tuple[str, ...]:
@@ -378,11 +384,10 @@ class SurfacePlan(DrawnResult):
     def __str__(self) -> str:
         return "\n".join(str(finding) for finding in self.findings)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything by name for JSON, SI."""
-        u, k = self.poses.groups.shape
-        rows, roles = self.poses.to_dicts(self.robot), self.list_roles()
-        poses = [
+    def list_poses(self) -> list[dict[str, Any]]:
+        """Return for each point its name, group, role, held coordinates, command and readings."""
+        k, roles = self.poses.groups.shape[1], self.list_roles()
+        return [
             {
                 "name": row["name"],
                 "group": f"group{i // k + 1}",
@@ -390,21 +395,8 @@ class SurfacePlan(DrawnResult):
                 "hold": list(self.list_fixed_coordinates(i // k, i % k)),
                 **{name: row[name] for name in ("via_home", "commanded", "readings")},
             }
-            for i, row in enumerate(rows)
+            for i, row in enumerate(self.poses.to_dicts(self.robot))
         ]
-        return {
-            "robot": self.robot.name,
-            "groups": u,
-            "points": k,
-            "rank": self.rank,
-            "possible_rank": self.possible,
-            "sd_first": self.sd_first,
-            "sd_last": self.sd_last,
-            "sigma": self.options.sigma,
-            "seed": self.options.seed,
-            "poses": poses,
-            "findings": self.findings,
-        }
 
 
 def plan_surfaces(
@@ -479,18 +471,30 @@ def improve_groups(
 def _arrange_points(
     groups: PlaneLineGroups, checker: ConstraintChecker, design: FloatArray
 ) -> tuple[PlannedPoses, FloatArray]:
-    """Return the poses of a design in their order, and the positions of the tool (u, k, 3) [m]."""
+    """Return the poses of a design in their order, and the positions of the tool (u, k, 3) [m].
+
+    The path goes via home where the straight one is not allowed.
+    """
     x = groups.place_points(design)
-    solution = inverse(groups.robot, x.reshape(-1, x.shape[2]))
-    u, k = x.shape[:2]
+    (u, k), flat = x.shape[:2], x.reshape(-1, x.shape[2])
+    from_home = check_paths(checker, np.broadcast_to(locate_home(groups.robot), flat.shape), flat)
+    if not from_home.allowed.all():
+        isolated = int((~from_home.allowed).sum())
+        reasons = list_reasons(from_home.count_violations())
+        raise EstimationError(
+            report_finding(
+                "plan.points-isolated", isolated=isolated, points=len(flat), reasons=reasons
+            )
+        )
+    solution = inverse(groups.robot, flat)
     poses = PlannedPoses(
         tuple(
             f"{g + 1}.{f'p{i}' if i < 2 else f'plane{i - 1}'}" for g in range(u) for i in range(k)
         ),
-        x.reshape(-1, x.shape[2]),
+        flat,
         solution.q,
         np.zeros(u * k, dtype=bool),
-        _require_paths(checker, x),
+        ~np.concatenate([[True], check_paths(checker, flat[:-1], flat[1:]).allowed]),
         np.arange(u * k).reshape(u, k),
     )
     return poses, (solution.T @ groups.robot.tool)[:, :3, 3].reshape(u, k, 3)
@@ -526,23 +530,6 @@ def _draw_allowed(
                 )
             )
     return np.concatenate(designs), np.concatenate(rows)
-
-
-def _require_paths(checker: ConstraintChecker, x: FloatArray) -> BoolArray:
-    """Return before which points (u * k,), in their order, the path goes via home."""
-    flat = x.reshape(-1, x.shape[2])
-    home = np.broadcast_to(locate_home(checker.robot), flat.shape)
-    from_home = check_paths(checker, home, flat)
-    if not from_home.allowed.all():
-        raise EstimationError(
-            report_finding(
-                "plan.points-isolated",
-                isolated=int((~from_home.allowed).sum()),
-                points=len(flat),
-                reasons=list_reasons(from_home.count_violations()),
-            )
-        )
-    return ~np.concatenate([[True], check_paths(checker, flat[:-1], flat[1:]).allowed])
 
 
 def _rms_sd(rows: FloatArray, rank: int) -> float:

@@ -17,8 +17,7 @@ from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import inverse
 from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.path import locate_home
-from loopcal.planning.prediction import ExpectedErrors
-from loopcal.planning.problem import ErrorCurve, name_groups
+from loopcal.planning.problem import ErrorCurve, ExpectedErrors, name_groups
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import DrawnResult
 from loopcal.results.serialization import to_json
@@ -107,6 +106,18 @@ class ErrorForecast:
     FIELDS: ClassVar[tuple[Field, ...]] = fields(before="", evenly_drawn="random", after="")
 
 
+POSE_FIELDS = (
+    Field("use", "poses.uses", "pose"),
+    Field(
+        "commanded",
+        "poses.coordinates",
+        "pose coordinate",
+        units=lambda plan: list_dimensions(plan.robot.controlled),
+    ),
+    Field("reading", "poses.readings", "pose actuator", units="robot.actuators.dimension"),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Plan(DrawnResult):
     """Poses to measure.
@@ -140,14 +151,7 @@ class Plan(DrawnResult):
         *fields(poses=lambda plan: plan.poses.to_dicts(plan.robot)),
         *fields(compared=lambda plan: plan.list_compared(), curve=""),
         *fields(notes=lambda plan: list(map(str, plan.notes)), findings=""),
-        Field("use", "poses.uses", "pose"),
-        Field(
-            "commanded",
-            "poses.coordinates",
-            "pose coordinate",
-            units=lambda plan: list_dimensions(plan.robot.controlled),
-        ),
-        Field("reading", "poses.readings", "pose actuator", units="robot.actuators.dimension"),
+        *POSE_FIELDS,
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(
         pose="poses.labels", coordinate="robot.controlled", actuator="robot.actuators.name"

@@ -13,8 +13,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.planning.path import locate_home
 from loopcal.planning.plane_line_planning import SurfacePlan
-from loopcal.planning.prediction import DIMENSIONS
-from loopcal.planning.problem import ErrorCurve
+from loopcal.planning.problem import DIMENSIONS, ErrorCurve
 from loopcal.planning.result import Plan, PlannedPoses
 from loopcal.report.figures.style import (
     COLORS,
