@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.core import limits
@@ -52,8 +52,6 @@ from loopcal.studies.specification.levels import (
 )
 from loopcal.studies.specification.scores import check_question
 from loopcal.studies.specification.study import BLOCK, REPLICATES, Study
-
-T = TypeVar("T")
 
 WHAT, FORMAT = "study file", 1
 
@@ -105,14 +103,9 @@ SETTINGS = ("title", "seed", "replicates", "block", "scores", "questions")
 QUICK = "quick"
 
 
-@dataclass(frozen=True)
-class StudyContent:
-    """The content of a study file, and where each of its keys was read.
-
-    Attributes
-    ----------
-    file : for lines. values : key -> content. places : key -> its location in the file, which for
-        replacements of the quick tier is below `quick`.
+class StudyContent(NamedTuple):
+    """The content of a study file by key, and where each key was read: for replacements of the
+    quick tier, below `quick`.
     """
 
     file: YamlFile
@@ -167,9 +160,19 @@ def build_study(content: StudyContent) -> Study:
     location = places["replicates"][:-1] if "replicates" in places else ()
     settings = read_record(file, settings_values, StudySettings, None, location)
     robots = read_robots(content)
-    factors: dict[str, Any] = {
-        key: read_levels(content, key, LEVELS[key]) for key in LEVELS if key in values
-    }
+    factors: dict[str, Any] = {}
+    for key in (key for key in LEVELS if key in values):
+        record, factors[key] = LEVELS[key], {}
+        plain = getattr(record, "PLAIN", None)
+        for name, value, place in _list_items(content, key):
+            if plain is None and not isinstance(value, dict):
+                raise file.error(
+                    f"the level {name!r} of {key!r} must state its settings; write "
+                    "'name: {setting: value}' lines",
+                    place,
+                )
+            stated = value if isinstance(value, dict) else {plain: value}
+            factors[key][name] = read_record(file, stated, record, None, place)
     study = Study(
         title=settings.title,
         robots={name: robot for name, (robot, _) in robots.items()},
@@ -181,24 +184,25 @@ def build_study(content: StudyContent) -> Study:
         questions=settings.questions,
         **factors,
     )
-    study = replace(study, poses=_load_pose_files(study, robots, content))
-    check_levels(study, {name: robot for name, (_, robot) in robots.items()}, content)
+    machines = [robot for _, robot in robots.values()]
+    study = replace(study, poses=_load_pose_files(study, machines, content))
+    check_levels(study, machines, content)
     return study
 
 
 def _load_pose_files(
-    study: Study, robots: Mapping[str, tuple[Robot, Mechanism]], content: StudyContent
+    study: Study, robots: Sequence[Mechanism], content: StudyContent
 ) -> dict[str, PosesLevel]:
     """Return the levels of poses, those of files with the poses of these files."""
     file, levels = content.file, dict(study.poses)
     for name, value, place in _list_items(content, "poses") if "poses" in content.values else ():
         stated = value if isinstance(value, dict) else {}
+        key_place = (*place, "file")
         if "coordinates" in stated:
             key_place = (*place, "coordinates")
             raise file.error("poses are given by a file; write 'file: poses.csv'", key_place)
         if "file" not in stated:
             continue
-        key_place = (*place, "file")
         if len(stated) > 1:
             raise file.error("a file of poses needs no other setting; remove the others", key_place)
         path = find_file_beside(file, stated["file"], key_place)
@@ -207,30 +211,13 @@ def _load_pose_files(
                 f"there is no file {stated['file']!r} beside the study file", key_place
             )
         try:
-            read = [load_poses(path, robot).tolist() for _, robot in robots.values()]
+            read = [load_poses(path, robot).tolist() for robot in robots]
         except LoopcalError as error:
             raise file.error(f"the poses cannot be read: {error}", key_place) from None
         if any(poses != read[0] for poses in read):
             raise file.error("the robots of this study read other poses from this file", key_place)
         coordinates = tuple(tuple(pose) for pose in read[0])
         levels[name] = replace(levels[name], count=len(coordinates), coordinates=coordinates)
-    return levels
-
-
-def read_levels(content: StudyContent, key: str, record: type[T]) -> dict[str, T]:
-    """Return name -> level of a factor: a mapping of records, or a list of plain values."""
-    plain, levels = getattr(record, "PLAIN", None), {}
-    for name, value, place in _list_items(content, key):
-        if isinstance(value, dict):
-            levels[name] = read_record(content.file, value, record, None, place)
-        elif plain is None:
-            raise content.file.error(
-                f"the level {name!r} of {key!r} must state its settings; write "
-                "'name: {setting: value}' lines",
-                place,
-            )
-        else:
-            levels[name] = read_record(content.file, {plain: value}, record, None, place)
     return levels
 
 
@@ -281,7 +268,7 @@ def _name(file: YamlFile, value: Any, place: Location) -> str:
     return Path(value).stem if isinstance(value, str) and "/" in value else str(value)
 
 
-def check_levels(study: Study, robots: Mapping[str, Mechanism], content: StudyContent) -> None:
+def check_levels(study: Study, robots: Sequence[Mechanism], content: StudyContent) -> None:
     """Refuse levels that no block could be computed with, at their lines."""
     for key, check in (
         ("instruments", lambda level: make_instrument(level, NoiseLevel())),
@@ -302,10 +289,9 @@ def check_levels(study: Study, robots: Mapping[str, Mechanism], content: StudyCo
 
 def _check_surfaces(level: PosesLevel, study: Study) -> None:
     """Raise DataError where points on planes and lines, and instruments and effects do not fit."""
-    for instrument in study.instruments.values():
-        if level.is_on_surfaces:
-            check_surfaces(make_instrument(instrument, NoiseLevel()))
     if level.is_on_surfaces:
+        for instrument in study.instruments.values():
+            check_surfaces(make_instrument(instrument, NoiseLevel()))
         for effects in study.effects.values():
             check_effects(effects)
         if study.scores.verdict:
@@ -327,11 +313,11 @@ def _check_method(level: MethodLevel, study: Study) -> None:
         )
 
 
-def _check_errors(level: ErrorsLevel, robots: Mapping[str, Mechanism]) -> None:
+def _check_errors(level: ErrorsLevel, robots: Sequence[Mechanism]) -> None:
     """Raise DataError where a robot has no parameter of a name, or one of another dimension, or has
     common errors, whose sizes have no lower bound.
     """
-    for robot in robots.values():
+    for robot in robots:
         if level.smallest and robot.parameters.common:
             raise DataError(
                 f"{robot.name} has errors that several parameters have in common, whose sum has no "
@@ -341,18 +327,8 @@ def _check_errors(level: ErrorsLevel, robots: Mapping[str, Mechanism]) -> None:
         resolve_patterns(robot.parameters, level.deviations)
 
 
-# --- A study file to begin with.
-
-PLACE = "ROBOT"
-"""Stands for the robot in the template."""
-
-
 def write_template(path: Path, robot: str) -> None:
-    """Write a study file with a comment for each setting.
-
-    Parameters
-    ----------
-    robot : name of a shipped robot, or a robot file, which is named relative to the study file.
+    """Write a study file with a comment for each setting, for a shipped robot or a robot file.
 
     Raises
     ------
@@ -360,16 +336,12 @@ def write_template(path: Path, robot: str) -> None:
     """
     load_robot(robot)
     text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
-    write_text(path, text.replace(f"[{PLACE}]", f"[{quote_robot(path, robot)}]"))
+    write_text(path, text.replace("[ROBOT]", f"[{quote_robot(path, robot)}]"))
 
 
 def quote_robot(path: Path, robot: str) -> str:
     """Return how a study file names a robot: a shipped one by its name, another one by its file,
     relative to the study file.
-
-    Raises
-    ------
-    FileError : there is no such robot.
     """
     file, name = find_robot_file(robot), robot
     if robot not in list_shipped_robots():

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,8 @@ from loopcal.io.core.text_file import replace_file
 from loopcal.studies.execution.executors import import_optional
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import iterate_trials
-from loopcal.studies.specification.study import Cell, Study
+from loopcal.studies.specification.study import Study
 from loopcal.typing import FloatArray, Progress, report_no_progress
-
-TRIAL = "trial"
-"""Column of the number of the trial in its cell, from 0."""
-
-FORMATS = (".csv", ".parquet")
-"""Endings of the files."""
 
 
 def export_trials(
@@ -40,23 +33,12 @@ def export_trials(
     ------
     DataError : another ending. FileError : it cannot be written. StudyError : pyarrow is missing.
     """
-    ending, count = path.suffix.lower(), 0
-    if ending not in FORMATS:
-        raise DataError(f"{path} must end in {' or '.join(FORMATS)}, which decides its format")
+    ending = path.suffix.lower()
+    if ending not in (".csv", ".parquet"):
+        raise DataError(f"{path} must end in .csv or .parquet, which decides its format")
     write = _write_csv if ending == ".csv" else _write_parquet
     with replace_file(path) as temporary, store.keep_state():
-        count = write(study, store, temporary, progress)
-    return count
-
-
-def _iterate_blocks(
-    study: Study, store: StudyStore, progress: Progress
-) -> Iterator[tuple[Cell, int, FloatArray]]:
-    """Yield cell, first trial and scores of all blocks."""
-    for cell in study.cells:
-        progress(cell.number, len(study.cells), "writing trials")
-        for first, scores in iterate_trials(study, store, cell):
-            yield cell, first, scores
+        return write(study, store, temporary, progress)
 
 
 def _write_csv(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
@@ -65,13 +47,15 @@ def _write_csv(study: Study, store: StudyStore, path: Path, progress: Progress) 
     titles = [f"{c.name}{unit}" for c, unit in zip(study.columns, units, strict=True)]
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*names, TRIAL, *titles])
-        for cell, first, scores in _iterate_blocks(study, store, progress):
+        writer.writerow([*names, "trial", *titles])
+        for cell in study.cells:
+            progress(cell.number, len(study.cells), "writing trials")
             levels = [cell.levels[name] for name in names]
-            for i, row in enumerate(scores.tolist()):
-                numbers = [value if math.isfinite(value) else "" for value in row]
-                writer.writerow([*levels, first + i, *numbers])
-            count += len(scores)
+            for first, scores in iterate_trials(study, store, cell):
+                for i, row in enumerate(scores.tolist()):
+                    numbers = [value if math.isfinite(value) else "" for value in row]
+                    writer.writerow([*levels, first + i, *numbers])
+                count += len(scores)
     return count
 
 
@@ -83,7 +67,7 @@ def _write_parquet(study: Study, store: StudyStore, path: Path, progress: Progre
     schema = arrow.schema(
         [
             *(arrow.field(name, word) for name in names),
-            arrow.field(TRIAL, arrow.int64()),
+            arrow.field("trial", arrow.int64()),
             *(
                 arrow.field(c.name, arrow.float64(), metadata={"unit": c.unit})
                 for c in study.columns

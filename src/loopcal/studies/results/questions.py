@@ -13,7 +13,8 @@ therefore wrong in at most 5 % of studies. A trial that failed is a machine that
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -36,12 +37,13 @@ from loopcal.studies.results.study_result import (
     find_columns,
     iterate_trials,
 )
-from loopcal.studies.specification.levels import LevelChain, Question, list_chains
+from loopcal.studies.specification.levels import Question, list_chains
 from loopcal.studies.specification.scores import check_question
 from loopcal.studies.specification.study import Cell, Study
 from loopcal.units import Unit, find_unit
 
 Certainty = Literal["certain", "between", "none", "unknown"]
+State = Literal["yes", "no", "open"]
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class LevelShare:
     reached: int
     trials: int
     share: Interval
-    state: Literal["yes", "no", "open"]
+    state: State
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,28 @@ class AnsweredQuestion:
     score_unit: str
     answers: tuple[Answer, ...]
 
+    @property
+    def title(self) -> str:
+        """The question as a heading."""
+        asked, symbol = self.question, SHOWN_UNITS[self.score_unit]
+        number = self.limit / (find_unit(symbol).factor_to_si if symbol else 1.0)
+        limit = f"{number:.6g} {symbol}".strip()
+        name = f"{self.name}: " if self.name else ""
+        score = asked.score.replace("_", " ")
+        return (
+            f"{name}{asked.wanted} level of {asked.factor} with {score} up to {limit} on "
+            f"{_percent(asked.share)} % of machines"
+        )
+
     def __str__(self) -> str:
         """Return the question, and one line for each answer with the shares that decide it."""
-        return describe_answers(self)
+        lines = [f"{self.title}:"]
+        for answer in self.answers:
+            levels = [f"{factor} {level}" for factor, level in answer.levels.items()]
+            named = ", ".join([*levels, *([answer.chain] if answer.chain else [])])
+            said = f"{say_answer(answer, self.question.wanted)} ({say_deciding_shares(answer)})"
+            lines.append(f"  {named}: {said}" if named else f"  {said}")
+        return "\n".join(lines)
 
 
 def answer_question(
@@ -117,26 +138,35 @@ def answer_question(
     ------
     DataError : see `check_question`.
     """
-    limit = check_question(study, question)
-    chains = list_chains(study, question.factor)
+    limit, factor = check_question(study, question), question.factor
+    chains = list_chains(study, factor)
     (place,) = find_columns(study, [question.score])
+    varied = [other for other in study.varied_factors if other != factor]
+    groups: dict[tuple[str, ...], dict[str, Cell]] = {}
+    for cell in study.cells:
+        others = tuple(cell.levels[other] for other in varied)
+        groups.setdefault(others, {})[cell.levels[factor]] = cell
     answers = []
     with store.keep_state():
-        for others, cells in _group_cells(study, question.factor):
+        for others, cells in groups.items():
             counts = {
                 level: _count_reached(study, store, cell, place, limit)
                 for level, cell in cells.items()
             }
-            answers += [_answer(question, others, chain, counts) for chain in chains]
+            for chain in chains:
+                chosen = {level: counts[level] for level in chain.levels}
+                decided = decide(chosen, question.share, question.wanted)
+                certainty, candidates, may_be_none, states = decided
+                shares = tuple(
+                    LevelShare(level, value, *chosen[level], *states[level])
+                    for level, value in zip(chain.levels, chain.values, strict=True)
+                )
+                best = None if may_be_none else candidates[-1]
+                named = dict(zip(varied, others, strict=True)), chain.label, chain.quantity
+                end = certainty, best, candidates, may_be_none, shares
+                answers.append(Answer(*named, chain.unit, *end))
     unit = study.columns[place].unit
     return AnsweredQuestion(name, question, limit, unit, tuple(answers))
-
-
-def answer_all(study: Study, store: StudyStore) -> tuple[AnsweredQuestion, ...]:
-    """Return the answers to the questions of a study."""
-    return tuple(
-        answer_question(study, store, question, name) for name, question in study.questions.items()
-    )
 
 
 def decide(
@@ -144,80 +174,34 @@ def decide(
     share: float,
     wanted: Literal["smallest", "largest"] = "smallest",
     confidence: float = LEVEL,
-) -> tuple[Certainty, tuple[str, ...], bool, Mapping[str, tuple[Interval, str]]]:
+) -> tuple[Certainty, tuple[str, ...], bool, Mapping[str, tuple[Interval, State]]]:
     """Decide which level is the smallest or largest that reaches a demanded share.
 
-    Parameters
-    ----------
     counts : level -> (machines within the limit, machines), levels in increasing order.
     confidence : with which all intervals hold together.
 
-    Returns
-    -------
-    certainty, candidates, may_be_none : as in `Answer`; candidates begin at the end of the levels
-        that is asked for, and where a level reaches the share for certain, it is the last of them.
-    states : level -> (interval, state).
+    Returns certainty, candidates, may_be_none as in `Answer`, and level -> (interval, state).
+    Candidates begin at the end of the levels that is asked for; where a level reaches the share for
+    certain, it is the last of them.
     """
     each = 1.0 - (1.0 - confidence) / max(len(counts), 1)
-    states: dict[str, tuple[Interval, str]] = {}
+    states: dict[str, tuple[Interval, State]] = {}
     for level, (reached, trials) in counts.items():
         interval = compute_binomial_interval(reached, trials, each)
-        state = "yes" if interval.low >= share else "no" if interval.high < share else "open"
+        state: State = "yes" if interval.low >= share else "no" if interval.high < share else "open"
         states[level] = interval, state
     candidates: list[str] = []
     is_reached = False
     for level in counts if wanted == "smallest" else reversed(list(counts)):
-        state = states[level][1]
-        if state != "no":
+        if not is_reached and states[level][1] != "no":
             candidates.append(level)
-        if state == "yes":
-            is_reached = True
-            break
-    if not any(trials for _, trials in counts.values()):
-        certainty: Certainty = "unknown"
-    elif not candidates:
+            is_reached = states[level][1] == "yes"
+    certainty: Certainty = "certain" if is_reached and len(candidates) == 1 else "between"
+    if not candidates:
         certainty = "none"
-    else:
-        certainty = "certain" if is_reached and len(candidates) == 1 else "between"
+    if not any(trials for _, trials in counts.values()):
+        certainty = "unknown"
     return certainty, tuple(candidates), not is_reached, states
-
-
-def _answer(
-    question: Question,
-    others: Mapping[str, str],
-    chain: LevelChain,
-    counts: Mapping[str, tuple[int, int]],
-) -> Answer:
-    """Return the answer for the levels of a chain."""
-    chosen = {level: counts[level] for level in chain.levels}
-    certainty, candidates, may_be_none, states = decide(chosen, question.share, question.wanted)
-    shares = tuple(
-        LevelShare(level, value, *chosen[level], states[level][0], states[level][1])  # type: ignore[arg-type]
-        for level, value in zip(chain.levels, chain.values, strict=True)
-    )
-    best = None if may_be_none else candidates[-1]
-    return Answer(
-        others,
-        chain.label,
-        chain.quantity,
-        chain.unit,
-        certainty,
-        best,
-        candidates,
-        may_be_none,
-        shares,
-    )
-
-
-def _group_cells(study: Study, factor: str) -> Iterator[tuple[dict[str, str], dict[str, Cell]]]:
-    """Yield the other varied levels, and level of the factor -> cell."""
-    groups: dict[tuple[tuple[str, str], ...], dict[str, Cell]] = {}
-    varied = [name for name in study.varied_factors if name != factor]
-    for cell in study.cells:
-        others = tuple((name, cell.levels[name]) for name in varied)
-        groups.setdefault(others, {})[cell.levels[factor]] = cell
-    for others, cells in groups.items():
-        yield dict(others), cells
 
 
 def _count_reached(
@@ -235,8 +219,6 @@ def _count_reached(
     return (0, 0) if converged and not defined else (reached, trials)
 
 
-# --- Answers of a study as sentences and tables.
-
 NOTE = (
     "Shares of the simulated machines within the limit; failed trials count as outside. The "
     "intervals of one row hold together with 95 % probability. Levels between those of the study "
@@ -253,109 +235,63 @@ def view_answers(answered: Sequence[AnsweredQuestion]) -> list[Block]:
     """Return the page of answered questions; empty without any."""
     page: list[Block] = []
     for item in answered:
-        page += [state_question(item), tabulate_answers(item), ""]
+        page += [item.title, tabulate_answers(item), ""]
     if any(answer.certainty == "between" for item in answered for answer in item.answers):
         return [*page, f"{NOTE} {EXTEND}"]
     return [*page, NOTE] if page else []
-
-
-def state_question(answered: AnsweredQuestion) -> str:
-    """Return a question as a heading."""
-    question = answered.question
-    symbol = SHOWN_UNITS[answered.score_unit]
-    number = answered.limit / (find_unit(symbol).factor_to_si if symbol else 1.0)
-    limit = f"{number:.6g} {symbol}".strip()
-    name = f"{answered.name}: " if answered.name else ""
-    score = question.score.replace("_", " ")
-    return (
-        f"{name}{question.wanted} level of {question.factor} with {score} up to {limit} on "
-        f"{_percent(question.share)} % of machines"
-    )
-
-
-def describe_answers(answered: AnsweredQuestion) -> str:
-    """Return a question as text, and one line for each answer with the shares that decide it."""
-    lines = [f"{state_question(answered)}:"]
-    for answer in answered.answers:
-        levels = [f"{factor} {level}" for factor, level in answer.levels.items()]
-        named = ", ".join([*levels, *([answer.chain] if answer.chain else [])])
-        said = say_answer(answer, answered.question.wanted)
-        shares = "; ".join(_say_share(share) for share in list_deciding_shares(answer))
-        lines.append(f"  {named}: {said} ({shares})" if named else f"  {said} ({shares})")
-    return "\n".join(lines)
 
 
 def tabulate_answers(answered: AnsweredQuestion) -> Table:
     """Return a row for each combination of the other factors: the answer, and the shares that
     decide it.
     """
-    first = answered.answers[0]
-    others = list(first.levels)
-    has_chains = any(answer.chain for answer in answered.answers)
-    columns = [word_column(factor, wraps=True) for factor in others]
-    columns += [word_column(answered.question.factor, wraps=True)] if has_chains else []
-    columns += [word_column("answer", wraps=True), word_column("shares", wraps=True)]
-    rows = tuple(
-        (
-            *(answer.levels[factor] for factor in others),
-            *([answer.chain] if has_chains else []),
-            say_answer(answer, answered.question.wanted),
-            "; ".join(_say_share(share) for share in list_deciding_shares(answer)),
-        )
-        for answer in answered.answers
-    )
-    return Table("", tuple(columns), rows)
+    answers, asked = answered.answers, answered.question
+    columns = {factor: [a.levels[factor] for a in answers] for factor in answers[0].levels}
+    if any(answer.chain for answer in answers):
+        columns[asked.factor] = [answer.chain for answer in answers]
+    columns["answer"] = [say_answer(answer, asked.wanted) for answer in answers]
+    columns["shares"] = list(map(say_deciding_shares, answers))
+    headings = tuple(word_column(title, wraps=True) for title in columns)
+    return Table("", headings, tuple(zip(*columns.values(), strict=True)))
 
 
 def say_answer(answer: Answer, wanted: str) -> str:
     """Return the answer in words, such as `20`, `not certain: 20 or 40`, or `no level`."""
-    names = answer.candidates
-    first = answer.shares[0 if wanted == "smallest" else -1].level
+    names, few = answer.candidates, len(answer.candidates) < 3
     if answer.certainty == "unknown":
         return "no trials with this score"
     if answer.certainty == "none":
         return "no level"
     if answer.certainty == "certain":
+        first = answer.shares[0 if wanted == "smallest" else -1].level
         return f"{names[0]}, the {wanted} of the study" if names[0] == first else names[0]
     if not answer.may_be_none:
-        return (
-            f"not certain: {' or '.join(names)}"
-            if len(names) < 3
-            else (f"not certain: between {names[0]} and {names[-1]}")
-        )
-    return (
-        f"not certain: {' or '.join(names)}, or no level"
-        if len(names) < 3
-        else (f"not certain: one from {names[0]} to {names[-1]}, or no level")
-    )
+        words = " or ".join(names) if few else f"between {names[0]} and {names[-1]}"
+        return f"not certain: {words}"
+    words = " or ".join(names) if few else f"one from {names[0]} to {names[-1]}"
+    return f"not certain: {words}, or no level"
 
 
-def list_deciding_shares(answer: Answer) -> list[LevelShare]:
+def say_deciding_shares(answer: Answer) -> str:
     """Return the shares of the candidates, and of the levels beside them; of all where there are
     no candidates.
     """
     chosen = {share.level for share in answer.shares if share.level in answer.candidates}
-    if not chosen:
-        return list(answer.shares)
     for level, next_level in pairwise(share.level for share in answer.shares):
         if (level in answer.candidates) != (next_level in answer.candidates):
             chosen |= {level, next_level}
-    return [share for share in answer.shares if share.level in chosen]
-
-
-def _say_share(share: LevelShare) -> str:
-    interval = share.share
-    if not share.trials:
-        return f"{share.level}: no trials"
-    low, high = _percent(interval.low), _percent(interval.high)
-    return f"{share.level}: {_percent(interval.value)} % ({low} to {high})"
+    said = []
+    for level, share in ((s.level, s) for s in answer.shares if s.level in chosen or not chosen):
+        value, low, high = map(_percent, (share.share.value, share.share.low, share.share.high))
+        said.append(
+            f"{level}: {value} % ({low} to {high})" if share.trials else f"{level}: no trials"
+        )
+    return "; ".join(said)
 
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.3g}"
 
-
-# --- Tables of a summary: for the screen, and with every factor as a column for files.
 
 JSON, CSV = "summary.json", "summary.csv"
 """Files of a summary in the folder of its study."""
@@ -389,7 +325,13 @@ def list_shown(study: Study, summary: StudySummary, names: Sequence[str] = ()) -
     DataError : a score that the study does not have.
     """
     find_columns(study, names)
-    return tuple(names or (name for name in SHOWN if _is_shown(summary, name)))
+
+    def is_shown(name: str) -> bool:
+        """Return whether a score is more than rounding in some cell."""
+        scores = [score for cell in summary.cells if (score := cell.find_score(name))]
+        return any(score.median is None or score.median.value > 1e-12 for score in scores)
+
+    return tuple(names or filter(is_shown, SHOWN))
 
 
 def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> list[Block]:
@@ -402,10 +344,7 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
         f"{SUMMARY_NOTE} {FRAMES[study.scores.frame]}",
         tabulate_medians(study, summary, shown),
     ]
-    counts: dict[str, int] = {}
-    for cell in summary.cells:
-        for code, count in cell.failed.items():
-            counts[code] = counts.get(code, 0) + count
+    counts = sum((Counter(cell.failed) for cell in summary.cells), Counter[str]())
     return [*page, *explain_failures(counts, summary.trials)]
 
 
@@ -434,10 +373,8 @@ def write_summary(
     """Write summary.json, with the answered questions, summary.csv, and figures (name -> content)
     into the folder of a study.
     """
-    table = tabulate_all(study, summary)
-    text = to_json(build_document(summary, answered))
-    write_text(folder / JSON, text)
-    write_text(folder / CSV, table.to_csv())
+    write_text(folder / JSON, to_json(build_document(summary, answered)))
+    write_text(folder / CSV, tabulate_all(study, summary).to_csv())
     for name, content in figures.items():
         write_bytes(folder / name, content)
 
@@ -448,80 +385,54 @@ def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) 
     units = {column.name: UNITS[column.unit] for column in study.columns}
     columns = [word_column(factor, wraps=True) for factor in factors]
     columns += [Column("trials"), Column("failed")]
-    columns += [
-        Column(name.replace("_", " "), "" if units[name].symbol == "1" else units[name].symbol)
-        for name in names
-    ]
-    rows = tuple(
-        (
-            *(cell.levels[factor] for factor in factors),
-            str(cell.trials),
-            str(sum(cell.failed.values())),
-            *(_format_score(cell, name, units[name]) for name in names),
-        )
-        for cell in summary.cells
-    )
-    return Table("", tuple(columns), rows)
-
-
-def tabulate_all(study: Study, summary: StudySummary) -> Table:
-    """Return a table of all factors and all scores in SI, with intervals, for programs."""
-    factors = tuple(study.levels)
-    columns = [word_column(factor) for factor in factors]
-    columns += [Column(name) for name in ("trials", "failed", "converged")]
-    suffixes = ("", " low", " high")
-    names = [c for c in study.columns[1:] if any(x.find_score(c.name) for x in summary.cells)]
-    kinds = ("median", "high", "mean")
-    present = [
-        (c, kind)
-        for c in names
-        for kind in kinds
-        if any(getattr(x.find_score(c.name), kind, None) for x in summary.cells)
-    ]
-    words = {"median": " median", "high": " 95 %", "mean": " mean"}
-    columns += [
-        Column(f"{c.name}{words[kind]}{suffix}", "" if c.unit == "1" else c.unit)
-        for c, kind in present
-        for suffix in suffixes
-    ]
+    for name in names:
+        symbol = units[name].symbol
+        columns.append(Column(name.replace("_", " "), "" if symbol == "1" else symbol))
     rows = []
     for cell in summary.cells:
-        row = [*(cell.levels[factor] for factor in factors), str(cell.trials)]
-        row += [str(sum(cell.failed.values())), _write(cell.converged.value)]
-        for c, kind in present:
-            interval = getattr(cell.find_score(c.name), kind, None)
-            ends = (
-                (math.nan,) * 3
-                if interval is None
-                else (interval.value, interval.low, interval.high)
-            )
-            row += [_write(end) for end in ends]
+        row = [*(cell.levels[f] for f in factors), str(cell.trials), str(sum(cell.failed.values()))]
+        for name in names:
+            score = cell.find_score(name)
+            interval = None if score is None else score.median or score.mean
+            row.append(ABSENT if interval is None else _say_interval(interval, units[name]))
         rows.append(tuple(row))
     return Table("", tuple(columns), tuple(rows))
 
 
-def _is_shown(summary: StudySummary, name: str) -> bool:
-    """Return whether a score is more than rounding in some cell."""
-    scores = [score for cell in summary.cells if (score := cell.find_score(name))]
-    return any(score.median is None or score.median.value > 1e-12 for score in scores)
-
-
-def _format_score(cell: CellSummary, name: str, unit: Unit) -> str:
-    """Return `value (low to high)` of a cell."""
-    score = cell.find_score(name)
-    interval = None if score is None else score.median or score.mean
-    return ABSENT if interval is None else format_interval(interval, unit)
-
-
-def format_interval(interval: Interval, unit: Unit) -> str:
+def _say_interval(interval: Interval, unit: Unit) -> str:
     """Return `value (low to high)` in a unit."""
-    value, low, high = (
-        format_number(number / unit.factor_to_si, 3)
-        for number in (interval.value, interval.low, interval.high)
-    )
-    return f"{value} ({low} to {high})"
+    ends = (interval.value, interval.low, interval.high)
+    return "{} ({} to {})".format(*(format_number(end / unit.factor_to_si, 3) for end in ends))
 
 
-def _write(value: float) -> str:
-    """Return a number that a program reads back; nothing where it is not finite."""
-    return repr(float(value)) if math.isfinite(value) else ""
+def tabulate_all(study: Study, summary: StudySummary) -> Table:
+    """Return a table of all factors and all scores in SI, with intervals, for programs."""
+    kinds = {"median": " median", "high": " 95 %", "mean": " mean"}
+
+    def find(cell: CellSummary, score: str, kind: str) -> Interval | None:
+        return getattr(cell.find_score(score), kind, None)
+
+    present = [
+        (column, kind)
+        for column in study.columns[1:]
+        for kind in kinds
+        if any(find(cell, column.name, kind) for cell in summary.cells)
+    ]
+    columns = [word_column(factor) for factor in study.levels]
+    columns += [Column(name) for name in ("trials", "failed", "converged")]
+    columns += [
+        Column(f"{c.name}{kinds[kind]}{suffix}", "" if c.unit == "1" else c.unit)
+        for c, kind in present
+        for suffix in ("", " low", " high")
+    ]
+    rows = []
+    for cell in summary.cells:
+        numbers = [cell.converged.value]
+        for column, kind in present:
+            found = find(cell, column.name, kind)
+            numbers += [math.nan] * 3 if found is None else [found.value, found.low, found.high]
+        row = [*(cell.levels[factor] for factor in study.levels), str(cell.trials)]
+        row += [str(sum(cell.failed.values()))]
+        row += [repr(float(x)) if math.isfinite(x) else "" for x in numbers]
+        rows.append(tuple(row))
+    return Table("", tuple(columns), tuple(rows))

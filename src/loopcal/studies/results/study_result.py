@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.results.result import TableResult
-from loopcal.results.tables import Block, Column, Table, word_column
+from loopcal.results.tables import Block, Column, build_table, word_column
 from loopcal.studies.execution.executors import import_optional
 from loopcal.studies.files.store import StudyStore, is_driven, read_store
 from loopcal.studies.files.study_folder import load_specification, read_study
@@ -69,10 +69,8 @@ class StudyResult(TableResult):
 
     def answer_questions(self) -> tuple[AnsweredQuestion, ...]:
         """Return the answers to the questions of the study file."""
-        from loopcal.studies.results.questions import answer_all
-
-        with read_store(self.folder) as store:
-            return answer_all(load_specification(store), store)
+        questions = read_study(self.folder).questions
+        return tuple(self._ask(question, name) for name, question in questions.items())
 
     def find_smallest(
         self, factor: str, score: str, limit: str | float, share: float = 0.95
@@ -112,12 +110,12 @@ class StudyResult(TableResult):
 
         return draw_score(self.study, self.summarize(), score, factor)
 
-    def _ask(self, question: Question) -> AnsweredQuestion:
+    def _ask(self, question: Question, name: str = "") -> AnsweredQuestion:
         """Return the answers to a question."""
         from loopcal.studies.results.questions import answer_question
 
         with read_store(self.folder) as store:
-            return answer_question(load_specification(store), store, question)
+            return answer_question(load_specification(store), store, question, name)
 
     def read_scores(self, cell: Cell | int, columns: Sequence[str] | None = None) -> FloatArray:
         """Return the scores of the stored trials of a cell: (t, s), SI.
@@ -233,8 +231,6 @@ def read_trials(
     return numbers[:done], scores[:done]
 
 
-# --- Summaries of the trials of a study, each with the interval that its number of trials leaves.
-
 LEVEL = 0.95
 """Of all intervals."""
 
@@ -263,8 +259,7 @@ class ScoreSummary:
 
     Attributes
     ----------
-    name, unit : of the score. median, high : quantiles 0.5 and 0.95; None of a share.
-    mean : with its Monte-Carlo interval. What does not exist is None.
+    median, high : quantiles 0.5 and 0.95. mean : also of shares. What does not exist is None.
     """
 
     name: str
@@ -276,12 +271,8 @@ class ScoreSummary:
 
 @dataclass(frozen=True)
 class CellSummary:
-    """The stored trials of one cell.
-
-    Attributes
-    ----------
-    levels : factor -> level. trials : that are stored. failed : code -> trials.
-    converged : share of the trials. scores : of those that converged.
+    """The stored trials of one cell: their number, code of a failure -> trials, the share of the
+    converged ones, and the scores of these.
     """
 
     levels: Mapping[str, str]
@@ -297,12 +288,7 @@ class CellSummary:
 
 @dataclass(frozen=True)
 class StudySummary:
-    """All cells of a study.
-
-    Attributes
-    ----------
-    title, seed, replicates : of the study. trials : that are stored. cells : in its order.
-    """
+    """All cells of a study in its order, and the number of stored trials."""
 
     title: str
     seed: int
@@ -317,15 +303,15 @@ class StudySummary:
 
 
 def summarize_study(study: Study, store: StudyStore) -> StudySummary:
-    """Return the summary of the stored trials."""
+    """Return the summary of the stored trials; memory is bounded by `MEMORY`."""
     with store.keep_state():
-        cells = tuple(summarize_cell(study, store, cell) for cell in study.cells)
+        cells = tuple(_summarize_cell(study, store, cell) for cell in study.cells)
     trials = sum(cell.trials for cell in cells)
     return StudySummary(study.title, study.seed, study.replicates, trials, cells)
 
 
-def summarize_cell(study: Study, store: StudyStore, cell: Cell) -> CellSummary:
-    """Return the summary of the stored trials of a cell; memory is bounded by `MEMORY`."""
+def _summarize_cell(study: Study, store: StudyStore, cell: Cell) -> CellSummary:
+    """Return the summary of the stored trials of a cell."""
     outcome = read_trials(study, store, cell, [0])[1][:, 0].astype(int)
     is_good, columns = outcome == 0, study.columns
     failed = {OUTCOMES[i]: int((outcome == i).sum()) for i in sorted(set(outcome.tolist()) - {0})}
@@ -416,12 +402,9 @@ def compute_binomial_interval(count: float, number: float, confidence: float = L
     return Interval(count / number, float(low), float(high))
 
 
-# --- How much of a study is stored.
-
-
 @dataclass(frozen=True)
 class CellStatus:
-    """A cell. `blocks` : stored, of `total`. `seconds` : of computation."""
+    """Blocks of a cell that are stored, of all, and seconds of their computation."""
 
     number: int
     levels: Mapping[str, str]
@@ -432,14 +415,11 @@ class CellStatus:
 
 @dataclass(frozen=True)
 class StudyStatus:
-    """The state of a folder.
+    """How much of the study of a folder is stored.
 
-    Attributes
-    ----------
-    title : of the study. is_running : whether a driver computes it now. blocks, total : stored, and
-        of the study. trials : stored. worker_seconds : of computation, the sum over all workers.
-    remaining : estimate of the same for what is missing; None where nothing is known.
-    factors : that have several levels. cells : in the order of the study.
+    is_running : whether a driver computes it now. worker_seconds : of computation, the sum over all
+    workers. remaining : estimate of the same for what is missing; None where nothing is known.
+    factors : that have several levels.
     """
 
     title: str
@@ -488,13 +468,9 @@ def view_status(state: StudyStatus, format_duration: Callable[[float], str]) -> 
             f"Computed in {format_duration(state.worker_seconds)} of one worker; about "
             f"{format_duration(state.remaining)} remain, divided by the workers"
         )
-    columns = (Column("cell"), *(word_column(name, wraps=True) for name in state.factors))
-    rows = tuple(
-        (
-            str(cell.number),
-            *(cell.levels[name] for name in state.factors),
-            f"{cell.blocks} of {cell.total}",
-        )
-        for cell in state.cells
-    )
-    return [*page, Table("", (*columns, Column("blocks")), rows)]
+    columns = [
+        (Column("cell"), lambda cell: str(cell.number)),
+        *((word_column(n, wraps=True), lambda cell, n=n: cell.levels[n]) for n in state.factors),
+        (Column("blocks"), lambda cell: f"{cell.blocks} of {cell.total}"),
+    ]
+    return [*page, build_table("", state.cells, *columns)]

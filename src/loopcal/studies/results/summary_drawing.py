@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- Which factor of a study is along the axis of a figure, has colors, and has panels.
-
 CHAIN = ""
 """Stands for a factor: the words in which levels along the axis differ, beside their number."""
 
@@ -90,14 +88,12 @@ class Layout:
     panels: tuple[str, ...]
     along: Axis
 
-    def find_level(self, cell: CellSummary, factor: str) -> str:
-        """Return the level of a factor in a cell."""
+    def find_level(self, cell: CellSummary, factor: str | None) -> str:
+        """Return the level of a factor in a cell; empty without one."""
+        if factor is None:
+            return ""
         level = cell.levels[factor or self.axis]
         return level if factor else self.along.chains[level]
-
-    def name_level(self, factor: str, level: str) -> str:
-        """Return a level with its factor."""
-        return f"{factor} {level}".strip()
 
     def place(self, cell: CellSummary) -> float:
         """Return where a cell is along the axis."""
@@ -117,30 +113,18 @@ def choose_layout(study: Study, factor: str | None = None) -> Layout:
         hint = suggest_names(factor, factors)
         raise DataError(f"{factor!r} is not a factor{hint}; factors: {', '.join(factors)}")
     varied = study.varied_factors
-    lengths = {name: _count_ordered(study, name) for name in varied}
+    lengths = {
+        name: max(len(c.levels) * bool(c.quantity) for c in list_chains(study, name))
+        for name in varied
+    }  # largest number of levels that have an order; 0 without any
     axis = factor or max(varied, key=lengths.__getitem__, default=factors[0])
     along = _place_levels(list_chains(study, axis), axis)
     counts = {CHAIN: len(set(along.chains.values()))} if along.chains else {}
-    counts |= {
-        name: len({cell.levels[name] for cell in study.cells}) for name in varied if name != axis
-    }
+    counts |= {name: len(study.levels[name]) for name in varied if name != axis}
     # the factor with the most levels that have a color each, so that panels are few
     usable = [name for name, count in counts.items() if count <= len(COLORS)]
     color = max(usable, key=counts.__getitem__, default=None)
     return Layout(axis, color, tuple(name for name in counts if name != color), along)
-
-
-def list_colors(summary: StudySummary, layout: Layout) -> dict[str, str]:
-    """Return level -> color, the same in all panels."""
-    if layout.color is None:
-        return {"": COLORS[0]}
-    levels = dict.fromkeys(layout.find_level(cell, layout.color) for cell in summary.cells)
-    return dict(zip(levels, COLORS, strict=False))
-
-
-def _count_ordered(study: Study, factor: str) -> int:
-    """Return the largest number of levels of a factor that have an order; 0 without any."""
-    return max(len(chain.levels) * bool(chain.quantity) for chain in list_chains(study, factor))
 
 
 def _place_levels(chains: Sequence[LevelChain], factor: str) -> Axis:
@@ -237,7 +221,8 @@ def draw_score(
     column = study.columns[place]
     asked = [question for question in study.questions.values() if question.score == score]
     limits = tuple(dict.fromkeys(check_question(study, question) for question in asked))
-    colors = list_colors(summary, layout)
+    levels = dict.fromkeys(layout.find_level(cell, layout.color) for cell in summary.cells)
+    colors = dict(zip(levels, COLORS, strict=False))  # the same in all panels
     drawing = Drawing(layout, column, UNITS[column.unit], colors, limits)
     columns = min(len(groups), 3)
     rows = -(-len(groups) // columns)
@@ -277,7 +262,7 @@ def _group(summary: StudySummary, layout: Layout) -> dict[str, list[CellSummary]
     groups: dict[str, list[CellSummary]] = {}
     for cell in summary.cells:
         levels = {name: layout.find_level(cell, name) for name in layout.panels}
-        title = ", ".join(layout.name_level(*item) for item in levels.items())
+        title = ", ".join(f"{factor} {level}".strip() for factor, level in levels.items())
         groups.setdefault(title, []).append(cell)
     return groups
 
@@ -289,11 +274,7 @@ def _draw_panel(axes: Any, cells: Sequence[CellSummary], drawing: Drawing) -> No
     offset = 0.0 if is_numeric else min(OFFSET, SPREAD / len(colors))
     for number, (name, color) in enumerate(colors.items()):
         shift = (number - (len(colors) - 1) / 2.0) * offset
-        chosen = [
-            cell
-            for cell in cells
-            if layout.color is None or layout.find_level(cell, layout.color) == name
-        ]
+        chosen = [cell for cell in cells if layout.find_level(cell, layout.color) == name]
         chosen.sort(key=layout.place)
         for kind, (style, _) in STYLES.items():
             points = [
@@ -379,7 +360,7 @@ def _label(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> list[Any]
         axes.tick_params(axis="y", labelsize=SMALL)
     names = {} if layout.color is None else drawing.colors
     handles = [
-        Line2D([], [], color=color, lw=2.0, label=layout.name_level(layout.color or "", level))
+        Line2D([], [], color=color, lw=2.0, label=f"{layout.color or ''} {level}".strip())
         for level, color in names.items()
     ]
     handles += [
