@@ -159,11 +159,9 @@ class RunReport:
 
     Attributes
     ----------
-    total : blocks of the study, or of the share that was asked for. before : of these, stored when
-        it began. computed : stored by it.
-    given_up : blocks that stopped every worker, and cells whose poses did, by name.
-    trials : that it stored. losses : workers that were lost, as far as is known.
-    seconds : from start to end. worker_seconds : of computation, the sum over all workers.
+    total : blocks that were asked for. before : of these, stored when it began. computed, trials :
+        stored by it. given_up : blocks that stopped every worker, and cells whose poses did.
+    losses : workers that were lost, as far as is known. worker_seconds : sum over all workers.
     """
 
     total: int
@@ -280,17 +278,13 @@ LONGEST = 30.0
 
 @dataclass(frozen=True)
 class TimeEstimate:
-    """How long a study takes.
+    """How long a study takes, by a block of some of its cells.
 
     Attributes
     ----------
-    cells, trials, blocks : of the study. measured : cells of which a block was computed.
-    seconds_per_block : mean of these blocks. plans : sets of poses to draw or to plan, which cells
-    have in common. seconds_per_plan : mean of those of the measured cells.
-    worker_seconds : of the study, by one worker.
-    workers : processors of this computer. seconds : of the study by as many processes.
-    bytes : of its store. failed : share of the trials of these blocks that failed.
-    computed : trials of these blocks. failures : code -> trials of these blocks.
+    measured : cells of which a block was computed. plans : sets of poses to draw or to plan, which
+        cells have in common. worker_seconds, seconds : by one worker, and by as many `workers`.
+    bytes : of the store. failed : share of the computed trials that failed, and by their code.
     """
 
     cells: int

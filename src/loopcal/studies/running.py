@@ -95,8 +95,6 @@ def run_study(
         return run_blocks(source.study, store, executor, share, progress, threads)
 
 
-# --- Calibrate one trial of a study as `loopcal calibrate` does, with its files and run folder.
-
 ROBOT, TRUTH, DATA = "robot.yaml", "truth.yaml", "measurements.csv"
 """Files of the folder of inputs: the nominal robot, the true machine, and what was measured."""
 
@@ -108,13 +106,8 @@ INPUTS = FolderKind(
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A calibrated trial.
-
-    Attributes
-    ----------
-    report, document : of the calibration, and of its run folder. inputs : folder of its inputs.
-    findings : that the files state other tolerances than the cell, or that the calibration has
-        another method than the cell.
+    """A calibrated trial: the report and the document of its run folder, and the folder of its
+    inputs. findings : that files or calibration differ from the cell in tolerances or method.
     """
 
     report: CalibrationReport
@@ -132,15 +125,11 @@ def calibrate_trial(
     force: bool = False,
     progress: Progress = report_no_progress,
 ) -> Replay:
-    """Calibrate the machine of one trial with all checks, and write its run folder.
+    """Calibrate the machine of one trial with all checks, and write its run folder; cell
+    and trial count from 0.
 
     A second folder beside it, `NAME-input`, gets the robot file, the measurements and the true
     machine, for `loopcal calibrate`.
-
-    Parameters
-    ----------
-    folder : of the study. cell, trial : both count from 0. output : run folder to make.
-    command : the command line, for the run folder. force : replace an older run.
 
     Raises
     ------

@@ -7,14 +7,13 @@ import os
 import signal
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from loopcal import environment
-from loopcal.environment import use_one_thread
+from loopcal.environment import import_optional, use_one_thread
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
 
@@ -41,10 +40,8 @@ class Answer(Generic[T, R]):
 
     Attributes
     ----------
-    task : as it was submitted.
-    result : of the function; None where the task was given up.
-    seconds : of computation by the worker.
-    losses : number of workers that were lost while they had this task, as far as is known.
+    result : of the function; None where the task was given up. seconds : of computation by the
+        worker. losses : workers that were lost while they had this task, as far as is known.
     """
 
     task: T
@@ -84,52 +81,6 @@ def compute_timed(function: Callable[[T], R], task: T) -> tuple[R, float]:
     start = time.perf_counter()
     result = function(task)
     return result, time.perf_counter() - start
-
-
-class TaskQueue(Generic[T]):
-    """Tasks that wait for a worker. Those that lost their worker come last.
-
-    Parameters
-    ----------
-    tasks : taken one by one, when a worker is free; see `Executor.map_blocks`.
-
-    Attributes
-    ----------
-    is_exhausted : whether `tasks` has no further one.
-    """
-
-    def __init__(self, tasks: Iterable[T | None]) -> None:
-        self._tasks = iter(tasks)
-        self._returned: deque[T] = deque()
-        self._losses: dict[str, int] = {}
-        self.is_exhausted: bool = False
-
-    def take(self) -> T | None:
-        """Return the next task; None where there is none, or none before the next answer."""
-        task = None
-        if not self.is_exhausted:
-            try:
-                task = next(self._tasks)
-            except StopIteration:
-                self.is_exhausted = True
-        if task is None and self._returned:
-            task = self._returned.popleft()
-        return task
-
-    def give_back(self, task: T) -> bool:
-        """Accept a task whose worker was lost; return whether it will be computed again."""
-        losses = self._losses[task.key] = self.count_losses(task) + 1
-        if losses < MOST_LOSSES:
-            self._returned.append(task)
-        return losses < MOST_LOSSES
-
-    def count_losses(self, task: T) -> int:
-        """Return how many workers were lost with this task."""
-        return self._losses.get(task.key, 0)
-
-    def answer(self, task: T, result: R | None, seconds: float = 0.0) -> Answer[T, R]:
-        """Return the answer to a task, and forget its losses."""
-        return Answer(task, result, seconds, self._losses.pop(task.key, 0))
 
 
 @dataclass(frozen=True)
@@ -173,32 +124,37 @@ class Pool(Protocol):
 def map_in_flight(
     pool: Pool, function: Callable[[T], R], tasks: Iterable[T | None]
 ) -> Generator[Answer[T, R], None, None]:
-    """Keep every slot of a pool filled, and yield answers; see `Executor.map_blocks`."""
-    queue, in_flight = TaskQueue(tasks), dict[Any, T]()
+    """Keep every slot of a pool filled, and yield answers; see `Executor.map_blocks`. Tasks that
+    lost their worker come last.
+    """
+    waiting, in_flight = iter(tasks), dict[Any, T]()
+    returned, losses = deque[T](), Counter[str]()
     while True:
-        while len(in_flight) < pool.count_slots() and (task := queue.take()) is not None:
-            in_flight[pool.submit(function, task, queue.count_losses(task))] = task
+        while len(in_flight) < pool.count_slots():
+            task = next(waiting, None)
+            if task is None and returned:
+                task = returned.popleft()
+            if task is None:
+                break
+            in_flight[pool.submit(function, task, losses[task.key])] = task
         if not in_flight:
             return
         for handle in pool.wait(list(in_flight)):
             task = in_flight.pop(handle)
             try:
-                answer = queue.answer(task, *pool.take(handle))
+                result, seconds = pool.take(handle)
             except WorkerLostError:
-                if queue.give_back(task):
+                losses[task.key] += 1
+                if losses[task.key] < MOST_LOSSES:
+                    returned.append(task)
                     continue
-                answer = queue.answer(task, None)
-            yield answer
+                result, seconds = None, 0.0
+            yield Answer(task, result, seconds, losses.pop(task.key, 0))
 
 
 @dataclass(frozen=True)
 class Processes:
-    """Worker processes on this computer.
-
-    Parameters
-    ----------
-    workers : their number.
-    """
+    """So many worker processes on this computer."""
 
     workers: int
 
@@ -289,16 +245,6 @@ def _without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def import_optional(module: str, extra: str) -> Any:
-    """Return a module of an optional package, see `loopcal.environment.import_optional`.
-
-    Raises
-    ------
-    StudyError : it is not installed.
-    """
-    return environment.import_optional(module, extra, StudyError)
-
-
 QUEUED = 2
 """Tasks in flight for each thread of a cluster: one is computed, the next one waits there."""
 
@@ -338,7 +284,7 @@ class _DaskPool:
     def __init__(self, client: Any, address: str) -> None:
         self._client, self._address = client, address
         self._count, self._end = 0, 0.0
-        distributed = import_optional("distributed", "dask")
+        distributed = import_optional("distributed", "dask", StudyError)
         self._finished = distributed.as_completed(loop=client.loop)
 
     def count_slots(self) -> int:
@@ -363,7 +309,7 @@ class _DaskPool:
         return [next(self._finished)]
 
     def take(self, handle: Any) -> tuple[Any, float]:
-        distributed = import_optional("distributed", "dask")
+        distributed = import_optional("distributed", "dask", StudyError)
         try:
             return handle.result()
         except distributed.KilledWorker as error:
@@ -380,7 +326,7 @@ def _report_lost(address: str) -> StudyError:
 @contextmanager
 def _connect_to_dask(address: str, patience: float) -> Iterator[Any]:
     """Yield a client of a scheduler that has a worker."""
-    distributed = import_optional("distributed", "dask")
+    distributed = import_optional("distributed", "dask", StudyError)
     try:
         client = distributed.Client(address, timeout=patience, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -465,7 +411,7 @@ class _RayPool:
 @contextmanager
 def _connect_to_ray(address: str | None, processors: int | None) -> Iterator[Any]:
     """Yield ray with a cluster in use."""
-    ray = import_optional("ray", "ray")
+    ray = import_optional("ray", "ray", StudyError)
     if ray.is_initialized():
         yield ray
         return

@@ -8,9 +8,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-from loopcal.errors import DataError
+from loopcal.environment import import_optional
+from loopcal.errors import DataError, StudyError
 from loopcal.io.core.text_file import replace_file
-from loopcal.studies.execution.executors import import_optional
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import iterate_trials
 from loopcal.studies.specification.study import Study
@@ -60,8 +60,8 @@ def _write_csv(study: Study, store: StudyStore, path: Path, progress: Progress) 
 
 
 def _write_parquet(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
-    arrow = import_optional("pyarrow", "tables")
-    parquet = import_optional("pyarrow.parquet", "tables")
+    arrow = import_optional("pyarrow", "tables", StudyError)
+    parquet = import_optional("pyarrow.parquet", "tables", StudyError)
     names, count = tuple(study.levels), 0
     word = arrow.dictionary(arrow.int32(), arrow.string())
     schema = arrow.schema(

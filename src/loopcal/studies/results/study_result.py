@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.errors import DataError, suggest_names
+from loopcal.environment import import_optional
+from loopcal.errors import DataError, StudyError, suggest_names
 from loopcal.results.result import TableResult
 from loopcal.results.tables import Block, Column, build_table, word_column
-from loopcal.studies.execution.executors import import_optional
 from loopcal.studies.files.store import StudyStore, is_driven, read_store
 from loopcal.studies.files.study_folder import load_specification, read_study
 from loopcal.studies.simulation.fits import OUTCOMES
@@ -140,7 +140,7 @@ class StudyResult(TableResult):
         ------
         StudyError : pandas is not installed.
         """
-        pandas = import_optional("pandas", "tables")
+        pandas = import_optional("pandas", "tables", StudyError)
         study, names = self.study, tuple(self.study.levels)
         with read_store(self.folder) as store:
             read = [(cell, *read_trials(study, store, cell)) for cell in study.cells]
@@ -166,7 +166,7 @@ class StudyResult(TableResult):
         ------
         StudyError : xarray is not installed.
         """
-        xarray = import_optional("xarray", "tables")
+        xarray = import_optional("xarray", "tables", StudyError)
         study, names = self.study, tuple(self.study.levels)
         levels = {n: list(dict.fromkeys(cell.levels[n] for cell in study.cells)) for n in names}
         shape = (*(len(level) for level in levels.values()), study.replicates)

@@ -22,7 +22,6 @@ from loopcal.estimate.tolerance_components import InflatedTolerances
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot
 from loopcal.measure.instrument import Instrument, Seed, make_random_stream
-from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import collect_nuisance_parameters
 from loopcal.measure.simulation import Trials, sample_truth
 from loopcal.mechanism.model import Mechanism
@@ -89,20 +88,14 @@ def draw_machines(robot: Mechanism, errors: ErrorsLevel, n_trials: int, seed: Se
     truth = sample_truth(robot, n_trials, seed, errors.distribution)
     drawn = truth - table.nominal
     if errors.smallest:
-        drawn = raise_sizes(drawn, robot, errors.smallest)
+        # sizes from `smallest` times the largest one to the largest one, with the same signs and
+        # standard deviations
+        tolerance, least = np.nan_to_num(table.tolerance), errors.smallest
+        largest = np.sqrt(3.0 / (1.0 + least + least**2)) * tolerance
+        share = np.abs(drawn) / np.where(tolerance > 0.0, np.sqrt(3.0) * tolerance, 1.0)
+        size = np.where(drawn == 0.0, 0.0, largest * (least + (1 - least) * share))
+        drawn = np.sign(drawn) * size
     return table.nominal + errors.error_factor * drawn
-
-
-def raise_sizes(drawn: FloatArray, robot: Mechanism, smallest: float) -> FloatArray:
-    """Return uniform errors (t, p) whose sizes lie between `smallest` times the largest one and the
-    largest one, with the same signs and standard deviations.
-    """
-    tolerance = np.nan_to_num(robot.parameters.tolerance)
-    largest = np.sqrt(3.0 / (1.0 + smallest + smallest**2)) * tolerance
-    share = np.abs(drawn) / np.where(tolerance > 0.0, np.sqrt(3.0) * tolerance, 1.0)
-    return np.sign(drawn) * np.where(
-        drawn == 0.0, 0.0, largest * (smallest + (1 - smallest) * share)
-    )
 
 
 def resolve_patterns(table: ParameterTable, values: Mapping[str, str]) -> dict[str, float]:
@@ -128,8 +121,6 @@ def resolve_patterns(table: ParameterTable, values: Mapping[str, str]) -> dict[s
     return resolved
 
 
-# --- The instrument of a cell.
-
 SURFACES = {"plane", "line"}
 """Kinds of an instrument for points of planes and perpendicular lines."""
 
@@ -152,7 +143,7 @@ def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
             distribution=level.distribution,
         )
     )
-    known = [name for sensor in instrument.sensors for name in list_column_names(sensor.kind)]
+    known = [column.name for sensor in instrument.sensors for column in sensor.kind.columns]
     for name in level.unused:
         if name not in known:
             hint = suggest_names(name, known)
@@ -191,41 +182,25 @@ def check_surfaces(instrument: Instrument) -> None:
         )
 
 
-def list_column_names(kind: Kind) -> list[str]:
-    """Return the names of the columns of a kind."""
-    return [column.name for column in kind.columns]
-
-
 def hide_columns(trials: Trials, unused: tuple[str, ...]) -> Trials:
     """Return trials in which unused columns are not measured."""
     if not unused:
         return trials
     measured = []
     for sensor, values in zip(trials.instrument.sensors, trials.measured, strict=True):
-        is_hidden = np.array([name in unused for name in list_column_names(sensor.kind)])
+        is_hidden = np.array([column.name in unused for column in sensor.kind.columns])
         measured.append(np.where(is_hidden, np.nan, values))
     return replace(trials, measured=tuple(measured))
-
-
-# --- Points that an instrument holds on planes and perpendicular lines: the true machine moves
-# until its tool is there, so that all gaps are zero and the readings differ from machine to
-# machine.
-
-
-def make_layout(robot: Mechanism, coordinates: FloatArray, groups: int) -> Layout:
-    """Return the groups of points with controlled coordinates (n, c)."""
-    return Layout(robot, coordinates.reshape(groups, -1, coordinates.shape[1]))
 
 
 def measure_held_points(
     layout: Layout, truth: FloatArray, instrument: Instrument, seed: Seed, is_exact: bool = False
 ) -> Trials:
-    """Return the measurements of true machines (t, p) [SI] that are held.
+    """Return the measurements of true machines (t, p) [SI] that are held on planes and lines: each
+    moves until its tool is there, so that all gaps are zero and the readings differ.
 
-    Parameters
-    ----------
     instrument : kinds plane and line at the points. The noise of the plane is that of each held
-        coordinate. is_exact : whether the points are held without noise.
+    coordinate. is_exact : whether the points are held without noise.
     """
     n = layout.points
     assigned = Instrument(tuple(sensor.assign_rows(n) for sensor in instrument.sensors))
@@ -260,22 +235,14 @@ def check_effects(effects: EffectsLevel) -> None:
             )
 
 
-# --- Measured and held-out poses of a cell, which are computed once and are part of its tasks.
-
-TOLERANCES = ("tolerance_factor", "tolerances")
-"""Settings of errors that change the tolerances, and with them planned poses."""
-
 SURFACE_SIGMA = 1e-3
 """Noise for which points on surfaces are planned [m]; it does not change which are best."""
 
 
 @dataclass(frozen=True, eq=False)
 class CellPoses:
-    """The poses of all blocks of a cell, and of all cells that have the same ones.
-
-    Attributes
-    ----------
-    measured, held_out : controlled coordinates [m, rad], a list for each pose.
+    """The poses of all blocks of a cell, and of all cells that have the same ones, as lists of
+    controlled coordinates [m, rad].
     """
 
     measured: list[list[float]]
@@ -292,10 +259,10 @@ def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
     description = {key: content[key] for key in ("robot", "poses", "seed")}
     description["held_out"] = convert(content["scores"], Scores).held_out
     if is_planned(level):
-        errors = content["errors"]
-        tolerances = {key: errors[key] for key in TOLERANCES if key in errors}
         description |= {key: content[key] for key in ("instrument", "noise")}
-        description["errors"] = tolerances
+        stated = content["errors"]  # those settings that change the tolerances
+        names = ("tolerance_factor", "tolerances")
+        description["errors"] = {name: stated[name] for name in names if name in stated}
     return description
 
 
@@ -305,7 +272,9 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     robot = build_robot_of(description["robot"])
     held_out = sample_workspace(robot.nominal, description["held_out"], seed + 1).coordinates
     chosen_seed = seed if level.seed is None else level.seed
-    stream = choose_stream(chosen_seed, seed + 1)
+    stream: int | np.random.Generator = chosen_seed
+    if chosen_seed == seed + 1:  # otherwise the measured poses would be the held-out ones
+        stream = np.random.default_rng(np.random.SeedSequence(chosen_seed, spawn_key=(0,)))
     if level.coordinates:
         measured = np.array(level.coordinates)
     elif level.is_on_surfaces:
@@ -322,15 +291,6 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
         chosen = plan(change_tolerances(robot, errors).nominal, instrument, options=options)
         measured = chosen.poses.coordinates
     return CellPoses(measured.tolist(), held_out.tolist())
-
-
-def choose_stream(seed: int, held_out: int) -> int | np.random.Generator:
-    """Return the seed of drawn poses, or another stream in place of the seed of the held-out poses:
-    with the same one, the measured poses would be the held-out ones.
-    """
-    if seed != held_out:
-        return seed
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
 
 
 def plan_plane_line_points(
@@ -350,9 +310,6 @@ def plan_plane_line_points(
 def is_planned(level: PosesLevel) -> bool:
     """Return whether the poses of a level are planned, which takes as long as many trials."""
     return level.choice == "planned" and not level.coordinates
-
-
-# --- The estimation method of a cell.
 
 
 def make_fit_options(level: MethodLevel) -> FitOptions:

@@ -20,7 +20,7 @@ from loopcal.estimate.trial_identification import compute_trial_posterior, ident
 from loopcal.measure.instrument import Instrument, Noise, Seed, Uniform, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import solve_commanded_poses
-from loopcal.measure.simulation import Disturbance, Trials, simulate_trials
+from loopcal.measure.simulation import Disturbance, simulate_trials
 from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
@@ -31,7 +31,6 @@ from loopcal.studies.simulation.machines import (
     hide_columns,
     make_fit_options,
     make_instrument,
-    make_layout,
     measure_held_points,
     place_instrument,
 )
@@ -50,20 +49,13 @@ from loopcal.studies.specification.study import format_json
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-# --- Effects that a fit does not know of: altered noise, and disturbed machines and instruments.
-
 EFFECTS = 3
 """Purpose of the random stream of a trial from which the direction of drift and jump is drawn."""
 
 
 @dataclass(frozen=True, eq=False)
 class AlteredNoise(Noise):
-    """Noise whose true distribution differs from the stated one.
-
-    Parameters
-    ----------
-    stated : what the fit is told. effects : noise factor, Student's t, correlation and outliers.
-    """
+    """Noise whose true distribution, by the effects, differs from that which the fit is told."""
 
     stated: Noise
     effects: EffectsLevel
@@ -115,11 +107,8 @@ def alter_noise(instrument: Instrument, effects: EffectsLevel) -> Instrument:
 def make_disturbance(
     robot: Mechanism, truth: FloatArray, poses: FloatArray, effects: EffectsLevel, seed: Seed
 ) -> Disturbance:
-    """Return what the effects do to t machines while they are measured.
-
-    Parameters
-    ----------
-    robot : nominal. truth : (t, p) [SI]. poses : (n, c) commanded coordinates, in their order.
+    """Return what the effects do to true machines (t, p) [SI] while they are measured at commanded
+    coordinates (n, c), in this order; robot : nominal.
     """
     n = len(poses)
     return Disturbance(
@@ -160,13 +149,6 @@ def draw_motion(effects: EffectsLevel, trials: int, n: int, seed: Seed) -> Float
     later = 2 * np.arange(n) >= n
     size = effects.drift * np.linspace(-0.5, 0.5, n) + effects.jump * (later - later.mean())
     return size[:, None] * direction[:, None, :]
-
-
-OF_BLOCK = ("block",)
-"""Keys of the content of a task that differ between the blocks of a cell."""
-
-KEPT_CELLS = 4
-"""Cells that a process keeps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,12 +192,11 @@ class PreparedCell:
 
 
 def prepare_cell(content: Mapping[str, Any]) -> PreparedCell:
-    """Return the cell of the content of a task."""
-    common = {key: value for key, value in content.items() if key not in OF_BLOCK}
-    return _prepare(format_json(common))
+    """Return the cell of the content of a task; the latest ones are kept."""
+    return _prepare(format_json({key: x for key, x in content.items() if key != "block"}))
 
 
-@lru_cache(maxsize=KEPT_CELLS)
+@lru_cache(maxsize=4)
 def _prepare(text: str) -> PreparedCell:
     """Return the cell of the common content of its blocks, as JSON."""
     content = json.loads(text)
@@ -229,7 +210,9 @@ def _prepare(text: str) -> PreparedCell:
     method = convert(content["method"], MethodLevel)
     effects = convert(content["effects"], EffectsLevel)
     scores = convert(content["scores"], Scores)
-    layout = make_layout(robot, measured, poses.groups) if poses.is_on_surfaces else None
+    layout = None
+    if poses.is_on_surfaces:
+        layout = Layout(robot, measured.reshape(poses.groups, -1, measured.shape[1]))
     motions = np.zeros((12, 0))
     if scores.error_frame != BASE:
         nominal = robot.values[None]
@@ -240,7 +223,10 @@ def _prepare(text: str) -> PreparedCell:
             check_effects(effects)
             exact = measure_held_points(layout, nominal, instrument, 0, is_exact=True)
             exact = replace(exact, recorded=None)
-        motions = find_fitted_motions(robot, exact)
+        # those that measurements of the nominal robot do not determine, if a parameter moves them
+        posterior = compute_trial_posterior(identify_trials(robot, exact, MAP()), exact, 0)
+        if choose_error_frame(posterior).fitted:
+            motions = list_unfixed_motions(posterior)
     commanded = solve_commanded_poses(robot, measured)
     return PreparedCell(
         robot,
@@ -260,13 +246,3 @@ def _prepare(text: str) -> PreparedCell:
         content["seed"],
         content["trials"],
     )
-
-
-def find_fitted_motions(robot: Mechanism, trials: Trials) -> FloatArray:
-    """Return the motions (12, k) of frames that are fitted before errors are stated: those that
-    measurements of the nominal robot do not determine; none where no parameter moves these frames.
-    """
-    fits = identify_trials(robot, trials, MAP())
-    posterior = compute_trial_posterior(fits, trials, 0)
-    is_moved = choose_error_frame(posterior).fitted
-    return list_unfixed_motions(posterior) if is_moved else np.zeros((12, 0))
