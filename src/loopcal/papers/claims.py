@@ -90,35 +90,23 @@ class Claim:
         >>> [Claim("lower", record).decide({"n": n, "all": 4}) for n in (4, 0, 1)]
         [True, False, None]
         """
-
-        def holds(comparisons: Sequence[Sequence[Any]]) -> bool:
-            return all(
-                RELATIONS[relation](_find(quantity, data), _find(limit, data))
-                for quantity, relation, limit in comparisons
-            )
-
-        if holds(self.record["agrees"]):
-            return True
-        return False if holds(self.record.get("disagrees", ())) else None
+        for key, answer in (("agrees", True), ("disagrees", False)):
+            comparisons = self.record.get(key, ())
+            if all(RELATIONS[how](_find(a, data), _find(b, data)) for a, how, b in comparisons):
+                return answer
+        return None
 
     def judge(self, draws: Sequence[Mapping[str, Any]] = (), /, **data: Any) -> Verdict:
-        """Return the verdict.
-
-        Parameters
-        ----------
-        draws : numbers of each repeated draw, which replace those of `data` in the comparisons.
-        data : the numbers.
+        """Return the verdict; draws : numbers of each repeated draw, which replace those of `data`
+        in the comparisons.
         """
-        if draws:
-            return self._word([self.decide({**data, **drawn}) for drawn in draws], data)
-        return self._word([], data, self.decide(data))
+        decided = [self.decide({**data, **drawn}) for drawn in draws]
+        return self._word(decided, data, self.decide(data) if not draws else None)
 
     def judge_everywhere(self, places: Mapping[str, Mapping[str, Any]], /, **data: Any) -> Verdict:
         """Return the verdict on a claim that holds in a draw if it holds there in all places.
 
-        Parameters
-        ----------
-        places : label -> quantity -> (t,) its number in each draw. data : other numbers.
+        places : label -> quantity -> (t,) its number in each draw.
         """
         held, shares = [], []
         for label, quantities in places.items():

@@ -35,12 +35,14 @@ ANY_ERRORS = "errors: [1]  # normal errors, in tolerances of the robot file"
 
 @dataclass(frozen=True)
 class Paper:
-    """A published study that can be repeated."""
+    """A published study that can be repeated; name : on the command line.
 
-    name: str  # on the command line
+    studies : robot -> its study file in the folder; that of the first is adapted to other robots.
+    """
+
+    name: str
     title: str
     source: str
-    # robot -> its study file in the folder; that of the first robot is adapted to other robots
     studies: Mapping[str, str]
 
     @property
@@ -53,15 +55,8 @@ class Paper:
     ) -> Reproduction:
         """Repeat the study.
 
-        Parameters
-        ----------
-        seed : of all that is drawn. trials : drawings behind each statistical number, at least 2.
-        progress : receives a few words on each step.
-
-        Raises
-        ------
-        DataError
-            A seed below zero, or fewer than 2 trials.
+        trials : drawings behind each statistical number. progress : receives a few words on each
+        step. DataError for a seed below zero or fewer than 2 trials.
         """
         if seed < 0 or trials < 2:
             raise DataError(
@@ -85,14 +80,12 @@ class Paper:
         """Return the study of a robot of the paper; default: of the first."""
         from loopcal.studies.files.study_file import load_study
 
-        return load_study(Path(str(self._file(self.studies[robot or next(iter(self.studies))]))))
+        name = self.studies[robot or next(iter(self.studies))]
+        return load_study(Path(str(files(self.package) / name)))
 
     def read_file(self, name: str) -> str:
         """Return the text of a file of the paper."""
-        return self._file(name).read_text("utf-8")
-
-    def _file(self, name: str) -> Any:
-        return files(self.package) / name
+        return (files(self.package) / name).read_text("utf-8")
 
 
 PAPERS: Mapping[str, Paper] = {
@@ -125,13 +118,7 @@ PAPERS: Mapping[str, Paper] = {
 
 
 def find_paper(name: str) -> Paper:
-    """Return a paper by its name.
-
-    Raises
-    ------
-    DataError
-        No paper is called so.
-    """
+    """Return a paper by its name; DataError where no paper is called so."""
     if name not in PAPERS:
         raise DataError(
             f"{name!r} is not a paper that can be repeated{suggest_names(name, PAPERS)}; known are "
@@ -173,10 +160,6 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
 
     Another robot gets as many poses of its own workspace in place of a file of poses, and errors by
     its tolerances in place of the errors of one machine.
-
-    Raises
-    ------
-    FileError : there is no such robot.
     """
     from loopcal.studies.files.study_file import quote_robot
 

@@ -79,7 +79,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure as data, with units on the axes and the number of cases in the caption."""
+    """A figure as data."""
 
     name: str  # of its file
     title: str
@@ -191,7 +191,10 @@ class Comparison:
         """
         lines: list[tuple[Cell, ...]] = []
         for i, (label, texts) in enumerate(self.published.rows.items()):
-            computed = map(_write_like, self.computed[i], texts)
+            computed = []  # as the printed ones are written, with one digit more
+            for value, text in zip(self.computed[i], texts, strict=True):
+                digits = max(1 - round(float(np.log10(last_digit(text)))), 1)
+                computed.append(f"{value:.3e}" if "E" in text.upper() else f"{value:.{digits}f}")
             shown = (f"{d:.1e}" if d else "0" for d in self.difference[i])
             marked = (d if ok else f"**{d}**" for d, ok in zip(shown, self.within[i], strict=True))
             lines += [(label, "published", *texts), ("", "computed", *computed)]
@@ -289,13 +292,6 @@ def last_digit(text: str) -> float:
     (0.0001, 1e-05, 1.0, 1e-11)
     """
     return float(Decimal(1).scaleb(int(Decimal(text).as_tuple().exponent)))
-
-
-def _write_like(value: float, printed: str) -> str:
-    """Write a number as the printed one is, with one digit more."""
-    if "E" in printed.upper():
-        return f"{value:.3e}"
-    return f"{value:.{max(1 - round(float(np.log10(last_digit(printed)))), 1)}f}"
 
 
 @cache

@@ -13,6 +13,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -60,13 +61,9 @@ class Reproduction:
     def verdict_groups(self) -> dict[str, tuple[tuple[int, Verdict], ...]]:
         """Verdicts with their numbers on a page, by title: statements of the paper, own checks."""
         ordered = sorted(self.content.verdicts, key=lambda verdict: verdict.is_own_check)
-        numbered = list(enumerate(ordered, 1))
-        titles = {"Statements of the paper": False, "Our own checks": True}
-        groups = {
-            title: tuple(pair for pair in numbered if pair[1].is_own_check is own)
-            for title, own in titles.items()
-        }
-        return {title: group for title, group in groups.items() if group}
+        titles = {False: "Statements of the paper", True: "Our own checks"}
+        groups = groupby(enumerate(ordered, 1), lambda pair: pair[1].is_own_check)
+        return {titles[is_own]: tuple(group) for is_own, group in groups}
 
     def summary(self) -> Table:
         """Return how many numbers of each published table agree to one unit of their last digit."""
@@ -80,9 +77,8 @@ class Reproduction:
 
     def to_dict(self) -> dict[str, Any]:
         """Return all content by name, for JSON."""
-        names = ("paper", "title", "source", "about", "settings")
         return {
-            **{name: getattr(self, name) for name in names},
+            **{name: value for name, value in vars(self).items() if name != "content"},
             "verdicts": self.content.verdicts,
             "figures": self.content.figures,
             "summary": self.summary().to_dict(),
@@ -108,21 +104,18 @@ def write_page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
 def write_folder(
     path: str | Path, reproduction: Reproduction, made_by: Mapping[str, Any], force: bool = False
 ) -> Path:
-    """Write a reproduction whole or not at all; return the folder.
+    """Write a reproduction whole or not at all, see `write_result_folder`; return the folder.
 
-    Parameters
-    ----------
-    path : folder to make. made_by : where the results come from. force : replace an earlier one.
-
-    Raises
-    ------
-    FileError : see `write_result_folder`.
+    made_by : where the results come from. force : replace an earlier one.
     """
     content, path = reproduction.content, Path(path)
     files = {"page.md": write_page(reproduction, made_by).encode("utf-8", "backslashreplace")}
     compared = [c.table() for c in content.comparisons]
     for table in (reproduction.summary(), *compared, *content.tables):
-        files[f"tables/{table.name}.csv"] = _write_csv(table).encode()
+        rows = serialization.to_json(table.rows)  # numbers in full, null where one is not finite
+        stream = StringIO()
+        csv.writer(stream, lineterminator="\n").writerows([table.columns, *rows])
+        files[f"tables/{table.name}.csv"] = stream.getvalue().encode()
         files[f"tables/{table.name}.json"] = to_json(table.to_dict()).encode()
     styles = choose_styles(content.figures)
     for figure in content.figures:
@@ -180,13 +173,3 @@ def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
     style.add_legend(canvas, handles)
     canvas.suptitle(figure.title, fontsize=style.TITLE)
     return canvas
-
-
-def _write_csv(table: Table) -> str:
-    """Return a table as CSV with a header; numbers in full, and no cell where one is not finite."""
-    stream = StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(table.columns)
-    rows = serialization.to_json(table.rows)
-    writer.writerows(["" if cell is None else cell for cell in row] for row in rows)
-    return stream.getvalue()

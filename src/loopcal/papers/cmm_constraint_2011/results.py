@@ -324,7 +324,13 @@ def _judge_table_3(results: Results) -> tuple[Verdict, ...]:
     from scipy.stats import beta
 
     draws, cells = results.draws, results.cells
-    shares = [_list_shares(draw) for draw in draws]
+    shares, place = [], steps.MEASURES.index("parameters [mm]")
+    for draw in draws:  # by how much the parameter errors decrease with the least noise
+        quiet = draw.cells["1", "0.0001"]
+        left = (quiet.errors[LS] / quiet.errors[BEFORE])[quiet.converged[LS], place]
+        mean = 100.0 * (1.0 - left.mean()) if len(left) else np.nan
+        reached = int((left <= 0.25).sum())
+        shares.append({"mean": mean, "reached": reached, "count": len(left)})
     better = [_compare_with_before(draw) for draw in draws]
     ranks = [
         {m: steps.compute_rank_correlation(draw.cells.values(), m) for m in METHODS}
@@ -346,14 +352,6 @@ def _judge_table_3(results: Results) -> tuple[Verdict, ...]:
             aligned=cell.compute_reduction(LS, POSITION_ALIGNED),
         ),
     )  # fmt: skip
-
-
-def _list_shares(draw: Draw) -> dict[str, Any]:
-    """Return by how much the norm of the parameter errors decreases with the least noise."""
-    quiet, place = draw.cells["1", "0.0001"], steps.MEASURES.index("parameters [mm]")
-    left = (quiet.errors[LS] / quiet.errors[BEFORE])[quiet.converged[LS], place]
-    mean = 100.0 * (1.0 - left.mean()) if len(left) else np.nan
-    return {"mean": mean, "reached": int((left <= 0.25).sum()), "count": len(left)}
 
 
 def _list_medians(draw: Draw) -> dict[tuple[str, str], list[float]]:
@@ -397,9 +395,11 @@ def _judge_points(results: Results) -> tuple[Verdict, ...]:
     one_plane, five_planes = fifties = results.draws[0].fifties
     places = {"ls": (ABSOLUTE, LS), "nominal": (AT_NOMINAL, LS), "aligned": (ALIGNED, LS),
               "prior": (ALIGNED, PRIOR)}  # fmt: skip
-    changes = {
-        name: [_format_change(fifty, *place) for fifty in fifties] for name, place in places.items()
-    }
+    changes = {name: [] for name in places}
+    for name, (frame, method) in places.items():
+        for fifty in fifties:
+            before, after = (fifty.compute_median(m, frame)[0] for m in (BEFORE, method))
+            changes[name].append(f"{before:.2g} to {after:.2g} mm")
     falls = [
         bool((fifty.compute_factors(method, frame) > 1.0).all())
         for fifty in fifties for frame in steps.FRAMES for method in METHODS
@@ -425,12 +425,6 @@ def _judge_points(results: Results) -> tuple[Verdict, ...]:
     )  # fmt: skip
 
 
-def _format_change(fifty: steps.FiftyPoints, frame: str, method: str) -> str:
-    """Return the mean position error before and after, as text."""
-    before, after = (fifty.compute_median(m, frame)[0] for m in (BEFORE, method))
-    return f"{before:.2g} to {after:.2g} mm"
-
-
 def _judge_arithmetic(results: Results) -> tuple[Verdict, ...]:
     """Judge the factors of Table 4, and those of root mean squares: rms^2 = mean^2 + sd^2."""
     table, possible = results.table_4, {}
@@ -449,8 +443,25 @@ def _judge_arithmetic(results: Results) -> tuple[Verdict, ...]:
 
 def _judge_methods(results: Results) -> tuple[Verdict, Verdict]:
     """Judge the prior, and the weights of the rows."""
-    priors = [_compare_prior(draw) for draw in results.draws]
-    weights = [_compare_weights(draw) for draw in results.draws]
+    priors, weights = [], []
+    for draw in results.draws:
+        medians = _list_medians(draw)
+        priors.append(
+            {
+                "better": sum(prior <= (1.0 + SURE) * ls for _, ls, prior in medians.values()),
+                "harmed": sum(not prior <= before for before, _, prior in medians.values()),
+                "medians": medians["0.01", "0.1"],
+            }
+        )
+        position = {n: c.compute_median(LS, POSITION_ALIGNED) for n, c in draw.weights.items()}
+        weights.append(
+            {
+                "position": position,
+                "limit": (1.0 + SURE) * position["full"],
+                "less": {n: 100.0 * (1.0 - position["full"] / p) for n, p in position.items()},
+                "nearer": 100.0 * (1.0 - position["distance"] / position["printed"]),
+            }
+        )
     parameters = {n: c.compute_median(PRIOR, NO_GAUGE) for n, c in results.draws[0].weights.items()}
     less, hardest = [w["less"]["printed"] for w in weights], results.cells["0.01", "0.1"]
     return (
@@ -463,25 +474,6 @@ def _judge_methods(results: Results) -> tuple[Verdict, Verdict]:
             highest=max(less), **weights[0],
         ),
     )  # fmt: skip
-
-
-def _compare_prior(draw: Draw) -> dict[str, Any]:
-    """Return in how many cells MAP is not worse than least squares, and worse than before."""
-    medians = _list_medians(draw)
-    better = [prior <= (1.0 + SURE) * ls for _, ls, prior in medians.values()]
-    harmed = [not prior <= before for before, _, prior in medians.values()]
-    return {"better": sum(better), "harmed": sum(harmed), "medians": medians["0.01", "0.1"]}
-
-
-def _compare_weights(draw: Draw) -> dict[str, Any]:
-    """Return the position errors of least squares with each weighting of the rows."""
-    position = {n: c.compute_median(LS, POSITION_ALIGNED) for n, c in draw.weights.items()}
-    return {
-        "position": position,
-        "limit": (1.0 + SURE) * position["full"],
-        "less": {name: 100.0 * (1.0 - position["full"] / p) for name, p in position.items()},
-        "nearer": 100.0 * (1.0 - position["distance"] / position["printed"]),
-    }
 
 
 def _judge_forms(results: Results) -> tuple[Verdict, Verdict]:

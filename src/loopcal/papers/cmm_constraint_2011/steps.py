@@ -511,9 +511,7 @@ def evaluate_arrangement(name: str, study: Study, seed: int, trials: int) -> Arr
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """One draw of points, machines and noise. A statement that holds in some draws only is labelled
-    so.
-    """
+    """One draw of points, machines and noise."""
 
     ten: Arrangement  # the ten planes
     cells: Mapping[tuple[str, str], Cell]  # Table 3, by (set, noise) as printed
@@ -651,16 +649,12 @@ class FormRow:
 
 
 def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
-    """Return points on planes and lines as measurements.
+    """Return points on planes and lines with readings (n, a) [SI] as measurements; sigma : of a
+    held coordinate [m].
 
     Kinds `plane` and `line` that name the same surface share the unknowns of that name (direction,
     height, shifts), so that the line is perpendicular to the plane by construction. Measured gaps
     are zero: the coordinates were held.
-
-    Parameters
-    ----------
-    layout : lines along any axes of the base. q : (n, a) readings [SI]. sigma : of a held
-        coordinate [m].
     """
     number = np.arange(layout.points).reshape(layout.groups, -1)
     axis = np.abs(layout.levers[0]).argmax(axis=1)

@@ -75,6 +75,10 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
     levels = steps.sweep_noise(setup, used, threshold, seed, trials)
     progress("methods and numbers of poses")
     residuals = PRINTED.table("table_6", "after").values / TO_PRINTED
+    residual = PRINTED.table("table_6", "after").values * steps.TO_SI
+    parameters = PRINTED.table("table_5", "after").values * 1e-3
+    parts = (residual[:, :3] / MM, residual[:, 3:], parameters)
+    rms = [steps.compute_rms(part) for part in parts]
     return Results(
         setup=setup,
         runs=runs,
@@ -85,7 +89,7 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
         outliers=outliers,
         rounding=rounding,
         comparisons={c.name: c for c in compare_tables(setup, runs["exact"], runs["presumed"])},
-        sizes=steps.compute_published_sizes(),
+        sizes=np.array([*rms, steps.integrate_errors(residual[None])[0]]),
         explained=steps.compute_explained_share(setup, residuals),
         noise=steps.recover_noise(setup),
     )

@@ -215,10 +215,8 @@ class Iterations:
 def draw_measured_poses(
     setup: Setup, noise: FloatArray | None = None, seed: int = 0, trial: int = 0
 ) -> FloatArray:
-    """Return the true poses (n, 6) with noise uniform in +-`noise` (6,) [m, rad]: step 3.
-
-    Without noise they are exact. The drawn numbers are those of `simulate_trials` for the same
-    seed and trial.
+    """Return the true poses (n, 6) with noise uniform in +-`noise` (6,) [m, rad]: step 3. The drawn
+    numbers are those of `simulate_trials` for the same seed and trial.
     """
     if noise is None:
         return setup.actual
@@ -229,18 +227,10 @@ def draw_measured_poses(
 def iterate(
     setup: Setup, measured: FloatArray, limit: int = 4, is_renewed: bool = True
 ) -> Iterations:
-    """Run steps 4 to 10 for a fixed number of iterations, beyond the paper's stopping rule too.
+    """Run steps 4 to 10 on measured poses (n, 6) [m, rad], `limit` times, beyond the paper's rule.
 
-    Parameters
-    ----------
-    measured : (n, 6) [m, rad]. limit : number of iterations.
     is_renewed : whether the matrix is computed anew at every corrected machine. The paper does not
-        say. False keeps the matrix of the nominal machine throughout.
-
-    Raises
-    ------
-    EstimationError
-        A corrected machine cannot reach a pose.
+    say. False keeps the matrix of the nominal machine throughout.
     """
     data = to_measurements(setup, measured)
     nominal = LegForm.at(setup.robot, setup.commanded)
@@ -300,14 +290,6 @@ class MethodResult:
     wide: float
 
 
-def compute_published_sizes() -> FloatArray:
-    """Return the four sizes of `Level` of Tables 5 and 6 as printed."""
-    residual = PRINTED.table("table_6", "after").values * TO_SI
-    parameters = compute_rms(PRINTED.table("table_5", "after").values * 1e-3)
-    rms = (compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:]))
-    return np.array([*rms, parameters, integrate_errors(residual[None])[0]])
-
-
 def calibrate_methods(
     study: Study, limits: tuple[float, float], methods: Sequence[str]
 ) -> Iterator[CalibratedCell]:
@@ -326,11 +308,18 @@ def sweep_noise(
     setup: Setup, iterations: int, threshold: float, seed: int, trials: int
 ) -> dict[tuple[float, float], Level]:
     """Repeat the ten steps at every level of noise; sizes are those after `iterations`."""
-    levels, study = {}, load_study(seed, trials)
+    levels, study, commanded = {}, load_study(seed, trials), setup.commanded
     for limits in LEVELS:
         integrated, sizes = [], np.zeros((trials, 4))
         for i, cell in enumerate(calibrate_methods(study, limits, PER_LEG)):
-            residual = compute_residuals(setup, cell)
+            T = forward_trials(setup.robot, cell.values, commanded.q[None], commanded.state).T
+            measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
+            residual = np.stack(
+                [
+                    subtract_poses(poses, to_coordinates(reached))
+                    for poses, reached in zip(measured, T, strict=True)
+                ]
+            )
             integrated.append([integrate_errors(of_trial[None])[0] for of_trial in residual])
             if i + 1 == iterations:
                 by_dimension = residual[..., :3] / MM, residual[..., 3:]
@@ -343,15 +332,6 @@ def sweep_noise(
     return levels
 
 
-def compute_residuals(setup: Setup, cell: CalibratedCell) -> FloatArray:
-    """Return measured minus corrected poses (t, n, 6) [m, rad]; NaN without an estimate."""
-    commanded = setup.commanded
-    T = forward_trials(setup.robot, cell.values, commanded.q[None], commanded.state).T
-    measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
-    pairs = zip(measured, T, strict=True)
-    return np.stack([subtract_poses(poses, to_coordinates(reached)) for poses, reached in pairs])
-
-
 def compare_methods(setup: Setup, seed: int, trials: int) -> dict[str, MethodResult]:
     """Compare the paper's method, all legs weighted together, and MAP on the same stated noise."""
     cells = calibrate_methods(load_study(seed, trials), STATED, (PER_LEG[-1], TOGETHER, PRIOR))
@@ -360,13 +340,18 @@ def compare_methods(setup: Setup, seed: int, trials: int) -> dict[str, MethodRes
     values = {"not calibrated": setup.robot.values[None]}
     values |= {name: cell.values for name, cell in zip(names, cells, strict=True)}
     unmeasured = [setup.take(draw_poses(name, UNMEASURED, seed)) for name in RANGES]
-    return {
-        name: MethodResult(
-            compute_rms((v - setup.truth.values) / MM),
-            *(_compute_position_error(other, v) for other in unmeasured),
-        )
-        for name, v in values.items()
-    }
+    results = {}
+    for name, v in values.items():
+        errors = [compute_rms((v - setup.truth.values) / MM)]
+        for poses in (other.commanded for other in unmeasured):  # at equal readings
+            predicted, true = (
+                forward_trials(setup.robot, machine, poses.q[None], poses.state).T[..., :3, 3]
+                for machine in (v, setup.truth.values[None])
+            )
+            squares = np.sum(((predicted - true) / MM) ** 2, axis=-1)
+            errors.append(float(np.sqrt(np.mean(squares))))
+        results[name] = MethodResult(*errors)
+    return results
 
 
 def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> list[tuple[Cell, ...]]:
@@ -414,16 +399,6 @@ def compute_explained_share(setup: Setup, residuals: FloatArray) -> FloatArray:
 
 def _linearize_truth(setup: Setup) -> LegForm:
     return LegForm.at(setup.truth, forward(setup.truth, setup.commanded.q, setup.commanded))
-
-
-def _compute_position_error(setup: Setup, values: FloatArray) -> float:
-    """Return the rms distance [mm] of true and predicted positions at equal readings."""
-    commanded = setup.commanded
-    predicted, true = (
-        forward_trials(setup.robot, v, commanded.q[None], commanded.state).T[..., :3, 3]
-        for v in (values, setup.truth.values[None])
-    )
-    return float(np.sqrt(np.mean(np.sum(((predicted - true) / MM) ** 2, axis=-1))))
 
 
 # --- the origin of Table 4 ----------------------------------------------------------------------

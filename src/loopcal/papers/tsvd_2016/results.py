@@ -117,15 +117,6 @@ def show_number(value: float) -> Cell:
     return float(value) if abs(value) > ROUNDING else 0.0
 
 
-def write_file_name(name: str) -> str:
-    """Return the name of a manipulator in file names."""
-    return name.lower().replace("-", "_")
-
-
-def _name_file(study: steps.Study | Situation) -> str:
-    return f"{write_file_name(study.name)}_{study.freedoms}"
-
-
 def _compare_counts(results: Results) -> Comparison:
     """Return the numbers that the text states, beside the computed ranks."""
     tripod = results.cases["3-PRS", 6]
@@ -140,9 +131,13 @@ def make_tables(results: Results) -> tuple[Table, ...]:
     """Return all tables: the analogues of Tables 1 to 8, and the figures as numbers."""
     cases, draws = results.cases.values(), results.draws
     ridge = [(n, lam, *map(show_number, errors[:2])) for n, lam, errors in results.ridge_steps]
+    noise, limits = results.noise.values, np.array([*steps.LIMITS[:3] * 1e3, *steps.LIMITS[3:]])
+    largest, rms = np.abs(noise).max(axis=0), np.sqrt(np.mean(noise**2, axis=0))
     return (
         TEXT.table("given", [row for name in steps.ROBOTS for row in _list_machine(name)]),
-        _list_noise(results.noise),
+        TEXT.table(
+            "noise", zip(NOISE_COLUMNS, largest, limits, rms, limits / np.sqrt(3.0), strict=True)
+        ),
         _list_ranks(cases),
         *(_list_outputs(name, results) for name in steps.ROBOTS),
         *map(make_medians, draws),
@@ -165,13 +160,6 @@ def _list_machine(name: str) -> list[tuple[str, str, str]]:
     heights = ", ".join(f"{1e3 * z:g}" for z in steps.HEIGHTS)
     z = f" at z {heights} mm" if "z" in robot.controlled else ""
     return [*rows, (name, "output range", f"96 poses, tilts of {tilts} deg{z}")]
-
-
-def _list_noise(noise: Printed) -> Table:
-    limits = np.array([*steps.LIMITS[:3] * 1e3, *steps.LIMITS[3:]])
-    largest, rms = np.abs(noise.values).max(axis=0), np.sqrt(np.mean(noise.values**2, axis=0))
-    columns = (NOISE_COLUMNS, largest, limits, rms, limits / np.sqrt(3.0))
-    return TEXT.table("noise", zip(*columns, strict=True))
 
 
 def _list_ranks(cases: Iterable[Case]) -> Table:
@@ -236,7 +224,7 @@ def _list_curves(case: Case) -> Table:
             errors = map(show_number, sweep.errors[i, :3])
             rows.append((algorithm, setting, spacing, *errors, sweep.runs.count[i]))
     low, high = case.bracket
-    name = f"curves_{_name_file(case.study)}"
+    name = f"curves_{case.study.file}"
     return TEXT.table("curves", rows, name, case=case.study.label, low=low, high=high)
 
 
@@ -249,7 +237,7 @@ def _list_history(case: Case) -> Table:
     ]
     labels = zip(robot.parameters.names, list_units(robot), strict=True)
     more = [(f"{parameter} [{unit}]", ".3g") for parameter, unit in labels]
-    name = f"history_{_name_file(case.study)}"
+    name = f"history_{case.study.file}"
     return TEXT.table("history", rows, name, more, case=case.study.label)
 
 
@@ -267,7 +255,7 @@ def make_medians(draws: Draws) -> Table:
             after = [show_number(x) for x in np.median(draws.commanded[method], axis=0)]
         lost = np.isinf(draws.errors[method][:, 0]).sum()
         rows.append((method, *cells, *after, show_number(middle[3]), lost))
-    name = f"draws_{write_file_name(draws.name)}"
+    name = f"draws_{steps.ROBOTS[draws.name].replace('-', '_')}"
     return TEXT.table("draws", rows, name, name=draws.name, trials=len(draws))
 
 
@@ -278,7 +266,7 @@ def make_ratios(draws: Draws) -> Table:
         columns = (draws.compute_ratio(PRIOR, other), *draws.compute_ratio_interval(PRIOR, other))
         cells = (show_number(column[i]) for i in (0, 1) for column in columns)
         rows.append((f"MAP over {other}", *cells))
-    name = f"ratios_{write_file_name(draws.name)}"
+    name = f"ratios_{steps.ROBOTS[draws.name].replace('-', '_')}"
     return TEXT.table("ratios", rows, name, name=draws.name, trials=len(draws))
 
 
@@ -291,7 +279,7 @@ def make_median_curves(situation: Situation) -> Table:
             if algorithm == RE and i > 0:
                 early = [show_number(x) for x in short[i - 1]]
             rows.append((algorithm, settings[i], *map(show_number, errors), *early))
-    name = f"curves_{_name_file(situation)}_machines"
+    name = f"curves_{situation.file}_machines"
     data = {"name": situation.label, "trials": len(situation)}
     return TEXT.table("median_curves", rows, name, **data)
 
@@ -361,46 +349,36 @@ def list_units(robot: Mechanism) -> tuple[str, ...]:
 
 
 def make_figures(results: Results) -> tuple[Figure, ...]:
-    """Return all figures: the analogues of figures 6 to 11."""
-    medians = [
-        _draw_medians(draws, situation, algorithm)
-        for draws in results.draws for situation in draws.situations for algorithm in (RE, TSVD)
-    ]  # fmt: skip
-    curves = [_draw_curve(case, a) for case in results.cases.values() for a in (RE, TSVD)]
-    histories = []
+    """Return all figures: the analogues of figures 6 to 11, and medians over many machines."""
+    figures = []
+    for draws, situation in ((d, s) for d in results.draws for s in d.situations):
+        prior = draws.compute_median(PRIOR if situation.freedoms == 6 else PRIOR_FIVE)
+        for algorithm, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 has no place on its axis
+            settings, errors = situation.settings[algorithm], situation.compute_median(algorithm)
+            file = f"medians_{situation.file}_{algorithm.lower()}"
+            drawn = algorithm, settings[first:], errors[first:], prior
+            data = {"name": situation.label, "trials": len(draws)}
+            figures.append(_draw_curve("medians", file, *drawn, **data))
+    for case in results.cases.values():
+        number, prior = FIGURES[case.study.name, case.study.freedoms], case.answers[PRIOR].errors
+        for algorithm, part in ((RE, "a"), (TSVD, "b")):
+            sweep = case.sweeps[algorithm]
+            drawn = algorithm, sweep.settings, sweep.errors, prior
+            data = {"number": f"{number}({part})", "case": case.study.label,
+                    "best": case.answers[algorithm].setting,
+                    "diverged": int(sweep.runs.is_diverged.sum())}  # fmt: skip
+            figures.append(_draw_curve("curve", f"figure_{number}{part}", *drawn, **data))
     for freedoms, algorithms in ((6, (LS, RE, TSVD)), (5, (RE, TSVD))):
         case = results.cases["RU-PUS-PRS", freedoms]
-        histories += [_draw_history(case, a, unit) for a in algorithms for unit in ("mm", "rad")]
-    return (*medians, *curves, *histories, _draw_steps(results))
+        figures += [_draw_history(case, a, unit) for a in algorithms for unit in ("mm", "rad")]
+    return (*figures, _draw_steps(results))
 
 
-def _draw_curve(case: Case, algorithm: str) -> Figure:
-    """Return output errors over lambda or k."""
-    sweep, part = case.sweeps[algorithm], "a" if algorithm == RE else "b"
-    number = FIGURES[case.study.name, case.study.freedoms]
-    return TEXT.figure(
-        "curve", _make_series(sweep.settings, sweep.errors),
-        _mark_prior(case.answers[PRIOR].errors), f"figure_{number}{part}", LOG[algorithm],
-        number=f"{number}({part})", algorithm=algorithm, case=case.study.label,
-        setting=SETTING[algorithm], best=case.answers[algorithm].setting,
-        diverged=int(sweep.runs.is_diverged.sum()),
-    )  # fmt: skip
-
-
-def _draw_medians(draws: Draws, situation: Situation, algorithm: str) -> Figure:
-    """Return the same curves as medians over many machines; lambda = 0 has no place on its axis."""
-    first = 1 if algorithm == RE else 0
-    settings, curve = situation.settings[algorithm], situation.compute_median(algorithm)
-    prior = draws.compute_median(PRIOR if situation.freedoms == 6 else PRIOR_FIVE)
-    return TEXT.figure(
-        "medians", _make_series(settings[first:], curve[first:]), _mark_prior(prior),
-        f"medians_{_name_file(situation)}_{algorithm.lower()}", LOG[algorithm],
-        algorithm=algorithm, name=situation.label, setting=SETTING[algorithm], trials=len(draws),
-    )  # fmt: skip
-
-
-def _make_series(settings: FloatArray, errors: FloatArray) -> list[Series]:
-    """Return position and angle errors (s, ..) over the settings (s,).
+def _draw_curve(
+    text: str, file: str, algorithm: str, settings: FloatArray, errors: FloatArray,
+    prior: FloatArray, **data: Any,
+) -> Figure:  # fmt: skip
+    """Return position and angle errors (s, ..) over the settings (s,), and those of MAP.
 
     Settings that diverged have no error; they are a series of their own at the upper end.
     """
@@ -410,11 +388,9 @@ def _make_series(settings: FloatArray, errors: FloatArray) -> list[Series]:
     if not usable.all():
         top = float(errors[usable, :2].max(initial=0.0)) or 1.0
         lines.append(Series.of(DIVERGED, settings[~usable], [top] * int((~usable).sum())))
-    return lines
-
-
-def _mark_prior(errors: FloatArray) -> dict[str, float]:
-    return {f"MAP, {label}": float(errors[i]) for i, label in enumerate(LABELS)}
+    levels = {f"MAP, {label}": float(prior[i]) for i, label in enumerate(LABELS)}
+    data |= {"algorithm": algorithm, "setting": SETTING[algorithm]}
+    return TEXT.figure(text, lines, levels, file, LOG[algorithm], **data)
 
 
 def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
@@ -437,7 +413,7 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
         "history", lines, None, f"figure_{number}_{algorithm.lower()}_{what}", log, number=number,
         method=f"{method}, {DIVERGED}" if answer.is_diverged else method, what=what, unit=unit,
         case=case.study.label, chosen=len(chosen), count=len(names), named=len(named),
-        file=_name_file(case.study), diverged=answer.is_diverged,
+        file=case.study.file, diverged=answer.is_diverged,
     )  # fmt: skip
 
 

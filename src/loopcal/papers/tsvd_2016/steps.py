@@ -126,8 +126,25 @@ RESAMPLES = 2000
 # --- machines and measurements ------------------------------------------------------------------
 
 
+class Labelled:
+    """Base of what belongs to one structure, measured in 6 or 5 coordinates of a pose."""
+
+    name: str
+    freedoms: int
+
+    @property
+    def label(self) -> str:
+        """Structure and measurement."""
+        return f"{self.name}, {self.freedoms}-DOF"
+
+    @property
+    def file(self) -> str:
+        """The same in names of files."""
+        return f"{ROBOTS[self.name].replace('-', '_')}_{self.freedoms}"
+
+
 @dataclass(frozen=True, eq=False)
-class Study:
+class Study(Labelled):
     """t machines of one structure, measured."""
 
     name: str  # of the structure in the paper
@@ -145,11 +162,6 @@ class Study:
     def freedoms(self) -> int:
         """Measured coordinates of a pose, 6 or 5."""
         return len(self.kind.components)
-
-    @property
-    def label(self) -> str:
-        """Structure and measurement."""
-        return f"{self.name}, {self.freedoms}-DOF"
 
     @cached_property
     def five(self) -> Study:
@@ -189,17 +201,11 @@ class Study:
     def compute_output_errors(
         self, values: FloatArray, machine: IntArray | None = None
     ) -> FloatArray:
-        """Return errors of poses over the output range, at equal readings, and of parameters.
+        """Return errors (a, 5) of poses over the output range, at equal readings, and of
+        parameters, see MEASURES. psi counts in none: the paper considers it unnecessary.
 
-        Parameters
-        ----------
         values : (a, p) identified [SI]; NaN rows give NaN. machine : (a,) of which machine;
-            default: one row each.
-
-        Returns
-        -------
-        errors : (a, 5), see MEASURES. psi counts in none of them: the paper considers it
-            unnecessary.
+        default: one row each.
         """
         is_finite = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
@@ -214,13 +220,11 @@ class Study:
     def compute_commanded_errors(
         self, values: FloatArray, machine: IntArray | None = None
     ) -> FloatArray:
-        """Return the first two errors (a, 2) of the true machines, commanded to the output range
-        with identified values.
+        """Return the first two errors (a, 2) of the true machines, relative to the pose of the
+        machine as designed, at the readings with which the identified machine would reach it;
+        parameters as for `compute_output_errors`.
 
-        The readings come from the inverse kinematics of the identified machine; the true machine
-        takes its pose at them; the error is relative to the pose of the machine as designed.
-        Coordinates without an actuator keep their errors, even with the true values. Parameters as
-        for `compute_output_errors`.
+        Coordinates without an actuator keep their errors, even with the true values.
         """
         is_finite = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
@@ -329,11 +333,8 @@ def iterate(
     study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT,
     ahead: float = AHEAD,
 ) -> Iterations:  # fmt: skip
-    """Run steps 5 to 9.
+    """Run steps 5 to 9 with the penalty (t | 1, p) of each setting, see `take_steps`.
 
-    Parameters
-    ----------
-    penalty : (t | 1, p) of each setting, see `take_steps`.
     machine : (t,) which machine was measured; default: the first. limit, ahead : see `StepRule`.
     """
     machine = np.zeros(len(penalty), dtype=np.int64) if machine is None else machine
@@ -427,6 +428,7 @@ def solve_case(measured: Study, progress: Callable[[str], None]) -> Case:
     truncated = run(penalize_truncated(ks, p), ks.astype(np.float64), first=1)
     plain = run(penalize_none(p), np.zeros(1))
     ranked = run(penalize_truncated(np.array([rank]), p), np.zeros(1))
+    safe = TRIED[~iterate(measured, penalize_ridge(TRIED, p), limit=3).is_diverged]
     return Case(
         study=measured,
         singular_values=s,
@@ -441,7 +443,7 @@ def solve_case(measured: Study, progress: Callable[[str], None]) -> Case:
             TSVD: answer(truncated, f"k = {ks[truncated.best]}"),
             **run_library(measured),
         },
-        bracket=find_bracket(measured),
+        bracket=(float(safe.min()), float(safe.max())),
         normal_equations=solve_normal_equations(measured),
     )
 
@@ -452,13 +454,6 @@ def space_lambdas(smallest: float) -> tuple[FloatArray, BoolArray]:
     ratios = np.geomspace(smallest, 1.0, EQUAL_RATIOS)
     lambdas = np.unique(np.concatenate([intervals, ratios[1:-1]]))
     return lambdas, np.isin(lambdas, intervals)
-
-
-def find_bracket(measured: Study) -> tuple[float, float]:
-    """Return the smallest and largest lambda of TRIED that does not diverge in three iterations."""
-    run = iterate(measured, penalize_ridge(TRIED, len(measured.robot.parameters)), limit=3)
-    safe = TRIED[~run.is_diverged]
-    return float(safe.min()), float(safe.max())
 
 
 def solve_normal_equations(measured: Study) -> float:
@@ -523,7 +518,7 @@ class Chosen:
 
 
 @dataclass(frozen=True, eq=False)
-class Situation:
+class Situation(Labelled):
     """One structure, t drawn machines, and the paper's methods."""
 
     name: str  # of the structure
@@ -540,11 +535,6 @@ class Situation:
 
     def __len__(self) -> int:
         return len(self.exact)
-
-    @property
-    def label(self) -> str:
-        """Structure and measurement."""
-        return f"{self.name}, {self.freedoms}-DOF"
 
     def compute_median(self, algorithm: str) -> FloatArray:
         """Return the median curve (s, 5)."""
@@ -716,7 +706,13 @@ def draw_machines(
             values[method] = lc.identify_trials(study.robot, study.trials, how).values
     errors = {m: whole.compute_output_errors(v) for m, v in values.items()}
     commanded = {m: whole.compute_commanded_errors(v) for m, v in values.items()}
-    errors[HINDSIGHT] = _run_in_hindsight(whole)
+    start, tried = None, []
+    for lam in HINDSIGHT_LAMBDAS:  # each machine and measure takes the best one
+        options = lc.FitOptions(start=start)
+        fit = lc.identify_trials(whole.robot, whole.trials, lc.Ridge(float(lam)), options=options)
+        start = fit.values
+        tried.append(whole.compute_output_errors(fit.values))
+    errors[HINDSIGHT] = np.min(tried, axis=0)
     for method, algorithm, situation in (
         (RAW_LS, LS, six),
         (RAW_RE, RE, six),
@@ -731,16 +727,3 @@ def draw_machines(
         {m: mark_diverged(of[m]) for m in METHODS if m in of} for of in (errors, commanded)
     )
     return Draws(name, six, five, errors, commanded)
-
-
-def _run_in_hindsight(measured: Study) -> FloatArray:
-    """Return the least error of each machine and measure over HINDSIGHT_LAMBDAS."""
-    start, tried = None, []
-    for lam in HINDSIGHT_LAMBDAS:
-        options = lc.FitOptions(start=start)
-        fit = lc.identify_trials(
-            measured.robot, measured.trials, lc.Ridge(float(lam)), options=options
-        )
-        start = fit.values
-        tried.append(measured.compute_output_errors(fit.values))
-    return np.min(tried, axis=0)
