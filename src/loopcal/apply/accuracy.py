@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,16 +62,13 @@ from loopcal.results.description import Field, fields, label_axes, within
 from loopcal.results.result import DrawnResult, TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 
-if TYPE_CHECKING:
-    from loopcal.results.tables import Block
-
 # Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
 # table G.2).
 COMPONENT_LEVEL = 0.954499736103642
 LEVEL = 0.95  # share of the errors below the expanded uncertainty of a length or an angle
-
 COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
 BLOCK = 1024  # poses whose sensitivities are in memory at once
+BATCH = 250  # trials that are identified at once; progress is reported between them
 
 Axes = Literal["base", "platform"]
 Point = Literal["tool", "platform"]
@@ -124,7 +121,6 @@ class PoseUncertainty(TableResult):
         return str(self.reference)
 
     def __repr__(self) -> str:
-        """Return the largest uncertainties and the frame."""
         position, angle = (
             float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
             for values in (self.position, self.orientation)
@@ -141,8 +137,8 @@ class PoseUncertainty(TableResult):
 
     @property
     def coverage_factor(self) -> FloatArray:
-        """(n, 6) factor k of each component: 2 where the noise is known, else that of Student's t
-        for the same coverage of 95.45 %.
+        """(n, 6) factor k of each component for a coverage of 95.45 %: 2 where the noise is known,
+        else that of Student's t.
         """
         return coverage_factor(self.degrees.components, COMPONENT_LEVEL)
 
@@ -219,13 +215,13 @@ def pose_uncertainty(
     for first in range(0, len(solution.q), BLOCK):
         rows = np.arange(first, min(first + BLOCK, len(solution.q)))
         H = transport(robot, solution.T[rows], axes, point)
-        blocks.append(_covariance(posterior, solution.take(rows), chosen, H))
+        blocks.append(_compute_covariance(posterior, solution.take(rows), chosen, H))
     T = np.where(solution.converged[:, None, None], solution.T, np.nan)
     covariance, *degrees = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
     return PoseUncertainty(T, covariance, chosen.describe(point, axes), PoseDegrees(*degrees))
 
 
-def _covariance(
+def _compute_covariance(
     posterior: Posterior, solution: Solution, frame: ErrorFrame, H: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the covariance (n, 6, 6) of poses, and its degrees of freedom as `PoseDegrees`.
@@ -239,10 +235,10 @@ def _covariance(
     size = np.linalg.norm(D[..., :p] * twist_weights(robot)[:, None], axis=(1, 2))
     D, by_discrepancy = np.split(H @ frame.relate(D, solution.T), [p], axis=2)
     of_frame = H @ frame.own_errors(solution.T)
-    rest = [of_frame, by_discrepancy]
-    slow = posterior.discrepancy
-    if slow is not None:
+    rest, squares = [of_frame, by_discrepancy], []
+    if (slow := posterior.discrepancy) is not None:
         rest.append(H @ slow.errors.rest(solution.T))
+        squares += slow.split_squares(by_discrepancy)
         posterior = posterior.without_discrepancy
     if robot.stated_sigma.any():
         rest.append(H @ (S.readings[0] * robot.stated_sigma))
@@ -255,9 +251,20 @@ def _covariance(
         tuple(part[None] for part in rest),
     )[0]
     covariance[~solution.converged] = np.nan
-    squares = [] if slow is None else slow.split_squares(by_discrepancy)
-    degrees = _count_degrees(posterior, covariance, D, of_frame, squares)
-    return covariance, degrees.components, degrees.position, degrees.orientation
+    # variances (n, 6) and degrees of freedom of the parts
+    for part in posterior.parts:
+        square = ((D @ (part.root / posterior.unit[:, None])) ** 2).sum(axis=2)
+        if part.source == NOISE:  # errors of the frame itself count as noise
+            square += (of_frame**2).sum(axis=2)
+        squares.append((square, part.degrees))
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    position, orientation = (
+        combine_degrees(
+            variance[:, chosen].sum(axis=1), [(s[:, chosen].sum(axis=1), nu) for s, nu in squares]
+        )
+        for chosen in (slice(3, 6), slice(0, 3))
+    )
+    return covariance, combine_degrees(variance, squares), position, orientation
 
 
 def combine_errors(
@@ -293,38 +300,6 @@ def combine_errors(
     return covariance
 
 
-def _count_degrees(
-    posterior: Posterior,
-    covariance: FloatArray,
-    D: FloatArray,
-    of_frame: FloatArray,
-    others: list[tuple[FloatArray, float]],
-) -> PoseDegrees:
-    """Return the effective degrees of freedom of poses.
-
-    covariance : (n, 6, 6). D : (n, 6, p) errors by the parameters in their units.
-    of_frame : (n, 6, k) errors by those of the frame itself, which count as noise.
-    others : variances (n, 6) and degrees of freedom of other parts that were estimated.
-    """
-    squares = list(others)
-    for part in posterior.parts:
-        square = ((D @ (part.root / posterior.unit[:, None])) ** 2).sum(axis=2)
-        if part.source == NOISE:
-            square += (of_frame**2).sum(axis=2)
-        squares.append((square, part.degrees))
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    return PoseDegrees(
-        combine_degrees(variance, squares),
-        *(
-            combine_degrees(
-                variance[:, chosen].sum(axis=1),
-                [(s[:, chosen].sum(axis=1), nu) for s, nu in squares],
-            )
-            for chosen in (slice(3, 6), slice(0, 3))
-        ),
-    )
-
-
 def expand_length(covariance: FloatArray, left: FloatArray) -> FloatArray:
     """Return lengths (n,) that a vector of covariance (n, 3, 3) exceeds in 5 % of cases.
 
@@ -350,9 +325,6 @@ def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> Floa
     R = T[:, :3, :3]
     arm = R @ robot.tool[:3, 3] if point == "tool" else np.zeros((len(T), 3))
     return geometry.transport_matrix(arm, R.swapaxes(1, 2) if axes == "platform" else None)
-
-
-# Uncertainty of poses over the workspace, compared with that of the measured poses.
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,23 +378,20 @@ class AccuracyMap(DrawnResult):
         return (self.position_ratio > 1.0) | (self.orientation_ratio > 1.0)
 
     def __str__(self) -> str:
-        """Return medians and maxima, and how many poses are extrapolated."""
         n = len(self.coordinates)
         lines = [f"Pose uncertainty (rms) at {n} poses: {self.uncertainty.frame}"]
-        for name, factor, symbol in (("position", 1e3, "mm"), ("orientation", 1e3, "mrad")):
-            values, measured = (
-                factor * getattr(u, name) for u in (self.uncertainty, self.measured)
-            )
+        for name, symbol in (("position", "mm"), ("orientation", "mrad")):
+            values, measured = (1e3 * getattr(u, name) for u in (self.uncertainty, self.measured))
             ratio = getattr(self, f"{name}_ratio")
             lines.append(
                 f"{name:<12} median {np.nanmedian(values):.3g} {symbol}, largest "
                 f"{np.nanmax(values):.3g} {symbol}; largest at measured poses "
                 f"{np.nanmax(measured):.3g} {symbol} (ratio up to {np.nanmax(ratio):.3g})"
             )
-        lines.append(
-            f"{int(self.extrapolated.sum())} of {n} poses are less certain than every measured pose"
+        count = int(self.extrapolated.sum())
+        return "\n".join(
+            [*lines, f"{count} of {n} poses are less certain than every measured pose"]
         )
-        return "\n".join(lines)
 
     __repr__ = __str__
 
@@ -471,11 +440,6 @@ def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
         return np.where(values == largest, 1.0, values / largest)
 
 
-# Check the linear prediction of pose errors by many simulated calibrations.
-
-BATCH = 250  # trials that are identified at once; progress is reported between them
-
-
 @dataclass(frozen=True, eq=False)
 class AccuracySimulation(TableResult):
     """Predicted and observed errors of n poses.
@@ -499,10 +463,10 @@ class AccuracySimulation(TableResult):
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=COMPONENTS)
 
-    def page(self) -> list[Block]:
-        """Return predicted and observed errors."""
-        counts = f"{self.trials} trials, {self.failed} did not converge"
-        return [f"{counts}; {self.predicted.frame}", self.main_table()]
+    def __str__(self) -> str:
+        return f"{self.trials} trials, {self.failed} did not converge; {self.predicted.frame}"
+
+    __repr__ = __str__
 
     @property
     def ratio(self) -> FloatArray:
@@ -543,7 +507,15 @@ def simulate_accuracy(
     posterior, squares, converged = None, np.zeros((len(compared.q), 6)), 0
     for first in range(0, trials, BATCH):
         progress(first, trials, "calibrating simulated machines")
-        batch = _take_trials(measured, slice(first, first + BATCH))
+        chosen = slice(first, first + BATCH)
+        batch = replace(
+            measured,
+            measured=tuple(values[chosen] for values in measured.measured),
+            truth=truth[chosen],
+            T=measured.T[chosen],
+            reached=measured.reached[chosen],
+            recorded=None if measured.recorded is None else measured.recorded[chosen],
+        )
         fits = identify_trials(robot, batch, method)
         valid, errors = _compare_with_truth(fits, batch, compared.q, compared.state)
         if posterior is None and valid.any():
@@ -563,18 +535,6 @@ def simulate_accuracy(
     predicted = pose_uncertainty(posterior, forward(posterior.robot, compared.q), point="platform")
     observed = np.sqrt(squares / converged)
     return AccuracySimulation(predicted, observed, converged, trials - converged)
-
-
-def _take_trials(trials: Trials, chosen: slice) -> Trials:
-    """Return some of the trials."""
-    return replace(
-        trials,
-        measured=tuple(values[chosen] for values in trials.measured),
-        truth=trials.truth[chosen],
-        T=trials.T[chosen],
-        reached=trials.reached[chosen],
-        recorded=None if trials.recorded is None else trials.recorded[chosen],
-    )
 
 
 def _compare_with_truth(

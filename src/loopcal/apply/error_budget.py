@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -49,25 +49,23 @@ from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-if TYPE_CHECKING:
-    pass
-
-
-# Split the covariance of a fit by the sources of its errors, and compute it for other sigmas.
-
-INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
 # Kinds of sources; others are the codes of the findings with which a covariance was added.
+INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
 EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
-
-
+# Kinds of sources whose errors the fit weighs against each other.
+OF_ROWS = (INSTRUMENT, READINGS, SETUP, TOLERANCES, EARLIER)
+PRIOR = "prior."  # begins codes of findings on the tolerances, whose errors count as theirs
+POSES, SEED = 200, 0  # number and seed of the poses that are drawn from the workspace
+NEGLIGIBLE = 0.01  # share of an expected error below which the sentence leaves out a source
+LENGTHS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
 SOURCE_WORDS = {
-    "instrument": "instrument: {name}",
-    "readings": "actuator readings",
-    "setup": "setup parameters",
-    "tolerances": "tolerances",
-    "earlier calibration": "earlier calibration",
-    "repeatability": "repeatability in use",
-    "residuals.model-discrepancy": "model discrepancy: {name}",
+    INSTRUMENT: "instrument: {name}",
+    READINGS: "actuator readings",
+    SETUP: "setup parameters",
+    TOLERANCES: "tolerances",
+    EARLIER: "earlier calibration",
+    REPEATABILITY: "repeatability in use",
+    DISCREPANCY: "model discrepancy: {name}",
     "residuals.correlated": "correlated errors",
     "residuals.drift": "drift",
     "residuals.trend": "trend",
@@ -76,7 +74,9 @@ SOURCE_WORDS = {
     "residuals.depend-on-reading": "dependence on a reading",
     "prior.inflation": "factor on the tolerances",
 }
-"""Kind of a source -> words; others are codes of findings that added a covariance."""
+
+
+# Split the covariance of a fit by the sources of its errors, and compute it for other sigmas.
 
 
 class Source(NamedTuple):
@@ -95,8 +95,7 @@ class Source(NamedTuple):
     @property
     def words(self) -> str:
         """What people read."""
-        template = SOURCE_WORDS.get(self.kind)
-        return self.kind if template is None else template.format(name=self.name)
+        return SOURCE_WORDS.get(self.kind, self.kind).format(name=self.name)
 
 
 class CovarianceSplit(NamedTuple):
@@ -108,20 +107,6 @@ class CovarianceSplit(NamedTuple):
     undetermined: BoolArray
 
 
-class _Penalty(NamedTuple):
-    """What a fit assumes of its p coordinates y: to_z (p, p) takes them to deviations in
-    tolerances, `penalty` (p,) their weights and `spread` (p,) the standard deviations of the
-    whitened deviations. `is_estimated` (p,) : those that follow the rows. `noise` : standard
-    deviation of the whitened rows.
-    """
-
-    to_z: FloatArray
-    is_estimated: BoolArray
-    penalty: FloatArray
-    spread: FloatArray
-    noise: float
-
-
 def split_covariance(
     fit: Identification, data: Measurements, linear: FitLinearization
 ) -> CovarianceSplit:
@@ -130,19 +115,26 @@ def split_covariance(
     fit : with intervals. data : its measurements, with the sigma of their readings, without
         excluded poses. linear : of both, see `linearize_fit`.
     """
-    assumed, evaluated = _read_penalty(fit, linear), _evaluate_noise(fit)
+    degrees = {part.source: part.degrees for part in reversed(fit.posterior.parts)}
+    of_noise, of_size = (degrees.get(source, np.inf) for source in (NOISE, TOLERANCES))
+    test = fit.residual_test
+    evaluation = "A and B" if np.isfinite(of_noise) else "B"
+    if test.noise == "estimated" or test.failed:
+        evaluation = "A"
     names, members = _number_sources(data, linear.problem)
-    sources = [Source(kind, name, *evaluated) for kind, name in names]
+    sources = [Source(kind, name, evaluation, of_noise) for kind, name in names]
     factors = list(fold_sources(linear.problem, linear.linearization, members, len(names)))
     U = factors[0].shape[1] - len(fit.names)
-    for kind, rows in _further_rows(fit, linear, U):
+    for kind, rows in _list_further_rows(fit, linear, U):
         sources.append(Source(kind, "", "B", np.inf))
         factors.append(rows)
-    own, moved = _propagate(assumed, factors, U)
-    sources.append(Source(TOLERANCES, "", *_evaluate_tolerances(fit)))
+    own, moved = _propagate(linear, factors, U)
+    evaluation_of_size = "B (assumed)" if fit.free_parameters.assumed.any() else "B"
+    evaluation_of_size = "A and B" if np.isfinite(of_size) else evaluation_of_size
+    sources.append(Source(TOLERANCES, "", evaluation_of_size, of_size))
     rest, of_setup = _separate_setup(own, moved, linear.linearization)
     if len(fit.nuisance):  # rows of stated setup parameters act by these alone
-        sources.append(Source(SETUP, "", *evaluated))
+        sources.append(Source(SETUP, "", evaluation, of_noise))
         rest.append(of_setup)
     merged: dict[Source, list[FloatArray]] = {}
     setup = next((source for source in sources if source.kind == SETUP), None)
@@ -156,30 +148,27 @@ def split_covariance(
             name = "position" if np.array_equal(part.root, of_position) else "orientation"
         key = Source(part.source, name, "A", part.degrees)
         merged.setdefault(key, []).append(part.root / fit.tolerance[:, None])
-    roots = tuple(
-        fit.tolerance[:, None] * np.concatenate(roots, axis=1) for roots in merged.values()
-    )
+    roots = tuple(fit.tolerance[:, None] * np.concatenate(each, axis=1) for each in merged.values())
     return CovarianceSplit(tuple(merged), roots, np.isinf(np.diag(fit.covariance)))
 
 
-def halve_sigma(
+def _halve_sigma(
     fit: Identification, data: Measurements, linear: FitLinearization, source: Source
 ) -> tuple[FloatArray, Linearization, Problem] | None:
     """Return a root (p, k) [SI] of the covariance without added parts if the sigma of a source of
     rows or of the tolerances were half as large, with its linearization; None for other sources.
 
     Every weight is that of the smaller sigma. Estimates stay, and so does a scale of the noise that
-    the residuals gave. The other arguments are as of `split_covariance`.
+    the residuals gave.
     """
-    assumed = _read_penalty(fit, linear)
-    changed, other = data, fit
+    changed, other, weight = data, fit, 1.0
     if source.kind == TOLERANCES:
-        assumed = assumed._replace(penalty=4.0 * assumed.penalty)
+        weight = 4.0
     elif source.kind == READINGS and data.reading_sigma is not None:
         changed = replace(data, reading_sigma=0.5 * data.reading_sigma)
     elif source.kind == INSTRUMENT:
         of_poses, of_base = (
-            tuple(_halve_interval(rows, source.name, data) for rows in observations)
+            tuple(_halve_instrument(rows, source.name, data) for rows in observations)
             for observations in (data.observations, data.base_observations)
         )
         changed = replace(data, observations=of_poses, base_observations=of_base)
@@ -195,38 +184,17 @@ def halve_sigma(
         return None
     problem, linearization = linearize_rows_of(other, changed)
     p = len(fit.names)
-    own, _ = _propagate(assumed, [linearization.factor[0, :p, :p]], 0)
+    own, _ = _propagate(linear, [linearization.factor[0, :p, :p]], 0, weight)
     return fit.tolerance[:, None] * np.concatenate(own, axis=1), linearization, problem
 
 
-def _read_penalty(fit: Identification, linear: FitLinearization) -> _Penalty:
-    """Return the assumptions of a fit; a direction that is not estimated has its tolerance."""
-    d, used = linear.decomposition, linear.is_estimated
-    to_z = d.deviation(np.eye(len(used))).T
-    penalty, spread = np.where(used, linear.penalty[0], 1.0), np.where(used, linear.spread, 1.0)
-    return _Penalty(to_z, used, penalty, spread, float(np.sqrt(linear.sources.noise)))
-
-
-def _evaluate_noise(fit: Identification) -> tuple[str, float]:
-    """Return how the noise of the rows was evaluated, and its degrees of freedom."""
-    degrees = _find_degrees(fit, NOISE)
-    test = fit.residual_test
-    if test.noise == "estimated" or test.failed:
-        return "A", degrees
-    return ("A and B" if np.isfinite(degrees) else "B"), degrees
-
-
-def _evaluate_tolerances(fit: Identification) -> tuple[str, float]:
-    """Return how the size of the deviations was evaluated, and its degrees of freedom."""
-    degrees = _find_degrees(fit, TOLERANCES)
-    if np.isfinite(degrees):
-        return "A and B", degrees
-    return ("B (assumed)" if fit.free_parameters.assumed.any() else "B"), degrees
-
-
-def _find_degrees(fit: Identification, source: str) -> float:
-    """Return the degrees of freedom of what a source contributes; infinite where it is known."""
-    return next((part.degrees for part in fit.posterior.parts if part.source == source), np.inf)
+def _halve_instrument(rows: Observations, name: str, data: Measurements) -> Observations:
+    """Return rows, those of an instrument with half their sigma."""
+    if not len(rows):
+        return rows
+    chosen = np.array([_name(rows, session, data) == name for session in rows.session.tolist()])
+    factor = np.where(chosen, 0.25, 1.0)[:, None, None]
+    return replace(rows, covariance=rows.covariance * factor)
 
 
 def _name(rows: Observations, session: str, data: Measurements) -> str:
@@ -254,18 +222,15 @@ def _number_sources(
         labels = [(INSTRUMENT, _name(rows, session, data)) for session in rows.session.tolist()]
         members.append(np.array([numbers.setdefault(label, len(numbers)) for label in labels]))
     if problem.is_uncertain:
-        label = (READINGS, "")
-        count = len(problem.rows[-1].poses)
-        members.append(np.full(count, numbers.setdefault(label, len(numbers))))
+        number = numbers.setdefault((READINGS, ""), len(numbers))
+        members.append(np.full(len(problem.rows[-1].poses), number))
     return list(numbers), members
 
 
-def _further_rows(
+def _list_further_rows(
     fit: Identification, linear: FitLinearization, U: int
 ) -> list[tuple[str, FloatArray]]:
-    """Return kind and rows (m, U + p) of the stated setup parameters, and of an earlier
-    calibration.
-    """
+    """Return rows (m, U + p) of the stated setup parameters, and of an earlier calibration."""
     rows = []
     problem, estimate = linear.problem, linear.linearization.nuisance
     if problem.nuisance is not None and estimate is not None and problem.nuisance.has_prior.any():
@@ -284,24 +249,24 @@ def _further_rows(
 
 
 def _propagate(
-    assumed: _Penalty, factors: list[FloatArray], U: int
+    linear: FitLinearization, factors: list[FloatArray], U: int, weight: float = 1.0
 ) -> tuple[list[FloatArray], list[FloatArray]]:
     """Return for each source of rows, and for the tolerances at the end, the error of the machine
     (p, k) [tolerances] and that of the setup parameters at a known machine (U, k).
 
-    With [A; P^(1/2)] = Q R, b A_k' is R^-1 Q_k'. A'A is never formed.
+    With [A; P^(1/2)] = Q R, b A_k' is R^-1 Q_k'. A'A is never formed. A direction that is not
+    estimated has its tolerance. The penalty P is that of the fit times a weight.
     """
-    own = [factor[:, U:] @ assumed.to_z * assumed.is_estimated for factor in factors]
-    penalty = np.diag(np.sqrt(assumed.penalty))
+    used, noise = linear.is_estimated, float(np.sqrt(linear.sources.noise))
+    to_z = linear.decomposition.deviation(np.eye(len(used))).T
+    penalty = np.diag(np.sqrt(weight * np.where(used, linear.penalty[0], 1.0)))
+    spread = np.where(used, linear.spread, 1.0)
+    own = [factor[:, U:] @ to_z * used for factor in factors]
     Q, R = np.linalg.qr(np.concatenate([*own, penalty]))
-    Q_blocks = np.split(Q, np.cumsum([len(rows) for rows in own]))
-    size = [assumed.noise] * len(own)
-    errors = [
-        assumed.to_z @ substitute_backward(R, s * q.T)
-        for s, q in zip(size, Q_blocks[:-1], strict=True)
-    ]
-    errors.append(assumed.to_z @ substitute_backward(R, (Q_blocks[-1] * assumed.spread[:, None]).T))
-    moved = [assumed.noise * factor[:, :U].T for factor in factors]
+    *of_rows, of_penalty = np.split(Q, np.cumsum([len(rows) for rows in own]))
+    whitened = [*(noise * q.T for q in of_rows), (of_penalty * spread[:, None]).T]
+    errors = [to_z @ substitute_backward(R, each) for each in whitened]
+    moved = [noise * factor[:, :U].T for factor in factors]
     return errors, [*moved, np.zeros((U, len(penalty)))]
 
 
@@ -326,26 +291,6 @@ def _separate_setup(
     return list(np.split(rest, ends, axis=1)), of_setup
 
 
-def _halve_interval(rows: Observations, name: str, data: Measurements) -> Observations:
-    """Return rows, those of a source with half their sigma."""
-    if not len(rows):
-        return rows
-    chosen = np.array([_name(rows, session, data) == name for session in rows.session.tolist()])
-    factor = np.where(chosen, 0.25, 1.0)[:, None, None]
-    return replace(rows, covariance=rows.covariance * factor)
-
-
-# Number of poses that are drawn from the workspace, and the seed of their draw.
-POSES, SEED = 200, 0
-NEGLIGIBLE = 0.01  # share of an expected error below which the sentence leaves out a source
-
-_LENGTHS = ("position", "orientation")
-# Kinds of sources whose errors the fit weighs against each other.
-_OF_ROWS = (INSTRUMENT, READINGS, SETUP, TOLERANCES, EARLIER)
-# Beginning of the codes of findings on the tolerances, whose errors count as theirs.
-PRIOR = "prior."
-
-
 class ErrorSources(NamedTuple):
     """Variances [m^2 or rad^2] of the length of an error, mean over poses, by kind of source.
 
@@ -367,6 +312,16 @@ class ErrorSources(NamedTuple):
         return float(np.sqrt(sum(self)))
 
 
+class HalvedErrors(NamedTuple):
+    """Root mean squares of position [m] and orientation [rad] from all sources with one sigma
+    halved, and the standard deviations (p,) of the parameters [SI].
+    """
+
+    position: float
+    orientation: float
+    parameters: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class SourceBudget:
     """What one source does, and what half its sigma would leave."""
@@ -378,16 +333,6 @@ class SourceBudget:
     parameters: FloatArray  # (p,) variances [SI]; NaN for undetermined parameters
     # root mean squares with half the sigma of this source; None where it has no sigma
     halved: HalvedErrors | None
-
-
-class HalvedErrors(NamedTuple):
-    """Root mean squares of position [m] and orientation [rad] from all sources with one sigma
-    halved, and the standard deviations (p,) of the parameters [SI].
-    """
-
-    position: float
-    orientation: float
-    parameters: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -444,7 +389,6 @@ class ErrorBudget(DrawnResult):
         return str(self.finding)
 
     def __repr__(self) -> str:
-        """Return the number of sources and the errors."""
         position, orientation = 1e3 * self.position.rms, 1e3 * self.orientation.rms
         return (
             f"<ErrorBudget: {len(self.lines)} sources; position {round_to_digits(position)} mm, "
@@ -453,41 +397,44 @@ class ErrorBudget(DrawnResult):
 
     def _list_line(self, line: SourceBudget) -> dict[str, Any]:
         """Return a source by name for JSON."""
-        halved, worst_index = line.halved, self.names.index(self.worst) if self.worst else None
-        source = line.source._asdict()
-        if not np.isfinite(line.source.degrees):
-            source["degrees"] = None
+        halved = None
+        if line.halved is not None:
+            sd = dict(zip(self.names, line.halved.parameters.tolist(), strict=True))
+            halved = {
+                "position_rms": line.halved.position,
+                "orientation_rms": line.halved.orientation,
+                "worst_parameter_sd": sd.get(self.worst),
+            }
+        degrees = line.source.degrees if np.isfinite(line.source.degrees) else None
         return {
-            **source,
+            **line.source._asdict(),
+            "degrees": degrees,
             "position": line.position,
             "orientation": line.orientation,
             "parameters": dict(zip(self.names, line.parameters.tolist(), strict=True)),
-            "halved": None
-            if halved is None
-            else {
-                "position_rms": halved.position,
-                "orientation_rms": halved.orientation,
-                "worst_parameter_sd": None
-                if worst_index is None
-                else float(halved.parameters[worst_index]),
-            },
+            "halved": halved,
         }
 
 
 def compute_error_budget(
     fit: Identification, data: Measurements, frame: str = FITTED
 ) -> ErrorBudget | None:
-    """Compute the uncertainty budget of a calibrated machine.
+    """Return the uncertainty budget of a calibrated machine; None where the fit has no intervals,
+    or where no pose is reached.
 
     frame : in which the errors of poses are stated, see `choose_error_frame`; "relative" means
         relative to the home pose.
-    Returns ErrorBudget; None where the fit has no intervals, or where no pose is reached.
     """
     check_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals):
         return None
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
-    solution, is_workspace = _choose_poses(fit, data)
+    is_workspace = True
+    try:
+        drawn = sample_workspace(fit.robot, POSES, SEED).solution
+        solution = drawn.take(np.flatnonzero(drawn.converged))
+    except MechanismError:  # the robot states no workspace
+        solution, is_workspace = locate_measured_poses(fit, data, POSES), False
     if not len(solution.q):
         return None
     effects = linearize_tool_errors(fit.posterior, solution, frame)
@@ -506,17 +453,6 @@ def compute_error_budget(
     return ErrorBudget(
         position, orientation, tuple(lines), fit.names, sd, worst, n, is_workspace, finding
     )
-
-
-def _choose_poses(fit: Identification, data: Measurements) -> tuple[Solution, bool]:
-    """Return poses from the workspace that the calibrated robot reaches, or the measured poses
-    where it states no workspace; and which of the two.
-    """
-    try:
-        solution = sample_workspace(fit.robot, POSES, SEED).solution
-    except MechanismError:
-        return locate_measured_poses(fit, data, POSES), False
-    return solution.take(np.flatnonzero(solution.converged)), True
 
 
 def _list_sources(
@@ -564,10 +500,10 @@ def _halve(
     effects: ToolErrors,
 ) -> HalvedErrors | None:
     """Return the errors from all sources with half the sigma of one."""
-    position, orientation = (sum(getattr(each, name) for each in lines) for name in _LENGTHS)
+    position, orientation = (sum(getattr(each, name) for each in lines) for name in LENGTHS)
     parameters = sum(each.parameters for each in lines)
-    if line.source.kind in _OF_ROWS:
-        halved = halve_sigma(fit, data, linear, line.source)
+    if line.source.kind in OF_ROWS:
+        halved = _halve_sigma(fit, data, linear, line.source)
         if halved is None:
             return None
         root, linearization, problem = halved
@@ -586,7 +522,7 @@ def _halve(
         D, own = effects.by_parameters / fit.posterior.unit, effects.by_frame
         own = own[..., :0] if frame == RELATIVE else own
         angle, place = compute_mean_squares(np.concatenate([D @ root, own], axis=2))
-        kept = [each for each in lines if each.source.kind not in _OF_ROWS]
+        kept = [each for each in lines if each.source.kind not in OF_ROWS]
         place += sum(each.position for each in kept)
         angle += sum(each.orientation for each in kept)
         rest = sum((each.parameters for each in kept), np.zeros(len(root)))
@@ -599,14 +535,14 @@ def _halve(
 
 def _add_kinds(lines: list[SourceBudget]) -> tuple[ErrorSources, ErrorSources]:
     """Return the variances of position and orientation by kind of source."""
-    sums = [dict.fromkeys(ErrorSources._fields, 0.0) for _ in _LENGTHS]
+    sums = {name: dict.fromkeys(ErrorSources._fields, 0.0) for name in LENGTHS}
     names = {DISCREPANCY: "discrepancy", EARLIER: "earlier"}
     for line in lines:
         kind = names.get(line.source.kind, line.source.kind)
         kind = TOLERANCES if kind.startswith(PRIOR) else kind
-        for total, name in zip(sums, _LENGTHS, strict=True):
+        for name, total in sums.items():
             total[kind if kind in total else "other"] += getattr(line, name)
-    return ErrorSources(**sums[0]), ErrorSources(**sums[1])
+    return ErrorSources(**sums["position"]), ErrorSources(**sums["orientation"])
 
 
 def _word(
@@ -618,16 +554,14 @@ def _word(
 ) -> Finding:
     """Return the errors in one sentence."""
     stated: dict[str, Any] = {}
-    dimensions = (("position", Dimension.LENGTH), ("orientation", Dimension.ANGLE))
-    for (name, dimension), sources in zip(dimensions, errors, strict=True):
+    for (name, dimension), sources in zip(LENGTHS.items(), errors, strict=True):
         size = fit.robot.size if dimension is Dimension.LENGTH else 1.0
-        rms_by_source = {key: float(np.sqrt(value)) for key, value in sources._asdict().items()}
         stated[name] = None
         if sources.rms > ROUNDING * size:
             quantities = {
-                key: fit.robot.to_quantity(value, dimension)
-                for key, value in rms_by_source.items()
-                if value > NEGLIGIBLE * sources.rms
+                key: fit.robot.to_quantity(rms, dimension)
+                for key, value in sources._asdict().items()
+                if (rms := float(np.sqrt(value))) > NEGLIGIBLE * sources.rms
             }
             stated[name] = (fit.robot.to_quantity(sources.rms, dimension), quantities)
     return report_finding(

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -22,10 +21,8 @@ from loopcal.diagnose.machine_changes import (
 from loopcal.diagnose.row_errors import Statistics, compute_statistics
 from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
 from loopcal.errors import DataError
-from loopcal.estimate.fit_linearization import FitUncertainty
 from loopcal.estimate.posterior import Posterior
 from loopcal.findings import Finding, report_finding
-from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_single_level
@@ -35,181 +32,16 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import UNITS, Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
-    pass
+    from loopcal.io.runs.run_folder import Run
 
-
-# What a comparison needs of a calibration, as `loopcal.Run` has it.
-
-
-class StoredRun(Protocol):
-    """A calibration that was read from its run folder; see `loopcal.Run`."""
-
-    @property
-    def path(self) -> Path:
-        """The run folder."""
-        ...
-
-    @property
-    def result(self) -> dict[str, Any]:
-        """Content of result.json."""
-        ...
-
-    @property
-    def robot(self) -> Mechanism:
-        """The corrected robot."""
-        ...
-
-    @property
-    def initial_robot(self) -> Mechanism:
-        """The robot before the calibration."""
-        ...
-
-    @property
-    def nuisance_values(self) -> Mapping[str, float]:
-        """Estimates of setup parameters by name [SI]."""
-        ...
-
-    @property
-    def initial_nuisance_values(self) -> Mapping[str, float]:
-        """The same before the calibration."""
-        ...
-
-    @property
-    def arrays(self) -> Mapping[str, np.ndarray]:
-        """Content of arrays.npz."""
-        ...
-
-    @property
-    def failure(self) -> Finding | None:
-        """Why its numbers are not for a machine; None where they are."""
-        ...
-
-    @property
-    def fitted_rows(self) -> FittedRows | None:
-        """The rows that it was fitted to; None where they are not known."""
-        ...
-
-    def load_posterior(self) -> Posterior:
-        """Return estimates and uncertainties."""
-        ...
-
-    def load_uncertainty(self) -> FitUncertainty | None:
-        """Return what the fit knows of machine and setup parameters together."""
-        ...
-
-
-def find_row_noise(run: StoredRun) -> dict[str, FloatArray]:
-    """Return the standard deviation of the measured values of each kind [SI], from its residuals
-    and these divided by it.
-    """
-    result = {}
-    for name, raw in run.arrays.items():
-        if not name.startswith("residual_"):
-            continue
-        whitened = run.arrays.get(name.replace("residual_", "whitened_", 1))
-        if whitened is None or whitened.shape != raw.shape or raw.ndim != 2 or not len(raw):
-            continue
-        usable = np.isfinite(raw) & np.isfinite(whitened) & (whitened != 0.0)
-        ratio = np.abs(raw) / np.where(usable, np.abs(whitened), np.inf)
-        medians = [
-            float(np.median(column[mask])) if mask.any() else 0.0
-            for column, mask in zip(ratio.T, usable.T, strict=True)
-        ]
-        result[name.split("_", 2)[2]] = np.array(medians)
-    return result
-
-
-def list_data_digests(run: StoredRun) -> tuple[str, ...]:
-    """Return the SHA-256 of the measurement files of a run."""
-    files = run.result.get("made_by", {}).get("inputs", {})
-    roles = ("data", "poses")
-    return tuple(sorted(f["sha256"] for r, f in files.items() if r.partition("-")[0] in roles))
-
-
-# Refuse calibrations whose numbers cannot be compared, and say why.
-
-# Attributes by which an argument is recognized as a run.
-NEEDED = ("path", "result", "robot", "arrays", "load_posterior")
-
-
-def check_runs(runs: Sequence[StoredRun]) -> None:
-    """Refuse too few runs, the same one twice, and what is no run."""
-    is_list = isinstance(runs, Sequence) and not isinstance(runs, str)
-    if not is_list or not all(hasattr(run, name) for run in runs for name in NEEDED):
-        raise DataError("runs: give a list of runs, such as [load_run('may'), load_run('june')]")
-    if len(runs) < 2:
-        raise DataError(report_finding("runs.too-few", count=len(runs)))
-    known = set()
-    for run in runs:
-        place = run.path.resolve()
-        if place in known:
-            raise DataError(report_finding("runs.given-twice", run=str(run.path)))
-        known.add(place)
-        if not run.result.get("fit", {}).get("parameters"):
-            raise DataError(report_finding("runs.no-calibration", run=str(run.path)))
-
-
-def refuse_incomparable(
-    first: StoredRun, second: StoredRun, names: tuple[str, str], is_same_data: bool
-) -> None:
-    """Refuse two runs whose parameters do not mean the same.
-
-    names : of both runs. is_same_data : whether both were fitted to the same rows; then they may
-        identify different parameters, because only methods and models are compared.
-    """
-    words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
-    mine, theirs = first.robot, second.robot
-    if name := _find_lonely(mine.parameters.names, theirs.parameters.names):
-        place = names[0] if name in mine.parameters.names else names[1]
-        raise DataError(report_finding("runs.other-parameters", **words, name=name, place=place))
-    structure = _list_structure(theirs)
-    for what, text in _list_structure(mine).items():
-        if text != structure[what]:
-            data: dict[str, Any] = {"what": what, "mine": text, "theirs": structure[what]}
-            raise DataError(report_finding("runs.other-mechanism", **words, **data))
-    free = [list_free(run) for run in (first, second)]
-    if not is_same_data and (name := _find_lonely(*free)):
-        place = names[0] if name in free[0] else names[1]
-        raise DataError(report_finding("runs.other-free", **words, name=name, place=place))
-    for i, name in enumerate(mine.parameters.names):
-        if name in free[0] or name in free[1]:
-            continue
-        dimension = mine.parameters.dimensions[i]
-        size = mine.size if dimension is Dimension.LENGTH else 1.0
-        values = [float(robot.values[i]) for robot in (mine, theirs)]
-        if abs(values[0] - values[1]) > EQUAL * size:
-            shown = [mine.to_quantity(value, dimension) for value in values]
-            data = {"name": name, "mine": shown[0], "theirs": shown[1]}
-            raise DataError(report_finding("runs.other-fixed-value", **words, **data))
-    refuse_other_dimensions(mine, theirs, names)
-
-
-def _find_lonely(first: Sequence[str], second: Sequence[str]) -> str:
-    """Return the first name that only one of two lists has; empty without any."""
-    return next((n for n in (*first, *second) if (n in first) != (n in second)), "")
-
-
-def list_free(run: StoredRun) -> tuple[str, ...]:
-    """Return the names of the parameters that a run identified."""
-    return tuple(row["name"] for row in run.result["fit"]["parameters"])
-
-
-def _list_structure(robot: Mechanism) -> dict[str, str]:
-    """Return what must be equal in two robots of the same parameters: name and text."""
-    table = robot.parameters
-    return {
-        "actuators": ", ".join(f"{a.name} ({a.dimension.value})" for a in robot.actuators),
-        "controlled coordinates": ", ".join(robot.controlled),
-        **{
-            f"physical dimensions of {name}": dimension.value
-            for name, dimension in zip(table.names, table.dimensions, strict=True)
-        },
-    }
-
-
-# The errors of several calibrations at the same held-out poses.
-
+NEEDED = ("path", "result", "robot", "arrays", "load_posterior")  # attributes of a run
 QUANTITIES = ("position", "orientation", "length")  # quantities whose errors are compared
+# Probability that any of the compared machines is declared changed although none is.
+CHANGE_LEVEL = 0.05
+CAUSE_LEVEL = 0.01  # probability of rejecting the true cause of a change
+# Probability of a chi-square as small as that of runs which share rows in another form.
+TOO_WELL = 1e-3
+COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a change
 
 
 @dataclass(frozen=True)
@@ -223,82 +55,6 @@ class RunErrors:
     common: Mapping[str, Statistics]
 
 
-def collect_errors(
-    runs: Sequence[StoredRun], names: Sequence[str], data: Measurements | None
-) -> tuple[tuple[RunErrors, ...], int, tuple[Finding, ...]]:
-    """Return the errors of each run, the number of common poses, and findings.
-
-    data : other measurements, at which all runs are validated; without it the common poses are
-        those that all runs of one data set held out.
-    """
-    own = [_read_errors(run, None) for run in runs]
-    if data is not None:
-        results = [_validate(run, data) for run in runs]
-        common = [errors for errors, _ in results]
-        found_rows = [finding for _, findings in results for finding in findings]
-        errors = zip(names, own, common, strict=True)
-        return tuple(RunErrors(*fields) for fields in errors), data.n_poses, tuple(found_rows)
-    poses = _find_common_poses(runs)
-    common = [_read_errors(run, poses) if poses else {} for run in runs]
-    errors = zip(names, own, common, strict=True)
-    return tuple(RunErrors(*fields) for fields in errors), len(poses), ()
-
-
-def _validate(run: StoredRun, data: Measurements) -> tuple[dict[str, Statistics], list[Finding]]:
-    """Return the errors of a run at other measurements."""
-    reused = report_reused_rows(run.fitted_rows, data)
-    validation = validate(
-        run.robot,
-        data,
-        before=run.initial_robot,
-        nuisance_values=run.nuisance_values,
-        nuisance_values_before=run.initial_nuisance_values,
-        uncertainty=run.load_uncertainty(),
-    )
-    errors = {name: e.statistics for name, e in validation.after.quantities.items()}
-    return errors, [] if reused is None else [reused]
-
-
-def _find_common_poses(runs: Sequence[StoredRun]) -> tuple[str, ...]:
-    """Return the poses that all runs of the same files held out: names of poses of different files
-    do not mean the same.
-    """
-    digests = [list_data_digests(run) for run in runs]
-    if not digests[0] or any(run_digests != digests[0] for run_digests in digests):
-        return ()
-    held_out = [((run.result.get("split") or {}).get("held_out") or ()) for run in runs]
-    return tuple(label for label in held_out[0] if all(label in others for others in held_out))
-
-
-def _read_errors(run: StoredRun, poses: Sequence[str] | None) -> dict[str, Statistics]:
-    """Return the stored errors at some of the held-out poses; at all of them where None."""
-    validation = run.result.get("validation") or {}
-    labels = validation.get("poses", ())
-    result = {}
-    for name in QUANTITIES:
-        stored = (validation.get("after") or {}).get(name)
-        if not stored or len(stored["errors"]) != len(labels):
-            continue
-        chosen = [
-            error
-            for label, error in zip(labels, stored["errors"], strict=True)
-            if error is not None and (poses is None or label in poses)
-        ]
-        if chosen:
-            result[name] = compute_statistics(np.abs(np.array(chosen, dtype=float)))
-    return result
-
-
-# Two calibrations: whether the machine has changed, and by what.
-
-# Probability that any of the compared machines is declared changed although none is.
-CHANGE_LEVEL = 0.05
-CAUSE_LEVEL = 0.01  # probability of rejecting the true cause of a change
-# Probability of a chi-square as small as that of runs which share rows in another form.
-TOO_WELL = 1e-3
-COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a change
-
-
 @dataclass(frozen=True, eq=False)
 class PairComparison:
     """A run against the first one."""
@@ -308,6 +64,7 @@ class PairComparison:
     second: str
     data: str  # "independent", "same", "shared" (some rows are common) or "unknown"
     shared: int  # number of common fitted rows
+    finding: Finding  # the result with its code
     names: tuple[str, ...]
     # shift, shift_sd: (p,) change of each parameter of `names` and its standard deviation, while
     # all others may have changed as well [SI]; NaN where the data do not determine it, or where
@@ -319,28 +76,20 @@ class PairComparison:
     significant: BoolArray
     # chi_square, degrees, p_value: of the change in all directions that both data sets determine;
     # NaN and 0 where it is not tested
-    chi_square: float
-    degrees: int
-    p_value: float
-    moved: bool | None  # whether the machine has changed; None where it is not tested
-    cause: ChangeCause  # what explains the change
+    chi_square: float = math.nan
+    degrees: int = 0
+    p_value: float = math.nan
+    moved: bool | None = None  # whether the machine has changed; None where it is not tested
+    # what explains the change
+    cause: ChangeCause = field(default_factory=lambda: ChangeCause("none"))
     # cause_shift, cause_sd: change of its parameters [SI]
-    cause_shift: FloatArray
-    cause_sd: FloatArray
-    finding: Finding  # the result with its code
+    cause_shift: FloatArray = field(default_factory=lambda: np.zeros(0))
+    cause_sd: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("first", "second", "data", "shared", "names", "shift", "shift_sd", "significant"),
-        *(
-            "chi_square",
-            "degrees",
-            "p_value",
-            "moved",
-            "cause",
-            "cause_shift",
-            "cause_sd",
-            "finding",
-        ),
+        *("chi_square", "degrees", "p_value", "moved", "cause", "cause_shift", "cause_sd"),
+        "finding",
     )
 
     def __repr__(self) -> str:
@@ -354,163 +103,6 @@ class PairComparison:
             return math.nan, math.nan, False
         i = self.names.index(name)
         return float(self.shift[i]), float(self.shift_sd[i]), bool(self.significant[i])
-
-
-@dataclass(frozen=True)
-class DataRelation:
-    """How the fitted rows of two runs are related: `kind` as in `PairComparison.data`."""
-
-    kind: str
-    shared: int = 0
-    total: int = 0
-
-
-def relate_data(first: StoredRun, second: StoredRun) -> DataRelation:
-    """Return whether two runs were fitted to common rows."""
-    mine, theirs = first.fitted_rows, second.fitted_rows
-    if mine is None or theirs is None:
-        return DataRelation("unknown")
-    noise = {**find_row_noise(first), **find_row_noise(second)}
-    readings = len(first.robot.actuators)
-    shared = min(
-        rows.count_shared(other_rows, readings, noise)
-        for rows, other_rows in ((mine, theirs), (theirs, mine))
-    )
-    total = max(len(mine), len(theirs))
-    kind = "independent" if not shared else "same" if shared == total else "shared"
-    return DataRelation(kind, shared, total)
-
-
-def compare_pair(
-    first: StoredRun, second: StoredRun, names: tuple[str, str], relation: DataRelation, tests: int
-) -> PairComparison:
-    """Compare a run with the first one.
-
-    relation : of their data. tests : number of runs that are compared with the first one.
-    """
-    words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
-    if relation.kind == "same":
-        finding = report_finding("runs.same-data", **words, shared=relation.shared)
-        return _leave_open(first, names, relation, finding)
-    if relation.kind == "shared":
-        counts: dict[str, Any] = {"shared": relation.shared, "total": relation.total}
-        finding = report_finding("runs.rows-shared", **words, **counts)
-        return _leave_open(first, names, relation, finding)
-    run, reason = "", "nothing"
-    for name, each in zip(names, (first, second), strict=True):
-        if obstacle := _find_obstacle(each):
-            run, reason = name, obstacle
-            break
-    else:
-        earlier = first.load_posterior()
-        changes = compare_information(earlier, second.load_posterior())
-        if changes.degrees:
-            return _test(earlier, changes, words, relation, tests)
-    finding = report_finding("runs.not-tested", **words, run=run, reason=reason)
-    return _leave_open(first, names, relation, finding)
-
-
-def _test(
-    earlier: Posterior,
-    changes: ParameterChanges,
-    words: Mapping[str, str],
-    relation: DataRelation,
-    tests: int,
-) -> PairComparison:
-    """Return the test of a change, and what explains it."""
-    level = compute_single_level(CHANGE_LEVEL, tests)
-    p_value = changes.compute_p_value(changes.chi_square, changes.degrees)
-    moved = p_value < level
-    cause, nothing = ChangeCause("none"), np.zeros(0)
-    cause_shift, cause_sd = nothing, nothing
-    judged: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
-    if moved:
-        cause = explain_change(changes, CAUSE_LEVEL)
-        if cause.parameters:
-            cause_shift, cause_sd = estimate_cause(changes, cause)
-        code = "runs.machine-changed"
-        judged |= _word_cause(earlier, cause, cause_shift, cause_sd)
-    else:
-        code = "runs.agree-too-well" if p_value > 1.0 - TOO_WELL else "runs.machine-unchanged"
-    if code == "runs.agree-too-well":
-        judged["probability"] = 1.0 - p_value
-    else:
-        judged |= {"p_value": p_value, "level": CHANGE_LEVEL}
-    finding = report_finding(code, **words, **judged)
-    shift, sd = changes.estimate_shifts()
-    single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shift).sum()))
-    return PairComparison(
-        words["first"],
-        words["second"],
-        relation.kind,
-        relation.shared,
-        changes.names,
-        shift,
-        sd,
-        np.nan_to_num(changes.test_shifts(), nan=1.0) < single,
-        changes.chi_square,
-        changes.degrees,
-        p_value,
-        bool(moved),
-        cause,
-        cause_shift,
-        cause_sd,
-        finding,
-    )
-
-
-def _word_cause(
-    earlier: Posterior, cause: ChangeCause, shift: FloatArray, sd: FloatArray
-) -> dict[str, Any]:
-    """Return what a finding states of a cause."""
-    change = ""
-    if cause.kind == "parameter":
-        robot, name = earlier.robot, cause.names[0]
-        unit = robot.get_unit(robot.parameters.dimensions[robot.parameters.index(name)])
-        value, half = (float(x[0]) / unit.factor_to_si for x in (shift, COVERED * sd))
-        change = f"{value:+.3g} {unit.symbol} +/- {half:.2g} {unit.symbol}"
-    alternatives = tuple(" and ".join(names) for names in cause.alternatives)
-    return {
-        "kind": cause.kind,
-        "names": cause.names,
-        "change": change,
-        "alternatives": alternatives,
-    }
-
-
-def _find_obstacle(run: StoredRun) -> str:
-    """Return why a run cannot be tested, as in `runs.not-tested`; empty where it can."""
-    if run.fitted_rows is None or "information_rows" not in run.arrays:
-        return "older"
-    if run.result["fit"]["status"] != "converged":
-        return "diverged"
-    information = run.load_posterior().information
-    return "" if information is not None and information.variance > 0.0 else "intervals"
-
-
-def _leave_open(
-    run: StoredRun, names: tuple[str, str], relation: DataRelation, finding: Finding
-) -> PairComparison:
-    """Return a comparison without a test."""
-    free = list_free(run)
-    unknown = np.full(len(free), np.nan)
-    return PairComparison(
-        *names,
-        relation.kind,
-        relation.shared,
-        free,
-        unknown,
-        unknown,
-        np.zeros(len(free), dtype=bool),
-        float("nan"),
-        0,
-        float("nan"),
-        None,
-        ChangeCause("none"),
-        np.zeros(0),
-        np.zeros(0),
-        finding,
-    )
 
 
 @dataclass(frozen=True)
@@ -588,7 +180,7 @@ class RunComparison(DrawnResult):
     __repr__ = __str__
 
 
-def compare_runs(runs: Sequence[StoredRun], data: Measurements | None = None) -> RunComparison:
+def compare_runs(runs: Sequence[Run], data: Measurements | None = None) -> RunComparison:
     """Compare calibrations side by side: sessions of one machine, several machines, or methods.
 
     The first run is the reference. Where the data of two runs are independent, whether the machine
@@ -614,25 +206,39 @@ def compare_runs(runs: Sequence[StoredRun], data: Measurements | None = None) ->
     >>> comparison.moved  # doctest: +SKIP
     False
     """
-    check_runs(runs)
-    names = _name_runs(runs)
+    _check_runs(runs)
+    folders = [run.path.resolve().name for run in runs]
+    names = [
+        str(run.path) if folders.count(folder) > 1 else folder
+        for folder, run in zip(folders, runs, strict=True)
+    ]
     first = runs[0]
     findings, pairs = [], []
     for name, run in zip(names[1:], runs[1:], strict=True):
-        relation = relate_data(first, run)
-        refuse_incomparable(first, run, (names[0], name), relation.kind == "same")
-        pairs.append(compare_pair(first, run, (names[0], name), relation, len(runs) - 1))
+        words = {"first": names[0], "second": name}
+        relation = _relate_data(first, run)
+        _refuse_incomparable(first, run, words, relation[0] == "same")
+        pairs.append(_compare_pair(first, run, words, relation, len(runs) - 1))
         findings.append(pairs[-1].finding)
     findings += [
         report_finding("runs.failed-run", run=name)
         for name, run in zip(names, runs, strict=True)
         if run.failure is not None
     ]
-    errors, poses, notes = collect_errors(runs, names, data)
-    findings += notes
+    if data is None:
+        held_out = _find_common_poses(runs)
+        poses = len(held_out)
+        common = [_read_errors(run, held_out) if held_out else {} for run in runs]
+    else:
+        poses = data.n_poses
+        common = [_validate(run, data, findings) for run in runs]
+    errors = tuple(
+        RunErrors(name, _read_errors(run, None), at_common)
+        for name, run, at_common in zip(names, runs, common, strict=True)
+    )
     if not poses and all(run_errors.own for run_errors in errors):
         findings.append(report_finding("runs.no-common-poses"))
-    parameters = tuple(dict.fromkeys(n for run in runs for n in list_free(run)))
+    parameters = tuple(dict.fromkeys(n for run in runs for n in _list_free(run)))
     table = first.robot.parameters
     dimensions = [table.dimensions[table.index(name)] for name in parameters]
     units = tuple(find_unit(first.robot.get_unit(d).symbol) for d in dimensions)
@@ -640,17 +246,7 @@ def compare_runs(runs: Sequence[StoredRun], data: Measurements | None = None) ->
     return RunComparison(summaries, parameters, units, tuple(pairs), errors, poses, tuple(findings))
 
 
-def _name_runs(runs: Sequence[StoredRun]) -> tuple[str, ...]:
-    """Return the names of the folders, or their paths where a name is not unique."""
-    names = [run.path.resolve().name for run in runs]
-    return tuple(
-        str(run.path) if names.count(name) > 1 else name
-        for name, run in zip(names, runs, strict=True)
-    )
-
-
-def _summarize(name: str, run: StoredRun) -> RunSummary:
-    """Return the column of a run."""
+def _summarize(name: str, run: Run) -> RunSummary:
     fit = run.result["fit"]
     estimates, plus_minus = {}, {}
     for row in fit["parameters"]:
@@ -661,3 +257,271 @@ def _summarize(name: str, run: StoredRun) -> RunSummary:
         plus_minus[row["name"]] = None if half is None or unit is None else half * unit.factor_to_si
     verdict = str(run.result.get("verdict", "")).replace("_", " ")
     return RunSummary(name, run.robot.name, fit.get("method", ""), verdict, estimates, plus_minus)
+
+
+def _list_free(run: Run) -> tuple[str, ...]:
+    """Return the names of the parameters that a run identified."""
+    return tuple(row["name"] for row in run.result["fit"]["parameters"])
+
+
+# Refuse calibrations whose numbers cannot be compared, and say why.
+
+
+def _check_runs(runs: Sequence[Run]) -> None:
+    """Refuse too few runs, the same one twice, and what is no run."""
+    is_list = isinstance(runs, Sequence) and not isinstance(runs, str)
+    if not is_list or not all(hasattr(run, name) for run in runs for name in NEEDED):
+        raise DataError("runs: give a list of runs, such as [load_run('may'), load_run('june')]")
+    if len(runs) < 2:
+        raise DataError(report_finding("runs.too-few", count=len(runs)))
+    known = set()
+    for run in runs:
+        place = run.path.resolve()
+        if place in known:
+            raise DataError(report_finding("runs.given-twice", run=str(run.path)))
+        known.add(place)
+        if not run.result.get("fit", {}).get("parameters"):
+            raise DataError(report_finding("runs.no-calibration", run=str(run.path)))
+
+
+def _refuse_incomparable(
+    first: Run, second: Run, words: Mapping[str, str], is_same_data: bool
+) -> None:
+    """Refuse two runs whose parameters do not mean the same.
+
+    words : names of both. is_same_data : whether both were fitted to the same rows; then they may
+        identify different parameters, because only methods and models are compared.
+    """
+
+    def refuse_lonely(code: str, mine: Sequence[str], theirs: Sequence[str]) -> None:
+        for name in (n for n in (*mine, *theirs) if (n in mine) != (n in theirs)):
+            place = words["first" if name in mine else "second"]
+            raise DataError(report_finding(code, **words, name=name, place=place))
+
+    mine, theirs = first.robot, second.robot
+    refuse_lonely("runs.other-parameters", mine.parameters.names, theirs.parameters.names)
+    structure = _list_structure(theirs)
+    for what, text in _list_structure(mine).items():
+        if text != structure[what]:
+            data: dict[str, Any] = {"what": what, "mine": text, "theirs": structure[what]}
+            raise DataError(report_finding("runs.other-mechanism", **words, **data))
+    free = [_list_free(run) for run in (first, second)]
+    if not is_same_data:
+        refuse_lonely("runs.other-free", *free)
+    for i, name in enumerate(mine.parameters.names):
+        if name in free[0] or name in free[1]:
+            continue
+        dimension = mine.parameters.dimensions[i]
+        size = mine.size if dimension is Dimension.LENGTH else 1.0
+        values = [float(robot.values[i]) for robot in (mine, theirs)]
+        if abs(values[0] - values[1]) > EQUAL * size:
+            shown = [mine.to_quantity(value, dimension) for value in values]
+            data = {"name": name, "mine": shown[0], "theirs": shown[1]}
+            raise DataError(report_finding("runs.other-fixed-value", **words, **data))
+    refuse_other_dimensions(mine, theirs, (words["first"], words["second"]))
+
+
+def _list_structure(robot: Mechanism) -> dict[str, str]:
+    """Return what must be equal in two robots of the same parameters: name and text."""
+    table = robot.parameters
+    return {
+        "actuators": ", ".join(f"{a.name} ({a.dimension.value})" for a in robot.actuators),
+        "controlled coordinates": ", ".join(robot.controlled),
+        **{
+            f"physical dimensions of {name}": dimension.value
+            for name, dimension in zip(table.names, table.dimensions, strict=True)
+        },
+    }
+
+
+# The errors of calibrations at the same held-out poses.
+
+
+def _validate(run: Run, data: Measurements, findings: list[Finding]) -> dict[str, Statistics]:
+    """Return the errors of a run at other measurements; add a finding on rows that it fitted."""
+    reused = report_reused_rows(run.fitted_rows, data)
+    findings += [] if reused is None else [reused]
+    validation = validate(
+        run.robot,
+        data,
+        before=run.initial_robot,
+        nuisance_values=run.nuisance_values,
+        nuisance_values_before=run.initial_nuisance_values,
+        uncertainty=run.load_uncertainty(),
+    )
+    return {name: e.statistics for name, e in validation.after.quantities.items()}
+
+
+def _find_common_poses(runs: Sequence[Run]) -> tuple[str, ...]:
+    """Return the poses that all runs of the same files held out: names of poses of different files
+    do not mean the same.
+    """
+    digests = []
+    for run in runs:
+        files = run.result.get("made_by", {}).get("inputs", {})
+        of_data = [r for r in files if r.partition("-")[0] in ("data", "poses")]
+        digests.append(sorted(files[role]["sha256"] for role in of_data))
+    if not digests[0] or any(digest != digests[0] for digest in digests):
+        return ()
+    held_out = [((run.result.get("split") or {}).get("held_out") or ()) for run in runs]
+    return tuple(label for label in held_out[0] if all(label in others for others in held_out))
+
+
+def _read_errors(run: Run, poses: Sequence[str] | None) -> dict[str, Statistics]:
+    """Return the stored errors at some of the held-out poses; at all of them where None."""
+    validation = run.result.get("validation") or {}
+    labels = validation.get("poses", ())
+    result = {}
+    for name in QUANTITIES:
+        stored = (validation.get("after") or {}).get(name)
+        if not stored or len(stored["errors"]) != len(labels):
+            continue
+        chosen = [
+            error
+            for label, error in zip(labels, stored["errors"], strict=True)
+            if error is not None and (poses is None or label in poses)
+        ]
+        if chosen:
+            result[name] = compute_statistics(np.abs(np.array(chosen, dtype=float)))
+    return result
+
+
+# Two calibrations: whether the machine has changed, and by what.
+
+
+def _relate_data(first: Run, second: Run) -> tuple[str, int, int]:
+    """Return whether two runs were fitted to common rows, as `PairComparison.data`, with the number
+    of common rows and of all.
+    """
+    mine, theirs = first.fitted_rows, second.fitted_rows
+    if mine is None or theirs is None:
+        return "unknown", 0, 0
+    noise = {**_find_row_noise(first), **_find_row_noise(second)}
+    readings = len(first.robot.actuators)
+    shared = min(
+        rows.count_shared(other_rows, readings, noise)
+        for rows, other_rows in ((mine, theirs), (theirs, mine))
+    )
+    total = max(len(mine), len(theirs))
+    return "independent" if not shared else "same" if shared == total else "shared", shared, total
+
+
+def _find_row_noise(run: Run) -> dict[str, FloatArray]:
+    """Return the standard deviation of the measured values of each kind [SI], from its residuals
+    and these divided by it.
+    """
+    result = {}
+    for name, raw in run.arrays.items():
+        if not name.startswith("residual_"):
+            continue
+        whitened = run.arrays.get(name.replace("residual_", "whitened_", 1))
+        if whitened is None or whitened.shape != raw.shape or raw.ndim != 2 or not len(raw):
+            continue
+        usable = np.isfinite(raw) & np.isfinite(whitened) & (whitened != 0.0)
+        ratio = np.abs(raw) / np.where(usable, np.abs(whitened), np.inf)
+        medians = [
+            float(np.median(column[mask])) if mask.any() else 0.0
+            for column, mask in zip(ratio.T, usable.T, strict=True)
+        ]
+        result[name.split("_", 2)[2]] = np.array(medians)
+    return result
+
+
+def _compare_pair(
+    first: Run, second: Run, words: Mapping[str, str], relation: tuple[str, int, int], tests: int
+) -> PairComparison:
+    """Compare a run with the first one.
+
+    words : names of both. relation : of their data. tests : number of runs that are compared.
+    """
+    kind, shared, total = relation
+    data: dict[str, Any]
+    if kind == "same":
+        code, data = "runs.same-data", {"shared": shared}
+    elif kind == "shared":
+        code, data = "runs.rows-shared", {"shared": shared, "total": total}
+    else:
+        obstacles = zip(words.values(), map(_find_obstacle, (first, second)), strict=True)
+        run, reason = next((each for each in obstacles if each[1]), ("", "nothing"))
+        if not run:
+            earlier = first.load_posterior()
+            changes = compare_information(earlier, second.load_posterior())
+            if changes.degrees:
+                return _test(earlier, changes, words, relation, tests)
+        code, data = "runs.not-tested", {"run": run, "reason": reason}
+    free = _list_free(first)
+    unknown = np.full(len(free), np.nan)
+    return PairComparison(
+        **words,
+        data=kind,
+        shared=shared,
+        finding=report_finding(code, **words, **data),
+        names=free,
+        shift=unknown,
+        shift_sd=unknown,
+        significant=np.zeros(len(free), dtype=bool),
+    )
+
+
+def _find_obstacle(run: Run) -> str:
+    """Return why a run cannot be tested, as in `runs.not-tested`; empty where it can."""
+    if run.fitted_rows is None or "information_rows" not in run.arrays:
+        return "older"
+    if run.result["fit"]["status"] != "converged":
+        return "diverged"
+    information = run.load_posterior().information
+    return "" if information is not None and information.variance > 0.0 else "intervals"
+
+
+def _test(
+    earlier: Posterior,
+    changes: ParameterChanges,
+    words: Mapping[str, str],
+    relation: tuple[str, int, int],
+    tests: int,
+) -> PairComparison:
+    """Return the test of a change, and what explains it."""
+    level = compute_single_level(CHANGE_LEVEL, tests)
+    p_value = changes.compute_p_value(changes.chi_square, changes.degrees)
+    moved = bool(p_value < level)
+    cause, cause_shift, cause_sd = ChangeCause("none"), np.zeros(0), np.zeros(0)
+    judged: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
+    code = "runs.machine-changed" if moved else "runs.machine-unchanged"
+    if moved:
+        cause, change = explain_change(changes, CAUSE_LEVEL), ""
+        if cause.parameters:
+            cause_shift, cause_sd = estimate_cause(changes, cause)
+        if cause.kind == "parameter":
+            robot, name = earlier.robot, cause.names[0]
+            unit = robot.get_unit(robot.parameters.dimensions[robot.parameters.index(name)])
+            shift, half = (
+                float(x[0]) / unit.factor_to_si for x in (cause_shift, COVERED * cause_sd)
+            )
+            change = f"{shift:+.3g} {unit.symbol} +/- {half:.2g} {unit.symbol}"
+        alternatives = tuple(" and ".join(names) for names in cause.alternatives)
+        judged |= {"kind": cause.kind, "names": cause.names}
+        judged |= {"change": change, "alternatives": alternatives}
+    if not moved and p_value > 1.0 - TOO_WELL:
+        code = "runs.agree-too-well"
+        judged["probability"] = 1.0 - p_value
+    else:
+        judged |= {"p_value": p_value, "level": CHANGE_LEVEL}
+    shifts, sd = changes.estimate_shifts()
+    single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shifts).sum()))
+    return PairComparison(
+        **words,
+        data=relation[0],
+        shared=relation[1],
+        finding=report_finding(code, **words, **judged),
+        names=changes.names,
+        shift=shifts,
+        shift_sd=sd,
+        significant=np.nan_to_num(changes.test_shifts(), nan=1.0) < single,
+        chi_square=changes.chi_square,
+        degrees=changes.degrees,
+        p_value=p_value,
+        moved=moved,
+        cause=cause,
+        cause_shift=cause_shift,
+        cause_sd=cause_sd,
+    )

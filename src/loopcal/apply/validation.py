@@ -19,12 +19,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
-from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows
+from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows, name_blunders
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
 from loopcal.diagnose.frame_drift import report_base_targets
 from loopcal.diagnose.row_errors import (
@@ -43,7 +43,7 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertainty
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
-from loopcal.findings.wording import list_names, round_to_digits
+from loopcal.findings.wording import list_names, name_count, round_to_digits
 from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
@@ -52,20 +52,19 @@ from loopcal.numerics.statistics import compute_chi_square_quantile, find_distin
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS, Dimension, Unit
-
-if TYPE_CHECKING:
-    pass
-
-
-# Findings of a validation: limits, setup parameters that moved, and poses that were left out.
 
 # Number of rows below which an error cannot be judged. At 4 rows the rms of noise alone varies by
 # a third.
 FEW_ROWS = 5
 GREW = 1.1  # factor by which an error must grow to be called larger
 NOISE_LEVEL = 1e-3  # probability that noise alone exceeds what is called the noise
+DOMINATES = 2.0  # factor by which blunders that dominate an rms error raise it
+REFUSED_SHARE = 0.5  # share of reused rows from which data are refused for validation
+ERRORS = ("before", "after")  # errors whose differences are stored
+# First word of the names of the stored arrays, `held_out_<before or after>_<quantity>`.
+PREFIX = "held_out"
 
 
 @dataclass(frozen=True)
@@ -104,224 +103,6 @@ class ErrorChange:
         return self.after > GREW * self.before and self.after > self.largest_noise
 
 
-def owner_of(name: str) -> str:
-    """Return the frame, target or surface of a setup parameter: `tracker` of `tracker.x`."""
-    return name.rsplit(".", 1)[0]
-
-
-def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
-    """Return the frames, targets and surfaces that are kept, and those fitted to the rows."""
-    kept = dict.fromkeys(owner_of(n) for n in prediction.setup.table.names if n in prediction.kept)
-    fitted = dict.fromkeys(
-        owner_of(n) for n in prediction.setup.table.names if n not in prediction.kept
-    )
-    return {"kept": tuple(kept), "fitted": tuple(fitted)}
-
-
-def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
-    """Return the frame of errors in words.
-
-    setup : frames, targets and surfaces that were estimated. Without any, positions and
-        orientations are those in the stated frame of the instrument.
-    """
-    if setup:
-        return f"after the best fit of {list_names(setup, 6)}"
-    if {"position", "orientation"} & errors.quantities.keys():
-        return "in the stated frame"
-    return "without any frame"
-
-
-def report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]:
-    """Report where the setup parameters come from."""
-    before, after = group_setup(first), group_setup(last)
-    only_after = tuple(name for name in after["kept"] if name in before["fitted"])
-    codes = {
-        "validation.setup-kept": after["kept"],
-        "validation.setup-fitted-before": only_after,
-        "validation.setup-fitted": after["fitted"],
-    }
-    return [report_finding(code, names=names) for code, names in codes.items() if names]
-
-
-def report_few_rows(after: PoseErrors) -> list[Finding]:
-    """Report quantities that too few rows measure."""
-    counts = {name: len(find_distinct(errors.rows)) for name, errors in after.quantities.items()}
-    return [
-        report_finding("validation.few-rows", quantity=quantity, count=count)
-        for quantity, count in counts.items()
-        if 0 < count < FEW_ROWS
-    ]
-
-
-def report_left_out(data: Measurements, compared: PredictionComparison) -> list[Finding]:
-    """Report poses with rows that no statistic contains, and poses that were estimated."""
-    has_rows = np.zeros(data.n_poses, dtype=bool)
-    for o in data.observations:
-        has_rows[o.rows[o.weight > 0.0]] = True
-    estimated = compared.estimated & compared.usable
-    cases = {
-        "validation.unreachable-poses": ~compared.usable & compared.predictable,
-        "validation.missing-readings": has_rows & ~compared.predictable,
-        "validation.poses-estimated": estimated,
-    }
-    named = {code: [data.labels[i] for i in np.flatnonzero(out)] for code, out in cases.items()}
-    extra: dict[str, dict[str, Any]] = {
-        "validation.poses-estimated": {"absorbed": int(compared.absorbed.sum())}
-    }
-    return [
-        report_finding(code, names=tuple(f"pose {name}" for name in names), **extra.get(code, {}))
-        for code, names in named.items()
-        if names
-    ]
-
-
-def report_moved_setup(
-    robot: Mechanism, compared: PredictionComparison, kept: Mapping[str, float]
-) -> list[Finding]:
-    """Report kept frames, targets and surfaces that were apparently moved after the fit."""
-    data = compared.data
-    table, rows = data.nuisance_parameters.table, data.observations
-    owner = {p.name: owner_of(p.name) for p in table.entries}
-
-    def measure_errors(refit: tuple[str, ...]) -> tuple[float, int]:
-        """Return the whitened rms error with these fitted again, and the equations left over."""
-        values = {name: v for name, v in kept.items() if owner.get(name) not in refit}
-        try:
-            prediction = predict_poses(robot, data, compared.solution, compared.usable, values)
-        except DataError:  # too few rows to fit it
-            return float("nan"), 0
-        total = 0.0
-        for o, residual in zip(rows, prediction.residuals(rows), strict=True):
-            present = np.where(o.present, residual, 0.0)
-            total += float(((o.whitener @ present[..., None]) ** 2).sum())
-        fitted = sum(p.free and owner[p.name] in refit for p in table.entries)
-        left = sum(o.n_residuals for o in rows) - fitted
-        return float(np.sqrt(total / max(left, 1))), left
-
-    names = dict.fromkeys(owner[p.name] for p in table.entries if p.free and p.name in kept)
-    moved = find_moved_setups(tuple(names), measure_errors)
-    if moved is None:
-        return []
-    return [report_finding("validation.setup-moved", names=moved[0], times=moved[1])]
-
-
-def check_limit(name: str, limit: float | None) -> None:
-    """Refuse a limit below 0, or NaN: no error could keep it, or exceed it."""
-    if limit is None:
-        return
-    if not limit >= 0.0:
-        raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
-
-
-def check_limits(
-    after: PoseErrors,
-    poses: tuple[str, ...],
-    limits: Mapping[str, float | None],
-    units: Mapping[str, Unit],
-) -> list[Finding]:
-    """Report limits that the largest error exceeds, and limits on what no row measures."""
-    findings = []
-    for quantity, limit in limits.items():
-        if limit is None:
-            continue
-        errors = after[quantity]
-        if not len(errors.rows):
-            findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
-            continue
-        worst, unit = int(np.argmax(errors.size)), units[quantity]
-        if errors.size[worst] > limit:
-            findings.append(
-                report_finding(
-                    "gates.limit-exceeded",
-                    quantity=quantity,
-                    pose=poses[errors.rows[worst]],
-                    target=errors.targets[worst],
-                    error=Quantity(float(errors.size[worst]) / unit.factor_to_si, unit.symbol),
-                    limit=Quantity(limit / unit.factor_to_si, unit.symbol),
-                )
-            )
-    return findings
-
-
-# Held-out poses that do not fit: the search, and findings with their largest errors.
-
-# Factor by which an rms error must fall without the blunders to be called dominated by them.
-DOMINATES = 2.0
-
-
-def find_blunders(
-    robot: Mechanism, compared: PredictionComparison, uncertainty: FitUncertainty | None
-) -> tuple[Blunder, ...]:
-    """Return the compared poses that neither the calibration nor the other poses explain.
-
-    robot : the calibrated one. uncertainty : of the calibration; None where it is not known, then
-        the noise and the other poses decide.
-    """
-    data, after = compared.data.take(compared.usable), compared.after
-    values = dict(zip(after.setup.table.names, after.values[0].tolist(), strict=True))
-    check = check_held_out_rows(robot, data, values, after.kept, uncertainty)
-    if check is None:
-        return ()
-    from loopcal.diagnose.blunders import name_blunders
-
-    return name_blunders(check, data)
-
-
-def report_blunders(
-    blunders: tuple[Blunder, ...], errors: Validation, rest: Validation | None
-) -> list[Finding]:
-    """Return a finding for each blunder, and whether they dominate the errors.
-
-    errors : of all poses. rest : without the blunders.
-    """
-    largest = _find_largest(blunders, errors)
-    findings = [b.report(**result) for b, result in zip(blunders, largest, strict=True)]
-    if rest is None:
-        return findings
-    poses = tuple(label for blunder in blunders for label in blunder.poses)
-    for quantity, unit in errors.units.items():
-        all_rows, without = (e.after.statistics(quantity).rms for e in (errors, rest))
-        if all_rows > DOMINATES * without or np.isnan(without):
-            error, left = (
-                None if np.isnan(x) else Quantity(x / unit.factor_to_si, unit.symbol)
-                for x in (all_rows, without)
-            )
-            dominated = report_finding(
-                "validation.blunders-dominate",
-                poses=poses,
-                quantity=quantity,
-                error=error,
-                without=left,
-            )
-            return [*findings, dominated]
-    return findings
-
-
-def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[str, Any]]:
-    """Return quantity, target and error of the largest error of each blunder, compared with the
-    noise; empty where only actuator readings are compared.
-    """
-    owners: dict[str, list[int]] = {}
-    for i, blunder in enumerate(blunders):
-        for label in blunder.poses:
-            owners.setdefault(label, []).append(i)
-    of_row = [
-        {i for label in poses.split("/") for i in owners.get(label, ())} for poses in errors.poses
-    ]
-    nothing: dict[str, str | Quantity] = {"quantity": "", "target": "", "error": ""}
-    worst, results = [0.0] * len(blunders), [nothing] * len(blunders)
-    for quantity, of_rows in errors.after.quantities.items():
-        floor, unit = errors.noise_floor.rms[quantity], errors.units[quantity]
-        entries = zip(of_rows.rows.tolist(), of_rows.size.tolist(), of_rows.targets, strict=True)
-        for row, size, target in entries:
-            for i in of_row[row]:
-                if size > worst[i] * floor:
-                    worst[i] = size / floor
-                    error = Quantity(size / unit.factor_to_si, unit.symbol)
-                    results[i] = {"quantity": quantity, "target": target, "error": error}
-    return results
-
-
 @dataclass(frozen=True, eq=False)
 class Validation(DrawnResult):
     """Errors on measured poses before and after calibration, over the r rows of all kinds.
@@ -336,8 +117,8 @@ class Validation(DrawnResult):
     noise_floor : the errors that the measurement noise alone causes.
     unreachable : labels of poses that one of the two geometries cannot reach; no statistic contains
         them.
-    limit_position, limit_angle : limits [m], [rad] on the largest prediction error of a position
-        and of an orientation after calibration; None for no limit.
+    limit_position, limit_angle : limits [m], [rad] on the largest prediction error after
+        calibration; None for no limit.
     units : of each quantity, in which it is shown.
     findings : limits that are exceeded (failures), and notes.
     alignment : names of frames, targets and surfaces: `kept` from the fit, `fitted` to these rows.
@@ -382,7 +163,7 @@ class Validation(DrawnResult):
             reasons=lambda v: list(map(str, v.failures)),
             notes=lambda v: [str(f) for f in v.findings if f.severity is not Severity.FAILURE],
         ),
-        *fields("findings", "blunders", without_blunders=lambda v: v._without_blunders()),
+        *fields("findings", "blunders", without_blunders=lambda v: v._list_without_blunders()),
         *fields("frame", "alignment", "kinds", "setup_count", "absorbed", "judged"),
         *(
             Field(name, lambda v, i=i: [row[i] for row in v.list_sizes()], "row")
@@ -407,16 +188,14 @@ class Validation(DrawnResult):
 
     @property
     def has_several_kinds(self) -> bool:
-        """Whether several kinds of measurement are mixed; then only errors divided by sigma can be
-        compared.
-        """
+        """Whether kinds of measurement are mixed: only errors divided by sigma are comparable."""
         return len(self.kinds) > 2
 
     @property
     def values_left(self) -> int:
-        """Measured values that are left to check the geometry: all, less one for each setup
-        parameter that was fitted to them, and less those that estimated poses take up. With none
-        left every geometry predicts these rows.
+        """Measured values that check the geometry: all, less one for each setup parameter that was
+        fitted to them, and less those that estimated poses take up. With none left every geometry
+        predicts these rows.
         """
         return self.kinds[-1].count - self.setup_count - self.absorbed
 
@@ -467,22 +246,23 @@ class Validation(DrawnResult):
 
     def list_sizes(self) -> list[tuple[str, str, str, str, float, float]]:
         """Return pose, target, quantity, unit, and sizes before and after [SI] of every error."""
-        rows = []
-        for quantity in self.quantities:
-            before, after = self.before[quantity].size, self.after[quantity]
-            symbol = SI_SYMBOLS[after.dimension]
+        return [
+            (self.poses[i], target, quantity, SI_SYMBOLS[after.dimension], *sizes)
+            for quantity, after in self.after.quantities.items()
             for i, target, *sizes in zip(
-                after.rows, after.targets, before.tolist(), after.size.tolist(), strict=True
-            ):
-                rows.append((self.poses[i], target, quantity, symbol, *sizes))
-        return rows
+                after.rows,
+                after.targets,
+                self.before[quantity].size.tolist(),
+                after.size.tolist(),
+                strict=True,
+            )
+        ]
 
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""
-        rows, poses = len(self.poses), self.judged
-        words = f"{rows} {'row' if rows == 1 else 'rows'}, {self.frame}"
-        if not rows:
-            words = f"the actuator readings of {poses} {'pose' if poses == 1 else 'poses'}"
+        words = f"{name_count(len(self.poses), 'row')}, {self.frame}"
+        if not self.poses:
+            words = f"the actuator readings of {name_count(self.judged, 'pose')}"
         lines = [f"Validation on {words}:", *self.describe_rms()]
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
 
@@ -493,9 +273,9 @@ class Validation(DrawnResult):
             unit = self.units.get(quantity)
             factor, symbol = (1.0, "sigma") if unit is None else (unit.factor_to_si, unit.symbol)
             name = "all kinds" if unit is None else quantity
-            values = (change.before, change.after, change.noise_floor)
             before, after, floor = (
-                f"{round_to_digits(value / factor)} {symbol}" for value in values
+                f"{round_to_digits(value / factor)} {symbol}"
+                for value in (change.before, change.after, change.noise_floor)
             )
             lines.append(
                 f"  {name} (rms): {before} before, {after} after calibration (noise floor {floor})"
@@ -504,8 +284,7 @@ class Validation(DrawnResult):
 
     __repr__ = __str__
 
-    def _without_blunders(self) -> dict[str, Any] | None:
-        """Return the errors without blunders for JSON; None without any."""
+    def _list_without_blunders(self) -> dict[str, Any] | None:
         rest = self.without_blunders
         names = ("poses", "before", "after", "noise_floor", "kinds", "judged")
         return None if rest is None else {name: getattr(rest, name) for name in names}
@@ -540,15 +319,22 @@ def validate(
 
     Raises
     ------
-    DataError : a limit below 0; the data belong to
-        another robot, contain no row, or every pose is unreachable.
+    DataError : a limit below 0; the data belong to another robot, contain no row, or every pose is
+        unreachable.
     """
     check_limit("limit_position", limit_position)
     check_limit("limit_angle", limit_angle)
-    robot = fit.robot if isinstance(fit, Identification) else fit
-    old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
+    robot, old, nuisance = fit, before, None
+    if isinstance(fit, Identification):
+        robot, old, nuisance = fit.robot, before or fit.initial, fit.nuisance
+        uncertainty = collect_uncertainty(fit) if uncertainty is None else uncertainty
+    assert isinstance(robot, Mechanism)
     check_actuators(data, robot)
-    values_before, values = _choose_setup(fit, before, nuisance_values_before, nuisance_values)
+    if nuisance_values_before is None:
+        is_usual = before is None and nuisance_values is None and nuisance is not None
+        nuisance_values_before = nuisance.starts if is_usual and nuisance is not None else {}
+    if nuisance_values is None:
+        nuisance_values = {} if nuisance is None else nuisance.values
     owners = {owner_of(name) for name in data.nuisance_parameters.table.names}
     for pattern in refit:
         if not any(fnmatchcase(owner, pattern) for owner in owners):
@@ -557,13 +343,18 @@ def validate(
                 f"no frame, target or surface of these data is called {pattern!r}"
                 f"{suggest_names(pattern, owners)}; the data have: {listed}"
             )
-    kept_before, kept = _keep_setup(values_before, refit), _keep_setup(values, refit)
-    compared = compare_predictions(old, robot, data, kept_before, kept)
+    kept_before, kept = (
+        {
+            name: value
+            for name, value in values.items()
+            if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
+        }
+        for values in (nuisance_values_before, nuisance_values)
+    )
+    compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
     limits = {"position": limit_position, "orientation": limit_angle}
     result = _summarize(robot, compared, limits)
-    if uncertainty is None and isinstance(fit, Identification):
-        uncertainty = collect_uncertainty(fit)
-    blunders = find_blunders(robot, compared, uncertainty)
+    blunders = _find_blunders(robot, compared, uncertainty)
     rest = None
     if blunders:
         named = {label for blunder in blunders for label in blunder.poses}
@@ -576,14 +367,14 @@ def validate(
         result,
         unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
         findings=(
-            *check_limits(result.after, compared.rows, limits, result.units),
+            *_check_limits(result, limits),
             *report_conformity(conformity, limits, result.after, result.units),
-            *report_blunders(blunders, result, rest),
+            *_report_blunders(blunders, result, rest),
             *report_base_targets(data),
-            *report_moved_setup(robot, compared, kept),
-            *report_left_out(data, compared),
-            *report_few_rows(result.after),
-            *report_setup(compared.before, compared.after),
+            *_report_moved_setup(robot, compared, kept),
+            *_report_left_out(data, compared),
+            *_report_few_rows(result.after),
+            *_report_setup(compared.before, compared.after),
         ),
         blunders=blunders,
         without_blunders=rest,
@@ -596,24 +387,22 @@ def _summarize(
 ) -> Validation:
     """Return the errors of a comparison, without findings."""
     rows = compared.data.observations
-    errors_before = compared.before.residuals(rows)
-    errors_after = compared.after.residuals(rows)
+    before, after = compared.before.residuals(rows), compared.after.residuals(rows)
     missed = compared.before.differences(rows, compared.reached)
-    after = compute_row_errors(rows, errors_after)
+    reached = [m - r for m, r in zip(missed, after, strict=True)]
+    errors = compute_row_errors(rows, after)
     return Validation(
         poses=compared.rows,
-        before=compute_row_errors(rows, errors_before),
-        after=after,
-        commanded_before=compute_row_errors(rows, [-r for r in errors_before]),
-        commanded_after=compute_row_errors(
-            rows, [m - r for m, r in zip(missed, errors_after, strict=True)]
-        ),
+        before=compute_row_errors(rows, before),
+        after=errors,
+        commanded_before=compute_row_errors(rows, [-r for r in before]),
+        commanded_after=compute_row_errors(rows, reached),
         not_compensable=compute_row_errors(rows, missed),
         noise_floor=compute_noise_floor(rows),
         unreachable=(),
         limit_position=limits["position"],
         limit_angle=limits["orientation"],
-        units={name: robot.get_unit(e.dimension) for name, e in after.quantities.items()},
+        units=_find_units(robot, errors),
         alignment=group_setup(compared.after),
         kinds=compared.kind_errors(),
         setup_count=compared.after.fitted_count,
@@ -622,63 +411,230 @@ def _summarize(
     )
 
 
-def _choose_setup(
-    fit: Identification | Mechanism,
-    before: Mechanism | None,
-    values_before: Mapping[str, float] | None,
-    values: Mapping[str, float] | None,
-) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    """Return setup parameters [SI] for the geometry before and for the calibrated one.
+def _find_units(robot: Mechanism, errors: PoseErrors) -> dict[str, Unit]:
+    return {name: robot.get_unit(e.dimension) for name, e in errors.quantities.items()}
 
-    Those that are not given are those of the fit; a robot has none.
+
+# Limits.
+
+
+def check_limit(name: str, limit: float | None) -> None:
+    """Refuse a limit below 0, or NaN: no error could keep it, or exceed it."""
+    if limit is not None and not limit >= 0.0:
+        raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
+
+
+def _check_limits(errors: Validation, limits: Mapping[str, float | None]) -> list[Finding]:
+    """Report limits that the largest error exceeds, and limits on what no row measures."""
+    findings = []
+    for quantity, limit in limits.items():
+        of_rows = errors.after[quantity]
+        if limit is None:
+            continue
+        if not len(of_rows.rows):
+            findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
+            continue
+        worst, size, unit = int(np.argmax(of_rows.size)), of_rows.size.max(), errors.units[quantity]
+        if size > limit:
+            error, allowed = (
+                Quantity(float(x) / unit.factor_to_si, unit.symbol) for x in (size, limit)
+            )
+            findings.append(
+                report_finding(
+                    "gates.limit-exceeded",
+                    quantity=quantity,
+                    pose=errors.poses[of_rows.rows[worst]],
+                    target=of_rows.targets[worst],
+                    error=error,
+                    limit=allowed,
+                )
+            )
+    return findings
+
+
+# Setup parameters: frames, targets, surfaces and offsets.
+
+
+def owner_of(name: str) -> str:
+    """Return the frame, target or surface of a setup parameter: `tracker` of `tracker.x`."""
+    return name.rsplit(".", 1)[0]
+
+
+def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
+    """Return the frames, targets and surfaces that are kept, and those fitted to the rows."""
+    groups: dict[str, dict[str, None]] = {"kept": {}, "fitted": {}}
+    for name in prediction.setup.table.names:
+        groups["kept" if name in prediction.kept else "fitted"][owner_of(name)] = None
+    return {key: tuple(owners) for key, owners in groups.items()}
+
+
+def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
+    """Return the frame of errors in words; without any `setup` that was estimated, positions and
+    orientations are those in the stated frame of the instrument.
     """
-    nuisance = fit.nuisance if isinstance(fit, Identification) else None
-    if values_before is None:
-        started = before is None and values is None and nuisance is not None
-        values_before = nuisance.starts if started and nuisance is not None else {}
-    if values is None:
-        values = {} if nuisance is None else nuisance.values
-    return values_before, values
+    if setup:
+        return f"after the best fit of {list_names(setup, 6)}"
+    if {"position", "orientation"} & errors.quantities.keys():
+        return "in the stated frame"
+    return "without any frame"
 
 
-def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, float]:
-    """Return the setup parameters that are not to be fitted again."""
-    return {
-        name: value
-        for name, value in values.items()
-        if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
+def _report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]:
+    """Report where the setup parameters come from."""
+    before, after = group_setup(first), group_setup(last)
+    codes = {
+        "validation.setup-kept": after["kept"],
+        "validation.setup-fitted-before": tuple(
+            name for name in after["kept"] if name in before["fitted"]
+        ),
+        "validation.setup-fitted": after["fitted"],
     }
+    return [report_finding(code, names=names) for code, names in codes.items() if names]
 
 
-# Rows that a calibration was fitted to are no independent validation.
+def _report_moved_setup(
+    robot: Mechanism, compared: PredictionComparison, kept: Mapping[str, float]
+) -> list[Finding]:
+    """Report kept frames, targets and surfaces that were apparently moved after the fit."""
+    data, rows = compared.data, compared.data.observations
+    entries = data.nuisance_parameters.table.entries
+    owner = {p.name: owner_of(p.name) for p in entries}
 
-REFUSED_SHARE = 0.5  # share of reused rows from which data are refused for validation
+    def measure_errors(refit: tuple[str, ...]) -> tuple[float, int]:
+        """Return the whitened rms error with these fitted again, and the equations left over."""
+        values = {name: v for name, v in kept.items() if owner.get(name) not in refit}
+        try:
+            prediction = predict_poses(robot, data, compared.solution, compared.usable, values)
+        except DataError:  # too few rows to fit it
+            return float("nan"), 0
+        total = 0.0
+        for o, residual in zip(rows, prediction.residuals(rows), strict=True):
+            present = np.where(o.present, residual, 0.0)
+            total += float(((o.whitener @ present[..., None]) ** 2).sum())
+        fitted = sum(p.free and owner[p.name] in refit for p in entries)
+        left = sum(o.n_residuals for o in rows) - fitted
+        return float(np.sqrt(total / max(left, 1))), left
+
+    names = dict.fromkeys(owner[p.name] for p in entries if p.free and p.name in kept)
+    moved = find_moved_setups(tuple(names), measure_errors)
+    if moved is None:
+        return []
+    return [report_finding("validation.setup-moved", names=moved[0], times=moved[1])]
+
+
+# Poses and quantities of which little or nothing is compared.
+
+
+def _report_few_rows(after: PoseErrors) -> list[Finding]:
+    """Report quantities that too few rows measure."""
+    counts = {name: len(find_distinct(errors.rows)) for name, errors in after.quantities.items()}
+    return [
+        report_finding("validation.few-rows", quantity=quantity, count=count)
+        for quantity, count in counts.items()
+        if 0 < count < FEW_ROWS
+    ]
+
+
+def _report_left_out(data: Measurements, compared: PredictionComparison) -> list[Finding]:
+    """Report poses with rows that no statistic contains, and poses that were estimated."""
+    has_rows = np.zeros(data.n_poses, dtype=bool)
+    for o in data.observations:
+        has_rows[o.rows[o.weight > 0.0]] = True
+    absorbed = {"absorbed": int(compared.absorbed.sum())}
+    cases: tuple[tuple[str, BoolArray, dict[str, Any]], ...] = (
+        ("unreachable-poses", ~compared.usable & compared.predictable, {}),
+        ("missing-readings", has_rows & ~compared.predictable, {}),
+        ("poses-estimated", compared.estimated & compared.usable, absorbed),
+    )
+    return [
+        report_finding(
+            f"validation.{code}",
+            names=tuple(f"pose {data.labels[i]}" for i in np.flatnonzero(poses)),
+            **more,
+        )
+        for code, poses, more in cases
+        if poses.any()
+    ]
+
+
+# Held-out poses that neither the calibration nor the others explain.
+
+
+def _find_blunders(
+    robot: Mechanism, compared: PredictionComparison, uncertainty: FitUncertainty | None
+) -> tuple[Blunder, ...]:
+    """Return the compared poses that do not fit the calibrated robot; without its `uncertainty`
+    the noise and the other poses decide.
+    """
+    data, after = compared.data.take(compared.usable), compared.after
+    values = dict(zip(after.setup.table.names, after.values[0].tolist(), strict=True))
+    check = check_held_out_rows(robot, data, values, after.kept, uncertainty)
+    return () if check is None else name_blunders(check, data)
+
+
+def _report_blunders(
+    blunders: tuple[Blunder, ...], errors: Validation, rest: Validation | None
+) -> list[Finding]:
+    """Return a finding for each blunder, and whether they dominate the errors of all poses.
+
+    rest : the errors without the blunders.
+    """
+    largest = _find_largest(blunders, errors)
+    findings = [b.report(**result) for b, result in zip(blunders, largest, strict=True)]
+    if rest is None:
+        return findings
+    poses = tuple(label for blunder in blunders for label in blunder.poses)
+    for quantity, unit in errors.units.items():
+        every, without = (e.after.statistics(quantity).rms for e in (errors, rest))
+        if every > DOMINATES * without or np.isnan(without):
+            error, left = (
+                None if np.isnan(x) else Quantity(x / unit.factor_to_si, unit.symbol)
+                for x in (every, without)
+            )
+            code = "validation.blunders-dominate"
+            stated = {"poses": poses, "quantity": quantity, "error": error, "without": left}
+            return [*findings, report_finding(code, **stated)]
+    return findings
+
+
+def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[str, Any]]:
+    """Return quantity, target and error of the largest error of each blunder, compared with the
+    noise; empty where only actuator readings are compared.
+    """
+    of_row = []  # blunders of each row, which may compare several poses
+    for poses in errors.poses:
+        labels = set(poses.split("/"))
+        of_row.append([i for i, blunder in enumerate(blunders) if labels & set(blunder.poses)])
+    results: list[dict[str, Any]] = [{"quantity": "", "target": "", "error": ""} for _ in blunders]
+    worst = [0.0] * len(blunders)
+    for quantity, of_rows in errors.after.quantities.items():
+        floor, unit = errors.noise_floor.rms[quantity], errors.units[quantity]
+        entries = zip(of_rows.rows.tolist(), of_rows.size.tolist(), of_rows.targets, strict=True)
+        for row, size, target in entries:
+            for i in of_row[row]:
+                if size > worst[i] * floor:
+                    worst[i] = size / floor
+                    error = Quantity(size / unit.factor_to_si, unit.symbol)
+                    results[i] = {"quantity": quantity, "target": target, "error": error}
+    return results
 
 
 def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding | None:
-    """Return the finding that some rows belong to a calibration; None where no row does.
-
-    fitted : the rows of the calibration; None where they are not known. data : for validation.
+    """Return the finding that some rows for validation belong to a calibration, whose rows are
+    `fitted`; None where no row does, or they are not known. Refuse half of the rows or more.
     """
     reused = (fitted or FittedRows()).find_in(data)
     if not reused.count:
         return None
-    refused = reused.count >= REFUSED_SHARE * reused.total
-    finding = report_finding(
-        "validation.rows-reused",
-        Severity.REFUSAL if refused else Severity.WARNING,
-        **reused._asdict(),
-    )
-    if refused:
+    is_refused = reused.count >= REFUSED_SHARE * reused.total
+    severity = Severity.REFUSAL if is_refused else Severity.WARNING
+    finding = report_finding("validation.rows-reused", severity, **reused._asdict())
+    if is_refused:
         raise DataError(finding)
     return finding
 
 
 # A validation in a run folder: its numbers in result.json, and its differences as arrays.
-
-ERRORS = ("before", "after")  # errors whose differences are stored
-# First word of the names of the stored arrays, `held_out_<before or after>_<quantity>`.
-PREFIX = "held_out"
 
 
 def store_differences(validation: Validation) -> dict[str, FloatArray]:
@@ -704,13 +660,18 @@ def restore_validation(
         return None
     errors = {
         name: _restore_errors(content[name], arrays, f"{PREFIX}_{name}")
-        for name in ("before", "after", "commanded_before", "commanded_after", "not_compensable")
+        for name in (*ERRORS, "commanded_before", "commanded_after", "not_compensable")
     }
+    rest = content["without_blunders"]
+    if rest is not None:
+        unknown = {"commanded_before": {}, "commanded_after": {}, "not_compensable": {}}
+        unknown |= {"blunders": (), "without_blunders": None, "failed": ()}
+        rest = restore_validation({**content, **unknown, **rest}, {}, robot)
     return restore(
         Validation,
         content,
         **errors,
-        units={name: robot.get_unit(e.dimension) for name, e in errors["after"].quantities.items()},
+        units=_find_units(robot, errors["after"]),
         noise_floor=restore(NoiseFloor, {"metrics": content["noise_floor"]}),
         findings=(),
         conformity={},
@@ -718,25 +679,13 @@ def restore_validation(
             restore(Blunder, blunder, explanation=Explanation("none"))
             for blunder in content["blunders"]
         ),
-        without_blunders=_restore_rest(content["without_blunders"], content, robot),
+        without_blunders=rest,
     )
-
-
-def _restore_rest(
-    rest: Mapping[str, Any] | None, whole: Mapping[str, Any], robot: Mechanism
-) -> Validation | None:
-    """Return the statistics without blunders."""
-    if rest is None:
-        return None
-    unknown = {"commanded_before": {}, "commanded_after": {}, "not_compensable": {}}
-    unknown |= {"blunders": (), "without_blunders": None, "failed": ()}
-    return restore_validation({**whole, **unknown, **rest}, {}, robot)
 
 
 def _restore_errors(
     content: Mapping[str, Any], arrays: Mapping[str, np.ndarray], name: str
 ) -> PoseErrors:
-    """Return the errors by quantity."""
     quantities = {}
     for quantity, stored in content.items():
         components = arrays.get(f"{name}_{quantity}")
