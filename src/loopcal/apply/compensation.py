@@ -155,10 +155,8 @@ class Compensation(TableResult):
 
     def __str__(self) -> str:
         """Return how many targets are reached, and the findings of those that are not."""
-        usable = self.usable
-        n, reached = len(self.labels), int(usable.sum())
-        lines = [f"{self.robot.name}: {reached} of {n} targets reached ({self.mode})"]
-        missed = np.flatnonzero(~usable).tolist()
+        n, missed = len(self.labels), np.flatnonzero(~self.usable).tolist()
+        lines = [f"{self.robot.name}: {n - len(missed)} of {n} targets reached ({self.mode})"]
         lines += [f"target {self.labels[i]!r} {self.findings[i]}" for i in missed[:SHOWN]]
         if len(missed) > SHOWN:
             lines.append(f"and {len(missed) - SHOWN} more")
@@ -215,35 +213,44 @@ def compensate(
     count.begin(TASK)
     unchanged = forward(robot, uncorrected.q)
     before = geometry.pose_difference(unchanged.T, wanted)
-    result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
+    final, commands, distances = best, None, np.zeros((1, len(wanted), 6))
     if mode == "commands":
-        result = _shift_commands(robot, old, uncorrected, best, steps, count)
+        final, commands, distances = _shift_commands(robot, old, uncorrected, best, steps, count)
     count.begin(TASK)
-    distances, not_compensable = result.distances, geometry.pose_difference(best.T, wanted)
-    is_solved = uncorrected.converged & best.converged & result.final.converged
-    final, commands = _blank_rows(result, ~is_solved)
+    not_compensable = geometry.pose_difference(best.T, wanted)
+    findings = _report_targets(robot, uncorrected, best, final, distances, not_compensable)
+    # Elsewhere the iteration ends at some pose, but it is not the one nearest to the target.
+    is_solved = uncorrected.converged & best.converged & final.converged
+    status = np.where(is_solved, final.status, np.maximum(final.status, Status.UNREACHABLE))
+    solved = replace(
+        final,
+        status=status.astype(np.int8),
+        q=np.where(is_solved[:, None], final.q, np.nan),
+        T=np.where(is_solved[:, None, None], final.T, np.nan),
+    )
     names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
+    uncertainty = None
     if posterior is not None:
         before = _remove_unfixed_frames(posterior, old, wanted, before, frame)
-    after = geometry.pose_difference(result.final.T, wanted)
+        uncertainty = pose_uncertainty(posterior, solved, frame=frame, origin_name=names[0])
+    is_answered = uncorrected.converged & unchanged.converged
+    remaining = geometry.pose_difference(final.T, wanted)
     return Compensation(
         mode=mode,
         labels=names,
         robot=robot,
         controller=old,
-        readings=final.q,
-        commands=commands,
+        readings=solved.q,
+        commands=None if commands is None else np.where(is_solved[:, None], commands, np.nan),
         wanted=wanted,
-        reached=final.T,
-        before=_keep_rows(before, uncorrected.converged & unchanged.converged),
-        remaining=_keep_rows(after, is_solved),
-        not_compensable=_keep_rows(not_compensable, is_solved),
+        reached=solved.T,
+        before=np.where(is_answered[:, None], before, np.nan),
+        remaining=np.where(is_solved[:, None], remaining, np.nan),
+        not_compensable=np.where(is_solved[:, None], not_compensable, np.nan),
         residual_position=np.linalg.norm(distances[..., 3:], axis=2),
         residual_orientation=np.linalg.norm(distances[..., :3], axis=2),
-        uncertainty=None
-        if posterior is None
-        else pose_uncertainty(posterior, final, frame=frame, origin_name=names[0]),
-        findings=_report_targets(robot, uncorrected, best, result, not_compensable),
+        uncertainty=uncertainty,
+        findings=findings,
     )
 
 
@@ -264,16 +271,6 @@ def _remove_unfixed_frames(
     return frames.remove(errors[None], T, reference[None])[0]
 
 
-@dataclass(frozen=True, eq=False)
-class _Iteration:
-    """Outcome of the fixed-point iteration."""
-
-    final: Solution  # where the machine goes
-    commands: FloatArray | None  # (n, c) [m, rad], or None
-    # (steps + 1, n, 6) twists from the best poses, before the first and after each step
-    distances: FloatArray
-
-
 def _shift_commands(
     robot: Mechanism,
     controller: Mechanism,
@@ -281,10 +278,11 @@ def _shift_commands(
     best: Solution,
     steps: int,
     count: StepCounter,
-) -> _Iteration:
-    """Shift commands until the machine goes to the best poses.
+) -> tuple[Solution, FloatArray, FloatArray]:
+    """Shift commands until the machine goes to the best poses: where it goes, the commands (n, c)
+    [m, rad], and twists (steps + 1, n, 6) from the best poses, before and after each step.
 
-    The shift is a twist, so no choice of angles is singular. `count` receives the steps.
+    The shift is a twist, so no choice of angles is singular.
     """
     solution = uncorrected
     commands = read_coordinates(solution.T, controller.controlled)
@@ -297,69 +295,43 @@ def _shift_commands(
         solution = inverse(controller, commands, solution if solution.converged.all() else None)
         final = forward(robot, solution.q)
         distances.append(geometry.pose_difference(final.T, best.T))
-    return _Iteration(final, commands, np.stack(distances))
-
-
-def _keep_rows(errors: FloatArray, is_kept: BoolArray) -> FloatArray:
-    """Return errors (n, 6) of the chosen rows (n,), and NaN for the others."""
-    return np.where(is_kept[:, None], errors, np.nan)
-
-
-def _blank_rows(result: _Iteration, rows: BoolArray) -> tuple[Solution, FloatArray | None]:
-    """Return the final solution and the commands (n, c) without numbers in rows (n,).
-
-    There the iteration ends at some pose, but it is not the one nearest to the target.
-    """
-    final, commands = result.final, result.commands
-    status = np.where(rows, np.maximum(final.status, Status.UNREACHABLE), final.status)
-    blank = replace(
-        final,
-        status=status.astype(np.int8),
-        q=np.where(rows[:, None], np.nan, final.q),
-        T=np.where(rows[:, None, None], np.nan, final.T),
-    )
-    return blank, None if commands is None else np.where(rows[:, None], np.nan, commands)
+    return final, commands, np.stack(distances)
 
 
 def _report_targets(
     robot: Mechanism,
     uncorrected: Solution,
     best: Solution,
-    result: _Iteration,
+    final: Solution,
+    distances: FloatArray,
     not_compensable: FloatArray,
 ) -> tuple[Finding, ...]:
     """Return one finding for each target."""
-    final, distance = result.final, result.distances * twist_weights(robot) / robot.size
+    distances = distances * twist_weights(robot) / robot.size
     allowed, why = check_limits(robot, robot.values[None], final.q[None], final.state)
-    first, last = np.linalg.norm(distance[0], axis=1), np.linalg.norm(distance[-1], axis=1)
+    first, last = np.linalg.norm(distances[[0, -1]], axis=2)
     is_loose = last > np.maximum(REDUCED * first, ROUNDING)
     position = np.linalg.norm(not_compensable[:, 3:], axis=1)
     angle = np.linalg.norm(not_compensable[:, :3], axis=1)
-    solved = [(solution, solution.converged) for solution in (best, uncorrected, final)]
-    is_solved, closed = np.all([converged for _, converged in solved], axis=0), best.closed
-    findings = []
+    solutions = [(solution, solution.converged) for solution in (best, uncorrected, final)]
+    closed, findings = best.closed, []
     for i in range(len(not_compensable)):
-        if not is_solved[i]:
-            failed = next(solution for solution, converged in solved if not converged[i])
-            if failed is best and closed[i]:
-                findings.append(report_finding("compensation.other-mode"))
-                continue
+        failed = next((solution for solution, converged in solutions if not converged[i]), None)
+        values: dict[str, Any] = {}
+        if failed is best and closed[i]:
+            code = "other-mode"
+        elif failed is not None:
             whose = "the controller's geometry: " if failed is uncorrected else ""
-            reason = whose + str(failed.explain(i))
-            findings.append(report_finding("compensation.unreachable", reason=reason))
+            code, values = "unreachable", {"reason": whose + str(failed.explain(i))}
         elif not allowed[0, i]:
-            findings.append(report_finding("compensation.outside-limits", limit=str(why[0, i])))
+            code, values = "outside-limits", {"limit": str(why[0, i])}
         elif is_loose[i]:
-            findings.append(report_finding("compensation.not-converged"))
+            code = "not-converged"
         elif position[i] > ROUNDING * robot.size or angle[i] > ROUNDING:
-            findings.append(
-                report_finding(
-                    "compensation.reached-in-part",
-                    names=tuple(robot.controlled),
-                    position=robot.to_quantity(float(position[i]), Dimension.LENGTH),
-                    orientation=robot.to_quantity(float(angle[i]), Dimension.ANGLE),
-                )
-            )
+            code, values = "reached-in-part", {"names": tuple(robot.controlled)}
+            values["position"] = robot.to_quantity(float(position[i]), Dimension.LENGTH)
+            values["orientation"] = robot.to_quantity(float(angle[i]), Dimension.ANGLE)
         else:
-            findings.append(report_finding("compensation.reached"))
+            code = "reached"
+        findings.append(report_finding(f"compensation.{code}", **values))
     return tuple(findings)

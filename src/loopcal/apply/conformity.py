@@ -26,7 +26,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -41,14 +41,11 @@ from loopcal.results.result import Result
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
 
-if TYPE_CHECKING:
-    from loopcal.results.tables import Block
-
 LEVEL = 0.95  # probability that conformity and nonconformity need: the default of ISO 14253-1:2017
 # Probabilities of the bounds of an interval, and of the estimate between them.
 INTERVAL = (0.025, 0.5, 0.975)
-# Fields that findings state of an estimate with its interval.
-INTERVAL_NAMES = ("estimate", "expanded", "low", "high")
+# What findings state of an estimate with its interval, and of its limit.
+STATED = ("estimate", "expanded", "low", "high", "limit", "guard_band", "acceptance_limit")
 NODES = 32  # values of tau in each of the two searches
 MOST = 2000  # errors that are compared one by one
 NEGLIGIBLE = 1e-6  # density of tau, in terms of the largest one, that is left out
@@ -92,11 +89,11 @@ class Conformity(Result):
         rule=lambda _: "ISO 14253-1, JCGM 106",
     )
 
-    def page(self) -> list[Block]:
+    def __str__(self) -> str:
         """Return the decision with its probability; numbers are in m or rad."""
         error = f"error {self.estimate:.4g} (95 %: {self.low:.4g} to {self.high:.4g})"
         decision = f"{self.decision.value} with a probability of {100.0 * self.probability:.3g} %"
-        return [f"{error} against a limit of {self.limit:.4g}, all in m or rad: {decision}"]
+        return f"{error} against a limit of {self.limit:.4g}, all in m or rad: {decision}"
 
     @property
     def expanded(self) -> float:
@@ -216,11 +213,6 @@ def report_conformity(
 ) -> list[Finding]:
     """Return the statement on each limit, or why there is none."""
     findings = []
-    codes = {
-        Decision.CONFORMS: "conformity.conforms",
-        Decision.UNDECIDED: "conformity.undecided",
-        Decision.FAILS: "conformity.fails",
-    }
     for quantity, limit in limits.items():
         if limit is None or not len(after[quantity].rows):
             continue
@@ -230,17 +222,11 @@ def report_conformity(
         result, unit = judged[quantity], units[quantity]
         values: dict[str, Any] = {
             name: Quantity(float(getattr(result, name)) / unit.factor_to_si, unit.symbol)
-            for name in (*INTERVAL_NAMES, "limit", "guard_band", "acceptance_limit")
+            for name in STATED
         }
-        finding = report_finding(
-            codes[result.decision],
-            quantity=quantity,
-            count=result.count,
-            probability=result.probability,
-            level=result.level,
-            **values,
-        )
-        findings.append(finding)
+        values |= {name: getattr(result, name) for name in ("count", "probability", "level")}
+        code = f"conformity.{result.decision.name.lower()}"
+        findings.append(report_finding(code, quantity=quantity, **values))
     return findings
 
 

@@ -21,10 +21,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.apply.validation import describe_frame, group_setup
 from loopcal.diagnose.row_errors import (
@@ -44,17 +43,24 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, SI_SYMBOLS, Dimension
 
-if TYPE_CHECKING:
-    pass
-
-
-# The result of `assess_repeatability`: what each visited pose shows.
-
-# Dimensions of the quantities.
-DIMENSIONS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
+POSITION, ORIENTATION = "position", "orientation"
+DIMENSIONS = {POSITION: Dimension.LENGTH, ORIENTATION: Dimension.ANGLE}
+TAIL = 0.025  # probability beyond each bound of an interval
+STANDARD_VISITS = 30  # visits of each pose that ISO 9283 asks for
+# Share of the scatter that the uncertainty of the instrument may be (ISO 9283, section 6.4).
+LARGEST_NOISE = 0.25
+FEWEST_VISITS = 2  # visits without which there is no scatter
+NORMAL = 1.959963984540054  # quantile of the normal distribution for intervals of 95 %
+LARGE = 1e3  # square of the mean over its variance beyond which its length is normal
+SMALLEST_SHARE = 0.05  # share of the variance that the direction of the mean has at least
+DRAWS = 1000  # drawn sets of visits for the interval of RP_l
+MANY = 20  # times as many visits give the true RP_l of a scatter
+# Columns of the data frame.
+COLUMNS = ("pose", "target", "direction", "quantity", "component", "unit", "AP", "AP_low")
+COLUMNS += ("AP_high", "RP", "RP_low", "RP_high", "visits")
 
 
 class Estimate(NamedTuple):
@@ -69,13 +75,7 @@ class Estimate(NamedTuple):
 class VisitedPose:
     """Pose accuracy and repeatability of one target at one commanded pose."""
 
-    pose: str  # label of its first visit
-    # target, direction: names of the target and of the direction of approach (the group of the
-    # rows); empty for the only one
-    target: str
-    direction: str
     visits: int  # their number
-    components: tuple[str, ...]  # names of the measured components, such as ("x", "y", "z")
     mean: FloatArray  # (c,) attained minus commanded values
     # accuracy, repeatability: AP_p and RP_l of a position; None for an orientation
     accuracy: Estimate | None
@@ -83,6 +83,12 @@ class VisitedPose:
     # accuracies, repeatabilities: AP and RP of each component
     accuracies: tuple[Estimate, ...]
     repeatabilities: tuple[Estimate, ...]
+    pose: str = ""  # label of its first visit
+    # target, direction: names of the target and of the direction of approach (the group of the
+    # rows); empty for the only one
+    target: str = ""
+    direction: str = ""
+    components: tuple[str, ...] = ()  # names of the measured ones, such as ("x", "y", "z")
     commanded: int = 0  # number of the commanded pose
 
     def list_accuracies(self) -> tuple[Estimate, ...]:
@@ -95,24 +101,13 @@ class VisitedPose:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content by name for JSON, SI."""
-        listed = {
-            name: {
-                component: estimate._asdict()
-                for component, estimate in zip(self.components, estimates, strict=True)
-            }
-            for name, estimates in (("AP", self.accuracies), ("RP", self.repeatabilities))
+        whole = {"AP_p": self.accuracy, "RP_l": self.repeatability}
+        of_each = {"AP": self.accuracies, "RP": self.repeatabilities}
+        return {
+            **{name: getattr(self, name) for name in ("pose", "target", "direction", "visits")},
+            **{name: estimate for name, estimate in whole.items() if estimate is not None},
+            **{n: dict(zip(self.components, each, strict=True)) for n, each in of_each.items()},
         }
-        whole = {
-            name: estimate._asdict()
-            for name, estimate in (("AP_p", self.accuracy), ("RP_l", self.repeatability))
-            if estimate is not None
-        }
-        names = ("pose", "target", "direction", "visits")
-        return {**{name: getattr(self, name) for name in names}, **whole, **listed}
-
-
-NUMBERS = ("AP", "AP_low", "AP_high", "RP", "RP_low", "RP_high", "visits")
-"""Columns of numbers of the data frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,23 +132,20 @@ class Repeatability(DrawnResult):
         *fields(standard=lambda _: "ISO 9283:1998", frame=""),
         *(
             Field(name, lambda result, name=name: result.poses.get(name), is_optional=True)
-            for name in ("position", "orientation")
+            for name in DIMENSIONS
         ),
-        *fields(variations=lambda result: result.list_variations(), findings=""),
+        *fields(
+            variations=lambda result: [
+                {"pose": pose, "target": target, "vAP_p": value}
+                for (pose, target), value in result.variations.items()
+            ],
+            findings="",
+        ),
         *(
             Field(name, lambda result, i=i: [row[i] for row in result.list_rows()], "row")
-            for i, name in enumerate(
-                ("pose", "target", "direction", "quantity", "component", "unit", *NUMBERS)
-            )
+            for i, name in enumerate(COLUMNS)
         ),
     )
-
-    def list_variations(self) -> list[dict[str, Any]]:
-        """Return the variations by name."""
-        return [
-            {"pose": pose, "target": target, "vAP_p": value}
-            for (pose, target), value in self.variations.items()
-        ]
 
     def list_rows(self) -> list[tuple[Any, ...]]:
         """Return AP and RP with their intervals, one row for each pose and component [SI]."""
@@ -179,39 +171,16 @@ class Repeatability(DrawnResult):
 
     def __str__(self) -> str:
         """Return the largest values of each quantity, and the findings."""
-        lines = [
-            f"{name}, largest of {len(poses)}: {describe_largest(poses, name)}"
-            for name, poses in self.poses.items()
-        ]
+        lines = []
+        for name, poses in self.poses.items():
+            unit, words = DISPLAY_UNITS[DIMENSIONS[name]], []
+            accuracies = [abs(e.value) for pose in poses for e in pose.list_accuracies()]
+            repeatabilities = [e.value for pose in poses for e in pose.list_repeatabilities()]
+            for symbol, values in (("AP", accuracies), ("RP", repeatabilities)):
+                size = round_to_digits(max(values) / unit.factor_to_si)
+                words.append(f"{symbol} {size} {unit.symbol}")
+            lines.append(f"{name}, largest of {len(poses)}: {', '.join(words)}")
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
-
-
-def describe_largest(poses: tuple[VisitedPose, ...], quantity: str) -> str:
-    """Return the largest AP and RP of some poses in words; those of a position are AP_p and RP_l,
-    those of an orientation the largest of any component.
-    """
-    unit = DISPLAY_UNITS[DIMENSIONS[quantity]]
-    accuracies = [abs(e.value) for pose in poses for e in pose.list_accuracies()]
-    repeatabilities = [e.value for pose in poses for e in pose.list_repeatabilities()]
-    words = []
-    for name, values in (("AP", accuracies), ("RP", repeatabilities)):
-        words.append(f"{name} {round_to_digits(max(values) / unit.factor_to_si)} {unit.symbol}")
-    return ", ".join(words)
-
-
-TAIL = 0.025  # probability beyond each bound of an interval
-STANDARD_VISITS = 30  # visits of each pose that ISO 9283 asks for
-# Share of the scatter that the uncertainty of the instrument may be (ISO 9283, section 6.4).
-LARGEST_NOISE = 0.25
-FEWEST_VISITS = 2  # visits without which there is no scatter
-NORMAL = 1.959963984540054  # quantile of the normal distribution for intervals of 95 %
-LARGE = 1e3  # square of the mean over its variance beyond which its length is normal
-SMALLEST_SHARE = 0.05  # share of the variance that the direction of the mean has at least
-DRAWS = 1000  # drawn sets of visits for the interval of RP_l
-# Sets of visits that together give the true RP_l of a scatter, in terms of `DRAWS` visits.
-MANY = 20
-
-POSITION, ORIENTATION = "position", "orientation"
 
 
 def assess_repeatability(
@@ -232,18 +201,22 @@ def assess_repeatability(
     DataError : no position or orientation is measured, or no pose is visited twice.
     """
     check_actuators(data, robot)
-    data = _keep_poses(data)
+    kept = tuple(
+        o
+        for o in data.observations
+        if o.kind.poses_per_row == 1
+        and {g.quantity for g in list_error_groups(o.kind)} & DIMENSIONS.keys()
+    )
+    if not kept:
+        raise DataError(report_finding("repeatability.nothing-measured"))
+    data = replace(data, observations=kept)
     compared = compare_predictions(robot, robot, data, nuisance_values, nuisance_values)
     rows = compared.data.observations
     errors = compute_row_errors(rows, compared.after.residuals(rows))
-    noise = compute_noise_floor(rows)
-    visit = np.concatenate([o.rows for o in compared.data.observations])
-    direction = np.concatenate([o.group for o in compared.data.observations])
-    places = _RowPlaces(compared.data.repeats[visit], visit, direction)
     poses = {
         quantity: entries
-        for quantity in (POSITION, ORIENTATION)
-        if (entries := _describe_poses(errors[quantity], quantity, places, compared.data.labels))
+        for quantity in DIMENSIONS
+        if (entries := _describe_poses(errors[quantity], quantity, compared.data))
     }
     if not poses:
         raise DataError(report_finding("repeatability.no-repeats"))
@@ -252,62 +225,39 @@ def assess_repeatability(
         frame=describe_frame(errors, (*setup["kept"], *setup["fitted"])),
         poses=poses,
         variations=_find_variations(poses.get(POSITION, ())),
-        findings=_report(poses, setup["fitted"], noise.rms),
+        findings=_report(poses, setup["fitted"], compute_noise_floor(rows).rms),
     )
-
-
-class _RowPlaces(NamedTuple):
-    """Of each row (r,): the number of the commanded pose, of its visit, and the direction."""
-
-    commanded: IntArray
-    visit: IntArray
-    direction: NDArray[np.str_]
-
-
-def _keep_poses(data: Measurements) -> Measurements:
-    """Return the rows that measure positions or orientations of one pose."""
-    kept = tuple(
-        o
-        for o in data.observations
-        if o.kind.poses_per_row == 1
-        and {g.quantity for g in list_error_groups(o.kind)} & {POSITION, ORIENTATION}
-    )
-    if not kept:
-        raise DataError(report_finding("repeatability.nothing-measured"))
-    return replace(data, observations=kept)
 
 
 def _describe_poses(
-    errors: QuantityErrors, quantity: str, places: _RowPlaces, labels: Sequence[str]
+    errors: QuantityErrors, quantity: str, data: Measurements
 ) -> tuple[VisitedPose, ...]:
     """Return the characteristics of all targets at poses that were visited twice or more."""
+    visit = np.concatenate([o.rows for o in data.observations])
+    direction = np.concatenate([o.group for o in data.observations])
+    commanded_poses = data.repeats[visit]
     is_measured = np.isfinite(errors.components).any(axis=0)
     names = np.array(["", "", ""], dtype=object)
     names[is_measured] = errors.measured[: int(is_measured.sum())]
     keys: dict[tuple[int, str, str], list[int]] = {}
     for i, (row, target) in enumerate(zip(errors.rows.tolist(), errors.targets, strict=True)):
-        key = (int(places.commanded[row]), target, str(places.direction[row]))
+        key = (int(commanded_poses[row]), target, str(direction[row]))
         keys.setdefault(key, []).append(i)
     entries = []
-    for (commanded, target, direction), chosen in keys.items():
+    for (commanded, target, of), chosen in keys.items():
         attained = -errors.components[chosen]
         columns = np.isfinite(attained).all(axis=0)
         attained = attained[:, columns]
-        if len(chosen) < FEWEST_VISITS or not attained.size:
-            continue
-        label = labels[int(places.visit[errors.rows[chosen[0]]])]
-        shown = tuple(str(name) for name in names[columns])
-        entry = describe_visits(attained, quantity == POSITION)
-        entries.append(
-            replace(
-                entry,
-                pose=label,
+        if len(chosen) >= FEWEST_VISITS and attained.size:
+            entry = replace(
+                describe_visits(attained, quantity == POSITION),
+                pose=data.labels[int(visit[errors.rows[chosen[0]]])],
                 target=target,
-                direction=direction,
-                components=shown,
+                direction=of,
+                components=tuple(str(name) for name in names[columns]),
                 commanded=commanded,
             )
-        )
+            entries.append(entry)
     return tuple(entries)
 
 
@@ -322,11 +272,7 @@ def describe_visits(attained: FloatArray, is_position: bool) -> VisitedPose:
     half = coverage_factor(n - 1) * sd / np.sqrt(n)
     low, high = (np.sqrt((n - 1) / compute_chi_square_quantile(n - 1, p)) for p in (TAIL, 1 - TAIL))
     return VisitedPose(
-        pose="",
-        target="",
-        direction="",
         visits=n,
-        components=(),
         mean=mean,
         accuracy=_estimate_accuracy(attained) if is_position else None,
         repeatability=_estimate_repeatability(attained) if is_position else None,
@@ -366,15 +312,12 @@ def _estimate_accuracy(attained: FloatArray) -> Estimate:
     factor, degrees = float(coverage_factor(n - 1)), trace / unit
     unit *= (factor / NORMAL) ** 2 / n
     statistic = size**2 / unit
-    if statistic > LARGE:
-        return Estimate(size, size - NORMAL * np.sqrt(unit), size + NORMAL * np.sqrt(unit))
-    bounds = [
+    low, high = (
         float(np.sqrt(chndtrinc(statistic, degrees, p) * unit))
         if chndtr(statistic, degrees, 0.0) > p
         else 0.0
         for p in (1.0 - TAIL, TAIL)
-    ]
-    low, high = bounds
+    )
     return Estimate(size, low, max(high, NORMAL * float(np.sqrt(unit))))
 
 
@@ -395,10 +338,8 @@ def _estimate_repeatability(attained: FloatArray) -> Estimate:
 
 
 def _find_variations(poses: Sequence[VisitedPose]) -> dict[tuple[str, str], float]:
-    """Return vAP_p of targets at poses that were approached from several directions.
-
-    Entries of one commanded pose have the same number of components; their labels differ, so the
-    pose has the label of its first direction.
+    """Return vAP_p of targets at poses that were approached from several directions; the labels of
+    one commanded pose differ, so it has that of its first direction.
     """
     groups: dict[tuple[int, str], list[VisitedPose]] = {}
     for pose in poses:
