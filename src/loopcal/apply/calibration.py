@@ -7,17 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from loopcal.apply.calibration_findings import (
-    check_split_instruments,
-    report_conventions,
     report_fit,
     report_freedoms,
-    report_repeats,
     report_scale,
     report_unexplained,
     report_validation,
 )
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
-from loopcal.apply.calibration_report import CalibrationReport, describe_provenance
+from loopcal.apply.calibration_report import CalibrationReport, Provenance
 from loopcal.apply.error_budget import compute_error_budget
 from loopcal.apply.height_errors import map_height_errors
 from loopcal.apply.validation import Validation, validate
@@ -28,6 +25,7 @@ from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets, report_moved_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.start_values import check_start_values
+from loopcal.engine import collect_versions
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.identification import identify
@@ -35,16 +33,16 @@ from loopcal.estimate.information import count_equations
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import list_instrument_frames
-from loopcal.findings import Finding, report_finding, sort_by_importance
+from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import check_instruments
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
 
 if TYPE_CHECKING:
     from loopcal.diagnose.cross_validation import ModelChoice
-    from loopcal.diagnose.suggestions import MeasurementSuggestion
     from loopcal.estimate.recalibration import Change
 
 # Codes of data that a geometry cannot reach.
@@ -209,7 +207,13 @@ def _report(
     count.begin("computing the uncertainty budget")
     budget = compute_error_budget(fit, fitted, options.frame) if fit.converged else None
     count.begin("looking for further measurements")
-    suggestions = _suggest(fit, fitted)
+    suggestions = None
+    if fit.converged and fit.unidentifiable:
+        from loopcal.diagnose.identifiable_parameters import identifiability
+        from loopcal.diagnose.suggestions import suggest_measurements
+
+        analysis = identifiability(fit.robot, fitted, fit.options.rank_tolerance)
+        suggestions = suggest_measurements(analysis)
     start = check_start_values(fit)
     comparison = None
     if options.compare_with is not None:
@@ -217,14 +221,17 @@ def _report(
 
         comparison = compare_with_values(fit, options.compare_with)
     examined = () if examination is None else examination.findings
+    doubts = () if conventions.finding is None else (conventions.finding,)
+    repeats = tuple(f"pose {label}" for label in split.list_repeats())
     findings = [
-        *report_conventions(conventions),
+        # fit and validation answer doubts about conventions
+        *(replace(finding, severity=Severity.INFO) for finding in doubts),
         *report_fit(fit),
         *report_unexplained(fit, examined),
         *impossible,
         *(report_validation(errors, held_out is not None) if fit.converged else ()),
-        *report_repeats(split),
-        *check_split_instruments(split),
+        *([report_finding("workflow.held-out-repeats", names=repeats)] if repeats else []),
+        *check_instruments(split.list_observations()),
         *report_freedoms(fit, fitted),
         *report_scale(fit, fitted),
         *report_base_targets(fitted),
@@ -251,7 +258,7 @@ def _report(
         model_choice=choice,
         change=change,
         comparison=comparison,
-        provenance=describe_provenance(options),
+        provenance=Provenance(collect_versions(), {"hold_out": options.seed}, options.to_dict()),
     )
 
 
@@ -273,13 +280,3 @@ def _validate(
         if error.code in NOTHING_TO_COMPARE:
             return None, [report_finding("workflow.nothing-to-validate", reason=str(error))]
         raise
-
-
-def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSuggestion, ...] | None:
-    """Return further measurements that determine open combinations; None where none is open."""
-    if not fit.converged or not fit.unidentifiable:
-        return None
-    from loopcal.diagnose.identifiable_parameters import identifiability
-    from loopcal.diagnose.suggestions import suggest_measurements
-
-    return suggest_measurements(identifiability(fit.robot, data, fit.options.rank_tolerance))

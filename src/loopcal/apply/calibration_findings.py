@@ -5,12 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
-from loopcal.apply.calibration_options import DataSplit
 from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation import FEW_ROWS, Validation
 from loopcal.apply.verdict import BASE_MOVED
-from loopcal.diagnose.conventions.convention_check import ConventionCheck
 from loopcal.diagnose.gauge_freedoms import GaugeFreedoms, find_gauge_freedoms
 from loopcal.estimate.null_space import Combination
 from loopcal.estimate.posterior import Posterior
@@ -18,7 +17,6 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure.kinds.joints import Closure
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import check_instruments
 from loopcal.units import Dimension
 
 # Finding that a calibration is not expected to improve on the tolerances.
@@ -26,11 +24,6 @@ NO_GAIN = "model.no-expected-gain"
 ON_BASE = (*BASE_MOVED, "data.base-session-unused")  # findings on targets on the base
 # Factor on sigma from which an estimated noise is no property of an instrument.
 UNUSUAL_NOISE = 10.0
-
-
-def report_conventions(check: ConventionCheck) -> list[Finding]:
-    """Return doubts about conventions, which fit and validation answer: worth knowing."""
-    return [] if check.finding is None else [replace(check.finding, severity=Severity.INFO)]
 
 
 def report_fit(fit: Identification) -> list[Finding]:
@@ -76,41 +69,21 @@ def report_validation(errors: Validation | None, is_held_out: bool) -> list[Find
         return [*own, few]
     if checked.values_left < FEW_ROWS:
         values, setup = checked.kinds[-1].count, checked.setup_count
-        held_out_setup = report_finding("workflow.held-out-setup", values=values, setup=setup)
-        return [*own, held_out_setup]
-    return [
-        *own,
-        *(
-            report_finding("gates.errors-grew", quantity=quantity, times=1.0 / change.times)
-            for quantity, change in checked.changes().items()
-            if change.has_grown
-        ),
+        return [*own, report_finding("workflow.held-out-setup", values=values, setup=setup)]
+    return own + [
+        report_finding("gates.errors-grew", quantity=quantity, times=1.0 / change.times)
+        for quantity, change in checked.changes().items()
+        if change.has_grown
     ]
-
-
-def report_repeats(split: DataSplit) -> list[Finding]:
-    """Return which held-out poses repeat fitted ones, where poses were chosen by name."""
-    names = tuple(f"pose {label}" for label in split.list_repeats())
-    return [report_finding("workflow.held-out-repeats", names=names)] if names else []
-
-
-def check_split_instruments(split: DataSplit) -> list[Finding]:
-    """Return the instruments that were not validly calibrated when they measured."""
-    held_out = () if split.held_out is None else split.held_out.observations
-    return check_instruments((*split.fitted.all_observations, *held_out))
 
 
 def report_scale(fit: Identification, data: Measurements) -> list[Finding]:
     """Return that heights do not test the fixed lengths from which x and y have their scale."""
     if not fit.converged or not measures_only_heights(data):
         return []
-    names = tuple(
-        parameter.name
-        for parameter, is_free in zip(
-            fit.robot.parameters.entries, fit.robot.parameters.free, strict=True
-        )
-        if not is_free and parameter.dimension is Dimension.LENGTH
-    )
+    table = fit.robot.parameters
+    columns = zip(table.names, table.dimensions, table.free, strict=True)
+    names = tuple(n for n, d, is_free in columns if not is_free and d is Dimension.LENGTH)
     return [report_finding("workflow.undetermined-scale", names=names)] if names else []
 
 
@@ -123,19 +96,12 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     motions, count = freedoms.motions, freedoms.changing_count
     findings = [report_readings_gauge(motions, freedoms.count)] if is_readings_alone(data) else []
     if motions.count:
-        findings.append(
-            report_finding(
-                "workflow.frame-freedoms", count=motions.count, frames=tuple(motions.frames)
-            )
-        )
+        moved: dict[str, Any] = {"count": motions.count, "frames": tuple(motions.frames)}
+        findings.append(report_finding("workflow.frame-freedoms", **moved))
     if count > 0:
-        findings.append(
-            report_finding("workflow.undetermined-combinations", count=count, names=freedoms.names)
-        )
+        changing: dict[str, Any] = {"count": count, "names": freedoms.names}
+        findings.append(report_finding("workflow.undetermined-combinations", **changing))
     return findings
-
-
-# What combinations of parameters that data leave open do: move frames only, or change poses.
 
 
 @dataclass(frozen=True)
@@ -164,9 +130,6 @@ def sort_undetermined(
     changing = tuple(c for c in unidentifiable if not c.meaning)
     names = dict.fromkeys(name for c in changing or unidentifiable for name in c.names)
     return UndeterminedCombinations(find_gauge_freedoms(posterior), count, changing, tuple(names))
-
-
-# What redundant readings alone leave open, in one sentence.
 
 
 def is_readings_alone(data: Measurements) -> bool:

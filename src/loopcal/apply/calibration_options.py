@@ -17,18 +17,16 @@ from loopcal.estimate.posterior import Posterior
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_seed, check_type
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 
 
 def describe_wrong_share(share: float) -> str:
-    """Return what is wrong with a share of held-out poses; empty where nothing is.
-
-    A number from 1 to below 100 was probably meant in percent, or as a number of poses.
-    """
+    """Return what is wrong with a share of held-out poses; empty where nothing is."""
     if 0.0 <= share < 1.0:
         return ""
     fault = f"{share:g}, which is not a share of the poses, from 0 to below 1"
-    if not 1.0 <= share < 100.0:
+    if not 1.0 <= share < 100.0:  # others were probably meant in percent, or as a number of poses
         return f"{fault}; write 0.25 for a quarter"
     return (
         f"{fault}; write {share / 100:g} for {share:g} %, or the number of poses to hold out "
@@ -93,8 +91,14 @@ class CalibrationOptions:
         check_limit("limit_angle", self.limit_angle)
         if self.free_limb is not None and self.prior is None:
             raise DataError(report_finding("workflow.free-limb-needs-prior", limb=self.free_limb))
-        if self.prior is not None:
-            self._check_prior()
+        chosen = {
+            "method": self.fit.method is not None,
+            "loss": self.fit.loss is not None,
+            "choose_model": self.choose_model,
+        }
+        excluded = [option for option, is_chosen in chosen.items() if is_chosen]
+        if self.prior is not None and excluded:
+            raise DataError(report_finding("workflow.option-excludes-prior", option=excluded[0]))
 
     @property
     def has_limit(self) -> bool:
@@ -112,19 +116,6 @@ class CalibrationOptions:
                 plain[key] = dict(value) if isinstance(value, Mapping) else {OBJECT: repr(value)}
         return {**plain, "fit": self.fit.to_dict()}
 
-    def _check_prior(self) -> None:
-        """Refuse what is no earlier calibration, and options that cannot be combined with it."""
-        chosen = {
-            "method": self.fit.method is not None,
-            "loss": self.fit.loss is not None,
-            "choose_model": self.choose_model,
-        }
-        for option, is_chosen in chosen.items():
-            if is_chosen:
-                raise DataError(report_finding("workflow.option-excludes-prior", option=option))
-
-
-# Measurements divided into those to fit and those held out for validation.
 
 UNKNOWN = np.array(np.inf)  # sigma of readings that may be missing
 
@@ -137,6 +128,11 @@ class DataSplit:
     held_out: Measurements | None  # measurements for validation; None where there are none
     share: float  # the share that was asked for; 0 where poses were named, or none were held out
     seed: int  # of the random choice
+
+    def list_observations(self) -> tuple[Observations, ...]:
+        """Return the observations of both sets, those of targets on the base once."""
+        held_out = () if self.held_out is None else self.held_out.observations
+        return (*self.fitted.all_observations, *held_out)
 
     def list_repeats(self) -> tuple[str, ...]:
         """Return the labels of held-out poses that repeat a fitted one."""
@@ -153,8 +149,7 @@ class DataSplit:
         """Return share, seed and labels of the held-out poses for JSON; None without any."""
         if self.held_out is None:
             return None
-        labels = list(self.held_out.labels)
-        return {"hold_out": self.share, "seed": self.seed, "held_out": labels}
+        return {"hold_out": self.share, "seed": self.seed, "held_out": list(self.held_out.labels)}
 
 
 def split_data(
@@ -183,9 +178,8 @@ def split_data(
         is_held_out = [label in names for label in data.labels]
         if all(is_held_out):
             raise DataError("all poses of the data are held out; leave some to fit")
-        fitted = data.take([not chosen for chosen in is_held_out])
-        return DataSplit(fitted, data.take(is_held_out), 0.0, seed)
+        is_fitted = [not chosen for chosen in is_held_out]
+        return DataSplit(data.take(is_fitted), data.take(is_held_out), 0.0, seed)
     if not hold_out:
         return DataSplit(data, None, 0.0, seed)
-    fitted, validation = data.split(hold_out=hold_out, seed=seed)
-    return DataSplit(fitted, validation, hold_out, seed)
+    return DataSplit(*data.split(hold_out=hold_out, seed=seed), hold_out, seed)

@@ -14,9 +14,9 @@ from loopcal.apply import height_errors
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit
 from loopcal.apply.validation import store_differences
 from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict, recommend_values
-from loopcal.engine import collect_versions
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
+from loopcal.findings.wording import name_count
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import InstrumentRecord, list_instruments
 from loopcal.mechanism.model import Mechanism
@@ -49,11 +49,6 @@ class Provenance:
     versions: Mapping[str, str]  # of loopcal, numpy, scipy and python, and the engine that computed
     seeds: Mapping[str, int]  # by name
     options: Mapping[str, Any]  # as plain data
-
-
-def describe_provenance(options: CalibrationOptions) -> Provenance:
-    """Return the versions in use, the seeds and the options."""
-    return Provenance(collect_versions(), {"hold_out": options.seed}, options.to_dict())
 
 
 def _count_fitted_poses(fit: Identification, data: Measurements) -> int:
@@ -119,22 +114,16 @@ class CalibrationReport(TableResult):
         *fields("verdict", "headline", "states_expected_error", "findings", "recommendation"),
         *fields("next_step", passed=lambda report: not report.failures),
         *fields(reasons=lambda report: list(map(str, report.failures)), fit="identification"),
-        *fields(
-            start="", split=lambda report: report.split.to_dict(), instruments="", validation=""
-        ),
-        *(
-            Field(name, of, is_optional=True)
-            for name, of in (
-                ("change", "change"),
-                ("expected_error", "budget"),
-                ("comparison", "comparison"),
-                ("model_choice", "model_choice"),
-                ("examination", "examination"),
-                ("remedies", "suggestions"),
-                ("reading_errors", "reading_errors"),
-                ("height_errors", "height_errors"),
-            )
-        ),
+        *fields("start", split=lambda report: report.split.to_dict()),
+        *fields("instruments", "validation"),
+        Field("change", is_optional=True),
+        Field("expected_error", "budget", is_optional=True),
+        Field("comparison", is_optional=True),
+        Field("model_choice", is_optional=True),
+        Field("examination", is_optional=True),
+        Field("remedies", "suggestions", is_optional=True),
+        Field("reading_errors", is_optional=True),
+        Field("height_errors", is_optional=True),
         *fields(options="provenance.options"),
     )
 
@@ -161,8 +150,7 @@ class CalibrationReport(TableResult):
     @property
     def instruments(self) -> tuple[InstrumentRecord, ...]:
         """The stated instruments of all measurements, each once."""
-        held_out = () if self.split.held_out is None else self.split.held_out.observations
-        return list_instruments((*self.split.fitted.all_observations, *held_out))
+        return list_instruments(self.split.list_observations())
 
     @property
     def top_findings(self) -> tuple[Finding, ...]:
@@ -198,10 +186,8 @@ class CalibrationReport(TableResult):
         are doubtful.
         """
         fit = self.identification
-        if fit.residual_test.is_doubtful:
-            return False
-        explained = fit.posterior.discrepancy is not None
-        return self.budget is not None and (explained or not fit.residual_test.failed)
+        explained = fit.posterior.discrepancy is not None or not fit.residual_test.failed
+        return self.budget is not None and explained and not fit.residual_test.is_doubtful
 
     @property
     def headline(self) -> str:
@@ -210,7 +196,7 @@ class CalibrationReport(TableResult):
         fitted, verdict = _count_fitted_poses(fit, self.split.fitted), self.verdict.value
         return (
             f"{verdict[0].upper()}{verdict[1:]}: {self.robot.name}, {len(fit.names)} parameters "
-            f"from {fitted} {'pose' if fitted == 1 else 'poses'}."
+            f"from {name_count(fitted, 'pose')}."
         )
 
     def __str__(self) -> str:
@@ -227,9 +213,8 @@ class CalibrationReport(TableResult):
     __repr__ = __str__
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return arrays to store [SI]: those of the fit, `initial`, the values of all parameters
-        before the calibration, `poses`, the labels of the fitted poses, the differences at held-out
-        poses, and errors of heights.
+        """Return arrays to store [SI]: those of the fit, the `initial` values of all parameters,
+        labels of the fitted `poses`, differences at held-out poses, and errors of heights.
         """
         fit, errors, heights = self.identification, self.validation, self.height_errors
         return {
@@ -245,8 +230,5 @@ class CalibrationReport(TableResult):
         return self.identification.records()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as JSON values by name, SI: dictionaries, lists, numbers and text.
-
-        A number that is not finite becomes None.
-        """
+        """Return the result as JSON values by name, SI; a number that is not finite is None."""
         return to_json(json_fields(self))

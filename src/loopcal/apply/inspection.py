@@ -64,23 +64,18 @@ class IdentifiabilityReport:
         analysis = self.analysis
         if not analysis.unidentifiable:
             return []
-        freedoms = sort_undetermined(
-            analysis.posterior, analysis.unidentifiable, analysis.n_parameters - analysis.rank
-        )
+        left = analysis.n_parameters - analysis.rank
+        freedoms = sort_undetermined(analysis.posterior, analysis.unidentifiable, left)
         motions, changing = freedoms.motions, freedoms.changing
         findings = []
         if self.is_readings_alone:
             findings.append(report_readings_gauge(motions, freedoms.count))
         if motions.count:
-            findings.append(
-                report_finding(
-                    "identifiability.frames-only", count=motions.count, frames=motions.frames
-                )
-            )
+            moved: dict[str, Any] = {"count": motions.count, "frames": motions.frames}
+            findings.append(report_finding("identifiability.frames-only", **moved))
         if (count := freedoms.changing_count) > 0:
-            findings.append(
-                report_finding("identifiability.changes-poses", count=count, names=freedoms.names)
-            )
+            changed: dict[str, Any] = {"count": count, "names": freedoms.names}
+            findings.append(report_finding("identifiability.changes-poses", **changed))
             findings += [c.finding for c in changing] if len(changing) <= FEW else []
         return findings
 
@@ -91,17 +86,10 @@ class IdentifiabilityReport:
         solved = Counter(m.words for s in self.suggestions for m in s.measurements)
         if not solved:
             return [s.finding for s in self.suggestions]
-        words, count = max(solved.items(), key=lambda item: item[1])
-        total = len(self.suggestions)
-        return [
-            report_finding(
-                "identifiability.measure-for-all",
-                words=words,
-                count=count,
-                total=total,
-                left=total - count,
-            )
-        ]
+        (words, count), total = solved.most_common(1)[0], len(self.suggestions)
+        stated: dict[str, Any] = {"words": words, "count": count}
+        stated |= {"total": total, "left": total - count}
+        return [report_finding("identifiability.measure-for-all", **stated)]
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *within("analysis", [field for field in Identifiability.FIELDS if field.name != "scaling"]),
@@ -133,8 +121,6 @@ def analyze_identifiability(
     return IdentifiabilityReport(analysis, suggestions, subset, accuracy, is_readings_alone(data))
 
 
-# Inspect a robot: its readings at home, and the limits that home exceeds.
-
 ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
 
 
@@ -149,23 +135,24 @@ class RobotInspection:
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(name="robot.name", path="robot.record.path", freedoms="robot.freedoms"),
         *fields(controlled="robot.controlled", size="robot.size", home="robot.home"),
-        *fields(tool="robot.tool", actuators=lambda inspection: inspection.list_actuators()),
+        *fields(tool="robot.tool"),
+        *fields(
+            actuators=lambda inspection: [
+                {"name": a.name, "dimension": a.dimension, "stroke": a.stroke}
+                for a in inspection.robot.actuators
+            ]
+        ),
         *fields(parameters=lambda inspection: inspection.list_parameters()),
         *fields(common_errors="robot.parameters.common"),
         *fields(notes=lambda inspection: list(map(str, inspection.robot.findings)), findings=""),
     )
 
-    def list_actuators(self) -> list[dict[str, Any]]:
-        """Return name, dimension and stroke of each actuator."""
-        names = ("name", "dimension", "stroke")
-        return [{name: getattr(a, name) for name in names} for a in self.robot.actuators]
-
     def list_parameters(self) -> list[dict[str, Any]]:
         """Return what the robot states of each parameter [SI]."""
-        names = ("name", "dimension", "nominal", "value", "tolerance", "free")
         entries = zip(self.robot.parameters.entries, self.robot.values, strict=True)
         return [
-            {name: value if name == "value" else getattr(p, name) for name in names}
+            {"name": p.name, "dimension": p.dimension, "nominal": p.nominal, "value": value}
+            | {"tolerance": p.tolerance, "free": p.free}
             for p, value in entries
         ]
 
@@ -175,10 +162,8 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
     solution = inverse(robot, robot.home[None])
     limits = evaluate_limits(robot, robot.values[None], solution.q[None], solution.state)
     exceeded = tuple(limit.name for limit in limits if limit.margin[0, 0] < -ROUNDING)
-    findings = list(robot.findings)
     proposal = propose_added_joints(robot)
-    if proposal is not None:
-        findings.append(proposal)
+    findings = [*robot.findings, *(() if proposal is None else (proposal,))]
     if exceeded:
         findings.append(report_finding("workflow.home-exceeds-limits", names=exceeded))
     if not len(robot.parameters):

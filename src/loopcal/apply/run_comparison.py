@@ -452,7 +452,8 @@ def _compare_pair(
     free = _list_free(first)
     unknown = np.full(len(free), np.nan)
     return PairComparison(
-        **words,
+        words["first"],
+        words["second"],
         data=kind,
         shared=shared,
         finding=report_finding(code, **words, **data),
@@ -509,7 +510,8 @@ def _test(
     shifts, sd = changes.estimate_shifts()
     single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shifts).sum()))
     return PairComparison(
-        **words,
+        words["first"],
+        words["second"],
         data=relation[0],
         shared=relation[1],
         finding=report_finding(code, **words, **judged),

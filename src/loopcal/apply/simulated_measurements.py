@@ -62,7 +62,7 @@ def simulate_measurements(
     skip_unreachable : leave out poses outside the reach or the strokes of the nominal or the true
         machine, and name them in the result. Poses without names keep their numbers.
     """
-    truth = draw_true_machine(robot, seed) if draw_errors else robot
+    truth = _choose_truth(robot, draw_errors, seed)
     targets = resolve_poses(truth.nominal, poses, seed)
     skipped: tuple[str, ...] = ()
     if skip_unreachable:
@@ -93,34 +93,25 @@ def fill_in_measurements(
     sheet: Measurements,
     instrument: Instrument,
     *,
+    are_contacts: bool = False,
     draw_errors: bool = False,
     seed: int = 1,
 ) -> SimulatedMeasurements:
-    """Simulate the measured values of a planned data sheet; the other arguments as above."""
-    truth = draw_true_machine(robot, seed) if draw_errors else robot
-    return SimulatedMeasurements(replace_measured_values(truth, sheet, instrument, seed), truth)
-
-
-def fill_in_contacts(
-    robot: Mechanism,
-    sheet: Measurements,
-    instrument: Instrument,
-    *,
-    draw_errors: bool = False,
-    seed: int = 1,
-) -> SimulatedMeasurements:
-    """Simulate the readings of a planned sheet of planes and lines, whose readings are those of the
-    commanded poses; the other arguments as above.
+    """Simulate the measured values of a planned data sheet; of planes and lines alone the readings,
+    which are those of the commanded poses in the sheet. The other arguments are as above.
     """
-    truth = draw_true_machine(robot, seed) if draw_errors else robot
-    data = simulate_contacts(truth, sheet, instrument, seed)
-    check_strokes(data, truth)
+    truth = _choose_truth(robot, draw_errors, seed)
+    if are_contacts:
+        data = simulate_contacts(truth, sheet, instrument, seed)
+        check_strokes(data, truth)
+    else:
+        data = replace_measured_values(truth, sheet, instrument, seed)
     return SimulatedMeasurements(data, truth)
 
 
-def draw_true_machine(robot: Mechanism, seed: int) -> Mechanism:
-    """Return a robot whose values are drawn from its tolerances."""
-    return robot.with_values(sample_truth(robot, 1, seed)[0])
+def _choose_truth(robot: Mechanism, draw_errors: bool, seed: int) -> Mechanism:
+    """Return a robot, or one whose values are drawn from its tolerances."""
+    return robot.with_values(sample_truth(robot, 1, seed)[0]) if draw_errors else robot
 
 
 def predict_noise_free(
@@ -143,8 +134,6 @@ def predict_noise_free(
         robot, targets, instrument, 0, robot, reading_sigma=reading_sigma, pose_names=names
     )
 
-
-# Build an instrument from a short description: kinds, noise, and which frames are unknown.
 
 # A frame that may be unknown -> the names that kinds have for it.
 FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
@@ -181,13 +170,29 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
     sigma = {Dimension.LENGTH: description.sigma_position, Dimension.ANGLE: description.sigma_angle}
     sensors = []
     for i, name in enumerate(description.kinds):
-        _check_kind(name, description.kinds[:i])
+        if name not in KINDS:
+            raise DataError(
+                f"{name!r} is not a kind of measurement{suggest_names(name, KINDS)}; known kinds "
+                f"are {', '.join(KINDS)}"
+            )
+        if name in description.kinds[:i]:
+            raise DataError(
+                f"the kind {name!r} is named twice; name it once, and add the second one to the "
+                "measurement file by hand"
+            )
         fields = _setting_names(name)
         kind: Any = KINDS[name](**{k: v for k, v in settings.items() if k in fields})
         if description.unknown_frames:
             kind = replace(kind, unknown=_name_unknown_frames(description.unknown_frames, kind))
+        if description.targets and not isinstance(kind, TargetKind):
+            able = ", ".join(name for name, known in KINDS.items() if issubclass(known, TargetKind))
+            raise DataError(
+                f"the kind {kind.name!r} measures no targets; leave out the targets, or choose one "
+                f"of {able}"
+            )
         if description.targets:
-            kind = _add_targets(kind, description.targets)
+            unknown = tuple(dict.fromkeys((*kind.unknown, "targets")))
+            kind = replace(kind, targets=tuple(description.targets), unknown=unknown)
         noise = np.array([sigma[column.dimension] for column in kind.noise_columns])
         sensors.append(Sensor(kind, DISTRIBUTIONS[description.distribution](noise)))
     for setting in settings:
@@ -198,20 +203,6 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
                 "choose another kind"
             )
     return Instrument(tuple(sensors))
-
-
-def _check_kind(name: str, earlier: Sequence[str]) -> None:
-    """Raise DataError for an unknown kind, or one that is named twice."""
-    if name not in KINDS:
-        raise DataError(
-            f"{name!r} is not a kind of measurement{suggest_names(name, KINDS)}; known kinds are "
-            f"{', '.join(KINDS)}"
-        )
-    if name in earlier:
-        raise DataError(
-            f"the kind {name!r} is named twice; name it once, and add the second one to the "
-            "measurement file by hand"
-        )
 
 
 def _setting_names(kind: str) -> set[str]:
@@ -235,18 +226,6 @@ def _name_unknown_frames(frames: Sequence[str], kind: object) -> tuple[str, ...]
             )
         names.append(names_of_frame[0])
     return tuple(names)
-
-
-def _add_targets(kind: Any, targets: Sequence[str]) -> Any:
-    """Return a kind with these targets, whose places are unknown."""
-    if not isinstance(kind, TargetKind):
-        able = ", ".join(name for name, known in KINDS.items() if issubclass(known, TargetKind))
-        raise DataError(
-            f"the kind {kind.name!r} measures no targets; leave out the targets, or choose one of "
-            f"{able}"
-        )
-    unknown = tuple(dict.fromkeys((*kind.unknown, "targets")))
-    return replace(kind, targets=tuple(targets), unknown=unknown)
 
 
 def place_targets(instrument: Instrument, robot: Mechanism) -> Instrument:

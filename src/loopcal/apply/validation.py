@@ -540,7 +540,7 @@ def _report_left_out(data: Measurements, compared: PredictionComparison) -> list
     has_rows = np.zeros(data.n_poses, dtype=bool)
     for o in data.observations:
         has_rows[o.rows[o.weight > 0.0]] = True
-    absorbed = {"absorbed": int(compared.absorbed.sum())}
+    absorbed: dict[str, Any] = {"absorbed": int(compared.absorbed.sum())}
     cases: tuple[tuple[str, BoolArray, dict[str, Any]], ...] = (
         ("unreachable-poses", ~compared.usable & compared.predictable, {}),
         ("missing-readings", has_rows & ~compared.predictable, {}),
@@ -592,7 +592,12 @@ def _report_blunders(
                 for x in (every, without)
             )
             code = "validation.blunders-dominate"
-            stated = {"poses": poses, "quantity": quantity, "error": error, "without": left}
+            stated: dict[str, Any] = {
+                "poses": poses,
+                "quantity": quantity,
+                "error": error,
+                "without": left,
+            }
             return [*findings, report_finding(code, **stated)]
     return findings
 
@@ -628,7 +633,8 @@ def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding
         return None
     is_refused = reused.count >= REFUSED_SHARE * reused.total
     severity = Severity.REFUSAL if is_refused else Severity.WARNING
-    finding = report_finding("validation.rows-reused", severity, **reused._asdict())
+    stated: dict[str, Any] = reused._asdict()
+    finding = report_finding("validation.rows-reused", severity, **stated)
     if is_refused:
         raise DataError(finding)
     return finding

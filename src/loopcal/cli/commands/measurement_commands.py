@@ -307,7 +307,7 @@ def _fill_in(
     robot: Mechanism, sheet: Path, draw_errors: bool, seed: int
 ) -> tuple[SimulatedMeasurements, str]:
     """Return the filled-in data of a plan, and what they are."""
-    from loopcal.apply.simulated_measurements import fill_in_contacts, fill_in_measurements
+    from loopcal.apply.simulated_measurements import fill_in_measurements
     from loopcal.io.data.measurement_file import (
         has_empty_readings,
         load_contact_sheet,
@@ -321,12 +321,13 @@ def _fill_in(
         ("poses", "draw", *DESCRIPTION[3:], "distribution", "sigma_reading", "skip_unreachable"),
         f"because --fill {sheet} states poses and instrument",
     )
-    instrument, how = load_instrument(sheet, robot), {"draw_errors": draw_errors, "seed": seed}
+    instrument = load_instrument(sheet, robot)
+    how = {"draw_errors": draw_errors, "seed": seed}
     if has_empty_readings(sheet, robot):
         planned = load_contact_sheet(sheet, find_plan_sheet(sheet), robot)
         is_closure = any(isinstance(rows.kind, Closure) for rows in planned.observations)
-        fill_in = fill_in_measurements if is_closure else fill_in_contacts
-        result = fill_in(robot, planned, instrument, **how)
+        how["are_contacts"] = not is_closure
     else:
-        result = fill_in_measurements(robot, load_measurements(sheet, robot), instrument, **how)
+        planned = load_measurements(sheet, robot)
+    result = fill_in_measurements(robot, planned, instrument, **how)
     return result, f"simulated by loopcal: {sheet.name}, seed {seed}"
