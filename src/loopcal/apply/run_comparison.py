@@ -285,7 +285,7 @@ def _check_runs(runs: Sequence[Run]) -> None:
 
 
 def _refuse_incomparable(
-    first: Run, second: Run, words: Mapping[str, str], is_same_data: bool
+    first: Run, second: Run, words: Mapping[str, Any], is_same_data: bool
 ) -> None:
     """Refuse two runs whose parameters do not mean the same.
 
