@@ -101,14 +101,10 @@ class BlockStream:
     It is that of the counter-based generator Philox, of which each trial and purpose uses a part of
     its own; Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11 (2011), doi
     10.1145/2063384.2063405.
-
-    Parameters
-    ----------
-    key : 128 bits of the study. block : number of the block.
     """
 
-    key: int
-    block: int
+    key: int  # 128 bits of the study
+    block: int  # number of the block
 
 
 Seed = int | BlockStream
@@ -116,12 +112,9 @@ Distribution = Literal["normal", "uniform"]
 
 
 def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Generator:
-    """Return the generator of one trial of a study, a function of these three numbers only.
+    """Return the generator of one trial of a study, counted from 0: a function of these three
+    numbers only.
 
-    Parameters
-    ----------
-    seed : of the study, or of a block of its trials.
-    trial : counted from 0. A trial gets the same numbers for any number of trials.
     purpose : separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3
         effects, 4 errors of the readings of held-out poses.
     """
@@ -138,15 +131,10 @@ class Sensor:
 
     Parameters
     ----------
-    rows : (r,) or (r, l) int, optional
-        Poses of each row. Default: every pose once. Where a row compares poses: each pose with the
-        next one, and the last with the first. Targets on the base are measured twice by default,
-        before and after the poses; their rows belong to no pose, and only their number matters.
+    rows : (r,) or (r, l) poses of each row. Default: every pose once. Where a row compares poses:
+        each pose with the next one, and the last with the first. Targets on the base are measured
+        twice by default, before and after the poses; only the number of their rows matters.
     session, group : text or (r,) text, see `Observations`.
-
-    Raises
-    ------
-    DataError : the noise does not have one number for each noise column of the kind.
     """
 
     kind: Kind
@@ -158,8 +146,8 @@ class Sensor:
     def __post_init__(self) -> None:
         check_type(self.kind, Kind, "kind", "such as loopcal.Pose()")
         check_type(self.noise, Noise, "noise", "such as loopcal.Gaussian([...])")
-        names = ", ".join(column.name for column in self.kind.noise_columns)
         if len(self.noise.sigma) != len(self.kind.noise_columns):
+            names = ", ".join(column.name for column in self.kind.noise_columns)
             raise DataError(
                 f"the noise of kind {self.kind.name!r} has {len(self.noise.sigma)} numbers; give "
                 f"one for each of {names}"

@@ -33,22 +33,19 @@ from loopcal.units import SI_SYMBOLS
 
 
 def check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observations]) -> None:
-    """Raise a DataError for rows of the base among those of poses, the reverse, and a target on two
-    bodies.
-    """
-    for rows in of_poses:
-        if rows.kind.is_of_base:
+    """Refuse rows of the base among those of poses, the reverse, and a target on two bodies."""
+    kinds = [rows.kind for rows in (*of_poses, *of_base)]
+    for i, kind in enumerate(kinds):
+        if kind.is_of_base and i < len(of_poses):
             raise DataError(
-                f"rows of kind {rows.kind.name!r} measure targets on the base; pass them as "
+                f"rows of kind {kind.name!r} measure targets on the base; pass them as "
                 "`base_observations`, not as `observations`"
             )
-    for rows in of_base:
-        if not rows.kind.is_of_base:
+        if i >= len(of_poses) and not kind.is_of_base:
             raise DataError(
-                f"rows of kind {rows.kind.name!r} measure poses; pass them as `observations`, or "
-                'give their kind `of="base"`'
+                f"rows of kind {kind.name!r} measure poses; pass them as `observations`, or give "
+                'their kind `of="base"`'
             )
-    kinds = [rows.kind for rows in (*of_poses, *of_base)]
     for kind in kinds:
         if kind.is_of_base and (shared := list_moving_targets(kind, kinds)):
             raise DataError(report_finding("data.target-on-two-bodies", targets=shared))
@@ -56,20 +53,16 @@ def check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observation
 
 def list_moving_targets(kind: Kind, others: Iterable[Kind]) -> tuple[str, ...]:
     """Return the targets of a kind of the base that are on a platform by another kind."""
-    moving = {
-        target
-        for other in others
-        if not other.is_of_base
-        for target in getattr(other, "targets", ())
-    }
+    others = [other for other in others if not other.is_of_base]
+    moving = {target for other in others for target in getattr(other, "targets", ())}
     return tuple(target for target in kind.target_columns if target in moving)
 
 
 def anchor_rows(rows: Observations, observations: Sequence[Observations]) -> IntArray:
     """Return a pose (r,) for each row of the base, on which its numbers do not depend.
 
-    It is the first pose of the same session that another row needs, so that nothing is solved for
-    its sake, and no session is joined with another; the first one of all where there is none.
+    It is the first pose of the same session (else of all) that another row needs, so that nothing
+    is solved for its sake, and no session is joined with another.
     """
     first: dict[str, int] = {}
     needed: list[int] = []
@@ -84,8 +77,7 @@ def anchor_rows(rows: Observations, observations: Sequence[Observations]) -> Int
     return np.array(poses, dtype=np.intp)
 
 
-SAME_READING = 1e-9
-"""Readings [m] or [rad] that differ by less belong to repeats of one pose."""
+SAME_READING = 1e-9  # readings [m] or [rad] that differ by less belong to repeats of one pose
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,8 +94,7 @@ class Measurements(TableResult):
     reading_sigma : (n, a) or an array that broadcasts to it [SI], standard deviation of each
         reading: 0 is exact, infinity is missing or ignored. A reading may be NaN only where its
         sigma is infinite. Default None: exact, unless the robot states the sigma of its actuators.
-    stated_values : tuple of StatedValue, optional
-        Priors and fixed values of nuisance parameters. Default: all are estimated from the data.
+    stated_values : priors and fixed values of nuisance parameters; others are estimated.
     base_observations : rows of targets that are fixed to the base (kinds with `of="base"`). They
         belong to no pose: whatever poses are taken, held out or weighted, these rows stay, and they
         are no errors of poses.
@@ -112,9 +103,8 @@ class Measurements(TableResult):
 
     Raises
     ------
-    DataError : shapes differ, a reading is not finite though its sigma is, a sigma is negative, a
-        row refers to a pose that does not exist, a block is partly held out, or a target is on the
-        base and on a platform.
+    DataError : shapes differ, a number is not finite, a row refers to a pose that does not exist, a
+        block is partly held out, or a target is on the base and on a platform.
     """
 
     robot_name: str
@@ -138,7 +128,18 @@ class Measurements(TableResult):
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(measured_pose="labels")
 
     def __post_init__(self) -> None:
-        readings = _check_readings(self.readings, self.reading_sigma is not None)
+        is_uncertain = self.reading_sigma is not None  # then NaN stands for a missing reading
+        if isinstance(self.readings, str):
+            raise DataError(
+                f"readings: got {describe(self.readings)}; give an array (n, a) in SI units; "
+                "loopcal.load_measurements reads a file"
+            )
+        try:
+            readings = check_array(self.readings, "readings", (None, None), allow_nan=is_uncertain)
+        except DataError as error:
+            if not is_uncertain and np.isnan(np.asarray(self.readings, dtype=float)).any():
+                raise DataError(f"{error}, or reading_sigma = inf where it is missing") from None
+            raise
         n = len(readings)
         if n == 0:
             raise DataError("the measurements have no pose; give at least one row of readings")
@@ -188,17 +189,18 @@ class Measurements(TableResult):
 
     def list_values(self) -> list[tuple[str, str, str, str, float]]:
         """Return kind, pose, component, unit and value [SI] of every measured number."""
-        rows = []
-        for o in self.observations:
-            for members, values in zip(
-                o.rows.reshape(len(o), -1), o.measured.tolist(), strict=True
-            ):
-                pose = "/".join(self.labels[i] for i in members)
-                rows += [
-                    (o.kind.name, pose, column.name, SI_SYMBOLS[column.dimension], value)
-                    for column, value in zip(o.kind.columns, values, strict=True)
-                ]
-        return rows
+        return [
+            (
+                o.kind.name,
+                "/".join(self.labels[i] for i in poses),
+                column.name,
+                SI_SYMBOLS[column.dimension],
+                value,
+            )
+            for o in self.observations
+            for poses, values in zip(o.rows.reshape(len(o), -1), o.measured.tolist(), strict=True)
+            for column, value in zip(o.kind.columns, values, strict=True)
+        ]
 
     @property
     def n_poses(self) -> int:
@@ -246,15 +248,13 @@ class Measurements(TableResult):
         for name in dict.fromkeys(name for rows in self.observations for name in rows.context):
             total, count = np.zeros(self.n_poses), np.zeros(self.n_poses)
             for rows in (rows for rows in self.observations if name in rows.context):
-                values = np.broadcast_to(
-                    rows.context[name][:, None], (len(rows), rows.kind.poses_per_row)
-                )
+                poses = rows.rows.reshape(len(rows), rows.kind.poses_per_row)
+                values = np.broadcast_to(rows.context[name][:, None], poses.shape)
                 present = ~np.isnan(values)
-                np.add.at(total, rows.rows.reshape(values.shape)[present], values[present])
-                np.add.at(count, rows.rows.reshape(values.shape)[present], 1.0)
-            means[name] = np.divide(
-                total, count, out=np.full(self.n_poses, np.nan), where=count > 0.0
-            )
+                np.add.at(total, poses[present], values[present])
+                np.add.at(count, poses[present], 1.0)
+            nothing = np.full(self.n_poses, np.nan)
+            means[name] = np.divide(total, count, out=nothing, where=count > 0.0)
         return means
 
     @property
@@ -263,14 +263,10 @@ class Measurements(TableResult):
         return self.take(~self.is_held_out) if self.is_held_out.any() else self
 
     def take(self, poses: ArrayLike) -> Self:
-        """Return the measurements of these poses (k,), in their order, or of a mask (n,).
+        """Return the measurements of these poses (k,), in their order, or of a mask (n,); DataError
+        where a pose does not exist, is named twice, or none is left.
 
         Rows of other poses are left out; those of targets on the base stay.
-
-        Raises
-        ------
-        DataError : a pose does not exist, is named twice, none is left, or `poses` is neither
-            indices nor a mask of all poses.
         """
         given = np.asarray(poses)
         is_mask = given.dtype == bool
@@ -316,13 +312,9 @@ class Measurements(TableResult):
         Parameters
         ----------
         hold_out : share of the poses that is not fitted (0.25 fits three poses of four), as nearly
-            as whole blocks allow; both sets get at least one block. The `hold_out` of a calibration
-            is the same share.
+            as whole blocks allow; both sets get at least one block. DataError unless it is between
+            0 and 1, or where all poses are in one block.
         seed : the same seed gives the same sets.
-
-        Raises
-        ------
-        DataError : the share is not between 0 and 1, or all poses are in one block.
         """
         check_seed(seed)
         if not 0.0 < hold_out < 1.0:
@@ -352,21 +344,14 @@ class Measurements(TableResult):
         A row that compares poses gets the product of their weights. Uncertain readings are weighted
         like the rows of their pose: sigma / sqrt(weight). `Observations.with_weights` weights
         single rows.
-
-        Raises
-        ------
-        DataError : the number of weights is not that of the poses, or one is negative.
         """
         given = check_array(weight, "the weight of the poses", (self.n_poses,))
         observations = tuple(
             rows.with_weights(given[rows.rows].reshape(len(rows), -1).prod(axis=1))
             for rows in self.observations
         )
-        return replace(
-            self,
-            observations=observations,
-            reading_sigma=weight_reading_sigma(self.reading_sigma, given),
-        )
+        sigma = weight_reading_sigma(self.reading_sigma, given)
+        return replace(self, observations=observations, reading_sigma=sigma)
 
 
 def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, ...]) -> BoolArray:
@@ -384,21 +369,6 @@ def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, 
         )
     mask.setflags(write=False)
     return mask
-
-
-def _check_readings(readings: ArrayLike, uncertain: bool) -> FloatArray:
-    """Return checked, read-only readings (n, a); NaN stands for a missing one and needs a sigma."""
-    if isinstance(readings, str):
-        raise DataError(
-            f"readings: got {describe(readings)}; give an array (n, a) in SI units; "
-            "loopcal.load_measurements reads a file"
-        )
-    try:
-        return check_array(readings, "readings", (None, None), allow_nan=uncertain)
-    except DataError as error:
-        if not uncertain and np.isnan(np.asarray(readings, dtype=float)).any():
-            raise DataError(f"{error}, or reading_sigma = inf where it is missing") from None
-        raise
 
 
 def _check_poses(rows: Observations, n: int) -> None:

@@ -28,17 +28,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StatedValue:
-    """A prior or a fixed value of one nuisance parameter.
+    """A prior or a fixed value of one nuisance parameter; DataError where a number is not allowed.
 
     Parameters
     ----------
     name : full name, such as `monday.tracker.x`.
     sd : standard deviation of a prior [SI]; 0 fixes the parameter.
     nominal : fixed value, or center of the prior [SI]; default: the nominal value of the kind.
-
-    Raises
-    ------
-    DataError : the standard deviation is negative, or a number is not finite.
     """
 
     name: str
@@ -54,33 +50,17 @@ class StatedValue:
         if self.nominal is not None and not np.isfinite(self.nominal):
             raise DataError(f"the value of {self.name!r} is {self.nominal}; give a finite number")
 
-    def apply_to(self, entry: Parameter) -> Parameter:
-        """Return the parameter with this prior or fixed value."""
-        nominal = entry.nominal if self.nominal is None else self.nominal
-        return replace(
-            entry,
-            nominal=nominal,
-            tolerance=self.sd or entry.tolerance,
-            free=entry.free and self.sd > 0.0,
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class NuisanceParameters:
-    """All nuisance parameters of measurements.
+    """All nuisance parameters of measurements."""
 
-    Attributes
-    ----------
-    table : the U parameters. A tolerance is a prior; a parameter without one is estimated from the
-        data alone; a fixed one keeps its value.
-    indices : tuple of (r, u) int
-        For each kind of the measurements, the parameters that each row uses.
-    factors : tuple of (r, u) or None, the parts of these parameters that each row takes, such as
-        its progress in a drift; None where all are 1. Default: all are 1.
-    """
-
+    # the U parameters; a tolerance is a prior, a parameter without one is estimated from the data
+    # alone, a fixed one keeps its value
     table: ParameterTable
-    indices: tuple[IntArray, ...]
+    indices: tuple[IntArray, ...]  # for each kind (r, u) the parameters that each row uses
+    # for each kind (r, u) the parts of these that each row takes, such as its progress in a drift;
+    # None where all are 1
     factors: tuple[FloatArray | None, ...] = ()
 
     def __len__(self) -> int:
@@ -97,9 +77,7 @@ class NuisanceParameters:
         return used if factor is None else used * factor
 
     def factor(self, kind: int) -> FloatArray | None:
-        """Return the parts (r, u) of their parameters that the rows of one kind take; None where
-        all are 1.
-        """
+        """Return the entry of `factors` of a kind."""
         return self.factors[kind] if self.factors else None
 
     def values(self, stated: Mapping[str, float] | None = None) -> FloatArray:
@@ -153,17 +131,11 @@ def collect_nuisance_parameters(
     labels: tuple[str, ...],
     stated_values: Iterable[StatedValue] = (),
 ) -> NuisanceParameters:
-    """Return the nuisance parameters of measurements.
+    """Return the nuisance parameters of measurements; DataError where two kinds share the name of a
+    parameter and state it differently.
 
-    Parameters
-    ----------
     observations : of `Measurements`, or sensors with explicit rows (`Sensor.assign_rows`).
-    labels : names of the poses.
-    stated_values : priors and fixed values; those of names that do not occur are ignored.
-
-    Raises
-    ------
-    DataError : two kinds share the name of a parameter and state it differently.
+    labels : names of the poses. stated_values : priors and fixed values, of any names.
     """
     entries: dict[str, Parameter] = {}
     references: dict[str, FloatArray] = {}
@@ -191,8 +163,13 @@ def collect_nuisance_parameters(
         shape = (len(keys), len(kind.nuisance_parameters))
         indices.append(np.array(used, dtype=np.intp).reshape(shape))
     for stated in stated_values:
-        if stated.name in entries:
-            entries[stated.name] = stated.apply_to(entries[stated.name])
+        if (entry := entries.get(stated.name)) is not None:
+            entries[stated.name] = replace(
+                entry,
+                nominal=entry.nominal if stated.nominal is None else stated.nominal,
+                tolerance=stated.sd or entry.tolerance,
+                free=entry.free and stated.sd > 0.0,
+            )
     table = ParameterTable(tuple(entries.values()))
     return NuisanceParameters(table, tuple(indices), tuple(factors))
 

@@ -27,31 +27,24 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
 
-_SMALLEST_PIVOT = 1e-7
-"""Smallest pivot of a correlation matrix. Below it a component equals a combination of the others
-to seven digits, and the inverse has fewer digits than a measurement.
-"""
+# Smallest pivot of a correlation matrix. Below it a component equals a combination of the others
+# to seven digits, and the inverse has fewer digits than a measurement.
+SMALLEST_PIVOT = 1e-7
+DATES = ("calibrated", "due", "measured")  # fields of an instrument that hold a date
+TextArray = NDArray[np.str_]  # names of sessions or groups
 
 
 def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatArray) -> FloatArray:
     """Return matrices W (r, m, m) with `W C W' = weight` on the present components, zero elsewhere.
 
-    W is the inverse lower Cholesky factor. Without a component, a Gaussian loses its row and column
-    of C. Here they are replaced by those of the identity, which keeps the shape and gives the same
-    factor for the other components.
+    W is the inverse lower Cholesky factor. Row and column of an absent component are replaced by
+    those of the identity, which keeps the shape and gives the same factor for the others. Each step
+    of a fit multiplies by the inverse, and numpy has no triangular solve of stacked blocks. It is
+    accurate, because the pivots of the correlation matrices are bounded from below.
 
-    The inverse is formed once, because each step of a fit multiplies residuals and Jacobians of all
-    rows by it, and numpy has no triangular solve of stacked blocks. It is accurate: blocks are
-    correlation matrices of a few components, whose pivots are bounded from below.
-
-    Parameters
-    ----------
-    covariance : (r, m, m) [SI], any numbers where a component is absent. present : (r, m) bool
+    covariance : (r, m, m) [SI], any numbers where a component is absent; DataError where it is not
+        symmetric and positive definite. present : (r, m).
     weight : (r,) factor of the squared residuals, not negative; 0 excludes a row.
-
-    Raises
-    ------
-    DataError : a covariance is not symmetric or not positive definite; rows are counted from 1.
     """
     both = present[:, :, None] & present[:, None, :]
     diagonal = np.eye(present.shape[1], dtype=bool)
@@ -75,7 +68,7 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
             _refuse(smallest <= max(float(np.min(smallest)), 0.0), "is not positive definite")
             raise
         pivots = np.min(np.einsum("rii->ri", L), axis=1)
-        _refuse(pivots < _SMALLEST_PIVOT, "is not positive definite to rounding")
+        _refuse(pivots < SMALLEST_PIVOT, "is not positive definite to rounding")
         inverse = np.asarray(np.tril(np.linalg.inv(L)), dtype=np.float64)
     else:  # as in most files
         root = np.sqrt(np.where(diagonal, correlation, 1.0))
@@ -91,10 +84,6 @@ def _refuse(wrong: BoolArray, what: str) -> None:
             "0 and correlations between -1 and 1 that are consistent"
         ),
     )
-
-
-DATES = ("calibrated", "due", "measured")
-"""Fields of an instrument that hold a date."""
 
 
 @dataclass(frozen=True)
@@ -167,27 +156,15 @@ def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
     """
     findings = []
     for record in list_instruments(observations):
-        dates = {name: getattr(record, name) for name in DATES}
-        if not record.measured:
-            if record.due:
-                findings.append(
-                    report_finding(
-                        "data.instrument-not-dated", instrument=str(record), due=record.due
-                    )
-                )
+        stated = {"instrument": str(record)} | {name: getattr(record, name) for name in DATES}
+        if not record.measured and record.due:
+            stated = {"instrument": str(record), "due": record.due}
+            findings.append(report_finding("data.instrument-not-dated", **stated))
         elif record.due and record.measured > record.due:
-            findings.append(
-                report_finding("data.instrument-past-due", instrument=str(record), **dates)
-            )
-        elif record.calibrated and record.measured < record.calibrated:
-            findings.append(
-                report_finding("data.instrument-calibrated-later", instrument=str(record), **dates)
-            )
+            findings.append(report_finding("data.instrument-past-due", **stated))
+        elif record.measured and record.measured < record.calibrated:
+            findings.append(report_finding("data.instrument-calibrated-later", **stated))
     return findings
-
-
-TextArray = NDArray[np.str_]
-"""Names of sessions or groups."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -200,8 +177,8 @@ class Observations:
     Parameters
     ----------
     kind : with the robot's tool, see `Kind.with_tool`.
-    rows : (r,) int, index of the pose of each row; (r, l) for kinds that compare l poses. A row of
-        targets on the base belongs to no pose: its number does not matter, and becomes 0.
+    rows : (r,) int, index of the pose of each row; (r, l) for kinds that compare l poses. Those of
+        targets on the base, which belong to no pose, become 0.
     measured : (r, c) [SI], NaN where not measured.
     covariance : (r, m, m) or (m, m) [SI], of the residuals, see `from_sigma` and
         `Kind.linearize_noise`. Entries of missing components are ignored.
@@ -210,9 +187,8 @@ class Observations:
         group share a surface. Default: one session and one group, without names.
     context : name -> (r,), notes to each row that enter no equation: `time` [s], `temperature` and
         `temperature.PLACE` [degC], NaN where missing.
-    progress : (r,), optional
-        Progress of each row through its session, from -0.5 to 0.5: the part that it takes of a
-        drift, see `drift_part`. Default: by the time of the rows, or else in their order.
+    progress : (r,), progress of each row through its session, from -0.5 to 0.5: the part that it
+        takes of a drift, see `drift_part`. Default: by the time of the rows, or else their order.
     source : where the rows come from, such as the name of a file; for messages.
     is_noise_assumed : whether nobody stated the covariance: a program that wrote the rows assumed
         it. It then decides no quality gate.
@@ -226,9 +202,8 @@ class Observations:
 
     Raises
     ------
-    DataError
-        If shapes do not fit the kind, a number is infinite, a covariance is not positive definite,
-        a weight is negative, a row compares a pose with itself, or the kind finds a row invalid.
+    DataError : shapes do not fit the kind, a number is infinite, a covariance is not positive
+        definite, a weight is negative, or a row is invalid or compares a pose with itself.
     """
 
     kind: Kind
@@ -303,15 +278,9 @@ class Observations:
 
         Parameters
         ----------
-        rows : (r,) int
-        measured : (r, c) [SI]
-        sigma : number, (m,) or (r, m) [SI], standard deviations.
-        session, group : text or (r,) text
-
-        Raises
-        ------
-        DataError : as the class, and if sigma is negative or does not have one number for each
-            noise column.
+        rows : (r,) int. measured : (r, c) [SI].
+        sigma : standard deviations [SI]: a number, (m,) or (r, m); DataError unless above 0.
+        session, group : text or (r,) text.
         """
         check_type(kind, Kind, "kind", "such as loopcal.Pose()")
         try:
@@ -321,13 +290,13 @@ class Observations:
                 f"measured: got {describe(measured)}; give an array of numbers (r, "
                 f"{len(kind.columns)}) in SI units; loopcal.load_measurements reads files"
             ) from None
-        names = ", ".join(column.name for column in kind.noise_columns)
         if values.ndim != 2 or values.shape[1] != len(kind.columns):
             columns = ", ".join(column.name for column in kind.columns)
             raise DataError(
                 f"measured values of kind {kind.name!r} have shape {values.shape}; give (r, "
                 f"{len(kind.columns)}): {columns}"
             )
+        names = ", ".join(column.name for column in kind.noise_columns)
         shape = (len(values), len(kind.noise_columns))
         sd = broadcast_array(sigma, shape, "sigma", f"one number, or one for each of {names}")
         wrong = sd[~(is_sd(sd) | np.isnan(sd) | (sd == 0.0))]
@@ -362,8 +331,8 @@ class Observations:
 
     @property
     def drift_part(self) -> FloatArray:
-        """(r,) the part of its session's drift that each row takes. Some rows of a session, such as
-        held-out ones, keep the parts that they have among all rows.
+        """(r,) the part of its session's drift that each row takes; some rows of a session, such as
+        held-out ones, keep theirs.
         """
         if len(self.progress):
             return self.progress

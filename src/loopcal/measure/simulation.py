@@ -45,46 +45,33 @@ from loopcal.typing import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """What happens at each measured pose although the model does not contain it.
+    """What happens at each measured pose although the model does not contain it; None for 0."""
 
-    Attributes
-    ----------
-    values : (t | 1, n, p) [SI] added to the true parameter values, such as thermal growth; None
-        where these are the same at all poses.
-    readings : (t | 1, n, a) [SI] true joint values minus readings, such as backlash; None for 0.
-    motion : (t | 1, n, 3) [m] displacement of what is measured, in base axes, such as the drift of
-        an instrument; None for 0. It is no part of the true poses.
-    """
-
+    # (t | 1, n, p) [SI] added to the true parameter values, such as thermal growth
     values: FloatArray | None = None
-    readings: FloatArray | None = None
+    readings: FloatArray | None = None  # (t | 1, n, a) [SI] joint values minus readings: backlash
+    # (t | 1, n, 3) [m] displacement of what is measured, in base axes, such as the drift of an
+    # instrument; it is no part of the true poses
     motion: FloatArray | None = None
-
-    def displace(self, T: FloatArray) -> FloatArray:
-        """Return the poses (t, n, 4, 4) that are measured at true poses T."""
-        if self.motion is None:
-            return T
-        moved = np.array(T)
-        moved[..., :3, 3] += self.motion
-        return moved
 
 
 NO_DISTURBANCE = Disturbance()
+NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
+STEPS = 20  # corrections of a commanded position; each leaves the share of the geometry's errors
+EXACT = 1e-6  # share of the noise to which a gap is reached
+# Parameters of a surface that move it along the residuals of its points, in their order.
+OFFSETS = ("height", "a", "b")
 
 
-def reach_poses(
+def _reach_poses(
     robot: Mechanism,
     values: FloatArray,
     readings: FloatArray,
     start: State,
     disturbance: Disturbance,
 ) -> tuple[FloatArray, State]:
-    """Return the true readings (t | 1, n, a) and the states (t, n) of t machines.
-
-    Parameters
-    ----------
-    values : (t, p) [SI] of each machine. readings : (n, a) [SI] of the controller.
-    start : (1, n) state of the commanded poses.
+    """Return the true readings (t | 1, n, a) and the states (t, n) of t machines of values (t, p)
+    [SI], from the readings (n, a) of the controller and the state (1, n) of the commanded poses.
     """
     true = readings[None]
     if disturbance.readings is not None:
@@ -124,9 +111,6 @@ def _reshape_state(state: State, shape: tuple[int, int], wanted: tuple[int, int]
     return map_arrays(change, state)
 
 
-NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Trials:
     """The same measurements of t machines, as stacked arrays.
@@ -135,14 +119,12 @@ class Trials:
     ----------
     instrument : with the robot's tool, and with explicit rows of every sensor.
     readings : (n, a) [SI], of the controller, equal in all trials.
-    measured : tuple of (t, r, c) [SI]
-        Columns of each sensor; NaN in rows that the true machine cannot reach.
+    measured : (t, r, c) [SI] columns of each sensor; NaN where the true machine does not reach.
     truth : (t, p) [SI], true parameter values of each trial.
     T : (t, n, 4, 4), true T_base_platform.
     reached : (t, n) bool, poses that the true machine reaches.
     nuisance_parameters : of the kinds, with their true values as nominal ones.
-    recorded : (t, n, a) [SI], optional
-        Recorded readings with their noise; None where they equal those of the controller.
+    recorded : (t, n, a) [SI] readings with their noise; None where they are the controller's.
     reading_sigma : (n, a) [SI], as in `Measurements`.
     """
 
@@ -164,9 +146,8 @@ class Trials:
         t, n = self.reached.shape
         missed = int(np.count_nonzero(~self.reached))
         note = f", {missed} of {self.reached.size} poses not reached" if missed else ""
-        return (
-            f"Trials of {self.robot_name!r}: {t} trials, {n} poses each{note}\n{self.instrument!r}"
-        )
+        counts = f"{t} trials, {n} poses each{note}"
+        return f"Trials of {self.robot_name!r}: {counts}\n{self.instrument!r}"
 
     def trial(self, i: int) -> Measurements:
         """Return the measurements of one trial."""
@@ -205,7 +186,6 @@ def sample_truth(
 
     Raises
     ------
-    DataError : there is no such distribution.
     MechanismError : the robot is over-constrained, so that its loops do not close with such errors.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
@@ -246,22 +226,18 @@ def simulate_trials(
     truth : (t, p) [SI], true parameter values of each machine, see `sample_truth`.
     poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI], as commanded.
     seed : trial i draws the same noise for any number of trials.
-    controller : Mechanism, optional
-        The geometry that turns poses into readings; default: the robot at its nominal values.
-    nuisance_values : name -> value [SI], optional
-        True values of setup parameters, such as `tracker.x`; default: nominal.
-    reading_sigma : number, (a,) or (n, a) [SI], optional
-        Standard deviation of the recorded readings, which are the true ones plus normal noise; 0 is
-        exact, infinity is missing. Default: as the robot states for its actuators.
+    controller : the geometry that turns poses into readings; default: the nominal robot.
+    nuisance_values : true values [SI] of setup parameters, such as `tracker.x`; default: nominal.
+    reading_sigma : number, (a,) or (n, a) [SI], standard deviation of the recorded readings, which
+        are the true ones plus normal noise; 0 is exact, infinity is missing. Default: as the robot
+        states for its actuators.
     disturbance : what happens at each pose although the model does not contain it.
-    pose_names : (labels, places), optional
-        Names of the poses, and their places such as `poses.csv:12`, for messages.
+    pose_names : names of the poses, and their places such as `poses.csv:12`, for messages.
 
     Raises
     ------
-    DataError : the controller cannot reach a pose, a setup parameter does not exist, `truth` has
-        another shape; or the kind `closure` is asked of a robot without redundant actuators or of
-        exact readings.
+    DataError : the controller cannot reach a pose, a setup parameter does not exist, or `truth` has
+        another shape.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
@@ -280,14 +256,16 @@ def simulate_trials(
     nuisance = collect_nuisance_parameters(assigned.sensors, labels)
     nuisance = nuisance.with_nominal(nuisance.values(nuisance_values))
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
-    true, state = reach_poses(robot, values, readings, commanded.state, disturbance)
+    true, state = _reach_poses(robot, values, readings, commanded.state, disturbance)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
     reached = np.array(np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2]))
     joints = select_joint_values(
         robot, list_sensed_joints(s.kind for s in assigned.sensors), true, state
     )
     streams = [make_random_stream(seed, trial, NOISE) for trial in range(len(values))]
-    seen = np.where(reached[..., None, None], disturbance.displace(T), np.eye(4))
+    seen = np.where(reached[..., None, None], T, np.eye(4))
+    if disturbance.motion is not None:
+        seen[..., :3, 3] += np.where(reached[..., None], disturbance.motion, 0.0)
     measured = []
     for k, sensor in enumerate(assigned.sensors):
         kind, rows = sensor.kind, sensor.assigned_rows
@@ -299,19 +277,9 @@ def simulate_trials(
             columns = np.where(complete[..., None], columns, np.nan)
         measured.append(columns)
     shown = true if disturbance.readings is None else true - disturbance.readings
-    recorded, sigma = record_readings(robot, shown, reading_sigma, len(values), seed)
-    return Trials(
-        assigned,
-        robot.name,
-        readings,
-        tuple(measured),
-        values,
-        T,
-        reached,
-        nuisance,
-        recorded,
-        sigma,
-    )
+    recorded = _record_readings(robot, shown, reading_sigma, len(values), seed)
+    columns = tuple(measured)
+    return Trials(assigned, robot.name, readings, columns, values, T, reached, nuisance, *recorded)
 
 
 def simulate(
@@ -324,25 +292,12 @@ def simulate(
     reading_sigma: ArrayLike | None = None,
     pose_names: tuple[Sequence[str], Sequence[str]] = ((), ()),
 ) -> Measurements:
-    """Measure commanded poses on one machine, at its true values: trial 0 of `simulate_trials`.
-
-    Raises
-    ------
-    DataError : the controller cannot reach a pose, or the true machine cannot reach it with the
-        readings of the controller.
+    """Measure commanded poses on one machine, at its true values: trial 0 of `simulate_trials`;
+    DataError where the controller or the true machine does not reach a pose.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
-    trials = simulate_trials(
-        robot,
-        robot.values[None],
-        poses,
-        instrument,
-        seed,
-        controller,
-        nuisance_values,
-        reading_sigma,
-        pose_names=pose_names,
-    )
+    how = (controller, nuisance_values, reading_sigma, NO_DISTURBANCE, pose_names)
+    trials = simulate_trials(robot, robot.values[None], poses, instrument, seed, *how)
     failed = np.flatnonzero(~trials.reached[0])
     if len(failed):
         name = name_pose(int(failed[0]), *pose_names)
@@ -357,18 +312,10 @@ def simulate(
 def replace_measured_values(
     robot: Mechanism, data: Measurements, instrument: Instrument, seed: int
 ) -> Measurements:
-    """Return measurements with simulated values in place of theirs, at their readings; those of
-    redundant actuators are simulated, too.
+    """Return measurements with simulated values of the true `robot` in place of theirs, at their
+    readings; those of redundant actuators are simulated, too.
 
-    Parameters
-    ----------
-    robot : the true machine, at its values.
     instrument : a sensor with its noise for each of `data.all_observations`, in their order.
-    seed : of the noise.
-
-    Raises
-    ------
-    DataError : the nominal or the true robot does not reach a pose.
     """
     nominal = forward(robot.nominal, data.readings)
     failed = np.flatnonzero(~nominal.converged)
@@ -393,7 +340,7 @@ def replace_measured_values(
     return replace(filled, readings=measured.readings, reading_sigma=measured.reading_sigma)
 
 
-def record_readings(
+def _record_readings(
     robot: Mechanism, true: FloatArray, sigma: ArrayLike | None, trials: int, seed: Seed
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return recorded readings (t, n, a) of true ones (t | 1, n, a), and their sigma (n, a); None
@@ -410,25 +357,15 @@ def record_readings(
     return np.where(present, true + noise, np.nan), resolved
 
 
-STEPS = 20
-"""Corrections of a commanded position: each leaves the share by which the geometry is wrong."""
-
-EXACT = 1e-6
-"""Share of the noise to which a gap is reached."""
-
-
 def simulate_contacts(
     robot: Mechanism, sheet: Measurements, instrument: Instrument, seed: int
 ) -> Measurements:
     """Return measurements of planes and lines with the readings at which a true machine touches.
 
-    Parameters
-    ----------
     robot : at its true values; its nominal ones are those of the controller.
     sheet : rows of planes and lines; its readings are those of the commanded poses, its missing
         gaps are zero.
     instrument : a sensor for each of `sheet.observations`; its noise is that of the contacts.
-    seed : of the noise of contacts and of readings.
 
     Raises
     ------
@@ -468,7 +405,7 @@ def simulate_contacts(
         rows = evaluate_measurements(sheet, T[None], values[None])
         shift, largest = _correct_positions(sheet, rows, noise)
         if largest <= limit:
-            recorded, sigma = record_readings(robot, q[None], sheet.reading_sigma, 1, seed)
+            recorded, sigma = _record_readings(robot, q[None], sheet.reading_sigma, 1, seed)
             readings = q if recorded is None else recorded[0]
             return replace(sheet, readings=readings, reading_sigma=sigma)
         commanded[:, places] += shift
@@ -514,19 +451,15 @@ def _place_surfaces(sheet: Measurements, T: FloatArray) -> FloatArray:
     return values
 
 
-OFFSETS = ("height", "a", "b")
-"""Parameters of a surface that move it along the residuals of its points, in their order."""
-
-
 def _correct_positions(
     sheet: Measurements, rows: tuple[EvaluatedRows, ...], noise: list[FloatArray]
 ) -> tuple[FloatArray, float]:
     """Return the smallest displacements (n, 3) [m] that close the gaps up to their noise, and the
     largest gap.
     """
-    gaps = [r.residual[0] - drawn for r, drawn in zip(rows, noise, strict=True)]
     poses = np.concatenate([np.repeat(r.poses[:, 0], r.residual.shape[2]) for r in rows])
     along = np.concatenate([r.jacobian[0, :, 0, :, 3:].reshape(-1, 3) for r in rows])
+    gaps = [r.residual[0] - drawn for r, drawn in zip(rows, noise, strict=True)]
     gap = np.concatenate([each.ravel() for each in gaps])
     shift = np.zeros((sheet.n_poses, 3))
     for pose in np.unique(poses):

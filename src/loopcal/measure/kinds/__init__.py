@@ -17,10 +17,9 @@ if TYPE_CHECKING:
 
 K = TypeVar("K")
 
+# Names of the kinds that contain actuator readings alone: uncertain ones, and those of poses
+# without a measured value.
 READINGS, CLOSURE = "readings", "closure"
-"""Names of the kinds that contain actuator readings alone: uncertain ones, and those of poses
-without a measured value.
-"""
 
 KINDS: Registry[type[Kind]] = Registry(
     "kind of measurement",

@@ -37,10 +37,6 @@ class Bearing(TargetKind):
     form : "theodolite" or "camera".
     Others : see `TargetKind`; "frame" (the station) and "targets" may be unknown.
 
-    Raises
-    ------
-    DataError : as `TargetKind`, or for another form.
-
     Examples
     --------
     >>> kind = Bearing(places=np.array([[1.0, 1.0, 0.0]]))
@@ -80,7 +76,7 @@ class Bearing(TargetKind):
         )
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
-        """Return both angles of points x (.., k, 3) and their derivatives."""
+        """Return both angles."""
         if self.form == "camera":
             return (*predict_camera_angles(x), {})
         a, b, c = x[..., 0], x[..., 1], x[..., 2]

@@ -150,11 +150,9 @@ class AxisKind(DirectionKind):
 class Direction(AxisKind):
     """Direction of an axis as a unit vector, such as the normal of a probed face.
 
-    Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to the measured m.
-
-    The residual is twice the tangent of half the angle between the predicted direction d and m,
-    along the two vectors B. It equals the angle where that is small, and is unbounded where d is
-    opposite to m.
+    Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to the measured m. It is
+    twice the tangent of half the angle between the predicted direction d and m, which equals the
+    angle where that is small, and is unbounded where d is opposite to m.
 
     Setup parameters [rad]: `frame.rx` to `frame.rz`, `axis.u` and `axis.v`.
 
@@ -163,11 +161,6 @@ class Direction(AxisKind):
     axis : (3,), the axis on the platform, of any length. If the axis is unknown, its nominal value.
     axis_name : name of the axis; its parameters begin with it.
     Others : see `AxisKind`; "frame" and "axis" may be unknown.
-
-    Raises
-    ------
-    DataError : the length of the axis is zero, the frame is not a pose, or `unknown` lists
-        something else.
 
     Examples
     --------
@@ -185,15 +178,8 @@ class Direction(AxisKind):
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """Return a known axis, and an unknown one in an unknown frame."""
-        return (
-            cls(),
-            cls(
-                axis=np.array([0.0, 0.6, 0.8]),
-                unknown=("axis", "frame"),
-                frame="cmm",
-                axis_name="face",
-            ),
-        )
+        face = np.array([0.0, 0.6, 0.8])
+        return (cls(), cls(axis=face, unknown=("axis", "frame"), frame="cmm", axis_name="face"))
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -216,7 +202,7 @@ class Direction(AxisKind):
         return UPWARD
 
     def detect_present(self, measured: FloatArray) -> BoolArray:
-        """Return both residuals as present, or none where a component is missing."""
+        """Return both residuals, or none where a component is missing."""
         return np.repeat(~np.any(np.isnan(measured), axis=-1, keepdims=True), 2, axis=-1)
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
@@ -256,7 +242,7 @@ class Direction(AxisKind):
     def _measure(
         self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
     ) -> FloatArray:
-        """Return columns (t, r, 3), rotated by noise (t, r, 2) perpendicular to the direction."""
+        """Return directions (t, r, 3), rotated by the noise (t, r, 2) perpendicular to them."""
         d, _ = self.locate_direction(T, values)
         rotation = np.cross(d, (make_perpendicular_basis(d) @ noise[..., None])[..., 0])
         return (geometry.exp_so3(rotation) @ d[..., None])[..., 0]
@@ -274,16 +260,11 @@ class Inclination(DirectionKind):
 
     Parameters
     ----------
-    up : (3,)
-        The upward vertical in the base, of any length. If gravity is unknown, its nominal value.
+    up : (3,), the upward vertical in the base, of any length. If gravity is unknown, its nominal
+        value.
     T_platform_sensor : (4, 4), mounting of the sensor; only its orientation matters.
     sensor : name of the sensor; the parameters of its mounting begin with it.
     unknown : which of "mounting" and "gravity" are unknown.
-
-    Raises
-    ------
-    DataError : the length of the vertical is zero, the mounting is not a pose, or `unknown` lists
-        something else.
 
     Examples
     --------
@@ -304,11 +285,8 @@ class Inclination(DirectionKind):
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """Return a level base, an unknown vertical, and an unknown mounting too."""
-        return (
-            cls(),
-            cls(unknown=("gravity",)),
-            cls(unknown=("mounting", "gravity"), sensor="level"),
-        )
+        both = cls(unknown=("mounting", "gravity"), sensor="level")
+        return (cls(), cls(unknown=("gravity",)), both)
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -321,7 +299,7 @@ class Inclination(DirectionKind):
         return self.sensor, self.T_platform_sensor[:3, :3], "gravity", self.up
 
     def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return both elevations (.., 2) and their derivatives (.., 2, 3)."""
+        """Return both elevations."""
         x, y, z = d[..., 0], d[..., 1], d[..., 2]
         level_x, level_y = np.sqrt(y * y + z * z), np.sqrt(x * x + z * z)
         angles = np.stack([np.arctan2(x, level_x), np.arctan2(y, level_y)], axis=-1)
@@ -371,11 +349,6 @@ class Autocollimation(AxisKind):
     mirror : name of the mirror; its parameters begin with it.
     Others : see `AxisKind`; "frame" and "mirror" may be unknown.
 
-    Raises
-    ------
-    DataError : the length of the normal is zero, the frame is not a pose, or `unknown` lists
-        something else.
-
     Examples
     --------
     >>> from loopcal.geometry import make_pose, rotation_about_axis
@@ -406,7 +379,7 @@ class Autocollimation(AxisKind):
         return self.frame, self.T_base_frame[:3, :3], self.mirror, self.normal
 
     def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return both angles (.., 2) and their derivatives (.., 2, 3)."""
+        """Return both angles."""
         return predict_camera_angles(d)
 
     def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:

@@ -84,10 +84,6 @@ class Distance(LengthKind):
     anchor_name : name of the fixed point. Kinds that use the same name share its parameters.
     Others : see `TargetKind`; "anchor", "targets" and "offset" (the zero of a wire) may be unknown.
 
-    Raises
-    ------
-    DataError : as `TargetKind`.
-
     Examples
     --------
     >>> kind = Distance(anchor=np.array([0.0, 0.0, 2.0]), places=np.zeros((1, 3)))
@@ -126,11 +122,8 @@ class Distance(LengthKind):
         return distance, unit, {**by_item, "anchor": -unit}
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """Return the fixed point by trilateration, with the targets at their stated places.
-
-        Raises
-        ------
-        DataError : all points are coplanar and the stated anchor does not say on which side it is.
+        """Return the fixed point by trilateration, with the targets at their stated places;
+        DataError where all points are coplanar, and the stated anchor is on neither side.
         """
         _, _, points, distances = self.collect_points(T, measured)
         if "anchor" not in self.unknown or len(distances) < 4 or self.is_of_base:

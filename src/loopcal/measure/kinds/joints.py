@@ -40,10 +40,6 @@ class JointSensor(Kind):
     measures : "length" or "angle": the dimension of the joints.
     unknown : "offset": the value that each sensor shows where its joint is zero.
 
-    Raises
-    ------
-    DataError : no joint is named or one twice, or `unknown` lists something else.
-
     Examples
     --------
     >>> kind = JointSensor(joints=("limb1.pin",), measures="angle", unknown=("offset",))
@@ -120,12 +116,6 @@ class Locked(JointSensor):
     ----------
     unknown : always "offset": the constant of each joint.
     Others : see `JointSensor`.
-
-    Examples
-    --------
-    >>> kind = Locked(joints=("q1",))
-    >>> [column.name for column in kind.columns]
-    ['q1.slip']
     """
 
     unknown: tuple[str, ...] = ("offset",)
@@ -147,19 +137,14 @@ class Locked(JointSensor):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ActuatorReadings(Kind):
-    """Recorded readings of all actuators. Residual: `true - recorded`.
-
-    Angles are not wrapped: a full turn too much is an error of a full turn.
-
-    Parameters
-    ----------
-    actuators : name -> dimension, in the order of the readings.
+    """Recorded readings of all actuators. Residual: `true - recorded`; angles are not wrapped,
+    because a full turn too much is an error of a full turn.
     """
 
     name: ClassVar[str] = READINGS
     description: ClassVar[str] = "the readings of the actuators"
     wraps_angles: ClassVar[bool] = False
-    actuators: Mapping[str, Dimension]
+    actuators: Mapping[str, Dimension]  # name -> dimension, in the order of the readings
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -189,11 +174,6 @@ class Closure(Kind):
     No column is measured, so that a row has no residual of its own, no noise and no setup. The
     robot must have more actuators than degrees of freedom. The `sigma` of its readings is the
     noise.
-
-    Examples
-    --------
-    >>> Closure().columns
-    ()
     """
 
     name: ClassVar[str] = CLOSURE

@@ -39,16 +39,12 @@ from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
+# Index of each invalid row, and the end of a sentence that says why.
 InvalidRows = tuple[tuple[int, str], ...]
-"""Index of each invalid row, and the end of a sentence that says why."""
-
+# Errors that all rows of a session share, a constant and a linear drift: setup items that any kind
+# may list as unknown.
 BIAS, DRIFT = SHARED_ERRORS = ("bias", "drift")
-"""Errors that all rows of a session share, a constant and a linear drift: setup items that any kind
-may list as unknown.
-"""
-
-BASE = "base"
-"""Name of the base among the bodies that a kind may be `of`; no stage has it."""
+BASE = "base"  # name of the base among the bodies that a kind may be `of`; no stage has it
 
 
 @dataclass(frozen=True)
@@ -63,40 +59,23 @@ POSITION_COLUMNS = tuple(Column(name, Dimension.LENGTH) for name in ("x", "y", "
 
 
 class Evaluation(NamedTuple):
-    """Residuals (predicted - measured) and their derivatives.
+    """Residuals (predicted - measured) and their derivatives; zero where nothing was measured."""
 
-    Components that were not measured are zero in all arrays.
-
-    Attributes
-    ----------
-    residual : (t, r, m) [SI]
-    jacobian : (t, r, m, 6), by the platform twist (omega, v) in base axes; with an axis of poses
-        before m where a row compares several poses.
-    nuisance : (t, r, m, u) or None, by the nuisance parameters of the kind; None where it has none.
-    joints : (t, r, m, j) or None
-        By the values of the joints that the kind senses; None where it senses poses only.
-    """
-
-    residual: FloatArray
+    residual: FloatArray  # (t, r, m) [SI]
+    # (t, r, m, 6) by the platform twist (omega, v) in base axes; with an axis of poses before m
+    # where a row compares several poses
     jacobian: FloatArray
-    nuisance: FloatArray | None = None
-    joints: FloatArray | None = None
+    nuisance: FloatArray | None = None  # (t, r, m, u) by the nuisance parameters of the kind
+    joints: FloatArray | None = None  # (t, r, m, j) by the values of the joints that it senses
 
 
 class MeasuredColumns(NamedTuple):
-    """Columns of rows as a kind compares its predictions with them, see `Kind.prepare_columns`.
+    """Columns of rows as a kind compares its predictions with them, see `Kind.prepare_columns`."""
 
-    Attributes
-    ----------
-    columns : (t, r, c) [SI], with a placeholder where nothing was measured.
-    reference : (t, r, k) the columns, or what a kind computes from them alone.
-    present : (t, r, m) residuals that exist. is_complete : whether all do.
-    """
-
-    columns: FloatArray
-    reference: FloatArray
-    present: BoolArray
-    is_complete: bool
+    columns: FloatArray  # (t, r, c) [SI], with a placeholder where nothing was measured
+    reference: FloatArray  # (t, r, k) the columns, or what a kind computes from them alone
+    present: BoolArray  # (t, r, m) residuals that exist
+    is_complete: bool  # whether all do
 
     def take(self, trials: IntArray) -> MeasuredColumns:
         """Return the columns of some trials."""
@@ -105,21 +84,13 @@ class MeasuredColumns(NamedTuple):
 
 
 class ErrorGroup(NamedTuple):
-    """Residuals that are the components of one error.
+    """Residuals that are the components of one error."""
 
-    Attributes
-    ----------
-    quantity : what the error is of, such as "position" or "length". dimension : of its number.
-    target : name of the target or joint, empty where a row has only one.
-    components : names of the components, such as ("x", "y", "z").
-    columns : their indices among the m residuals.
-    """
-
-    quantity: str
-    dimension: Dimension
-    target: str
-    components: tuple[str, ...]
-    columns: tuple[int, ...]
+    quantity: str  # what the error is of, such as "position" or "length"
+    dimension: Dimension  # of its number
+    target: str  # name of the target or joint, empty where a row has only one
+    components: tuple[str, ...]  # their names, such as ("x", "y", "z")
+    columns: tuple[int, ...]  # their indices among the m residuals
 
 
 def checked(check: Callable[[Any, str], FloatArray], what: str, default: Any = None) -> Any:
@@ -191,18 +162,14 @@ def update_setup_name(name: str) -> str:
 
 
 def measure_progress(session: np.ndarray, time: FloatArray | None) -> FloatArray:
-    """Return the progress (r,) of rows through their session, from -0.5 to 0.5: by time [s] where
-    all rows state one, else in their order.
-
-    Parameters
-    ----------
-    session : (r,) its name. time : (r,) or None.
+    """Return the progress (r,) of rows through their session (r,), from -0.5 to 0.5: by time (r,)
+    [s] where all rows state one, else in their order.
     """
-    by_time = time is not None and np.isfinite(time).all()
+    time = None if time is None or not np.isfinite(time).all() else time
     progress = np.zeros(len(session))
     for name in find_distinct(session):
         chosen = np.flatnonzero(session == name)
-        values = time[chosen] if by_time and time is not None else np.arange(float(len(chosen)))
+        values = np.arange(float(len(chosen))) if time is None else time[chosen]
         low, high = values.min(), values.max()
         if high > low:
             progress[chosen] = (values - 0.5 * (low + high)) / (high - low)
@@ -214,20 +181,17 @@ class Kind(ABC):
 
     Attributes
     ----------
-    name : name in files and in `KINDS`.
-    poses_per_row : number of poses that one row compares.
+    name : in files and in `KINDS`. poses_per_row : number of poses that one row compares.
     changes_with_pose : whether columns that stay constant while the robot moves indicate a mistake.
         It is False for touched surfaces and for locked joints, whose columns stay at 0.
     mixes_components : whether a motion of base and setup mixes the components of a residual, so
         that rows contain it in proportion to the residual; see docs/theory/identification.md.
     wraps_angles : whether differences of angles are wrapped into (-pi, pi].
-    description : str
-        What is measured, for suggestions to measure it with known setup; else "the" and the name.
-    length_error, angle_error : str
-        What its residuals are errors of, by dimension, such as "position"; see `list_error_groups`.
-    allowed_unknown : setup items that `unknown` may list.
-    bias_item : str
-        Setup item that the bias of a session is; the one that all kinds have, or one of its own.
+    description : what is measured, for suggestions to measure it with known setup; else "the" and
+        the name.
+    length_error, angle_error : what its residuals are errors of, by dimension, such as "position".
+    allowed_unknown : setup items that `unknown` may list. bias_item : the one that the bias of a
+        session is.
     unknown : setup items that are unknown; "bias" stands for `bias_item`.
     measures_points : whether it measures targets, which may be fixed to the base (`of: base`).
     of : the stage of a chain whose platform is measured, or "base"; empty for the end platform.
@@ -257,10 +221,9 @@ class Kind(ABC):
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
         set_fields(self, unknown=names)
         for setting in fields(self):
-            value = getattr(self, setting.name)
-            if "check" in setting.metadata and value is not None:
-                checked = setting.metadata["check"](value, setting.metadata["what"])
-                set_fields(self, **{setting.name: checked})
+            value, how = getattr(self, setting.name), setting.metadata
+            if "check" in how and value is not None:
+                set_fields(self, **{setting.name: how["check"](value, how["what"])})
         if self.of and self.poses_per_row > 1:
             raise DataError(
                 f"the kind {self.name!r} compares poses of the end platform; leave out "
@@ -335,9 +298,8 @@ class Kind(ABC):
         """Return instances that together show every setting, for documentation and tests."""
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
-        """Return the kind for a robot with this tool (4, 4).
-
-        It is the same object where the tool does not matter or is stated.
+        """Return the kind for a robot with this tool (4, 4); the same object where the tool does
+        not matter or is stated.
         """
         del T_platform_tool
         return self
@@ -363,16 +325,12 @@ class Kind(ABC):
         """The setup items that are unknown, in order. Errors that rows share come last: one
         parameter for each component.
         """
-        shared = {
-            item: SetupItem(
-                tuple(
-                    Parameter(name_shared_error(self, item, name), dimension, 0.0, scope="session")
-                    for name, dimension in list_components(self)
-                )
-            )
-            for item in self.shared_errors
-        }
-        return {**self.own_items, **shared}
+        items = dict(self.own_items)
+        for item in self.shared_errors:
+            named = [(name_shared_error(self, item, name), d) for name, d in list_components(self)]
+            shared = (Parameter(name, d, 0.0, scope="session") for name, d in named)
+            items[item] = SetupItem(tuple(shared))
+        return items
 
     @cached_property
     def is_drift(self) -> BoolArray:
@@ -407,9 +365,8 @@ class Kind(ABC):
 
     @property
     def references(self) -> Mapping[str, FloatArray]:
-        """The stated orientations or points that parameters are counted from, by name.
-
-        Kinds that share a name must agree on them.
+        """The stated orientations or points that parameters are counted from, by name, on which
+        kinds that share a name must agree.
         """
         return {k: v for item in self.setup_items.values() for k, v in item.references.items()}
 
@@ -448,10 +405,8 @@ class Kind(ABC):
         return np.concatenate([np.broadcast_to(v, (count, v.shape[1])) for v in columns], axis=-1)
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """Return candidates (k, u) for the nuisance parameters that rows share.
-
-        They follow from poses T (r, 4, 4) and columns (r, c), in closed form where there is one.
-        `loopcal.measure.initial_values` refines and compares them.
+        """Return candidates (k, u) for the nuisance parameters that rows share, from poses T
+        (r, 4, 4) and columns (r, c); `loopcal.measure.initial_values` refines and compares them.
         """
         del T, measured
         return self.nominal_values[None]
@@ -488,17 +443,11 @@ class Kind(ABC):
 
         Parameters
         ----------
-        T : (t or 1, r, 4, 4)
-            T_base_platform of each row (with an axis of poses where a row compares several).
-        measured : (t or 1, r, c) [SI]
-            NaN where not measured. Or the same prepared by `prepare_columns`.
-        nuisance : (t or 1, r or 1, u), optional
-            Values of the nuisance parameters of each row; default: nominal.
-        joints : (t, r, j), values of the joints in `sensed_joints`.
-
-        Raises
-        ------
-        DataError : the kind senses joints and none are given.
+        T : (t or 1, r, 4, 4) T_base_platform of each row (with an axis of poses where a row
+            compares several).
+        measured : (t or 1, r, c) [SI], NaN where not measured; or the result of `prepare_columns`.
+        nuisance : (t or 1, r or 1, u) of each row; default: nominal.
+        joints : (t, r, j), values of the joints in `sensed_joints`; DataError if one is missing.
         """
         if joints is None:
             self.stack_joints({}, np.zeros(0, dtype=np.intp))  # refuses where it senses any
@@ -524,36 +473,24 @@ class Kind(ABC):
             )
             result = result._replace(jacobian=np.zeros_like(result.jacobian), joints=by_entries)
         if self.shared_errors:
-            result = self._add_shared_errors(result, measured.columns, values)
-        return result if measured.is_complete else self._zero_absent(result, measured.present)
-
-    def _add_shared_errors(
-        self, evaluation: Evaluation, measured: FloatArray, values: FloatArray
-    ) -> Evaluation:
-        """Return the evaluation with the bias and drift of columns (.., r, c)."""
-        slope = self.linearize_noise(measured) @ self._spread
-        error = slope @ self._sum_shared_errors(values)[..., None]
-        residual = evaluation.residual + error[..., 0]
-        blocks = [slope] * len(self.shared_errors)
-        if evaluation.nuisance is not None:
-            blocks.insert(0, evaluation.nuisance)
-        columns = [np.broadcast_to(b, (*residual.shape, b.shape[-1])) for b in blocks]
-        return evaluation._replace(residual=residual, nuisance=np.concatenate(columns, axis=-1))
-
-    def _zero_absent(self, evaluation: Evaluation, present: BoolArray) -> Evaluation:
-        """Return the evaluation with zeros for components that are not `present` (t, r, m)."""
-        by_row = present[..., None]
-        by_twist = present[..., None, :, None] if self.poses_per_row > 1 else by_row
+            slope = self.linearize_noise(measured.columns) @ self._spread
+            error = slope @ self._sum_shared_errors(values)[..., None]
+            residual = result.residual + error[..., 0]
+            blocks = [] if result.nuisance is None else [result.nuisance]
+            blocks += [slope] * len(self.shared_errors)
+            columns = [np.broadcast_to(b, (*residual.shape, b.shape[-1])) for b in blocks]
+            result = result._replace(residual=residual, nuisance=np.concatenate(columns, axis=-1))
+        if measured.is_complete:
+            return result
+        present = measured.present[..., None]
+        by_twist = present[..., None, :, :] if self.poses_per_row > 1 else present
         by_nuisance, by_joints = (
-            None if derivative is None else np.where(by_row, derivative, 0.0)
-            for derivative in (evaluation.nuisance, evaluation.joints)
+            None if derivative is None else np.where(present, derivative, 0.0)
+            for derivative in (result.nuisance, result.joints)
         )
-        return Evaluation(
-            np.where(present, evaluation.residual, 0.0),
-            np.where(by_twist, evaluation.jacobian, 0.0),
-            by_nuisance,
-            by_joints,
-        )
+        residual = np.where(measured.present, result.residual, 0.0)
+        jacobian = np.where(by_twist, result.jacobian, 0.0)
+        return Evaluation(residual, jacobian, by_nuisance, by_joints)
 
     def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
         """Return the measured bodies (.., 4, 4): the end platforms T, those of a stage from their
@@ -578,17 +515,12 @@ class Kind(ABC):
         nuisance: FloatArray | None = None,
         joints: FloatArray | None = None,
     ) -> FloatArray:
-        """Return the columns that an instrument with this noise writes.
+        """Return the columns (t, r, c) [SI] that an instrument with this noise writes.
 
-        Parameters
-        ----------
+        To first order, `evaluate(T, measured).residual = -linearize_noise(measured) noise`.
+
         T : (t, r, 4, 4) true T_base_platform. noise : (t, r, m) in the noise columns.
         nuisance : (t or 1, r or 1, u), default nominal. joints : (t, r, j), default zero.
-
-        Returns
-        -------
-        measured : (t, r, c) [SI]
-            With `evaluate(T, measured).residual = -linearize_noise(measured) noise` to first order.
         """
         values = self.nominal_values[None, None] if nuisance is None else nuisance
         joints = np.zeros_like(noise) if joints is None else joints

@@ -18,10 +18,9 @@ from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Column, Evaluation, Kind, checked
 from loopcal.typing import FloatArray
 
+# The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in the
+# frame, and (.., k, g, w) by the setup items that only this kind has.
 Prediction = tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]
-"""The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in
-the frame, and (.., k, g, w) by the setup items that only this kind has.
-"""
 
 
 def name_point(pose: str, target: str, targets: Sequence[str]) -> str:
@@ -48,11 +47,6 @@ class TargetKind(Kind):
     of : stage of a chain on whose platform the targets are; default: the end platform. "base" (of
         the kinds position, bearing and distance): the targets are fixed to the base. Their rows
         belong to no pose, and unknown ones keep their places in all sessions.
-
-    Raises
-    ------
-    DataError : shapes do not fit, a name occurs twice, `unknown` lists something that is not
-        allowed, or places of targets on the base are neither stated nor unknown.
     """
 
     targets: tuple[str, ...] = ("target",)
@@ -167,12 +161,9 @@ class TargetKind(Kind):
     def collect_points(
         self, T: FloatArray, measured: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return every measured target as a row, at nominal nuisance parameters.
-
-        Returns
-        -------
-        moving : (q, 3, 3 k); `moving p + origin` is the point in the base, with p the places of all
-            targets. origin : (q, 3). points : (q, 3) in the base. columns : (q, g) measured.
+        """Return every measured target as a row, at nominal nuisance parameters: moving (q, 3, 3 k)
+        and origin (q, 3), by which `moving p + origin` is the point in the base with p the places
+        of all targets; these points (q, 3); and the measured columns (q, g).
         """
         k = len(self.targets)
         moving = (T[:, None, :3, None, :3] * np.eye(k)[:, None, :, None]).reshape(-1, 3, 3 * k)

@@ -29,10 +29,11 @@ from loopcal.measure.kinds.setup_parameters import POSITION_AXES
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
+# Measured tilt [rad] below which the normal replaces phi and theta; the noise of phi is twenty
+# times that of theta there.
 SMALL_TILT = 0.05
-"""Measured tilt [rad] below which the normal replaces phi and theta; the noise of phi is twenty
-times that of theta there.
-"""
+# Smallest |det E| of measured angles; below it a and c are the same rotation to a thousandth.
+SINGULAR_RATES = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -44,13 +45,9 @@ class ToolKind(Kind):
     T_base_frame : (4, 4), instrument frame in the base; default: the base itself. If the frame is
         unknown, this is its nominal value.
     T_platform_tool : (4, 4), tool on the platform; default: the tool of the robot.
-    unknown : tuple of str
-        Which of "frame" and "tool" are unknown, six numbers each. One value holds for a session.
+    unknown : which of "frame" and "tool" are unknown, six numbers each. One value holds for a
+        session.
     frame : name of the frame. Kinds that use the same name share its parameters.
-
-    Raises
-    ------
-    DataError : a frame is not a pose, or `unknown` lists something else.
     """
 
     T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
@@ -111,7 +108,6 @@ class ToolKind(Kind):
 
     @cached_property
     def _stated_inverse(self) -> FloatArray:
-        """The pose (4, 4) of the base in the stated frame."""
         return geometry.invert_pose(self.T_base_frame)
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
@@ -150,12 +146,7 @@ class Pose(ToolKind):
         a rotation vector or a quaternion is a rotation error rx ry rz about the axes of the frame.
         Noise of angles is noise of these angles, except near a singularity of the angles (`|det E|
         < 0.05`, E their rates), where it is a rotation error too.
-    T_base_frame, T_platform_tool, unknown, frame
-        See `ToolKind`.
-
-    Raises
-    ------
-    DataError : the orientation form does not exist or a frame is not a pose.
+    Others : see `ToolKind`.
 
     Examples
     --------
@@ -210,22 +201,20 @@ class Pose(ToolKind):
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows with an incomplete orientation or a quaternion whose length is not 1."""
         orientation = measured[..., :-3]
-        invalid = list_rows(
-            is_incomplete(orientation),
-            lambda _: (
-                "has an incomplete orientation; give all of its columns or none, or use the "
-                "kind 'component'"
-            ),
+        incomplete = (
+            "has an incomplete orientation; give all of its columns or none, or use the kind "
+            "'component'"
         )
+        invalid = list_rows(is_incomplete(orientation), lambda _: incomplete)
         if self.orientation != "quaternion":
             return invalid
-        length = np.linalg.norm(orientation, axis=-1)
+        length, rule = (
+            np.linalg.norm(orientation, axis=-1),
+            "must be 1 to 1e-3, with the scalar first",
+        )
         return invalid + list_rows(
             np.abs(length - 1.0) > 1e-3,
-            lambda i: (
-                f"has a quaternion of length {length[i]:.6g}; the length must be 1 to 1e-3, "
-                "with the scalar first"
-            ),
+            lambda i: f"has a quaternion of length {length[i]:.6g}; the length {rule}",
         )
 
     @property
@@ -253,9 +242,8 @@ class Pose(ToolKind):
     def _measure(
         self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
     ) -> FloatArray:
-        """Return columns (t, r, c) of the tool pose with noise (t, r, 6).
-
-        The first three numbers of the noise are a rotation error, or are added to the angles.
+        """Return the columns; the first three numbers of the noise are a rotation error, or are
+        added to the angles.
         """
         tool, _ = self.locate_tool(T, values)
         orientation = self.form.from_matrix(geometry.exp_so3(noise[..., :3]) @ tool[..., :3, :3])
@@ -278,16 +266,12 @@ class Pose(ToolKind):
             None if "frame" in self.unknown else self.T_base_frame,
             None if "tool" in self.unknown else self.stated_tool,
         )
-        items = {
-            "frame": setup.encode_frame(self.T_base_frame, frame),
-            "tool": setup.encode_frame(self.stated_tool, tool),
-        }
-        return self.assemble_values(items)
+        of_frame = setup.encode_frame(self.T_base_frame, frame)
+        of_tool = setup.encode_frame(self.stated_tool, tool)
+        return self.assemble_values({"frame": of_frame, "tool": of_tool})
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
-        """Return the matrix (..., 6, 6): E of the angles (or the identity, see the class) for the
-        rotation, the identity for x y z.
-        """
+        """Return E of the angles (or the identity, see the class), and the identity for x y z."""
         if not self.form.angles:
             return np.broadcast_to(np.eye(6), (*measured.shape[:-1], 6, 6))
         rates = self.form.rates(self._fill_orientation(measured))
@@ -322,10 +306,6 @@ def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, Flo
     return residual, setup.stack_diagonally(inverse, np.eye(3))
 
 
-SINGULAR_RATES = 1e-3
-"""Smallest |det E| of measured angles; below it a and c are the same rotation to a thousandth."""
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Component(ToolKind):
     """Some coordinates of the tool; z alone is a probed height. Residual: `predicted - measured` of
@@ -345,13 +325,7 @@ class Component(ToolKind):
         orientation.
     orientation : form of the angles, "tilt-torsion" (phi theta psi) or "euler-" and an order (a b
         c). Required if an angle is measured.
-    T_base_frame, T_platform_tool, unknown, frame
-        See `ToolKind`.
-
-    Raises
-    ------
-    DataError : a component does not exist or is named twice, if angles have no declared
-        orientation, or if phi is measured without theta.
+    Others : see `ToolKind`.
 
     Examples
     --------
@@ -467,10 +441,7 @@ class Component(ToolKind):
     def _measure(
         self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
     ) -> FloatArray:
-        """Return columns (t, r, m) of the tool with noise.
-
-        Near zero tilt the noise of phi and theta applies to the normal.
-        """
+        """Return the columns; near zero tilt the noise of phi and theta is that of the normal."""
         tool, _ = self.locate_tool(T, values)
         exact, _ = self._predict_components(tool)
         noisy = exact + noise
@@ -505,7 +476,6 @@ class Component(ToolKind):
 
     @property
     def _normal_indices(self) -> tuple[int, int]:
-        """Indices of theta and phi among the components."""
         return self.components.index("theta"), self.components.index("phi")
 
     def _predict_components(self, tool: FloatArray) -> tuple[FloatArray, FloatArray]:

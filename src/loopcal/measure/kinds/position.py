@@ -28,7 +28,7 @@ class Position(TargetKind):
 
     Parameters
     ----------
-    See `TargetKind`; "frame" and "targets" may be unknown.
+    Those of `TargetKind`; "frame" and "targets" may be unknown.
 
     Examples
     --------
@@ -59,11 +59,8 @@ class Position(TargetKind):
         return x, np.eye(3), {}
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """Return frame and targets in closed form.
-
-        Raises
-        ------
-        DataError : the frame is unknown and all points are collinear.
+        """Return frame and targets in closed form; DataError where the frame is unknown and all
+        points are collinear.
         """
         if self.is_of_base:
             base = np.broadcast_to(np.eye(4), (len(measured), 4, 4))

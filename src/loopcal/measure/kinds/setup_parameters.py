@@ -26,15 +26,10 @@ ROTATION_AXES, POSITION_AXES, DIRECTION_AXES = ("rx", "ry", "rz"), ("x", "y", "z
 
 @dataclass(frozen=True, eq=False)
 class SetupItem:
-    """A frame, direction, target, surface or offset that may be unknown.
+    """A frame, direction, target, surface or offset that may be unknown."""
 
-    Attributes
-    ----------
-    parameters : its nuisance parameters, with nominal values and scope.
-    references : name -> array, the stated orientations or points that they are counted from.
-    """
-
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Parameter, ...]  # with nominal values and scope
+    # name -> stated orientation or point that they are counted from
     references: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
@@ -92,12 +87,8 @@ def encode_rotation(stated: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def linearize_frame(values: FloatArray) -> FloatArray:
-    """Return the derivative (.., 6, 6) of a frame's twist by its values (.., 6).
-
-    It is the left Jacobian for the rotation and the identity for x y z.
-    """
-    rotation = geometry.left_jacobian_so3(values[..., :3])
-    return stack_diagonally(rotation, np.eye(3))
+    """Return the derivative (.., 6, 6) of a frame's twist by its values (.., 6)."""
+    return stack_diagonally(geometry.left_jacobian_so3(values[..., :3]), np.eye(3))
 
 
 def stack_diagonally(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -106,12 +97,9 @@ def stack_diagonally(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def make_perpendicular_basis(direction: FloatArray) -> FloatArray:
-    """Return two unit vectors B (.., 3, 2) perpendicular to unit vectors (.., 3).
-
-    B is a smooth function of the direction, except where z changes its sign.
-
-    Source: Duff et al., Building an Orthonormal Basis, Revisited, Journal of Computer Graphics
-    Techniques 6(1), 2017.
+    """Return two unit vectors B (.., 3, 2) perpendicular to unit vectors (.., 3), of which they
+    are a smooth function except where z changes its sign (Duff et al., Building an Orthonormal
+    Basis, Revisited, Journal of Computer Graphics Techniques 6(1), 2017).
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     s = np.where(z >= 0.0, 1.0, -1.0)
@@ -122,9 +110,8 @@ def make_perpendicular_basis(direction: FloatArray) -> FloatArray:
 
 
 def rotate_basis(stated: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the rotation R (.., 3, 3) of a direction at values (.., 2), and its derivative.
-
-    The derivative S (.., 3, 2) satisfies `dR = hat(S d(u, v)) R`.
+    """Return the rotation R (.., 3, 3) of a direction at values (.., 2), and its derivative S
+    (.., 3, 2): `dR = hat(S d(u, v)) R`.
     """
     B = make_perpendicular_basis(stated)
     rotation = (B @ values[..., None])[..., 0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -43,10 +43,6 @@ class SurfaceKind(TargetKind):
     Others : see `TargetKind`; "frame", "surface" and "targets" (the offsets of the probe) may be
     unknown. Faces of a body with known dimensions, such as a datum cube, are known surfaces in one
     unknown frame.
-
-    Raises
-    ------
-    DataError : as `TargetKind`, and if the length of a direction is zero.
     """
 
     through: FloatArray = checked(check_point, "the point of the surface", np.zeros(3))
@@ -58,23 +54,27 @@ class SurfaceKind(TargetKind):
     measures_points: ClassVar[bool] = False
     length_error: ClassVar[str] = "gap"
     fewest_points: ClassVar[int] = 3
+    surface_axes: ClassVar[tuple[str, ...]]  # names of the parameters of the surface
 
     @property
-    @abstractmethod
-    def surface_parameters(self) -> tuple[Parameter, ...]:
-        """The parameters of the surface; rows of one group share them."""
+    def nominal_surface(self) -> FloatArray:
+        """Nominal values (w,) of the parameters of the surface."""
+        return np.zeros(len(self.surface_axes))
 
     @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
-        """Also the surface."""
+        """Also the surface, whose parameters the rows of one group share."""
         stated = {f"{self.surface}.through": self.through, f"{self.surface}.along": self.along}
-        surface = setup.SetupItem(self.surface_parameters, stated)
-        return {**super().possible_setup, "surface": surface}
-
-    def _make_parameters(
-        self, names: tuple[str, ...], dimension: Dimension, nominal: FloatArray | None = None
-    ) -> tuple[Parameter, ...]:
-        return setup.make_parameters(self.surface, names, dimension, nominal, "group")
+        parameters = tuple(
+            Parameter(
+                f"{self.surface}.{axis}",
+                Dimension.ANGLE if axis in setup.DIRECTION_AXES else Dimension.LENGTH,
+                value,
+                scope="group",
+            )
+            for axis, value in zip(self.surface_axes, self.nominal_surface.tolist(), strict=True)
+        )
+        return {**super().possible_setup, "surface": setup.SetupItem(parameters, stated)}
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the surface in closed form, with the targets at their stated places."""
@@ -99,10 +99,6 @@ class Plane(SurfaceKind):
     Setup parameters: `plane.u`, `plane.v` [rad] and `plane.height` [m], and `target.x` to
     `target.z` [m] of each target.
 
-    Parameters
-    ----------
-    See `SurfaceKind`.
-
     Examples
     --------
     >>> kind = Plane(surface="bed", unknown=("surface",), places=np.zeros((1, 3)))
@@ -121,22 +117,10 @@ class Plane(SurfaceKind):
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """Return a known plane, and an unknown one probed with an unknown offset."""
-        return (
-            cls(),
-            cls(
-                unknown=("surface", "targets"),
-                targets=("probe",),
-                along=np.array([0.6, 0.0, 0.8]),
-                surface="bed",
-            ),
-        )
+        tilted = cls(along=np.array([0.6, 0.0, 0.8]), targets=("probe",), surface="bed")
+        return (cls(), replace(tilted, unknown=("surface", "targets")))
 
-    @property
-    def surface_parameters(self) -> tuple[Parameter, ...]:
-        """Two rotations and a height."""
-        return self._make_parameters(("u", "v"), Dimension.ANGLE) + self._make_parameters(
-            ("height",), Dimension.LENGTH
-        )
+    surface_axes: ClassVar[tuple[str, ...]] = ("u", "v", "height")
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return heights (.., k, 1) above the plane."""
@@ -175,10 +159,6 @@ class Line(SurfaceKind):
     Setup parameters: `line.u`, `line.v` [rad], `line.a` and `line.b` [m], and `target.x` to
     `target.z` [m] of each target.
 
-    Parameters
-    ----------
-    See `SurfaceKind`.
-
     Examples
     --------
     >>> kind = Line(surface="ruler", unknown=("surface",))
@@ -203,12 +183,7 @@ class Line(SurfaceKind):
         """Return a known line, and an unknown one."""
         return (cls(), cls(unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"))
 
-    @property
-    def surface_parameters(self) -> tuple[Parameter, ...]:
-        """Two rotations and two shifts."""
-        return self._make_parameters(("u", "v"), Dimension.ANGLE) + self._make_parameters(
-            ("a", "b"), Dimension.LENGTH
-        )
+    surface_axes: ClassVar[tuple[str, ...]] = ("u", "v", "a", "b")
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 2) from the line along B."""
@@ -247,13 +222,8 @@ class Sphere(SurfaceKind):
 
     Parameters
     ----------
-    radius : float [m]
-        Sum of the radii of ball and probe. If the surface is unknown, its nominal value.
+    radius : sum of the radii of ball and probe [m]. If the surface is unknown, its nominal value.
     Others : see `SurfaceKind`; `through` is the center, and `along` does not matter.
-
-    Raises
-    ------
-    DataError : as `SurfaceKind`, and if the radius is not above zero.
 
     Examples
     --------
@@ -280,11 +250,12 @@ class Sphere(SurfaceKind):
         far = np.array([1.5, -0.8, 1.1])
         return (cls(through=far), cls(unknown=("surface",), through=far, surface="ball"))
 
+    surface_axes: ClassVar[tuple[str, ...]] = ("x", "y", "z", "radius")
+
     @property
-    def surface_parameters(self) -> tuple[Parameter, ...]:
+    def nominal_surface(self) -> FloatArray:
         """Center and radius."""
-        nominal = np.array([*self.through, self.radius])
-        return self._make_parameters(("x", "y", "z", "radius"), Dimension.LENGTH, nominal)
+        return np.array([*self.through, self.radius])
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 1) from the sphere."""
