@@ -113,7 +113,7 @@ def check_rank(s, rank):
 
 @pytest.fixture(scope="module")
 def robot():
-    return zoo.nategh().with_values(zoo.nategh_truth())
+    return zoo.load_cached_robot("hexapod-nategh-agheli").with_values(zoo.nategh_truth())
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StatedValue:
-    """A prior or a fixed value of one nuisance parameter; DataError where a number is not allowed.
+    """A prior or a fixed value of one nuisance parameter.
 
     Parameters
     ----------

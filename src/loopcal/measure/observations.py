@@ -156,9 +156,10 @@ def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
     """
     findings = []
     for record in list_instruments(observations):
-        stated = {"instrument": str(record)} | {name: getattr(record, name) for name in DATES}
+        stated: dict[str, Any] = {name: getattr(record, name) for name in DATES}
+        stated["instrument"] = str(record)
         if not record.measured and record.due:
-            stated = {"instrument": str(record), "due": record.due}
+            stated = {"instrument": stated["instrument"], "due": record.due}
             findings.append(report_finding("data.instrument-not-dated", **stated))
         elif record.due and record.measured > record.due:
             findings.append(report_finding("data.instrument-past-due", **stated))

@@ -292,8 +292,11 @@ def simulate(
     reading_sigma: ArrayLike | None = None,
     pose_names: tuple[Sequence[str], Sequence[str]] = ((), ()),
 ) -> Measurements:
-    """Measure commanded poses on one machine, at its true values: trial 0 of `simulate_trials`;
-    DataError where the controller or the true machine does not reach a pose.
+    """Measure commanded poses on one machine, at its true values: trial 0 of `simulate_trials`.
+
+    Raises
+    ------
+    DataError : the controller or the true machine does not reach a pose.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     how = (controller, nuisance_values, reading_sigma, NO_DISTURBANCE, pose_names)
