@@ -54,7 +54,7 @@ def measure_distance(usual: IdentifiedTrials, other: IdentifiedTrials) -> np.nda
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), MAP(InflatedTolerances())], ids=repr)
 @pytest.mark.parametrize(("robot", "poses"), [(HEXAPOD, 20), (HEXAPOD, 8), (DELTA, 12)])
 def test_estimates_are_those_of_the_usual_descent(robot, poses, method, factor):
-    usual, chords = fit_both(robot, simulate(robot, 12, poses, factor), method)
+    usual, chords = fit_both(robot, simulate(robot, 6, poses, factor), method)
     assert usual.converged.all()
     assert measure_distance(usual, chords).max() < ACCEPTED_STEP
     assert (chords.iterations <= usual.iterations + 1).all()

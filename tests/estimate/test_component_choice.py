@@ -228,10 +228,11 @@ def test_choice_with_the_method_of_a_fit_is_the_same():
 
 @pytest.mark.slow
 def test_right_tolerances_rarely_get_a_component():
-    _, trials = simulate_deltas(150, {}, seed=4)
-    fits = [identify(DELTA, trials.trial(i)) for i in range(150)]
+    _, trials = simulate_deltas(60, {}, seed=4)
+    fits = [identify(DELTA, trials.trial(i)) for i in range(60)]
     conflicts = [f.prior_conflict for f in fits]
-    assert sum(bool(c.components) for c in conflicts if c) <= 12  # 4 % expected
+    # 4 % are expected; more than 10 have probability 2e-5
+    assert sum(bool(c.components) for c in conflicts if c) <= 10
 
 
 def test_undetectable_deviations_are_reported_where_the_prior_hides_them():

@@ -63,10 +63,10 @@ def test_corrected_robot_has_the_estimate(fit):
 
 @pytest.mark.slow
 def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
-    # errors up to 5 mm; our bounds on medians and on the worst of 100 draws [mm]
+    # errors up to 5 mm; our bounds on medians and on the worst of 20 draws [mm]
     robot, truth = zoo.load_cached_robot("hexapod-nategh-agheli"), zoo.nategh_truth()
     steps = []
-    for seed in range(100):
+    for seed in range(20):
         T = zoo.nategh_poses(np.random.default_rng(seed))
         exact = simulate(robot.with_values(truth), T, tracker(1e-15, 5e-15), seed)
         fit = identify(robot, exact, LeastSquares(), options=FitOptions(begin="closure"))

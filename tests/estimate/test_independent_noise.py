@@ -88,7 +88,7 @@ def expand(dense, q, scale, degrees):
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", ["given", "estimated"])
 def test_expanded_uncertainty_of_poses_and_its_coverage_with_6_degrees_of_freedom(noise):
-    fits = 150
+    fits = 60
     simulation = measure(Case("", is_few=True), fits)
     options = FitOptions(method=LeastSquares(), noise=noise)
     inside = []

@@ -53,7 +53,7 @@ def compare(seed: int, before: float, after: float, limb=None, poses=20, unknown
 @pytest.mark.parametrize("limb", [None, "tower1"])
 def test_a_wrong_sigma_does_not_change_the_test(limb) -> None:
     """Sigmas that are three times too small and twice too large, in one calibration or in both."""
-    for seed in range(2):
+    for seed in (0,):
         right = compare(seed, 1.0, 1.0, limb)
         assert right.moved == (right.p_value < CHANGE_LEVEL)
         for before, after in [(3.0, 3.0), (0.5, 0.5), (2.0, 1.0), (1.0, 3.0)]:
@@ -67,12 +67,12 @@ def test_a_wrong_sigma_does_not_change_the_test(limb) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "poses", "unknown"), [(2.0, 20, ()), (0.5, 8, ("frame",))])
 def test_unmoved_machines_are_declared_moved_at_the_stated_rate(ratio, poses, unknown) -> None:
-    """5 % of 16; p-values are uniform. Before, a sigma twice too small moved nearly every one."""
-    changes = [compare(s, ratio, ratio, poses=poses, unknown=unknown) for s in range(16)]
+    """5 % of 10; p-values are uniform. Before, a sigma twice too small moved nearly every one."""
+    changes = [compare(s, ratio, ratio, poses=poses, unknown=unknown) for s in range(10)]
     p_values = [change.p_value for change in changes]
     moved = [change.moved for change in changes if change.moved is not None]
-    assert len(moved) == 16
-    assert sum(moved) <= stats.binom.ppf(0.999, 16, CHANGE_LEVEL)
+    assert len(moved) == 10
+    assert sum(moved) <= stats.binom.ppf(0.999, 10, CHANGE_LEVEL)
     assert stats.kstest(p_values, "uniform").pvalue > 1e-3
     assert all(change.finding.data["level"] == CHANGE_LEVEL for change in changes)
 

@@ -155,7 +155,7 @@ def test_fit_in_an_unknown_frame_equals_that_in_a_known_frame_up_to_its_gauge():
 def test_intervals_of_robot_and_frame_contain_the_truth():
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame", "targets"))
-    truths, fits = sample_truth(robot, 60, 11), []
+    truths, fits = sample_truth(robot, 24, 11), []
     inside = []
     for i, truth in enumerate(truths):
         instrument = Instrument((make_sensor(kind, Gaussian, 20 * UM),))
@@ -269,7 +269,7 @@ def test_each_session_has_its_own_frame_and_elimination_cluster():
 
 @pytest.mark.slow
 def test_memory_hardly_grows_with_the_number_of_sessions(monkeypatch):
-    monkeypatch.setattr(blocks_module, "EXACT_BLOCK", 256)  # poses, those of 32 sessions
+    monkeypatch.setattr(blocks_module, "EXACT_BLOCK", 128)  # poses, those of 16 sessions
 
     def peak(sessions):
         day = np.repeat([f"day{i}" for i in range(sessions)], 8)
@@ -283,9 +283,9 @@ def test_memory_hardly_grows_with_the_number_of_sessions(monkeypatch):
         finally:
             tracemalloc.stop()
 
-    # blocks of 256 poses either way; per session there is a factor of 49 columns and little else
+    # blocks of 128 poses either way; per session there is a factor of 49 columns and little else
     peak(8)  # modules that are imported at the first fit count for none
-    assert peak(64) < 1.5 * peak(32) + 64 * 49**2 * 8
+    assert peak(32) < 1.5 * peak(16) + 32 * 49**2 * 8
 
 
 def test_priors_and_fixed_setup_parameters_are_respected():

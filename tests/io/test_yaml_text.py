@@ -134,7 +134,7 @@ NAMES = st.sampled_from((*WORDS.split(), *PHRASES)) | st.text(
 )
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(st.lists(NAMES, min_size=1, max_size=6, unique=True))
 def test_any_name_is_quoted_so_that_yaml_reads_it_back(names: list[str]) -> None:
     quoted = [quote_scalar(name) for name in names]
@@ -155,7 +155,7 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(
     st.dictionaries(
         NAMES.filter(lambda name: name != "identified"), VALUES, min_size=1, max_size=4
