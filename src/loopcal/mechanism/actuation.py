@@ -40,10 +40,8 @@ class Derivatives(NamedTuple):
 
 
 class DrivenJoints(NamedTuple):
-    """What values and readings make of a robot of one stage.
-
-    e : (t | 1, n_displacements) [m, rad]. tau : (t | 1, a, k) transmission terms.
-    joints : (t | 1, n, n_joints) values of the driven joints [m, rad].
+    """Displacements e (t | 1, d) [m, rad], terms tau (t | 1, a, k) of the transmissions, and values
+    (t | 1, n, J) of the driven joints [m, rad] of a robot of one stage.
     """
 
     e: FloatArray
@@ -60,10 +58,8 @@ def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJ
 
 
 class DrivenSums(NamedTuple):
-    """What values and readings make of a robot whose readings are fewer sums than its joints.
-
-    e : (t | 1, n_displacements) [m, rad]. sums : (t | 1, n, a) of joint values [m, rad].
-    weights : (t | 1, a, n_joints) of the joints in the sums.
+    """Displacements e (t | 1, d), sums (t | 1, n, a) of joint values [m, rad], and weights (t | 1,
+    a, J) of the joints in them, of a robot whose readings are fewer sums than its joints.
     """
 
     e: FloatArray
@@ -100,7 +96,7 @@ def solve_at_pose(
 ) -> tuple[State, FloatArray]:
     """Close every limb with the platform at T (t, n, 4, 4); return states and readings (t, n, a).
 
-    values : (t | 1, p). begin : (t, n), whose joints select the branch of each limb.
+    begin : (t, n), whose joints select the branch of each limb.
     """
     e, tau = robot.slots(values)
     guess, limbs = driven_values(robot.program, begin), robot.program.with_fixed_platform
@@ -114,9 +110,8 @@ def differentiate_at_pose(
 ) -> PoseDrivenSensitivity:
     """Differentiate readings and passive joints of redundant actuators at states (t, n).
 
-    With summed drives the derivatives are those of the driven joints in place of readings.
-
-    values : (t | 1, p). q : (t | 1, n, a) readings that close every limb; not used for sums.
+    With summed drives the derivatives are those of the driven joints in place of readings, and q is
+    not used.
     """
     t, n = state.T.shape[:2]
     names = name_passive_joints(robot)
@@ -157,10 +152,8 @@ def solve_open_sums(
     begin: State,
     max_iterations: int = ITERATIONS,
 ) -> State:
-    """Return the states (t, n) at which the weighted sums of driven joints are given.
-
-    e : (t | 1, d) displacements. weights : (t | 1, a, J). sums : (t | 1, n, a).
-    begin : (t | 1, n | 1) where Newton's method begins.
+    """Return the states (t, n) at which the weighted sums (t | 1, n, a) of driven joints are given,
+    by Newton's method from `begin` (t | 1, n | 1).
     """
     t = max(len(e), len(weights), len(sums), begin.T.shape[0])
     n = max(sums.shape[1], begin.T.shape[1])
@@ -216,9 +209,8 @@ def differentiate_open_sums(
     state: State,
     columns: ParameterUnits | None = None,
 ) -> Derivatives:
-    """Return the derivatives of the twist of the platform, (t, n, 6, p) and (t, n, 6, a).
-
-    columns : the parameters and their units; all parameters in SI without it.
+    """Return the derivatives of the twist of the platform, (t, n, 6, p) and (t, n, 6, a), by
+    `columns`, all parameters in SI without it.
     """
     chosen = robot.all_parameters if columns is None else columns
     at_pose = differentiate_at_pose(robot, values, q, state).readings
@@ -239,9 +231,8 @@ def differentiate_open_sums(
 def differentiate_driven_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State, platform: Derivatives
 ) -> Derivatives:
-    """Return the derivatives of the driven joints, (t, n, J, p) and (t, n, J, a).
-
-    platform : those of its twist, by all parameters in SI and by readings.
+    """Return the derivatives of the driven joints, (t, n, J, p) and (t, n, J, a), of those of the
+    platform's twist by all parameters in SI and by readings.
     """
     if robot.has_open_sums:
         by_parameters, by_pose = differentiate_at_pose(robot, values, q, state).readings

@@ -34,10 +34,8 @@ MOST_COPIES = 100
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A link transform, from coordinates behind the link to those before it.
-
-    name : unique in its limb.
-    transform : (4, 4) nominal [m]; the joint behind it moves along or about its z axis.
+    """A link transform (4, 4) [m] from coordinates behind the link to those before it; the joint
+    behind it moves along or about its z axis.
     """
 
     name: str

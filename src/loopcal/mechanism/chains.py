@@ -93,10 +93,8 @@ def split_stage_states(robot: Mechanism, state: State) -> list[State]:
 def locate_stage_bases(
     stages: Sequence[Stage], poses: Sequence[FloatArray]
 ) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return the bases and the platforms of all stages in the base of the chain.
-
-    poses : (.., 4, 4) of each stage. Both results have the same shapes, or (4, 4) for a base that
-    does not move.
+    """Return the bases and the platforms of all stages in the base of the chain, of the poses (..,
+    4, 4) of stages; a base that does not move is (4, 4).
     """
     bases: list[FloatArray] = []
     platforms: list[FloatArray] = []
@@ -114,9 +112,8 @@ def get_platforms(robot: Mechanism, state: State) -> list[FloatArray]:
 
 
 def select_readings(q: FloatArray, stage: Stage, count: int) -> FloatArray:
-    """Return the readings of a stage among those of a chain with `count` actuators.
-
-    q : (.., a), or (.., 2 a) with the directions of approach behind the readings.
+    """Return the readings of a stage among those (.., a) of a chain with `count` actuators, or
+    those (.., 2 a) with the directions of approach.
     """
     own = q[..., :count][..., stage.actuators]
     if q.shape[-1] == count:
@@ -153,8 +150,8 @@ def find_carrying_actuators(robot: Mechanism) -> IntArray:
 def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int, FloatArray]]:
     """Return the stages that carry a platform, and the maps (t, n, 6, 6) of their twists to it.
 
-    A stage's twist is in the axes of its own base, at the origin of its own platform. The result is
-    in base axes, at the origin of platform `end`.
+    A twist of a stage is in the axes of its base, at its platform; the result in base axes, at
+    `end`.
     """
     assert isinstance(state, ChainState)
     bases, platforms = locate_stage_bases(robot.stages, state.poses)
@@ -180,9 +177,8 @@ JointDerivative = Callable[[Mechanism, FloatArray, FloatArray, State], Any]
 def solve_stages(
     robot: Mechanism, values: FloatArray, q: FloatArray, start: State | None, solve: StageSolver
 ) -> ChainState:
-    """Solve forward kinematics of a chain for readings q (t | 1, n, a) and values (t | 1, p).
-
-    A row has the worst status of its stages. `start` (default: home) selects their modes.
+    """Solve forward kinematics of a chain for readings q (t | 1, n, a) and values (t | 1, p) from
+    `start` (default: home).
     """
     begins = [None] * len(robot.stages) if start is None else split_stage_states(robot, start)
     count = len(robot.actuators)
@@ -414,10 +410,8 @@ start; states are (1, R) or (R, 1), like the start.
 
 @dataclass(frozen=True, eq=False)
 class _Iterate:
-    """Readings of R rows and what follows from them.
-
-    q : (R, a). state : of R rows. gap : (R,) distance from the target [m]. step : (R, a) Newton
-    step. sign : (R,) of det(C D).
+    """Readings q (R, a) of R rows, their state, distance from the target (R,) [m], Newton step (R,
+    a), and sign of det(C D) (R,).
     """
 
     q: FloatArray
@@ -556,9 +550,8 @@ def solve_readings(
 ) -> State:
     """Return states (t, n) at controlled coordinates (t | 1, n, c); marks rows that fail.
 
-    Rows are independent of each other. `solve` and `differentiate` are the forward kinematics and
-    the derivatives of any robot. With `propose`, rows begin at the states that it returns, if these
-    converged. Without `follow`, rows that fail are not solved again along a path.
+    With `propose`, rows begin at the states that it returns, if these converged. Without `follow`,
+    rows that fail are not solved again along a path.
     """
     t, n = max(len(values), len(target)), target.shape[1]
     if not n:
@@ -595,9 +588,8 @@ def solve_readings(
 def _solve_within_reach(
     rows: _Rows, start: _Iterate, first: State, propose: Proposal | None, follow: bool
 ) -> _Iterate:
-    """Return the last iterates of rows from their start, whose forward solution began at `first`.
-
-    Rows whose target is farther away than the links span stay at the start.
+    """Return the last iterates of rows from their start, whose forward solution began at `first`;
+    rows with a target beyond what the links span stay at the start.
     """
     is_near = measure_target_excess(rows.robot, rows.values, rows.target) <= 0.0
     stalled = np.full_like(start.state.status, STALLED)

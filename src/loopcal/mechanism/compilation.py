@@ -60,9 +60,8 @@ from loopcal.units import DISPLAY_UNITS, LARGEST, SI_SYMBOLS, Dimension
 def find_impossible_values(
     robot: Mechanism, values: FloatArray
 ) -> tuple[tuple[str | None, Finding], ...]:
-    """Return (parameter, finding) for values (p,) [SI] that no machine of this structure has.
-
-    The parameter is None where single values are possible, but the loops cannot be closed.
+    """Return (parameter, finding) for values (p,) [SI] that no machine of this structure has; the
+    parameter is None where single values are possible, but the loops cannot be closed.
     """
     findings = tuple(_find_single_values(robot, values))
     if findings:
@@ -118,13 +117,11 @@ POINT = 1e-9
 def build(
     assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
 ) -> Mechanism:
-    """Compile a mechanism for the engine and find its home position.
+    """Compile the assembly of a family for the engine and find its home position.
 
-    assembly : as returned by the `expand` method of a family.
     units : display units of the file. record : the family record, kept for writing the file.
     Raises MechanismError: duplicate or unknown names, loops that cannot be closed at home, wrong
-        mobility (names the freedoms that are too many or too few), coordinates that cannot be
-        controlled.
+        mobility, coordinates that cannot be controlled.
     """
     check_assembly(assembly)
     if assembly.stages:
@@ -199,11 +196,10 @@ def _close_at_home(
 
 
 def compute_characteristic_length(assembly: Assembly) -> float:
-    """Return the root mean square distance [m] between base points, platform points and each other.
+    """Return the root mean square distance [m] between the points where limbs leave the base, those
+    where they end on the platform, and each other.
 
-    Base points are those where limbs leave the base, platform points those where they end. If all
-    coincide, the result is the root mean square of links and rods; DEFAULT_SIZE if every length is
-    zero.
+    If all coincide, it is that of links and rods; DEFAULT_SIZE if every length is zero.
     """
     home = assembly.home
     gaps = [
@@ -224,9 +220,8 @@ def compute_characteristic_length(assembly: Assembly) -> float:
 
 
 def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
-    """Return the slots of the addresses that parameters change, limb by limb.
-
-    Refuses maps onto addresses that the mechanism does not have.
+    """Return the slots of the addresses that parameters change, limb by limb; refuse unknown
+    addresses.
     """
     limbs = {limb.name: limb for limb in assembly.limbs}
     actuators, terms = {a.name for a in assembly.actuators}, name_terms(assembly.actuators)
@@ -286,9 +281,8 @@ def _group_limbs(
     slots_by_limb: Mapping[str, Mapping[Address, Slot]],
     locked: Mapping[int, tuple[int, ...]],
 ) -> tuple[tuple[Group, ...], dict[Address, int], int]:
-    """Group limbs of one structure and of the same locked joints; place displacements in e.
-
-    Returns the groups, the place of each address and the length of e.
+    """Group limbs of one structure and of the same locked joints; return also the place of each
+    address in e, and the length of e.
     """
     alike: dict[tuple[Any, ...], list[int]] = {}
     for i, limb in enumerate(assembly.limbs):
@@ -333,9 +327,8 @@ def _group_limbs(
 def _weigh_actuators(
     assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]
 ) -> tuple[float, ...] | None:
-    """Return relative standard deviations of redundant actuators, the largest one 1.
-
-    None without redundant actuators.
+    """Return relative standard deviations of redundant actuators, the largest one 1; None without
+    them.
     """
     if len(assembly.actuators) <= len(freedoms):
         return None
@@ -419,10 +412,7 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
 
 
 def _find_home(robot: Mechanism) -> State:
-    """Return the closed state at the controlled coordinates of the home pose.
-
-    Raises MechanismError: too few controlled coordinates, or loops that cannot be closed.
-    """
+    """Return the closed state at the controlled coordinates of the home pose."""
     program, values = robot.program, robot.values[None]
     shared = program.shared_drive_count
     movable = len(program.freedoms) - program.count_equations(free=True) - shared
@@ -449,11 +439,7 @@ def _find_home(robot: Mechanism) -> State:
 
 
 def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any) -> Mechanism:
-    """Return the mechanism of a chain: its stages one by one, then their structures joined.
-
-    Raises MechanismError: a stage cannot be built (names it), or the actuators cannot set the
-        controlled coordinates.
-    """
+    """Return the mechanism of a chain: its stages one by one, then their structures joined."""
     stages = _build_stages(assembly.stages)
     table = ParameterTable(assembly.parameters, assembly.common_errors)
     size = _compute_chain_size(stages)
@@ -510,10 +496,8 @@ def _build_stages(attached: Sequence[AttachedStage]) -> tuple[Stage, ...]:
 
 
 def _compute_chain_size(stages: Sequence[Stage]) -> float:
-    """Return the characteristic length [m] of a chain.
-
-    It is the root mean square distance of the end platform from the bases of the stages at home, or
-    the size of the largest stage with a loop, if that is larger.
+    """Return the root mean square distance [m] of the end platform from the bases of the stages at
+    home, or the size of the largest stage with a loop, if that is larger.
     """
     bases, platforms = locate_stage_bases(stages, [stage.robot.home for stage in stages])
     arms = np.array([platforms[-1][:3, 3] - base[:3, 3] for base in bases])
@@ -575,10 +559,7 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
 
 
 def _check_chain(robot: Mechanism, home: ChainState) -> None:
-    """Refuse a chain whose actuators do not set the controlled coordinates one by one.
-
-    The freedoms of the end platform are the rank of its derivatives by the readings.
-    """
+    """Refuse a chain whose actuators do not set the controlled coordinates one by one."""
     moving = find_carrying_actuators(robot)
     values = robot.values[None]
     _, tau = robot.slots(values)

@@ -122,9 +122,8 @@ class Loops(NamedTuple):
 def follow_path(
     loops: Loops, joints: FloatArray, begin: State, state: State, wrong: BoolArray
 ) -> State:
-    """Solve the wrong rows along the straight path of joint values from the start.
-
-    The steps become smaller until a row arrives.
+    """Solve the wrong rows along the straight path of joint values from the start, in smaller and
+    smaller steps.
     """
     robot, shape = loops.robot, (state.T.shape[0], state.T.shape[1])
     trial, pose = np.nonzero(wrong)
@@ -157,8 +156,8 @@ def _take_steps(
 ) -> State:
     """Solve rows (r, 1) in equal steps of the joint values between the ends of a path (r, 1, a).
 
-    With `leave`, a row that fails or opens wide on the way goes to the end at once: there the path
-    leaves the reach of the robot, and each further step would use many iterations for nothing.
+    With `leave`, a row that fails or opens wide on the way goes to the end at once: the path leaves
+    the reach of the robot there.
     """
     robot, (origin, target) = loops.robot, path
     current, moving = begin, np.arange(len(target))
@@ -236,10 +235,8 @@ def close_at_joints(
     goal: State | None = None,
     weights: FloatArray | None = None,
 ) -> State:
-    """Solve forward kinematics like `forward_trials`, for displacements and joint values.
-
-    e : (t | 1, n_displacements). joints : (t | 1, n, n_joints) values of the driven joints, n > 0.
-    With `weights` (t | 1, a, n_joints) they are their sums (t | 1, n, a).
+    """Solve forward kinematics like `forward_trials`, for displacements e (t | 1, d) and values (t
+    | 1, n, J) of the driven joints, or with `weights` (t | 1, a, J) their sums (t | 1, n, a).
     """
     begin = clear_sign(robot, start or robot.home_state)
     if robot.is_serial:
@@ -258,9 +255,8 @@ def close_at_joints(
 def step_towards_closure(
     robot: Mechanism, values: FloatArray, q: FloatArray, begin: State
 ) -> State:
-    """Return the states (t, n) one Newton step from `begin` at readings q (t | 1, n, a).
-
-    For robots without stages.
+    """Return the states (t, n) one Newton step from `begin` at readings q, for robots without
+    stages.
     """
     if robot.has_open_sums:
         e, sums, weights = drive_sums(robot, values, q)
@@ -270,10 +266,8 @@ def step_towards_closure(
 
 
 def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray) -> BoolArray:
-    """Return which readings q (t | 1, n, a) are solved from home without following a path, (t, n).
-
-    These solutions lie on home's side of every singularity. The test takes a fraction of the time
-    of following.
+    """Return which readings q (t | 1, n, a) are solved from home without following a path, on
+    home's side of every singularity, (t, n).
     """
     return forward_trials(robot, values, q, follow=False).status == Status.CONVERGED.value
 
@@ -322,9 +316,8 @@ def _close_with_free_actuators(
     start: State | None,
     max_iterations: int = ITERATIONS,
 ) -> State:
-    """Return states (t, n) at controlled coordinates, with every actuated joint free.
-
-    start : as given; without it the platform begins as commanded, where its coordinates state it.
+    """Return states (t, n) at controlled coordinates, with every actuated joint free, from `start`
+    as given.
     """
     e, _ = robot.slots(values)
     names, size = robot.controlled, robot.size
@@ -346,10 +339,8 @@ def _close_with_free_actuators(
 
 
 def determine_platform(robot: Mechanism) -> bool:
-    """Return whether the controlled coordinates state the whole pose and no limb adds a condition.
-
-    They are all freedoms of the platform, of which the others keep their values at home, and each
-    limb has as many unknown joints as equations.
+    """Return whether the controlled coordinates state the whole pose, and each limb has as many
+    unknown joints as equations.
     """
     if not robot.program.has_square_limbs:
         return False
@@ -363,11 +354,8 @@ def determine_platform(robot: Mechanism) -> bool:
 
 
 def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> NDArray[np.int8]:
-    """Return the sign of the determinant of closure with locked actuators (t, n).
-
-    It changes only at a singularity. A state with free actuators has another sign. With more
-    equations than freedoms the sign is 0. The sign of a chain is the product of those of its
-    stages.
+    """Return the sign of the determinant of closure with locked actuators (t, n), 0 with more
+    equations than freedoms. It changes only at a singularity.
     """
     if robot.stages:
         stages = each_stage(robot, values, state)
@@ -395,8 +383,8 @@ def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> Floa
 
 
 def needs_readings(program: Program) -> bool:
-    """Return whether the inverse solution is one for readings: joints with a shared drive would
-    part, and where loops may stay open, a free actuator would take a part of the gap.
+    """Return whether the inverse solution is one for readings: freed, joints with a shared drive
+    would part, and an actuator of loops that may stay open would take a part of the gap.
     """
     return program.may_stay_open or program.shared_drive_count > 0
 
@@ -406,10 +394,8 @@ def _inverse_by_readings(
 ) -> State:
     """Return states (t, n) at controlled coordinates (t | 1, n, c) by their readings.
 
-    Newton's method begins with each joint free, which is almost right where loops may stay open.
-    With shared drives the platform is then as commanded in all its freedoms, which the limbs of
-    many machines can reach one by one; elsewhere, such as where the platform's orientation follows
-    its position, the method begins at the start.
+    Newton's method begins with each joint free, which is almost right where loops may stay open,
+    and at the start where the orientation follows the position.
     """
     if not begin.closure_sign.any():
         # the guess of a home that is searched for has no sign yet
@@ -429,9 +415,8 @@ def _inverse_by_readings(
 
 
 def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, start: State) -> State:
-    """Return states with every joint free at targets (R, c); all are (1, R) or (R, 1).
-
-    With shared drives, coordinates that are not controlled are those of the start.
+    """Return states with every joint free at targets (R, c), (1, R) or (R, 1); with shared drives,
+    other coordinates are those of the start.
     """
     if not robot.program.shared_drive_count:
         shaped = target.reshape(*start.T.shape[:2], -1)
@@ -456,10 +441,8 @@ def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, sta
 def compute_limb_frames(
     robot: Mechanism, values: FloatArray, state: State
 ) -> tuple[FloatArray, ...]:
-    """Return the frames along each limb, for limits and pictures.
-
-    For each limb of the mechanism, in its order, an array (t, n, J + 2, 4, 4): T_base_link behind
-    each link 0..J (the last one is the tip), then the attachment.
+    """Return the frames along each limb, (t, n, J + 2, 4, 4): T_base_link behind each link 0..J
+    (the last one is the tip), then the attachment.
     """
     if robot.stages:
         assert isinstance(state, ChainState)

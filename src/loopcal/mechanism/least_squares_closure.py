@@ -119,12 +119,9 @@ def differentiate_open(
 def differentiate_unknowns(
     program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
 ) -> FloatArray:
-    """Differentiate the unknowns of a least-squares closure by p parameters and a readings.
-
-    Arguments are those of `loopcal.engine.differentiate`.
-
-    Returns (t, n, u, p + a), the freedoms of the platform, then the joints of
-        `list_unknown_joints`.
+    """Differentiate the unknowns of a least-squares closure, (t, n, u, p + a): the freedoms of the
+    platform, then the joints of `list_unknown_joints`. Arguments are those of
+    `loopcal.engine.differentiate`.
     """
     t, n = state.T.shape[:2]
     joints = [
@@ -282,9 +279,8 @@ def _correct_slopes(
 def _bend(
     program: Program, rows: _Rows, residuals: list[FloatArray], moves_slots: bool
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Return (dJ)'r of each group by freedoms, slots and joints, (N, k, m + u, ..).
-
-    All are zero where the loops are closed, and those by slots which no input moves.
+    """Return (dJ)'r of each group by freedoms, slots and joints, (N, k, m + u, ..); zero where the
+    loops are closed, and by slots which no input moves.
     """
     m, groups, N = len(program.freedoms), program.groups, len(rows.T)
     out = []

@@ -31,9 +31,8 @@ def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:
 
 
 def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
-    """Return -U^-1 right for upper triangular U (t, n, u, u) and right (t, n, u, c).
-
-    A pivot of zero gives infinities or NaN.
+    """Return -U^-1 right for upper triangular U (t, n, u, u) and right (t, n, u, c); a pivot of
+    zero gives infinities or NaN.
     """
     out = np.empty_like(right)
     with np.errstate(all="ignore"):
@@ -212,12 +211,10 @@ def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) 
 def follow_limb(
     group: Group, k: int, displacements: FloatArray, joints: FloatArray
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Return the frames along limb k of a group.
+    """Return the frames T_base_link behind each link 0..J of limb k, each (t, n | 1, 4, 4), the
+    last one the tip, and T_platform_attachment (t, 1, 4, 4).
 
     displacements : (t, s) of this limb. joints : (t, n, J + 1) its joint values.
-    Returns frames : T_base_link behind each link 0..J, each (t, n | 1, 4, 4); the last one is the
-        tip.
-    attachment : T_platform_attachment (t, 1, 4, 4).
     """
     move = np.zeros((len(displacements), len(group.joints) + 2, 6))
     pitch = np.broadcast_to(group.pitch[k], (len(displacements), len(group.joints))).copy()
@@ -236,9 +233,8 @@ def follow_limb(
 
 
 def measure_rod(group: Group, k: int, displacements: FloatArray) -> FloatArray:
-    """Return the lengths (t,) of the rod that ends limb k of a group [m]; 0 without one.
-
-    displacements : (t, s) of this limb. The value of its joint, if it is driven, is added to it.
+    """Return the lengths (t,) of the rod that ends limb k of a group [m], without the value of its
+    joint; 0 without one.
     """
     length = np.full(len(displacements), group.length[k] if group.ending == "distance" else 0.0)
     for slot, value in zip(group.slots, displacements.T, strict=True):

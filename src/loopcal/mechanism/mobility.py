@@ -57,10 +57,8 @@ MAIN_SHARE = 0.3
 
 
 def check_mobility(robot: Mechanism) -> None:
-    """Refuse actuators that cannot move and hold the platform at home.
-
-    Raises MechanismError: the actuators leave the platform free to move, or the limbs constrain it
-        too much; names the freedoms.
+    """Refuse actuators that cannot move and hold the platform at home; the error names the
+    freedoms.
     """
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]
@@ -127,9 +125,8 @@ def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
 
 
 def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
-    """Refuse coordinates that do not determine the platform where its limbs let it move.
-
-    state : (1, 1). Raises MechanismError.
+    """Refuse coordinates that do not determine the platform where its limbs let it move, at a state
+    (1, 1).
     """
     program = robot.program
     e, q = robot.slots(robot.values[None])[0], driven_values(program, state)
@@ -142,9 +139,8 @@ def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
 
 
 def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
-    """Refuse a home pose at which the loops are closed, but the iteration does not converge.
-
-    state : (1, 1). Raises MechanismError, which names the actuators that move nothing there.
+    """Refuse a home (1, 1) at which the loops are closed, but the iteration does not converge; the
+    error names the actuators that move nothing there.
     """
     if not state.residual[0, 0] < CLOSED * robot.size:
         return
@@ -179,13 +175,11 @@ def _word_dependent(robot: Mechanism, count: int) -> str:
 
 
 def find_idle_joints(program: engine.Program, guess: engine.State) -> dict[int, tuple[int, ...]]:
-    """Return the joints to lock of each limb that can move while tip and platform rest.
+    """Return the joints to lock of each limb that can move while tip and platform rest, one for
+    each motion.
 
-    An S-P-S leg, for example, can spin about its axis. One joint is locked for each such motion.
-    The passive twists of a limb are ranked by the singular values of their triangular factor, at
-    joint values away from any special position; of the joints in a null combination the one with
-    the largest component is chosen. Every limb is judged by its own geometry, independently of
-    other limbs of the same structure and of the order of limbs.
+    Of the joints in a null combination the one with the largest component is chosen, at joint
+    values away from any special position and independently of other limbs.
     """
     # the same disturbance in every limb: the result must not depend on the order of the limbs
     shifts = [np.random.default_rng(0).uniform(-0.3, 0.3, j.shape[-1]) for j in guess.joints]
@@ -233,9 +227,8 @@ def list_main_freedoms(names: Sequence[str], direction: FloatArray) -> list[str]
 
 
 def check_assembly(assembly: Assembly, *, is_stage: bool = False) -> None:
-    """Refuse inconsistent names, limbs, freedoms and ranges; raises MechanismError.
-
-    A stage that is a serial joint needs no controlled coordinates, because its joint is commanded.
+    """Refuse inconsistent names, limbs, freedoms and ranges; a stage that is a serial joint needs
+    no controlled coordinates.
     """
     refuse_more(MOST_LIMBS, len(assembly.limbs), f"{assembly.name} has", "limbs")
     for limb in assembly.limbs:

@@ -32,13 +32,10 @@ from loopcal.units import Dimension, Unit, find_unit
 
 
 class MovedSlots(NamedTuple):
-    """Which slots of a mechanism some parameters move.
+    """Slots (z,) of a mechanism that some parameters move, and by which of them (columns).
 
-    slots, columns : (z,) slots that may move, and by which of the parameters. A term of a summed
-        drive is there once for each joint, because it moves all of them.
-    terms : numbers of the transmission terms among them; of summed drives, counted through all
-        actuators.
-    pattern : the same as the engine knows it; displacements are the first slots.
+    A term of a summed drive is there once for each joint. terms : numbers of the transmission terms
+    among them. pattern : the same as the engine knows it; displacements are the first slots.
     """
 
     slots: IntArray
@@ -49,10 +46,8 @@ class MovedSlots(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ParameterUnits:
-    """Some parameters of a mechanism, each with the unit of its column.
-
-    slots : of the mechanism. places : (p,) positions of the parameters in its table.
-    units : (p,) [SI].
+    """Parameters at places (p,) of the table of a mechanism, each with the unit (p,) [SI] of its
+    column.
     """
 
     slots: SlotMap

@@ -69,10 +69,8 @@ class Modes(Result):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A search for modes.
-
-    solve : solve random starts. identify : numbers (n, k) that agree for equal solutions only.
-    measure : distance from home (n, k). read : readings (n, a) of solutions.
+    """A search for modes: how random starts are solved, numbers (n, k) that agree for equal
+    solutions only, the distance from home (n, k), and the readings (n, a) of solutions.
     """
 
     solve: Callable[[State], State]

@@ -115,8 +115,6 @@ def report_over_constraint(
 ) -> Mechanism:
     """Return the robot with a finding of its closure equations that repeat others, if any do, and
     with loops that may stay open where its file asks for the least-squares closure.
-
-    close_at_home : returns the robot of an assembly, to try fewer freedoms.
     """
     asks = robot.assembly.closure == "least-squares"
     rows = _linearize(robot, robot.home_state)[0]
@@ -182,10 +180,8 @@ def _name_directions(
     wrenches: FloatArray, freedoms: tuple[int, ...]
 ) -> list[tuple[FloatArray, dict[str, Any]]]:
     """Return a basis of the wrenches (r, m), each (m,) with the direction that it constrains, as
-    the catalog words it.
-
-    A wrench without force constrains a rotation, any other one the translation along its force.
-    Axes of the base are chosen where they can be, and have a name.
+    the catalog words it: a rotation without force, else the translation along the force. Axes of
+    the base first.
     """
     whole = np.zeros((len(wrenches), 6))
     whole[:, list(freedoms)] = wrenches
@@ -225,9 +221,7 @@ def _find_sufficient_freedoms(
     robot: Mechanism, close_at_home: Callable[[Assembly], Mechanism]
 ) -> tuple[str, ...]:
     """Return the most freedoms with which no equation repeats another; none where there are none.
-
-    Those in which the platform moves, home and near it, are among them. A freedom that is left out
-    hides the errors that move the platform in it, so that as few as possible are.
+    Those in which the platform moves, home and near it, are among them.
     """
     freedoms = robot.program.freedoms
     used = np.zeros(len(freedoms), bool)
@@ -284,17 +278,13 @@ def is_over_constrained(robot: Mechanism) -> bool:
 
 
 def refuse_free_breaking_parameters(robot: Mechanism) -> None:
-    """Raise the MechanismError `mechanism.free-parameters-open-loops` if free parameters open the
-    loops of an over-constrained robot.
-    """
+    """Refuse free parameters that open the loops of an over-constrained robot."""
     if names := find_breaking_parameters(robot):
         raise MechanismError(_report_breaking("mechanism.free-parameters-open-loops", robot, names))
 
 
 def refuse_drawn_errors(robot: Mechanism) -> None:
-    """Raise the MechanismError `mechanism.drawn-errors-open-loops` if parameters with a tolerance
-    open the loops of an over-constrained robot.
-    """
+    """Refuse parameters with a tolerance that open the loops of an over-constrained robot."""
     table = robot.parameters
     drawn = {p.name for p in table.entries if p.tolerance}
     if names := tuple(name for name in find_breaking_parameters(robot) if name in drawn):
@@ -324,10 +314,8 @@ def fix_breaking_parameters(robot: Mechanism) -> Mechanism:
 
 
 def _detect_breaking(robot: Mechanism) -> BoolArray:
-    """Return which parameters (p,) open the loops of an over-constrained robot.
-
-    At the poses of `find_nearby_states`, with the repeated equations w, it compares
-    w'E de/dp with E de/dp, of which passive joints absorb a part.
+    """Return which parameters (p,) open the loops: w'E de/dp is not zero beside E de/dp for the
+    repeated equations w, at the poses of `find_nearby_states`.
     """
     breaks = np.zeros(len(robot.parameters), bool)
     for stage in robot.stages:

@@ -88,11 +88,8 @@ def state_target(values: FloatArray, names: tuple[str, ...], base: FloatArray) -
 def compare_coordinates(
     T: FloatArray, target: FloatArray, names: tuple[str, ...], size: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far poses are from target coordinates, with the derivative in the twist.
-
-    T : (N, 4, 4). target : (N, c) coordinates. size : angles are multiplied by it [m].
-    Returns residual : (N, c) [m], present - target. columns : (N, c, 6) per twist (rotation,
-        translation).
+    """Return how far poses T (N, 4, 4) are from target coordinates (N, c) [m], present - target
+    with angles times `size`, and the columns (N, c, 6) per twist (rotation, translation).
     """
     residual = np.zeros(target.shape)
     columns = np.zeros((*target.shape, 6))

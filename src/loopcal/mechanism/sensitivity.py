@@ -56,11 +56,8 @@ def differentiate_pose(
     """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
     Return the twists (omega in base axes, velocity of the platform's origin) per unit of each
-    parameter (t, n, 6, p) and reading (t, n, 6, a).
-    Of loops that may stay open, the derivatives are those of the least-squares closure.
-
-    `columns` : the parameters and their units; all parameters in SI without it. Rows of singular
-    states have infinities or NaN.
+    parameter (t, n, 6, p), all in SI or those of `columns`, and reading (t, n, 6, a). Rows of
+    singular states have infinities or NaN.
     """
     if robot.stages:
         return differentiate_platform(robot, values, q, state, differentiate_pose, columns)
@@ -95,11 +92,9 @@ def fold_pose_rows(
     factor: FloatArray,
     driven: DrivenJoints | None = None,
 ) -> tuple[FloatArray, BoolArray]:
-    """Fold rows of observed poses into factors (t, p + 1, p + 1), without writing derivatives.
-
-    They are [G D | r] with D of `differentiate_pose`; see `engine.fold_poses`, also for the second
-    result (t, n). For robots without stages whose readings determine the joints. `driven` is that
-    of `drive_joints`, where it is known.
+    """Fold rows [G D | r] of observed poses into factors (t, p + 1, p + 1), with D of
+    `differentiate_pose`; see `engine.fold_poses`. For robots without stages whose readings
+    determine the joints.
     """
     e, tau, joints = driven or drive_joints(robot, values, q)
     inputs = columns.linearize(values, tau, q)
@@ -108,11 +103,8 @@ def fold_pose_rows(
 
 
 class PassiveSensitivity(NamedTuple):
-    """Derivatives of the passive joints.
-
-    names : of the j passive joints, as in `Solution.passive_names`.
-    parameters : (t, n, j, p) change of each joint [m, rad] per unit of each parameter. readings :
-        (t, n, j, a).
+    """Derivatives of the named passive joints, (t, n, j, p) by parameters and (t, n, j, a) by
+    readings.
     """
 
     names: tuple[str, ...]
@@ -123,10 +115,7 @@ class PassiveSensitivity(NamedTuple):
 def differentiate_passive_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PassiveSensitivity:
-    """Differentiate every passive joint in every parameter and reading.
-
-    A locked joint (one that only spins its limb) has zeros.
-    """
+    """Differentiate passive joints in every parameter and reading; a locked joint has zeros."""
     names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
     if robot.stages:
         whole = differentiate_joints(robot, values, q, state, differentiate_passive_joints)

@@ -148,9 +148,8 @@ class Singularity(Result):
 def analyze_singularity(
     robot: Mechanism, poses: ArrayLike | Solution, medians: tuple[float, float] | None = None
 ) -> Singularity:
-    """Return the distance of poses from singularities.
+    """Return the distance from singularities of a Solution, poses (n, 4, 4) or coordinates (n, c).
 
-    poses : a Solution, or poses (n, 4, 4) or controlled coordinates (n, c) for `inverse`.
     medians : of margin and drive margin, to compare with (default: over the workspace).
     """
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
@@ -266,10 +265,8 @@ def _sum_rows(
 def _compute_chain_margins(
     robot: Mechanism, state: State
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Return the margins of a chain: the least margin of its loops, and that of C D.
-
-    C D are the derivatives of the controlled coordinates by the readings. A chain of serial joints
-    alone has the margin 1: locked joints hold the platform in every direction alike.
+    """Return the least margin of the loops of a chain, 1 without loops, and that of the derivatives
+    C D of the controlled coordinates by the readings.
     """
     n, values = state.T.shape[1], robot.values[None]
     margin, direction = np.ones(n), np.tile(np.eye(6)[0], (n, 1))

@@ -76,8 +76,8 @@ Step = Callable[[IntArray, FloatArray, State], State]
 def connect_by_readings(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
     """Follow the straight paths of joint values from states `first` (1, k | 1) to `last` (1, k).
 
-    Return the last states, with the passive joints at the end of a path, and the rows (k,) that a
-    single safe step or a path without a singularity leads to.
+    Return the last states, with the passive joints at the end of a path, and which rows (k,) a safe
+    step or path leads to.
     """
     return _connect(robot, first, last, contracts(robot, first, last), _move_readings)
 
@@ -130,9 +130,8 @@ def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
 
 
 def measure_distance(robot: Mechanism, a: State, b: State) -> FloatArray:
-    """Return the largest difference (n,) of poses and joints of states (1, n | 1).
-
-    Lengths count per size of the robot, angles in radians.
+    """Return the largest difference (n,) of poses and joints of states (1, n | 1), lengths per
+    size.
     """
     twist = np.abs(geometry.pose_difference(*np.broadcast_arrays(a.T[0], b.T[0])))
     largest = np.maximum(twist[:, :3].max(axis=1), twist[:, 3:].max(axis=1) / robot.size)
@@ -250,10 +249,7 @@ def solve_in_mode(
 def _select_new(
     robot: Mechanism, again: State, state: State, rows: IntArray
 ) -> tuple[State, IntArray]:
-    """Return the solutions (1, k) of rows (k,) that are not those of a state, and their rows.
-
-    What was judged is not judged again.
-    """
+    """Return the solutions (1, k) of rows (k,) that are not those of a state, and their rows."""
     if robot.stages or not len(rows):
         return again, rows
     is_new = measure_distance(robot, again, select_poses(state, rows)) > SAME_JOINTS
@@ -275,10 +271,8 @@ def has_bends(robot: Mechanism) -> bool:
 
 
 def compute_bend(robot: Mechanism, state: State) -> NDArray[np.int8]:
-    """Return the sign (n,) of the determinant of the limbs at their platform, every joint free.
-
-    It changes where a limb is stretched or folded: there its readings have two solutions that
-    coincide, and the machine passes from one working mode to another.
+    """Return the sign (n,) of the determinant of the limbs at their platform, every joint free: it
+    changes where a limb is stretched or folded, from one working mode to another.
     """
     e, _ = robot.slots(robot.values[None])
     limbs, joints = robot.program.with_fixed_platform, driven_values(robot.program, state)
@@ -291,7 +285,7 @@ def reach_coordinates(
     """Solve inverse kinematics like `close_at_coordinates`, for coordinates (n, c).
 
     Return states (1, n), and the rows (n,) whose readings are known to lead from the start to their
-    pose; where these are not None, the states have the closure signs of `inverse_trials`.
+    pose; where these are not None, the states have closure signs.
     """
     values, target = robot.values[None], target[None]
     is_plain = not (robot.stages or robot.is_serial or needs_readings(robot.program))
@@ -309,13 +303,8 @@ def judge_modes(
 ) -> tuple[State, BoolArray]:
     """Return a state (1, n) with closure signs, and its closed rows that `begin` does not lead to.
 
-    arrives : as of `reach_coordinates`, where the state has its closure signs already.
-
-    The engine proves for most rows that their readings lead to their pose, which gives their sign,
-    too. For the others the sign is computed. Forward kinematics accepts no solution of another
-    sign, so rows of another sign are not solved. It ends where it comes close to the pose of the
-    state, to which it would converge. A chain is in another mode where a stage is; a serial limb
-    has one pose for its readings.
+    arrives : as of `reach_coordinates`. The engine proves most rows. For the others the sign is
+    computed, and those of the right sign are solved by forward kinematics up to their pose.
     """
     if robot.stages:
         return judge_stage_modes(robot, state, begin, judge_modes)
@@ -370,9 +359,7 @@ def _judge_by_readings(robot: Mechanism, state: State, begin: State) -> tuple[St
 def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
     """Return goals (1, k) of the right sign, and which of them `first` (1, k | 1) does not lead to.
 
-    Newton's method must lead to the pose of a goal from its readings, and a safe path too. A path
-    of readings is both. Where it ends before its goal, forward kinematics may still return along
-    larger steps, and a path of poses exist.
+    Newton's method must lead to the pose of a goal from its readings, and a safe path too.
     """
     returns, needs_path = _solve_from(robot, first, goal)
     start, is_other = repeat_poses(first, len(returns)), np.ones(len(returns), bool)
@@ -405,9 +392,8 @@ def _solve_from(
 
 
 def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:
-    """Return solutions (1, k) close to poses T (n, 4, 4), and which of these rows arrived (k,).
-
-    They are reached from the start `first` (1, n) in equal steps.
+    """Return solutions (1, k) close to poses T (n, 4, 4), reached from the start (1, n) in equal
+    steps, and which of these rows arrived (k,).
     """
     values, alive, current = robot.values[None], np.arange(len(T)), first
     twist = geometry.pose_difference(T, first.T[0])
@@ -752,10 +738,8 @@ class _Step:
 def find_nearest_reachable(
     robot: Mechanism, values: FloatArray, T: FloatArray, start: State | None = None
 ) -> State:
-    """Return states (1, n) with the reachable poses nearest to T (1, n, 4, 4), without signs.
-
-    values : (1, p). A row whose search ends before the distance is stationary, at the end of the
-    reach or after too many steps, is `NOT_CONVERGED`.
+    """Return states (1, n) with the reachable poses nearest to T (1, n, 4, 4), without signs; a row
+    whose search ends before the distance is stationary is `NOT_CONVERGED`.
     """
     state = close_at_coordinates(robot, values, read_coordinates(T, robot.controlled), start)
     if controls_all(robot) or not state.T.size:
@@ -826,9 +810,8 @@ def controls_all(robot: Mechanism) -> bool:
 
 
 def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
-    """Return d twist / d coordinate (t, n, 6, c), every actuator free [1/m, 1].
-
-    Coordinates are in the units of `compare_coordinates`.
+    """Return d twist / d coordinate (t, n, 6, c) [1/m, 1], every actuator free, in the units of
+    `compare_coordinates`.
     """
     names, freedoms = robot.controlled, list(robot.program.freedoms)
     t, n = state.T.shape[:2]

@@ -75,9 +75,8 @@ MOVABLE = 8
 
 
 def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
-    """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10).
-
-    It is NaN where no angle reaches the length, which a negative one never does.
+    """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10), NaN where none
+    reaches it.
     """
     level, reach, gamma = _describe(triangle)
     side, middle = triangle[..., 8], triangle[..., 9]
@@ -100,9 +99,8 @@ def compute_range(triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def find_side(start: float, triangle: FloatArray) -> tuple[float, float]:
-    """Return sin(theta - gamma) at a start angle [rad], and the middle of its side [rad].
-
-    triangle : (10,), of which the last two are not used.
+    """Return sin(theta - gamma) at a start angle [rad], and the middle of its side [rad], of a
+    triangle.
     """
     _, _, gamma = _describe(triangle)
     lead = geometry.wrap_angle(start - gamma)
@@ -185,11 +183,8 @@ def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
 
 
 def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
-    """Return the nominal transmission terms (a, 8), or (a, 18) if one is a triangle drive.
-
-    With summed drives they are (a, 18 + J).
-
-    Raises MechanismError: unknown term, or a gain of zero.
+    """Return the nominal transmission terms (a, 8), (a, 18) if one is a triangle drive, or (a, 18 +
+    J) with summed drives.
     """
     for actuator in actuators:
         wrong = sorted(set(actuator.terms) - set(ALL_TERMS))
@@ -254,10 +249,8 @@ def term_derivatives(
 
 
 def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Return the joint values (t, n, a) of readings q under terms tau (t | 1, a, 8 | 18 | 18 + a).
-
-    The angle of a triangle drive is NaN where no angle reaches its length. Summed drives must have
-    as many readings as joints.
+    """Return the joint values (t, n, a) of readings q under terms tau, NaN where no angle of a
+    triangle drive reaches its length. Summed drives must have as many readings as joints.
     """
     values = transmit_readings(q, tau, w)
     if (weights := select_weights(tau)) is not None:
@@ -278,9 +271,8 @@ def transmit_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArr
 
 
 def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a).
-
-    Of summed drives it is d sum / d reading.
+    """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a); of summed drives d sum /
+    d reading.
     """
     slopes, triangles = _evaluate_slopes(q, tau, w), find_triangles(tau)
     if not len(triangles):
@@ -293,10 +285,8 @@ def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
 
 
 def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Return the readings (t, n, a) of joint values, without backlash.
-
-    The linear terms are inverted exactly; Newton's method adds the others. Joints that read their
-    own values are returned as they are.
+    """Return the readings (t, n, a) of joint values, without backlash; Newton's method adds what is
+    not linear.
     """
     if (weights := select_weights(tau)) is not None:
         joints = apply_weights(weights, joints)

@@ -28,11 +28,7 @@ MIN_REACHABLE_SHARE = 1e-2
 
 
 class Limit(NamedTuple):
-    """A quantity that must stay between two bounds.
-
-    name : e.g. `stroke of q3`. dimension : length or angle. low, high : bounds [m or rad].
-    value : (t, n) [m or rad]. is_stroke : whether it is the stroke of an actuator.
-    """
+    """A quantity (t, n) that must stay between two bounds [m or rad], such as `stroke of q3`."""
 
     name: str
     dimension: Dimension
@@ -74,10 +70,8 @@ def evaluate_limits(
 def check_limits(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> tuple[BoolArray, NDArray[np.object_]]:
-    """Return which rows are within all limits (t, n), and a finding where one is not (t, n).
-
-    The findings are None where everything is allowed. A row is explained by its first exceeded
-    limit.
+    """Return which rows are within all limits (t, n), and the finding of the first exceeded one, or
+    None.
     """
     allowed, findings = np.ones(state.status.shape, bool), np.full(state.status.shape, None)
     for limit in evaluate_limits(robot, values, q, state):
@@ -191,10 +185,7 @@ def resolve_poses(robot: Mechanism, poses: ArrayLike | int, seed: int) -> FloatA
 
 
 def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
-    """Return the range of every controlled coordinate [m, rad]; phi is a full turn by default.
-
-    Raises MechanismError: the robot states no range for a coordinate.
-    """
+    """Return the range of every controlled coordinate [m, rad]; phi is a full turn by default."""
     stated = dict(robot.assembly.workspace)
     if "theta" in stated:
         stated.setdefault("phi", (-np.pi, np.pi))

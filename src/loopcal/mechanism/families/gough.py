@@ -88,11 +88,8 @@ class Screw:
 def build_ups_leg(
     name: str, motor: str, base: Direction, top: Direction, home: FloatArray, axes: bool
 ) -> PlacedLimb:
-    """Return a leg whose joints are all at zero in the home pose.
-
-    base, top : centers in base and platform frame [m]. home : (4, 4) T_base_platform of the home
-        pose.
-    axes : True for an upper joint of three axes, False for a ball.
+    """Return a leg whose joints are all at zero in the home pose (4, 4), with centers in base and
+    platform [m]. With `axes` the upper joint has three axes in place of a ball.
     """
     s, length = _find_direction(name, base, top, home)
     first = _across(s, EZ)
@@ -110,10 +107,7 @@ def build_ups_leg(
 def build_screw_leg(
     name: str, motor: str, base: Direction, top: Direction, home: FloatArray, screw: ScrewLeg
 ) -> PlacedLimb:
-    """Return a leg with a screw, in which the reading alone drives the slide.
-
-    Raises MechanismError: a joint axis lies along the leg at home.
-    """
+    """Return a leg with a screw, in which the reading alone drives the slide."""
     s, length = _find_direction(name, base, top, home)
     lower = _normalize(name, screw.base_axis)
     upper = home[:3, :3] @ _normalize(name, screw.platform_axis)
@@ -221,9 +215,8 @@ class Gough(RobotRecord):
     tolerances: GoughTolerances = field(default_factory=GoughTolerances)
 
     def expand(self) -> Assembly:
-        """Return six legs in the stated form.
-
-        Raises MechanismError: another number of legs, or a model that this form cannot carry.
+        """Return six legs in the stated form; raises MechanismError for a model that it cannot
+        carry.
         """
         self._check()
         legs, actuators, errors = [], [], ErrorModel()

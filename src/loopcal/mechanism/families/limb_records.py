@@ -102,8 +102,8 @@ def place_triangle(
 ) -> Mapping[str, float]:
     """Return the terms of a triangle in the joint's own frame, by name.
 
-    name : of the actuator. rotation : (3, 3) R_placed_joint, whose third column is the joint's
-        axis. start : angle of the joint near home [rad], which selects the side.
+    rotation : (3, 3) R_placed_joint, whose third column is the joint's axis. start : angle of the
+        joint near home [rad], which selects the side.
     Raises MechanismError: an anchor on the axis, a start at a dead point, or a stroke that no angle
         reaches.
     """
@@ -140,11 +140,9 @@ def place_triangle(
 def triangle_errors(
     name: str, drive: TriangleDrive, rotation: FloatArray, other: tuple[str, ...]
 ) -> ErrorModel:
-    """Return the unknown dimensions of a triangle, `q1.foot.x` and so on.
-
-    name, drive, rotation : as in `place_triangle`. other : terms of the drive beside the triangle.
-    Raises MechanismError: a dimension that a triangle does not have, or a skew about the joint's
-        own axis.
+    """Return the unknown dimensions of a triangle, `q1.foot.x` and so on; `other` are the other
+    terms of the drive. Raises MechanismError: a dimension that a triangle does not have, or a skew
+    about its axis.
     """
     known = (
         *(f"{point}.{axis}" for point in POINTS for axis in AXES[3:]),
@@ -579,10 +577,8 @@ def has_sums(actuators: Mapping[str, object]) -> bool:
 def list_readings(
     actuators: Mapping[str, object], joints: Mapping[str, str]
 ) -> dict[str, tuple[str, Mapping[str, float]]]:
-    """Return the readings of a file with sums: name -> (key in the file, weights of joints).
-
-    joints : driven joints by name, each with the name that the file states; a drive that copies of
-    a limb have in common is one reading for each copy.
+    """Return the readings of a file with sums: name -> (key in the file, weights of joints), of
+    driven joints by name, each with the name that the file states.
 
     Raises SumError: a triangle drive, or a drive that is no sum and moves no joint.
     """
@@ -612,12 +608,8 @@ def list_readings(
 def check_sums(
     sums: Mapping[str, Mapping[str, float]], turning: Mapping[str, bool], known: Mapping[str, str]
 ) -> None:
-    """Refuse sums that are no readings of the driven joints.
-
-    sums : weights of all readings of a file by name; of a drive without a sum {joint: 1}.
-    turning : whether each driven joint is rotary. known : driven joint -> its limb.
-    Raises SumError: an unknown joint, a sum of an angle and a length, weights that are all zero or
-        not finite, a joint in no sum, more readings than joints, or sums that depend on each other.
+    """Refuse sums, readings by name with the weights of their joints, that are no readings of the
+    driven joints. turning : whether each of them is rotary. known : driven joint -> its limb.
     """
     for name, weights in sums.items():
         _check_sum(name, weights, turning)
@@ -687,10 +679,8 @@ def is_weight(weights: Mapping[str, float], term: str) -> bool:
 def weight_errors(
     name: str, drive: object, weights: Mapping[str, float], other: tuple[str, ...]
 ) -> ErrorModel:
-    """Return the unknown weights of a sum, `q1.weight.m` and so on.
-
-    other : terms of the drive beside the weights.
-    Raises SumError: the weight of a joint that is not in the sum.
+    """Return the unknown weights of a sum, `q1.weight.m` and so on; `other` are the other terms of
+    the drive.
     """
     unknown: tuple[str, ...] = getattr(drive, "unknown", ())
     tolerance: RatioTolerance | None = getattr(drive, "weights", None)

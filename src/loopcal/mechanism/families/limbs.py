@@ -154,9 +154,8 @@ def build_actuator(name: str, placed: PlacedDrive) -> Actuator:
 
 
 def drive_errors(name: str, placed: PlacedDrive) -> ErrorModel:
-    """Return the unknown terms of a drive, `q1.offset` and so on.
-
-    Raises MechanismError: a term that the drive does not have, or a harmonic without a period.
+    """Return the unknown terms of a drive, `q1.offset` and so on; raises MechanismError for
+    impossible ones.
     """
     drive = placed.drive
     known = _list_terms(drive, placed.dimension)
@@ -210,10 +209,7 @@ def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
 
 
 def is_always_positive(named: NamedParameter) -> bool:
-    """Return whether only values above zero of a named parameter exist, if its nominal value is.
-
-    Raises MechanismError: the file says so, but the nominal value is not above zero.
-    """
+    """Return whether only values above zero of a named parameter exist, if its nominal value is."""
     is_stated = isinstance(named, NamedLength) and named.positive
     nominal = get_quantity(named)[1]
     if is_stated and not nominal > 0.0:
@@ -225,11 +221,8 @@ def is_always_positive(named: NamedParameter) -> bool:
 
 
 def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
-    """Return the engine's axis of a map entry and the change of it per unit of the parameter.
-
-    A file states a lead per turn, the engine a pitch per radian.
-
-    Raises MechanismError: the axis `pitch`, for which a file states the lead.
+    """Return the engine's axis of a map entry and the change of it per unit of the parameter: a
+    file states a lead per turn, the engine a pitch per radian.
     """
     if entry.axis == "pitch":
         raise MechanismError(
@@ -242,9 +235,8 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
 
 
 def check_units(named: NamedParameter, entry: MapEntry, drive: PlacedDrive | None) -> None:
-    """Refuse a map between unlike units; raises MechanismError with what to state.
-
-    `drive` is the drive that the entry names. A ratio is a slope for an angle.
+    """Refuse a map between unlike units, onto the drive that the entry names; a ratio is a slope
+    for an angle.
     """
     (dimension, _), axis = get_quantity(named), entry.axis
     if drive is None or axis not in ("offset", "backlash", "gain", "curve"):
@@ -527,10 +519,7 @@ def _tilts(limb: PlacedLimb, entry: Tilts) -> ErrorModel:
 
 
 def _find_element(limb: PlacedLimb, name: str) -> str:
-    """Return the link of a limb by name; a joint of several axes means its first.
-
-    Raises MechanismError: no such link; lists the existing ones.
-    """
+    """Return the link of a limb by name; a joint of several axes means its first."""
     for candidate in (name, f"{name}.1", f"{name}.turn"):
         if candidate in limb.elements:
             return candidate

@@ -86,12 +86,10 @@ def place_limb(
     actuator: str | None = None,
     cones: tuple[Cone, ...] = (),
 ) -> PlacedLimb:
-    """Return a limb made of its joints, its tip and its attachment.
+    """Return a limb of its joints from base to tip, its tip and its attachment.
 
-    steps : the joints from base to tip; the first placement is in the base frame.
-    tip : (4, 4) of the tip in the last carried frame [m]; its link is called `tip`, or `base` if
-        the limb has no joints.
-    attachment : (4, 4) in the platform frame [m]; its link is called `platform`.
+    tip : (4, 4) in the last carried frame [m]; its link is called `tip`, or `base` without joints.
+    attachment : (4, 4) in the platform [m]; its link is called `platform`.
     length, actuator, cones : of the rod of a `distance` ending [m].
     """
     back, links, rotations, placements = np.eye(4), [], {}, {}
@@ -116,11 +114,10 @@ def place_limb_with_ball(
     attachment: FloatArray,
     axes: FloatArray | None,
 ) -> PlacedLimb:
-    """Return a limb that ends in a ball joint on the platform.
+    """Return a limb that ends in a ball at `center` (3,) of the last carried frame [m].
 
-    center : (3,) of the ball in the last carried frame [m]. attachment : (4, 4) in the platform.
-    axes : None for a perfect ball. A ball of three rotary joints z, y, x through its center, with
-        errors of their own, has the orientation (3, 3) at which they are all at zero.
+    axes : None for a perfect ball; one of three rotary joints z, y, x, with errors of their own,
+        has the orientation (3, 3) at which they are all at zero.
     """
     if axes is None:
         return place_limb(name, steps, translate(*center), "ball", attachment)
@@ -134,11 +131,8 @@ def place_limb_with_ball(
 
 
 def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
-    """Return a rotation (3, 3) whose third column is along `axis`.
-
-    The axes x, y and z give a cyclic permutation.
-
-    Raises MechanismError: the axis is zero.
+    """Return a rotation (3, 3) whose third column is along `axis`; x, y and z give a cyclic
+    permutation.
     """
     length = float(np.linalg.norm(axis))
     if not length > 0:
@@ -154,11 +148,7 @@ def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
 def map_displacement(
     parameter: str, limb: PlacedLimb, element: str, axis: str, coefficient: float = 1.0
 ) -> tuple[LinearMap, ...]:
-    """Map a parameter onto a translation along, or a rotation about, an axis of the carried frame.
-
-    A translation along x acts along up to three axes of the link's own frame: the components of
-    R_carried_link' e_x.
-    """
+    """Map a parameter onto a translation along, or rotation about, an axis of the carried frame."""
     direction = coefficient * np.eye(3)[AXES.index(axis) % 3]
     return map_direction(parameter, limb, element, direction, turns=axis in AXES[:3])
 
@@ -166,9 +156,8 @@ def map_displacement(
 def map_direction(
     parameter: str, limb: PlacedLimb, element: str, direction: FloatArray, *, turns: bool
 ) -> tuple[LinearMap, ...]:
-    """Map a parameter onto a rotation about (or translation along) `direction` (3,).
-
-    The direction is in the carried frame.
+    """Map a parameter onto a rotation about (or translation along) `direction` (3,) of the carried
+    frame.
     """
     components = limb.rotations[element].T @ direction
     axes = AXES[:3] if turns else AXES[3:]
@@ -187,8 +176,6 @@ def map_slide_tilt(
 
     exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k if w' = -(P A_k)' w. The
     translation of what is placed off the slide is compensated to first order.
-
-    Raises MechanismError: the joint is not a slide.
     """
     names = limb.elements
     place = names.index(element)
@@ -240,9 +227,8 @@ class ErrorModel:
         return join_errors((self, other))
 
     def without_effects_of(self, named: ErrorModel) -> ErrorModel:
-        """Return these parameters without those whose effect `named` or earlier ones have already.
-
-        A parameter whose name is taken gets the suffix `.own`.
+        """Return these parameters without those whose effect `named` or earlier ones have already;
+        where a name is taken, `.own` is appended.
         """
         addresses = dict.fromkeys(entry.address for entry in named.maps + self.maps)
         place = {address: i for i, address in enumerate(addresses)}
@@ -295,9 +281,8 @@ def single_error(
     *maps: LinearMap,
     positive: bool = False,
 ) -> ErrorModel:
-    """Return an error model of one named parameter.
-
-    `positive` : whether only values above zero exist; a nominal value of zero then allows others.
+    """Return an error model of one named parameter; `positive` says that only values above zero
+    exist, if the nominal one is.
     """
     has_sign = positive and nominal > 0.0
     parameter = Parameter(name, dimension, float(nominal), tolerance, positive=has_sign)
@@ -320,10 +305,8 @@ def displacement_error(
 
 
 def point_errors(limb: PlacedLimb, element: str, tolerance: float | None, label: str) -> ErrorModel:
-    """Return the coordinates of a link's origin as parameters `limb.label.x`, `.y` and `.z`.
-
-    They are coordinates in the frame carried before the link; nominal values are those of its
-    placement, which is not rotated.
+    """Return the coordinates of a link's origin in the frame carried before it as parameters
+    `limb.label.x`, `.y` and `.z`, of a placement that is not rotated.
     """
     point = limb.placements[element][:3, 3]
     return join_errors(
@@ -353,9 +336,8 @@ def offset_error(
 
 
 def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = True) -> ErrorModel:
-    """Return the complete error model of a limb, see the module.
-
-    Without `offsets` the family names the offsets of the actuators itself.
+    """Return the complete error model of a limb; without `offsets` the family names those of the
+    actuators.
     """
     errors: list[ErrorModel] = []
 
@@ -448,9 +430,8 @@ class RatioTolerance:
 def standard_deviation(
     tolerance: LengthTolerance | AngleTolerance | RatioTolerance | None, name: str
 ) -> float | None:
-    """Return the standard deviation of a tolerance [SI], None if none is stated.
-
-    Raises MechanismError: both or neither of sd and limits, or a value that is not positive.
+    """Return the standard deviation of a tolerance [SI], None if none is stated; raises
+    MechanismError.
     """
     if tolerance is None:
         return None
@@ -485,10 +466,8 @@ class CommonErrorRecord:
     ratio: RatioTolerance | None = None
 
     def resolve(self, parameters: Sequence[Parameter]) -> CommonError:
-        """Return the common error of the parameters that match.
-
-        Raises MechanismError: no or several dimensions, a single parameter, or parameters of
-            another dimension or without a tolerance of their own.
+        """Return the common error of the parameters that match; raises MechanismError for unlike
+        parameters, a single one, or one without a tolerance of its own.
         """
         stated = {d: getattr(self, d.value) for d in Dimension if getattr(self, d.value)}
         if len(stated) != 1:
@@ -619,10 +598,6 @@ class RobotRecord:
     def assembly(self, expanded: Assembly | None = None) -> Assembly:
         """Return the expanded robot, with the parameters of `fixed` kept at their nominal values,
         the names of those that the controller stores, and the common errors of the others.
-
-        expanded : result of `expand`, where it is known.
-        Raises MechanismError: a name or pattern that matches no parameter, or a common error that
-            cannot be.
         """
         expanded = self.expand() if expanded is None else expanded
         names = [parameter.name for parameter in expanded.parameters]

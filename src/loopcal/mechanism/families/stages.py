@@ -90,11 +90,8 @@ class StageMap:
 
 
 def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> list[str]:
-    """Return what each stage is attached to: BASE, or an earlier stage.
-
-    parents : stated for each stage; None for the previous one.
-    Raises StageError: duplicate or reserved names, a stage on an unknown or later one, or a cycle
-        of stages.
+    """Return what each stage is attached to: BASE, or an earlier stage; None stands for the
+    previous one.
     """
     if not names:
         raise StageError("there are no stages; list those of the chain, from the base on", 0)
@@ -151,11 +148,7 @@ def join_stages(
     workspace: dict[str, tuple[float, float]],
     source: str,
 ) -> Assembly:
-    """Return the assembly of a chain; its home is that of its stages, and is found when it is
-    compiled.
-
-    Raises StageError: a stage without actuators, or an actuator of two stages.
-    """
+    """Return the assembly of a chain; its home is found when it is compiled."""
     _refuse_wrong_drives(stages)
     assemblies = [(stage.name, stage.assembly) for stage in stages]
     return Assembly(
@@ -347,12 +340,7 @@ class PlacedStages(Stages):
     robots: tuple[RobotRecord | None, ...] = ()
 
     def expand(self) -> Assembly:
-        """Return the assembly of all stages.
-
-        Raises StageError: names that do not fit together, a stage without actuators, a drive of two
-            stages.
-        Raises MechanismError: a stage that cannot be expanded.
-        """
+        """Return the assembly of all stages; raises StageError where they do not fit together."""
         if self.home != PoseRecord():
             raise MechanismError(
                 f"{self.name} states `home:`, but the home of a chain is that of its stages; state "

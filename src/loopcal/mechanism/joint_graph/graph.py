@@ -49,10 +49,8 @@ class GraphJoint:
         return self.kind == "R" and bool(self.origin_a and self.origin_b)
 
     def reverse(self) -> GraphJoint:
-        """Return the joint from the other body; its value stays the same.
-
-        T_a J(q) = T_b means T_b J(-q) = T_a, and J(-q) about an axis is J(q) about its opposite. A
-        pin that has the name of its place on the first body gets that of the other.
+        """Return the joint from the other body; its value stays the same, because its axis is the
+        opposite one. A pin that has the name of its place on the first body gets that of the other.
         """
         swapped = replace(
             self,
@@ -116,10 +114,8 @@ STEEP = 0.2
 
 
 def choose_coordinates(T: FloatArray, twists: FloatArray) -> tuple[str, ...]:
-    """Return coordinates of a platform that move independently, positions first.
-
-    T : (4, 4) of the platform at home. twists : (6, m) for the m motions of the mechanism,
-        (rotation, translation) [rad, m].
+    """Return coordinates of a platform at T (4, 4) that move independently, positions first, of
+    twists (6, m) (rotation, translation) [rad, m] for the m motions of the mechanism.
     """
     is_steep = np.hypot(T[0, 0], T[1, 0]) < STEEP
     names = (*POSITION, *(TILT if is_steep else EULER))

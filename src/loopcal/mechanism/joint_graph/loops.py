@@ -293,11 +293,7 @@ class Freedoms:
 
 def find_homes(graph: JointGraph) -> tuple[FloatArray, ...]:
     """Return joint values (j,) that close the loops, those within their limits and nearest to zero
-    first.
-
-    Poses of larger mobility, from which a link could move either way, are left out.
-
-    Raises MechanismError: the loops do not close; names the closure that remains open.
+    first, without poses of larger mobility; raises MechanismError where the loops do not close.
     """
     sizes = np.where(graph.turns, 1.0, graph.size)
     low, high = _list_limits(graph)
@@ -328,10 +324,9 @@ def is_drawn_pose(graph: JointGraph, q: FloatArray) -> bool:
 
 
 def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
-    """Return the freedoms of a mechanism at a home pose (j,).
-
-    The firmness is the product of two smallest singular values: of the closures by the passive
-    joints, idle motions left out, and of the platform's twist by the joint rates.
+    """Return the freedoms of a mechanism at a home pose (j,); the firmness is the product of the
+    smallest singular values of the closures by the passive joints, and of the platform's twist by
+    the rates.
     """
     sizes, passive = np.where(graph.turns, 1.0, graph.size), ~graph.is_driven
     rates = graph.find_motions(q) / sizes[:, None]
@@ -468,8 +463,7 @@ class Repair:
 
 def repair_rounded_loops(graph: JointGraph, rounding: tuple[float, float]) -> Repair:
     """Return a mechanism with loops that close; as it is where they do, or where no repair helps.
-
-    rounding : error of its lengths [m] and angles [rad] by the rounding of their numbers.
+    `rounding` is the error of its lengths [m] and angles [rad].
     """
     unchanged = Repair(graph)
     limit = rounding[1] + rounding[0] / graph.size
@@ -495,9 +489,8 @@ def _can_move(graph: JointGraph, q: FloatArray) -> bool:
 
 
 def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGraph, float]:
-    """Return the mechanism with axes parallel and closures without gaps at joint values (j,).
-
-    Bodies stay in their places. Also returns the largest rotation of an axis [rad].
+    """Return the mechanism with axes parallel and closures without gaps at joint values (j,),
+    bodies in their places, and the largest rotation of an axis [rad].
     """
     placement = graph.place(q[None])
     frames = {
@@ -543,9 +536,8 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
 def _align(
     axis: FloatArray, known: list[FloatArray], normals: list[FloatArray], limit: float
 ) -> FloatArray:
-    """Return the known direction (3,) that an axis is parallel to within a limit [rad], or itself.
-
-    Else it is put across the first of the normals that it is almost across.
+    """Return the known direction (3,) that an axis is parallel to within a limit [rad], or itself
+    across the first of the normals that it is almost across.
     """
     for other in known:
         if np.linalg.norm(np.cross(axis, other)) <= limit:

@@ -120,9 +120,8 @@ class LimbPaths:
 
 
 def find_limbs(block: Block) -> tuple[tuple[Path, ...] | None, bool]:
-    """Return the limbs of a block from its base to its platform, and whether they are all of it.
-
-    They are None where a limb branches; limbs that are not all of it need `is_translating`.
+    """Return the limbs of a block, None where one branches, and whether they are all of it; others
+    need `is_translating`.
     """
     complete = find_complete_limbs(block.graph, block.platform)
     if complete is not None:
@@ -139,8 +138,7 @@ def place_limbs(
 ) -> LimbPaths:
     """Return the limbs of a block at its home pose (j,), for a frame (4, 4) of its platform.
 
-    Loops of complete limbs are closed in all components of twist that one of their joints can have,
-    so that a planar loop has three equations, and one with a joint across its plane has six.
+    Loops of complete limbs are closed in all components of twist that one of their joints can have.
     """
     graph, platform = block.graph, block.platform
     freedoms = list_freedoms(graph, home, platform, T_body_frame, is_complete)
@@ -375,10 +373,8 @@ def find_stage_paths(
     """Return the stages at the nearest home pose in which the motors hold the platform firmly.
 
     `locate_frame` gives the frame (4, 4) of a body that is the platform of a stage,
-    `measure_rounding` the rounding errors [m, rad] of numbers that describe some bodies.
-
-    Raises MechanismError: the loops do not close, a limb branches, no limbs join base and platform,
-        or no motor holds a joint between them; a finding with the joints.
+    `measure_rounding` the rounding errors [m, rad] of numbers that describe some bodies. Refusals
+    name the joints.
     """
     path = find_blocks(whole, platform)  # without joints that move nothing in between
     kept = select_joints(whole, {joint for block in path for joint in block.graph.joints})
@@ -423,11 +419,9 @@ def find_stage_paths(
 
 
 def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
-    """Return the bodies at the ends of the mechanism that limbs join to what carries them.
-
-    Of the bodies of a loop, these are the ones with most limbs. Bodies in the middle of an
-    unbranched chain are left out where another body has more limbs, and bodies that fewer joints
-    than motors carry, where others have more.
+    """Return the bodies at the ends of the mechanism that limbs join to what carries them: of a
+    loop the ones with most limbs, and not those that fewer joints than motors carry, where others
+    have more.
     """
     driven = [block for block in list_blocks(graph) if block.graph.motors]
     carrying = {
@@ -484,10 +478,8 @@ def _select(graph: JointGraph, q: FloatArray, block: Block) -> FloatArray:
 
 
 def _turn_base(block: Block) -> tuple[Block, FloatArray]:
-    """Return a block in a base frame whose axes are along and across the plane of its loops.
-
-    Also returns that frame (4, 4) in the body that carries the block; it is that of the body where
-    its axes do, and where the loops are not in one plane.
+    """Return a block in a base frame whose axes are along and across the plane of its loops, and
+    that frame (4, 4) in the body that carries it, unturned where the loops are not in one plane.
     """
     graph = block.graph
     axes = graph.place(np.zeros((1, len(graph.tree)))).axes[0]
@@ -513,10 +505,8 @@ def _turn_base(block: Block) -> tuple[Block, FloatArray]:
 
 
 def _align_frame(paths: LimbPaths, T_body_frame: FloatArray) -> FloatArray:
-    """Return a frame (4, 4) of the platform with only those angles at home that it can change.
-
-    A robot file states no others. It is the given frame where the platform turns about all axes or
-    none.
+    """Return a frame (4, 4) of the platform with only those angles at home that it can change: a
+    robot file states no others.
     """
     turns = [name in paths.freedoms for name in AXES[:3]]
     place = paths.graph.get_place(paths.graph.place(paths.home[None]), paths.platform)[0]
@@ -579,10 +569,7 @@ class Bodies:
 
 
 def weld_bodies(base: str, welds: Sequence[Weld]) -> Bodies:
-    """Return the rigid bodies that welds make.
-
-    Raises MechanismError: a weld joins two links that are one rigid body already.
-    """
+    """Return the rigid bodies that welds make; raises MechanismError for a weld within one."""
     bodies = Bodies({})
     for weld in welds:
         (a, A), (b, B) = bodies.locate(weld.body_a), bodies.locate(weld.body_b)
@@ -599,10 +586,8 @@ def weld_bodies(base: str, welds: Sequence[Weld]) -> Bodies:
 
 
 def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, ...]) -> JointGraph:
-    """Return the mechanism of joints between bodies.
-
-    Raises MechanismError: a joint joins a body to itself, two join the same points of two bodies,
-        or a loop has driven joints only.
+    """Return the mechanism of joints between bodies; raises MechanismError for a joint within a
+    body, a repeated one, or a loop of driven joints only.
     """
     for joint in joints:
         if joint.body_a == joint.body_b:
