@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,18 +26,24 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
+# Values of a target within the first number of standard deviations count as static; the check
+# refuses them if the robot moves the target by more than the second number. A single column is
+# static if all its numbers are equal.
+STATIC_SIGMAS, MOVING_SIGMAS = 10.0, 100.0
+# Share of the motion of the robot below which values are constant by design: the poses are chosen
+# so that a probe touches a surface, a bar keeps its length, or the platform stays level. A robot
+# far from nominal then predicts a small change of a large motion.
+CONSTANT_SHARE = 0.1
+# Largest rotation of the base [rad], and displacement in sizes of the robot, with which values
+# count as constant by design. End stops that are wrong by millimeters tilt the bed of a printer.
+LARGEST_TILT = 0.25
+
 
 def check_closure(
     robot: Mechanism, kinds: Sequence[Kind], reading_sigma: FloatArray | None, n_poses: int
 ) -> None:
-    """Refuse the kind `closure` for a robot without redundant actuators, or for exact readings.
-
-    reading_sigma : (n, a) [SI] of the readings; None as the robot states.
-
-    Raises
-    ------
-    DataError : `data.closure-without-redundancy`, `data.closure-without-sigma`, or that of
-        `resolve_reading_sigma`.
+    """Refuse the kind `closure` for a robot without redundant actuators, or for exact readings
+    (standard deviations (n, a) [SI]; None as the robot states).
     """
     check_redundancy(robot, kinds)
     is_closure = any(kind.name == CLOSURE for kind in kinds)
@@ -46,56 +52,20 @@ def check_closure(
 
 
 def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
-    """Raise the DataError `data.closure-without-redundancy` for the kind `closure` of a robot that
-    does not have more actuators than freedoms.
-    """
+    """Refuse the kind `closure` for a robot that does not have more actuators than freedoms."""
     if robot.program.sigma is None and any(kind.name == CLOSURE for kind in kinds):
-        raise DataError(
-            report_finding(
-                "data.closure-without-redundancy",
-                robot=robot.name,
-                actuators=len(robot.actuators),
-                freedoms=len(robot.freedoms),
-            )
-        )
-
-
-STATIC_SIGMAS, MOVING_SIGMAS = 10.0, 100.0
-"""Values of a target within the first number of standard deviations count as static; the check
-refuses them if the robot moves the target by more than the second number. A single column is static
-if all its numbers are equal.
-"""
-
-CONSTANT_SHARE = 0.1
-"""Share of the motion of the robot below which values are constant by design: the poses are chosen
-so that a probe touches a surface, a bar keeps its length, or the platform stays level. A robot far
-from nominal then predicts a small change of a large motion.
-"""
-
-LARGEST_TILT = 0.25
-"""Largest rotation of the base [rad], and displacement in sizes of the robot, with which values
-count as constant by design. End stops that are wrong by millimeters tilt the bed of a printer.
-"""
+        counts = {"actuators": len(robot.actuators), "freedoms": len(robot.freedoms)}
+        code = "data.closure-without-redundancy"
+        raise DataError(report_finding(code, robot=robot.name, **counts))
 
 
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
-    """Refuse readings without a column for each actuator, and readings alone without information.
-
-    Raises
-    ------
-    DataError : `data.wrong-actuator-count`, or those of `check_closure`.
-    """
-    columns = measurements.readings.shape[1]
-    if columns != len(robot.actuators):
-        raise DataError(
-            report_finding(
-                "data.wrong-actuator-count",
-                columns=columns,
-                robot=robot.name,
-                actuators_count=len(robot.actuators),
-                actuators=tuple(actuator.name for actuator in robot.actuators),
-            )
-        )
+    """Refuse readings without one column per actuator, and readings alone without information."""
+    columns, names = measurements.readings.shape[1], tuple(a.name for a in robot.actuators)
+    if columns != len(names):
+        stated: dict[str, Any] = {"columns": columns, "robot": robot.name}
+        stated |= {"actuators_count": len(names), "actuators": names}
+        raise DataError(report_finding("data.wrong-actuator-count", **stated))
     kinds = [rows.kind for rows in measurements.observations]
     check_closure(robot, kinds, measurements.reading_sigma, measurements.n_poses)
 
@@ -110,10 +80,10 @@ def find_outside_strokes(readings: FloatArray, robot: Mechanism) -> FloatArray:
 def describe_outside_strokes(
     measurements: Measurements, robot: Mechanism, places: Mapping[int, str] | None = None
 ) -> dict[str, Any] | None:
-    """Return the data of a finding on readings outside their strokes; None without any.
+    """Return the data of a finding on readings outside their strokes; None without any: the reading
+    that is farthest outside, as a share of its stroke, and the number and the actuators of all.
 
-    They are the reading that is farthest outside, as a share of its stroke, and the number and the
-    actuators of all of them. `places` are those of poses by index, such as `data.csv:12`.
+    places : of poses by index, such as `data.csv:12`.
     """
     beyond = find_outside_strokes(measurements.readings, robot)
     if not beyond.any():
@@ -147,9 +117,7 @@ def check_strokes(
     allow: bool = False,
     places: Mapping[int, str] | None = None,
 ) -> None:
-    """Raise the DataError `data.outside-stroke` for readings outside the stroke of their actuator,
-    unless they are allowed; `places` as for `describe_outside_strokes`.
-    """
+    """Refuse readings outside the stroke of their actuator, unless they are allowed."""
     check_actuators(measurements, robot)
     described = None if allow else describe_outside_strokes(measurements, robot, places)
     if described is not None:
@@ -165,15 +133,8 @@ def check_duplicates(
     noise. Rows without a measured value repeat nothing. `allow` is for coarse instruments, which
     show the same number again.
 
-    Parameters
-    ----------
     places : place of each row of each of the observations, those of the base last, such as
-        `data.csv:12`, for the message.
-
-    Raises
-    ------
-    DataError
-        `data.duplicate-rows`, with the two poses and their places, or `data.duplicate-base-rows`.
+        `data.csv:12`.
     """
     if allow:
         return
@@ -190,9 +151,7 @@ def check_duplicates(
         content = np.concatenate(
             [measurements.readings[poses].reshape(len(poses), -1), measured, own], axis=1
         )
-        texts = [
-            np.concatenate([getattr(rows, name) for rows in alike]) for name in ("session", "group")
-        ]
+        texts = [np.concatenate([getattr(o, name) for o in alike]) for name in ("session", "group")]
         pair = _find_equal_rows(np.nan_to_num(content, nan=1e300), texts)
         if pair is not None:
             lines = [place for rows in alike for place in places_of.get(id(rows), ())]
@@ -233,15 +192,7 @@ def check_targets_move(
     the poses change them by less than `CONSTANT_SHARE` of what the motion of the platform could,
     perhaps after a small rigid motion of the base.
 
-    Parameters
-    ----------
-    T : (n, 4, 4) T_base_platform of each pose, of the nominal robot.
-    size : of the robot [m], by which translations and rotations are compared.
-
-    Raises
-    ------
-    DataError : `conventions.target-never-moves`, with the target, its range and the expected range;
-        `conventions.column-never-changes`, with a column of equal numbers.
+    T : (n, 4, 4) T_base_platform of each pose, of the nominal robot. size : of the robot [m].
     """
     if allow:
         return
@@ -258,51 +209,36 @@ def check_targets_move(
         if np.any(moves) and not _is_rigid_motion(static, predicted, possible, T[rows.rows], size):
             worst = int(np.argmax(np.where(moves, expected / static.noise, 0.0)))
             shown = DISPLAY_UNITS[kind.columns[static.columns[worst]].dimension]
-
-            numbers = [rows.measured[static.present][0, static.columns[0]], static.range[worst]]
             value, moved, planned = (
                 Quantity(float(number) / shown.factor_to_si, shown.symbol)
-                for number in (*numbers, expected[worst])
+                for number in (
+                    rows.measured[static.present][0, static.columns[0]],
+                    static.range[worst],
+                    expected[worst],
+                )
             )
+            stated: dict[str, Any] = {"target": static.target, "kind": kind.name, "moved": moved}
+            code = "conventions.target-never-moves"
             if static.target not in kind.target_columns:
-                raise DataError(
-                    report_finding(
-                        "conventions.column-never-changes",
-                        column=static.target,
-                        kind=kind.name,
-                        value=value,
-                        expected=planned,
-                    )
-                )
-            raise DataError(
-                report_finding(
-                    "conventions.target-never-moves",
-                    target=static.target,
-                    kind=kind.name,
-                    moved=moved,
-                    expected=planned,
-                )
-            )
+                code = "conventions.column-never-changes"
+                stated = {"column": static.target, "kind": kind.name, "value": value}
+            raise DataError(report_finding(code, **stated, expected=planned))
 
 
 def has_static_targets(measurements: Measurements) -> bool:
-    """Return whether the values of any target stay within the noise, so that `check_targets_move`
-    can refuse it.
-    """
+    """Return whether `check_targets_move` has anything to compare with the robot."""
     return any(True for _ in _find_static_targets(measurements))
 
 
 class _StaticTarget(NamedTuple):
-    """A target whose values stay within the noise: its present rows, columns, range of each column
-    (k,) and noise (k,) [SI].
-    """
+    """A target whose values stay within the noise."""
 
     rows: Observations
     target: str
-    present: BoolArray
+    present: BoolArray  # its rows
     columns: list[int]
-    range: FloatArray
-    noise: FloatArray
+    range: FloatArray  # (k,) of each column [SI]
+    noise: FloatArray  # (k,) [SI]
 
 
 def _find_possible_change(static: _StaticTarget, T: FloatArray, size: float) -> FloatArray:
@@ -330,10 +266,8 @@ def _find_possible_change(static: _StaticTarget, T: FloatArray, size: float) -> 
 def _is_rigid_motion(
     static: _StaticTarget, predicted: FloatArray, possible: FloatArray, T: FloatArray, size: float
 ) -> bool:
-    """Return whether a small rigid motion of the base turns the predicted values into constants.
-
-    Predicted values (r, columns) [SI] of poses T (r, 4, 4) are linearized in this motion; see
-    `CONSTANT_SHARE` and `LARGEST_TILT`.
+    """Return whether a small rigid motion of the base turns the predicted values (r, columns) [SI]
+    of poses T (r, 4, 4) into constants, to first order.
     """
     kind, h = static.rows.kind, 1e-6
     motions = np.tile(np.eye(4), (6, 1, 1))
@@ -357,16 +291,17 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
         comparable = kind.changes_with_pose and kind.poses_per_row == 1 and not kind.sensed_joints
         if not comparable or len(rows) < 3:
             continue
-        sigma = np.sqrt(np.einsum("rii->ri", rows.covariance)).max(axis=0)
-        noise = (
-            sigma if len(sigma) == len(kind.columns) else np.full(len(kind.columns), sigma.max())
-        )
+        noise = np.sqrt(np.einsum("rii->ri", rows.covariance)).max(axis=0)
+        targets = {name: list(columns) for name, columns in kind.target_columns.items()}
+        if len(noise) != len(kind.columns):
+            noise = np.full(len(kind.columns), noise.max())
+        elif len(kind.columns) > 1:  # each column by itself, too
+            for j, column in enumerate(kind.columns):
+                targets.setdefault(column.name, [j])
         for session in find_distinct(rows.session):
-            for target, indices in _list_columns(kind).items():
-                columns = list(indices)
-                present = (rows.session == session) & ~np.any(
-                    np.isnan(rows.measured[:, columns]), axis=1
-                )
+            for target, columns in targets.items():
+                is_complete = ~np.any(np.isnan(rows.measured[:, columns]), axis=1)
+                present = (rows.session == session) & is_complete
                 if np.count_nonzero(present) < 3:
                     continue
                 range_ = np.ptp(rows.measured[present][:, columns], axis=0)
@@ -375,29 +310,22 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
                     yield _StaticTarget(rows, target, present, columns, range_, noise[columns])
 
 
-def _list_columns(kind: Kind) -> dict[str, tuple[int, ...]]:
-    """Return the columns of each target, then each column of several by itself."""
-    columns = dict(kind.target_columns)
-    if 1 < len(kind.columns) == len(kind.noise_columns):
-        for j, column in enumerate(kind.columns):
-            columns.setdefault(column.name, (j,))
-    return columns
-
-
 def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:
     """Return observations in groups of one class and equal settings, as two files of one instrument
     give them.
     """
+
+    def are_equal(kind: Kind, other: Kind) -> bool:
+        names = [field.name for field in fields(kind) if field.init]
+        return type(kind) is type(other) and all(
+            np.array_equal(getattr(kind, name), getattr(other, name)) for name in names
+        )
+
     groups: list[list[Observations]] = []
     for rows in observations:
-        settings = [field.name for field in fields(cast(Any, rows.kind)) if field.init]
-        for group in groups:
-            other = group[0].kind
-            if type(other) is type(rows.kind) and all(
-                np.array_equal(getattr(other, s), getattr(rows.kind, s)) for s in settings
-            ):
-                group.append(rows)
-                break
-        else:
+        alike = next((group for group in groups if are_equal(rows.kind, group[0].kind)), None)
+        if alike is None:
             groups.append([rows])
+        else:
+            alike.append(rows)
     return groups

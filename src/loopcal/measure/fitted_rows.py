@@ -17,41 +17,27 @@ import numpy as np
 
 from loopcal.measure.kinds import READINGS
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import Observations
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray
 
-SAME = 1e-8
-"""Share of what a column spans up to which two numbers are the same."""
-
-SAME_READING = 1e-5
-"""The same for readings of rows whose measured values decide."""
-
-CHANCE = 1e-6
-"""Probability that the m measured values of a repeat agree: each differs by less than the m-th root
-of it, in standard deviations of the noise.
-"""
-
-LARGEST = 1e-2
-"""Largest such difference."""
-
-ENOUGH = 3
-"""Number of equal values by which rows of different kinds are the same."""
-
+SAME = 1e-8  # share of what a column spans up to which two numbers are the same
+SAME_READING = 1e-5  # the same for readings of rows whose measured values decide
+# Probability that the m measured values of a repeat agree: each differs by less than the m-th root
+# of it, in standard deviations of the noise, and by less than the largest difference.
+CHANCE, LARGEST = 1e-6, 1e-2
+ENOUGH = 3  # equal values by which rows of different kinds are the same
+# Steps [SI] of lengths and of angles of which the rounding of values is a multiple.
 SMALLEST_STEPS = (1e-9, np.deg2rad(1e-7))
-"""Steps [SI] of lengths and of angles of which the rounding of values is a multiple."""
+PREFIX = "fitted"  # first word of the names of the stored arrays
 
 
 class ComparedRows(NamedTuple):
-    """Rows of one kind: `content` (r, c) are `readings` columns of readings, then measured values
-    [SI]; `noise` (r, c) is the standard deviation of each number, zero where it is not known;
-    `poses` (r, l) are their poses.
-    """
+    """Rows of one kind."""
 
     kind: str
-    readings: int
-    content: FloatArray
-    noise: FloatArray
-    poses: np.ndarray
+    readings: int  # number of their columns of readings
+    content: FloatArray  # (r, c) readings, then measured values [SI]
+    noise: FloatArray  # (r, c) standard deviation of each number, zero where it is not known
+    poses: np.ndarray  # (r, l)
 
     @property
     def values(self) -> FloatArray:
@@ -59,7 +45,7 @@ class ComparedRows(NamedTuple):
         return self.content[:, self.readings :]
 
 
-def find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> BoolArray:
+def _find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> BoolArray:
     """Return which rows (r,) are copies of one of the fitted rows (k, c) [SI].
 
     is_same_form : whether the columns of both mean the same; otherwise values are looked for in all
@@ -205,32 +191,19 @@ def _mask_constants(values: FloatArray) -> FloatArray:
     return np.where(constant | (values == 0.0), np.nan, values)
 
 
-PREFIX = "fitted"
-"""First word of the names of the stored arrays."""
-
-
 class ReusedRows(NamedTuple):
-    """Rows of measurements that belong to a calibration.
+    """Rows of measurements that belong to a calibration."""
 
-    Attributes
-    ----------
-    poses : labels of their poses. count : number of these rows. total : number of all rows.
-    """
-
-    poses: tuple[str, ...]
+    poses: tuple[str, ...]  # labels of their poses
     count: int  # pyright: ignore[reportIncompatibleMethodOverride]
-    total: int
+    total: int  # number of all rows
 
 
 @dataclass(frozen=True, eq=False)
 class FittedRows:
-    """The rows that a calibration, and those before it that are its prior, were fitted to.
+    """The rows that a calibration, and those before it that are its prior, were fitted to."""
 
-    Attributes
-    ----------
-    groups : of each kind its name and (r, c) the readings and measured values [SI].
-    """
-
+    # of each kind its name and (r, c) the readings and measured values [SI]
     groups: tuple[tuple[str, FloatArray], ...] = ()
 
     def __len__(self) -> int:
@@ -238,7 +211,6 @@ class FittedRows:
         return sum(len(content) for _, content in self.groups)
 
     def __repr__(self) -> str:
-        """Return the number of rows and their kinds."""
         kinds = ", ".join(dict.fromkeys(kind for kind, _ in self.groups))
         return f"<FittedRows: {len(self)} rows{f' of {kinds}' if kinds else ''}>"
 
@@ -255,8 +227,6 @@ class FittedRows:
     ) -> int:
         """Return how many of these rows are among those of another calibration.
 
-        Parameters
-        ----------
         readings : number of actuators. noise : of each kind the standard deviation (m,) of its
             measured values, as far as it is known [SI].
         """
@@ -268,12 +238,16 @@ class FittedRows:
                 sd[width:] = noise[kind]
             poses = np.arange(len(content))[:, None]
             rows = ComparedRows(kind, width, content, np.broadcast_to(sd, content.shape), poses)
-            shared = np.zeros(len(content), dtype=bool)
-            for name, fitted in other.groups:
-                is_same_form = name == kind and fitted.shape[1] == content.shape[1]
-                shared |= find_agreeing(rows, fitted, is_same_form)
-            count += int(shared.sum())
+            count += int(other.find_copies(rows).sum())
         return count
+
+    def find_copies(self, rows: ComparedRows) -> BoolArray:
+        """Return which rows (r,) are copies of one of these."""
+        copies = np.zeros(len(rows.content), dtype=bool)
+        for kind, content in self.groups:
+            is_same_form = kind == rows.kind and content.shape[1] == rows.content.shape[1]
+            copies |= _find_agreeing(rows, content, is_same_form)
+        return copies
 
     def find_in(self, data: Measurements) -> ReusedRows:
         """Return which rows of other measurements, of weight above 0, are among these."""
@@ -282,10 +256,7 @@ class FittedRows:
         for rows in _list_rows(data):
             if rows.kind == READINGS and rows.kind not in kinds:
                 continue
-            reused = np.zeros(len(rows.content), dtype=bool)
-            for kind, content in self.groups:
-                is_same_form = kind == rows.kind and content.shape[1] == rows.content.shape[1]
-                reused |= find_agreeing(rows, content, is_same_form)
+            reused = self.find_copies(rows)
             labels += ["/".join(data.labels[j] for j in poses) for poses in rows.poses[reused]]
             total += len(reused)
         return ReusedRows(tuple(dict.fromkeys(labels)), len(labels), total)
@@ -295,14 +266,9 @@ def collect_fitted_rows(data: Measurements, are_readings_fitted: bool = False) -
     """Return the rows of measurements that a fit uses, with a weight above 0; with readings alone
     if these are fitted, as where actuators are redundant.
     """
-    groups = [
-        (o.kind.name, _take_content(o, data.readings)[1])
-        for o in data.observations
-        if are_readings_fitted or o.kind.name != READINGS
-    ]
-    if are_readings_fitted:
-        groups.append((READINGS, data.readings[_find_lonely_readings(data)]))
-    return FittedRows(tuple(groups))
+    rows = _list_rows(data) if are_readings_fitted else _list_rows(data)[:-1]
+    kept = (o for o in rows if are_readings_fitted or o.kind != READINGS)
+    return FittedRows(tuple((o.kind, o.content) for o in kept))
 
 
 def fitted_rows_from_arrays(arrays: Mapping[str, np.ndarray]) -> FittedRows | None:
@@ -315,39 +281,22 @@ def fitted_rows_from_arrays(arrays: Mapping[str, np.ndarray]) -> FittedRows | No
 
 def _list_rows(data: Measurements) -> list[ComparedRows]:
     """Return the rows of each kind that count, then the readings of poses without such rows."""
-    result = []
+    result, is_alone = [], np.ones(data.n_poses, dtype=bool)
     for o in data.observations:
-        counts, content, poses = _take_content(o, data.readings)
-        width = content.shape[1] - o.measured.shape[1]
+        is_alone[o.rows] = False
+        counts = np.isfinite(o.measured).any(axis=1) | (o.measured.shape[1] == 0)
+        counts &= o.weight > 0.0
+        poses = o.rows.reshape(len(o), o.rows[0].size if len(o) else 1)[counts]
+        width = poses.shape[1] * data.readings.shape[1]
+        read = data.readings[poses].reshape(len(poses), width)
+        content = np.concatenate([read, o.measured[counts]], axis=1)
         variance = np.einsum("rii->ri", o.covariance)
         if variance.shape != o.measured.shape:  # other residuals than values: noise is not known
             variance = np.zeros(o.measured.shape)
         sd = np.sqrt(np.where(np.isfinite(variance) & (variance > 0.0), variance, 0.0))
         noise = np.concatenate([np.zeros((len(content), width)), sd[counts]], axis=1)
         result.append(ComparedRows(o.kind.name, width, content, noise, poses))
-    is_alone = _find_lonely_readings(data)
-    alone, poses = data.readings[is_alone], np.flatnonzero(is_alone)[:, None]
-    return [*result, ComparedRows(READINGS, 0, alone, np.zeros(alone.shape), poses)]
-
-
-def _take_content(
-    rows: Observations, readings: FloatArray
-) -> tuple[BoolArray, FloatArray, IntArray]:
-    """Return which rows (r,) count, and of these the readings with the measured values, and the
-    poses.
-    """
-    counts = np.isfinite(rows.measured).any(axis=1) | (rows.measured.shape[1] == 0)
-    counts &= rows.weight > 0.0
-    poses = rows.rows.reshape(len(rows), rows.rows[0].size if len(rows) else 1)[counts]
-    read = readings[poses].reshape(len(poses), poses.shape[1] * readings.shape[1])
-    return counts, np.concatenate([read, rows.measured[counts]], axis=1), poses
-
-
-def _find_lonely_readings(data: Measurements) -> BoolArray:
-    """Return the poses (n,) without a row whose readings count."""
-    is_alone = np.ones(data.n_poses, dtype=bool)
-    for o in data.observations:
-        is_alone[o.rows] = False
     if data.reading_sigma is not None:
         is_alone &= np.isfinite(data.reading_sigma).any(axis=1)
-    return is_alone
+    alone, poses = data.readings[is_alone], np.flatnonzero(is_alone)[:, None]
+    return [*result, ComparedRows(READINGS, 0, alone, np.zeros(alone.shape), poses)]

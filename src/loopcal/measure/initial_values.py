@@ -25,27 +25,17 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 class EvaluatedRows(NamedTuple):
-    """Residuals and derivatives of one kind; l poses per row, l = 1 unless rows compare poses.
+    """Residuals and derivatives of one kind; l poses per row, l = 1 unless rows compare poses."""
 
-    Attributes
-    ----------
-    poses : (r, l) the poses of each row.
-    residual : (t, r, m) predicted - measured [SI].
-    jacobian : (t, r, l, m, 6) by the platform twists.
-    nuisance : (t, r, m, U) by all nuisance parameters of the measurements; zero where a row does
-        not use one, or it is fixed.
-    joints : (t, r, m, j) by the values of the joints `sensed_joints`, at the row's pose.
-    sensed_joints : names of these joints.
-    whitener : (r, m, m), zero where absent.
-    """
-
-    poses: IntArray
-    residual: FloatArray
-    jacobian: FloatArray
+    poses: IntArray  # (r, l) of each row
+    residual: FloatArray  # (t, r, m) predicted - measured [SI]
+    jacobian: FloatArray  # (t, r, l, m, 6) by the platform twists
+    # (t, r, m, U) by all nuisance parameters of the measurements; zero where a row does not use
+    # one, or it is fixed
     nuisance: FloatArray
-    joints: FloatArray
+    joints: FloatArray  # (t, r, m, j) by the values of the joints `sensed_joints`, at its pose
     sensed_joints: tuple[str, ...]
-    whitener: FloatArray
+    whitener: FloatArray  # (r, m, m), zero where absent
 
 
 def evaluate_measurements(
@@ -57,36 +47,31 @@ def evaluate_measurements(
 ) -> tuple[EvaluatedRows, ...]:
     """Return the evaluated rows of every kind at poses, those of targets on the base last.
 
-    Parameters
-    ----------
-    T : (t, n, 4, 4) T_base_platform of each pose.
-    values : (t or 1, U) of the nuisance parameters.
+    T : (t, n, 4, 4) T_base_platform of each pose. values : (t or 1, U) of the nuisance parameters.
     nuisance : default: collected from the measurements; collect them once for repeated calls.
-    joints : name -> (t or 1, n) of the joints that kinds sense, see
-        `loopcal.measure.readings.select_joint_values`; DataError if one is missing.
+    joints : name -> (t or 1, n) of the joints that kinds sense, see `select_joint_values`.
     """
     collected = measurements.nuisance_parameters if nuisance is None else nuisance
     evaluated = []
     for i, rows in enumerate(measurements.all_observations):
         kind, indices, factor = rows.kind, collected.indices[i], collected.factor(i)
         own = kind.stack_joints(joints or {}, rows.rows)
-        evaluation = rows.evaluate(T, collected.select(i, values), own)
-        t, r, m = evaluation.residual.shape
-        jacobian = evaluation.jacobian
+        residual, jacobian, by_own, by_joints = rows.evaluate(T, collected.select(i, values), own)
+        t, r, m = residual.shape
         by_nuisance = np.zeros((t, r, m, len(collected)))
-        if evaluation.nuisance is not None:
+        if by_own is not None:
             part = collected.table.free[indices] * (1.0 if factor is None else factor)
-            used = evaluation.nuisance * part[:, None, :]
+            used = by_own * part[:, None, :]
             used = np.broadcast_to(used, (t, r, m, indices.shape[1]))
             columns = np.broadcast_to(indices[:, None, :], used.shape)
             np.put_along_axis(by_nuisance, columns, used, axis=-1)
         evaluated.append(
             EvaluatedRows(
                 rows.rows.reshape(r, -1),
-                evaluation.residual,
+                residual,
                 jacobian[:, :, None] if kind.poses_per_row == 1 else jacobian,
                 by_nuisance,
-                np.zeros((t, r, m, 0)) if evaluation.joints is None else evaluation.joints,
+                np.zeros((t, r, m, 0)) if by_joints is None else by_joints,
                 kind.sensed_joints,
                 rows.whitener,
             )
@@ -101,8 +86,6 @@ def whiten_rows(
 ) -> FloatArray:
     """Return the whitened rows (t, M, p + U + 1) [machine | nuisance | residual] of all kinds.
 
-    Parameters
-    ----------
     twists : (t or 1, n, 6, p) derivative of the platform's twist by the machine's parameters; p = 0
         for nuisance parameters alone.
     joints : name -> (t or 1, n, p) derivatives of the joints' values; default: zero.
@@ -111,16 +94,13 @@ def whiten_rows(
     whitened = []
     for rows in evaluated:
         t = np.broadcast_shapes(rows.residual.shape[:1], twists.shape[:1])[0]
-        machine = (
-            np.sum(rows.jacobian @ twists[:, rows.poses], axis=2)
-            if p
-            else np.zeros((*rows.residual.shape, 0))
-        )
+        machine = np.zeros((*rows.residual.shape, 0))
+        if p:
+            machine = np.sum(rows.jacobian @ twists[:, rows.poses], axis=2)
         for j, name in enumerate(rows.sensed_joints):
             if joints is not None and name in joints:
-                machine = (
-                    machine + rows.joints[..., j, None] * joints[name][:, rows.poses[:, 0], None, :]
-                )
+                by_machine = joints[name][:, rows.poses[:, 0], None, :]
+                machine = machine + rows.joints[..., j, None] * by_machine
         blocks = (machine, rows.nuisance, rows.residual[..., None])
         raw = np.concatenate([np.broadcast_to(b, (t, *b.shape[1:])) for b in blocks], axis=-1)
         white = rows.whitener @ raw
@@ -136,8 +116,6 @@ def guess_nuisance_values(
 ) -> FloatArray:
     """Return values (U,) of the nuisance parameters that fit the measurements at given poses.
 
-    Parameters
-    ----------
     T : (n, 4, 4) T_base_platform of each pose, usually of the nominal robot at the readings.
     nuisance : with priors and fixed values; default: `measurements.nuisance_parameters`.
     joints : name -> (1, n) of joints that kinds sense.
@@ -165,19 +143,11 @@ def guess_nuisance_values_batch(
     steps: int = STEPS,
 ) -> FloatArray:
     """Return values (t, U) of the nuisance parameters for several sets of measured values, kind by
-    kind.
+    kind; of several sets, one without candidates keeps the nominal values.
 
-    Parameters
-    ----------
     measured : (t, r, c) of each kind; those of targets on the base last.
     T : (t | 1, n, 4, 4) T_base_platform.
     most : number of candidates of each set to refine, those with the lowest cost; default all.
-    steps : of the descent.
-
-    Raises
-    ------
-    DataError : as `guess_nuisance_values`. Of several sets, one without candidates keeps the
-        nominal values instead.
     """
     known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
     observations = measurements.all_observations
@@ -189,15 +159,8 @@ def guess_nuisance_values_batch(
         if is_kept.all():
             continue
         chosen = observations[i].take(members)
-        values[:, indices] = _refine_best_candidate(
-            chosen,
-            measured[i][:, members],
-            T[:, chosen.rows],
-            values[:, indices],
-            is_kept,
-            most,
-            steps,
-        )
+        given = (measured[i][:, members], T[:, chosen.rows], values[:, indices], is_kept)
+        values[:, indices] = _refine_best_candidate(chosen, *given, most, steps)
         known[indices] = True
     return values
 
@@ -213,7 +176,13 @@ def _list_groups(
     the base whose stated places determine a frame are before all others, since no pose is needed;
     other targets on the base are last.
     """
-    kinds = [_rank_kind(rows.kind) for rows in measurements.all_observations]
+
+    def rank(kind: Kind) -> int:
+        if isinstance(kind, Position) and kind.locates_frame:
+            return 0
+        return 2 if kind.is_of_base else 1
+
+    kinds = [(rank(rows.kind), type(rows.kind)) for rows in measurements.all_observations]
     groups = []
     for i, rows in enumerate(measurements.all_observations):
         if not rows.kind.nuisance_parameters or rows.kind.sensed_joints:
@@ -227,12 +196,6 @@ def _list_groups(
     return sorted(
         groups, key=lambda group: (kinds[group[0]][0], kinds.index(kinds[group[0]]), -len(group[1]))
     )
-
-
-def _rank_kind(kind: Kind) -> tuple[int, type[Kind]]:
-    """Return when the rows of a kind are used, and its class."""
-    is_first = isinstance(kind, Position) and kind.locates_frame
-    return (0 if is_first else 2 if kind.is_of_base else 1), type(kind)
 
 
 def _refine_best_candidate(

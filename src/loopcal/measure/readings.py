@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from loopcal.measure.kinds.joints import ActuatorReadings
     from loopcal.measure.measurements import Measurements
 
+# Largest finite standard deviation of a reading, in sizes of the robot or radians.
+LARGEST_SIGMA = 1e6
+NOT_A_SIGMA = (
+    "is not a standard deviation; give 0 (exact), a positive number from "
+    f"{SMALLEST_SD:g} on, or infinity (missing)"
+)
+
 
 def solve_commanded_poses(
     controller: Mechanism,
@@ -31,18 +38,11 @@ def solve_commanded_poses(
     labels: Sequence[str] = (),
     places: Sequence[str] = (),
 ) -> Solution:
-    """Return readings, poses and passive joints that a controller computes for commanded poses.
+    """Return readings, poses and passive joints that a controller computes for commanded poses;
+    DataError where its geometry does not reach one.
 
-    Parameters
-    ----------
-    controller : the geometry that the controller uses, usually the nominal robot.
-    commanded : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
+    commanded : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI].
     labels, places : names of the poses, and their places such as `poses.csv:12`, for messages.
-
-    Raises
-    ------
-    DataError
-        If the controller's geometry does not reach a pose, or there is another number of names.
     """
     solution = inverse(controller, commanded)
     if labels and len(labels) != len(solution):
@@ -75,8 +75,6 @@ def select_joint_values(
 ) -> dict[str, FloatArray]:
     """Return values (t or 1, n) [SI] of joints by name; DataError if the robot does not have one.
 
-    Parameters
-    ----------
     names : of actuators, whose value is their reading, or of passive joints as `limb.joint`.
     readings : (t or 1, n, a) [SI]. state : of t trials and n poses.
     """
@@ -122,19 +120,9 @@ def make_readings_kind(robot: Mechanism) -> ActuatorReadings:
     return ActuatorReadings({actuator.name: actuator.dimension for actuator in robot.actuators})
 
 
-LARGEST_SIGMA = 1e6
-"""Largest finite standard deviation of a reading, in sizes of the robot or radians."""
-
-NOT_A_SIGMA = (
-    "is not a standard deviation; give 0 (exact), a positive number from "
-    f"{SMALLEST_SD:g} on, or infinity (missing)"
-)
-
-
 def weight_reading_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatArray | None:
-    """Return standard deviations (n, a) of readings whose squares count by a weight (n,).
-
-    A weight of 0 makes them infinite; exact readings stay exact.
+    """Return standard deviations (n, a) of readings whose squares count by a weight (n,), of which
+    0 makes them infinite; exact readings stay exact.
     """
     if sigma is None:
         return None
@@ -177,20 +165,14 @@ def check_reading_sigma(
 
 
 def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) -> FloatArray | None:
-    """Return the standard deviations (n, a) [SI] of readings, or None where all are exact.
-
-    Given ones win over those that the robot states.
-
-    Parameters
-    ----------
-    given : (n, a) or None, as in `Measurements.reading_sigma`.
+    """Return the standard deviations (n, a) [SI] of readings, or None where all are exact; those
+    that are given win over those that the robot states.
 
     Raises
     ------
-    DataError : a sigma is negative, not a number, or finite but too large to mean anything; or if a
-        reading of a robot with redundant actuators is exact. The poses of such a robot are free and
-        readings follow from them, so that no reading can be kept; see
-        docs/theory/uncertain-readings.md.
+    DataError : a sigma is no standard deviation, or too large to mean anything; or a reading of a
+        robot with redundant actuators is exact. The poses of such a robot are free and readings
+        follow from them, see docs/theory/uncertain-readings.md.
     """
     if given is None:
         if not robot.stated_sigma.any():
@@ -227,11 +209,9 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
 
 
 def fill_in_reading_sigma(robot: Mechanism, data: Measurements) -> Measurements:
-    """Return measurements that contain the standard deviations that the robot states.
-
-    It is the same object where all readings are exact.
+    """Return measurements that contain the standard deviations that the robot states; the same
+    object where all readings are exact.
     """
     sigma = resolve_reading_sigma(robot, data.reading_sigma, data.n_poses)
-    return (
-        data if sigma is None or sigma is data.reading_sigma else replace(data, reading_sigma=sigma)
-    )
+    is_same = sigma is None or sigma is data.reading_sigma
+    return data if is_same else replace(data, reading_sigma=sigma)
