@@ -213,35 +213,38 @@ def five_bar() -> Mechanism:
 
 
 @cache
+def planar_arms(
+    endings: tuple[str, ...], freedoms: tuple[str, ...] = ("rz", "x", "y"), first: float = 90.0
+) -> Mechanism:
+    """A planar platform on arms with two passive joints: a crank of 150 mm and a rod of 170 mm from
+    feet on a circle of 300 mm, the first at an angle [deg], to corners on one of 60 mm.
+
+    A `rigid` ending has a pivot in the platform.
+    """
+    limbs = []
+    for i, ending in enumerate(endings):
+        angle = np.deg2rad(first + 360.0 * i / len(endings))
+        out = np.array((np.cos(angle), np.sin(angle), 0.0))
+        links = [
+            Link("base", place(0.3 * out, (0, 0, angle))),
+            Link("crank", place((0.15, 0, 0))),
+            Link("rod", place((0.17, 0, 0))),
+        ]
+        joints = [Joint("motor", "R", f"q{i + 1}", start=2.2), Joint("elbow", "R", start=1.7)]
+        if ending == "rigid":
+            joints.append(Joint("wrist", "R", start=-0.5))
+            links.append(Link("hand", np.eye(4)))
+        corner = Link("corner", place(0.06 * out))
+        limbs.append(Limb(f"arm{i + 1}", tuple(links), tuple(joints), ending, corner))
+    name, controlled = f"{len(endings)}-RRR", ("x", "y", "yaw")
+    return build(assemble(name, tuple(limbs), freedoms, controlled, np.eye(4)))
+
+
 def planar_rrr() -> Mechanism:
     """A planar 3-RRR with freedoms x, y and yaw: two limbs end in a point, one in a pivot rigid in
     the platform.
     """
-    limbs = []
-    for i, angle in enumerate(np.deg2rad((90.0, 210.0, 330.0)), start=1):
-        foot, corner = (
-            0.3 * np.array((np.cos(angle), np.sin(angle), 0.0)),
-            0.06 * np.array((np.cos(angle), np.sin(angle), 0)),
-        )
-        links = [
-            Link("base", place(foot, (0, 0, angle))),
-            Link("crank", place((0.15, 0, 0))),
-            Link("rod", place((0.17, 0, 0))),
-        ]
-        joints = [Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7)]
-        if i == 3:
-            joints.append(Joint("wrist", "R", start=-0.5))
-            links.append(Link("hand", np.eye(4)))
-        limbs.append(
-            Limb(
-                f"arm{i}",
-                tuple(links),
-                tuple(joints),
-                "rigid" if i == 3 else "ball",
-                Link("corner", place(corner)),
-            )
-        )
-    return build(assemble("3-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4)))
+    return planar_arms(("ball", "ball", "rigid"))
 
 
 # --- a tripod machine head: passive joints, three controlled coordinates of six

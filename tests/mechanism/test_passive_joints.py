@@ -1,33 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Derivatives of passive joints by parameters and readings agree with differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.mechanism.compilation import build
-from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.families.records import PoseRecord
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.sensitivity import differentiate_passive_joints
 from loopcal.mechanism.solutions import forward, make_solution
 from loopcal.units import Dimension
-from tests import zoo
 from tests.jacobians import check_jacobian
+from tests.mechanism.families.test_gough import CHAIN
 from tests.mechanism.kinematics.test_kinematics import sample_inverse
 
 
 def build_ups_hexapod():
-    record = Gough(
-        name="ups",
-        base=tuple(map(tuple, (zoo.HEXAPOD_BASE * zoo.MM).tolist())),
-        platform=tuple(map(tuple, (zoo.HEXAPOD_PLATFORM * zoo.MM).tolist())),
-        lengths=zoo.HEXAPOD_LENGTH * zoo.MM,
-        home=PoseRecord(z=0.2),
-        legs="ups",
-        error_model="complete",
-    )
-    return build(record.expand(), record=record)
+    return build(replace(CHAIN, error_model="complete").expand())
 
 
 @pytest.mark.parametrize("name", ["mixed_hexapod", "three_prs", "planar_rrr"])

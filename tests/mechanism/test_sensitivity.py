@@ -16,6 +16,7 @@ from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian, compile_quickly
+from tests.mechanism.derivatives import check_pose_derivatives
 from tests.mechanism.kinematics.test_kinematics import sample_inverse
 
 
@@ -86,21 +87,7 @@ def test_pose_derivatives_of_families_agree_with_differences_and_jax(name, legs,
 @pytest.mark.parametrize("name", ["mixed_hexapod", "three_prs", "five_bar", "planar_rrr"])
 def test_pose_derivatives_of_any_mechanism_agree_with_differences(name):
     robot, sol, _ = sample_inverse(name, 1)
-    values, q = robot.values[None], sol.q[None]
-    state = forward_trials(robot, values, q, start=sol.state)
-    result = differentiate_pose(robot, values, q, state)
-    unit = np.array(
-        [robot.size if d is Dimension.LENGTH else 1.0 for d in robot.parameters.dimensions]
-    )
-
-    def solved(x):  # one trial a parameter
-        moved = forward_trials(robot, values + x[0] * np.diag(unit), q, start=state)
-        return geometry.pose_difference(moved.T, np.broadcast_to(state.T, moved.T.shape))
-
-    check_jacobian(
-        solved, (result.parameters[0] * unit).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
-        atol=1e-7, atol_reason="closure to 1e-13, condition 30, step 1e-4",
-    )  # fmt: skip
+    check_pose_derivatives(robot, sol.q[None])
 
 
 def test_pose_derivatives_by_transmission_terms_agree_with_differences():

@@ -91,14 +91,3 @@ def test_sensitivities_agree_with_automatic_derivatives(machine):
     D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
     expected = -np.linalg.pinv(np.asarray(by_position)) @ np.asarray(by_values)
     assert_allclose(D[:, 3:5], expected, atol=1e-10)
-
-
-def test_sensitivities_agree_with_finite_differences(machine):
-    robot, _, readings = machine
-    state = lc.forward(robot, readings).state
-    D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
-    h = 1e-6
-    for i, step in enumerate(h * np.eye(12)):
-        ends = [lc.forward(robot.with_values(robot.values + s), readings).T for s in (step, -step)]
-        slope = (ends[0] - ends[1])[:, :2, 3] / (2 * h)
-        assert_allclose(D[:, 3:5, i], slope, atol=1e-6)  # second order at closed loops

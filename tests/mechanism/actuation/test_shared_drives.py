@@ -15,14 +15,12 @@ from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate_trials
 from loopcal.mechanism.chains import ChainState
-from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
-from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
-from tests.jacobians import check_jacobian
+from tests.mechanism.derivatives import check_pose_derivatives
 from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot
 
@@ -179,21 +177,4 @@ def test_nominal_palletizer_stays_level() -> None:
 
 
 def test_sensitivities_of_a_shared_drive_are_derivatives(tmp_path: Path) -> None:
-    robot = load_text(tmp_path, FOUR_BAR)
-    q = np.array([[[1.0]]])
-    state = forward_trials(robot, robot.values[None], q)
-    known = differentiate_pose(robot, robot.values[None], q, state)
-
-    def move(x: Array) -> Array:
-        T = forward_trials(robot, x, q, state).T[:, 0]
-        return np.column_stack([T[:, 0, 3], T[:, 1, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
-
-    check_jacobian(
-        move,
-        known.parameters[0, 0][[3, 4, 2]],
-        robot.values,
-        scale=0.05,
-        atol=1e-9,
-        atol_reason="[m, rad] Newton's own accuracy over the smallest step",
-        is_batched=True,
-    )
+    check_pose_derivatives(load_text(tmp_path, FOUR_BAR), np.array([[[1.0]]]))

@@ -8,27 +8,11 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.mechanism.actuation import differentiate_at_pose, solve_at_pose
-from loopcal.mechanism.assembly import Joint, Limb, Link
-from loopcal.mechanism.compilation import build
 from loopcal.mechanism.sensitivity import differentiate_passive_joints
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.states import Status
 from tests import zoo
 from tests.jacobians import check_jacobian
-
-
-def build_planar_robot_with_four_arms():
-    """Build a planar platform on four arms with two passive joints each and all parameters."""
-    limbs = []
-    for i, angle in enumerate(np.deg2rad((80.0, 170.0, 260.0, 350.0)), start=1):
-        axis = np.array((np.cos(angle), np.sin(angle), 0.0))
-        links = (Link("base", zoo.place(0.3 * axis, (0, 0, angle))), Link("crank", zoo.place((0.15, 0, 0))),  # noqa: E501
-                 Link("rod", zoo.place((0.17, 0, 0))))  # fmt: skip
-        joints = (Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7))
-        limbs.append(Limb(f"arm{i}", links, joints, "ball", Link("corner", zoo.place(0.06 * axis))))
-    return build(
-        zoo.assemble("4-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4))
-    )
 
 
 def solve_example_pose(robot, seed=0):
@@ -42,7 +26,7 @@ def solve_example_pose(robot, seed=0):
 
 
 def test_every_limb_closes_at_the_given_pose():
-    robot = build_planar_robot_with_four_arms()
+    robot = zoo.planar_arms(("ball",) * 4, first=80.0)
     values, T, state, q = solve_example_pose(robot)
     assert_allclose(state.T, T, atol=1e-14)  # [m], [rad]
     assert state.residual.max() < 1e-12 * robot.size
@@ -51,7 +35,7 @@ def test_every_limb_closes_at_the_given_pose():
 
 
 def test_reading_and_passive_joint_derivatives_at_a_pose_agree_with_differences():
-    robot = build_planar_robot_with_four_arms()
+    robot = zoo.planar_arms(("ball",) * 4, first=80.0)
     values, T, state, q = solve_example_pose(robot)
     result = differentiate_at_pose(robot, values, q, state)
     p, freedoms = values.shape[1], robot.program.freedoms
@@ -83,7 +67,7 @@ def test_reading_and_passive_joint_derivatives_at_a_pose_agree_with_differences(
 
 
 def test_derivatives_by_pose_and_by_readings_agree():
-    robot = build_planar_robot_with_four_arms()
+    robot = zoo.planar_arms(("ball",) * 4, first=80.0)
     values, _, state, q = solve_example_pose(robot)
     result = differentiate_at_pose(robot, values, q, state)
     by_reading = differentiate_passive_joints(robot, values, q, state)

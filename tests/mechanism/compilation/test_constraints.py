@@ -19,6 +19,9 @@ from tests import zoo
 HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))
 
 
+RIGID = ("rigid",) * 3
+
+
 def make_rigid_limb(name, frames, joints, corner):
     """Return a rigid limb with joints in these frames [base] at home, at joint values of zero."""
     attachment = zoo.place(corner)
@@ -141,29 +144,8 @@ def test_locked_joint_keeps_its_reported_start_value():
     assert_allclose(forward(other, q).T, forward(robot, q).T, atol=1e-11)
 
 
-def build_planar_3rrr(freedoms):
-    """Build a planar 3-RRR with rigid limb ends."""
-    limbs = []
-    for i, angle in enumerate(np.deg2rad((90.0, 210.0, 330.0)), start=1):
-        out = np.array((np.cos(angle), np.sin(angle), 0.0))
-        base, hand = Link("base", zoo.place(0.3 * out, (0, 0, angle))), Link("hand", np.eye(4))
-        links = (
-            base,
-            Link("crank", zoo.place((0.15, 0, 0))),
-            Link("rod", zoo.place((0.17, 0, 0))),
-            hand,
-        )
-        joints = (
-            Joint("motor", "R", f"q{i}", start=2.2),
-            Joint("elbow", "R", start=1.7),
-            Joint("wrist", "R", start=-0.5),
-        )
-        limbs.append(Limb(f"arm{i}", links, joints, "rigid", Link("corner", zoo.place(0.06 * out))))
-    return build(zoo.assemble("3-RRR", tuple(limbs), freedoms, ("x", "y", "yaw"), np.eye(4)))
-
-
 def test_planar_robot_with_six_freedoms_is_solved_and_reported_as_redundant():
-    whole, flat = build_planar_3rrr(zoo.AXES), build_planar_3rrr(("rz", "x", "y"))
+    whole, flat = zoo.planar_arms(RIGID, zoo.AXES), zoo.planar_arms(RIGID)
     assert flat.findings == ()
     (finding,) = whole.findings
     assert finding.code == "mechanism.repeated-equations"
@@ -185,7 +167,7 @@ def test_planar_robot_with_six_freedoms_is_solved_and_reported_as_redundant():
 
 def test_redundant_equations_are_reported_when_no_freedoms_avoid_them():
     turned = zoo.place((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
-    whole = build_planar_3rrr(zoo.AXES)
+    whole = zoo.planar_arms(RIGID, zoo.AXES)
     assembly = zoo.move_base(whole.assembly, turned)
     robot = build(replace(assembly, parameters=(), maps=(), controlled=("x", "y", "yaw")))
     (finding,) = robot.findings

@@ -9,12 +9,10 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.mechanism.kinematics import compute_readings, forward_trials
+from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
-from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward, inverse
-from loopcal.units import Dimension
-from tests.jacobians import check_jacobian
+from tests.mechanism.derivatives import check_pose_derivatives
 from tests.mechanism.families.ranks import random_coordinates
 from tests.zoo import load_cached_robot
 
@@ -67,46 +65,7 @@ def test_sensitivities_are_the_derivatives_of_forward_kinematics(name: str) -> N
     machine = load_cached_robot(name)
     solution = inverse(machine, random_coordinates(machine, 3, seed=13))
     assert solution.converged.all()
-    q, values = compute_readings(machine, machine.values[None], solution.state), machine.values
-    state = forward_trials(machine, values[None], q)
-    known = differentiate_pose(machine, values[None], q, state)
-
-    def by_value(x: np.ndarray) -> np.ndarray:
-        return geometry.pose_difference(forward_trials(machine, x, q, state).T, state.T[0])
-
-    def by_reading(x: np.ndarray) -> np.ndarray:
-        return geometry.pose_difference(
-            forward_trials(machine, values[None], q + x[:, None], state).T, state.T[0]
-        )
-
-    # the difference of two rotations is a logarithm, whose slope at zero is the angular velocity
-    length, angle = 0.02 * machine.size, 0.02
-    scale = np.array(
-        [length if d is Dimension.LENGTH else angle for d in machine.parameters.dimensions]
-    )
-    reason = "[m] Newton's own accuracy over the smallest step"
-    check_jacobian(
-        by_value,
-        known.parameters[0],
-        values,
-        scale=scale,
-        atol=1e-9 * machine.size,
-        atol_reason=reason,
-        is_batched=True,
-    )
-    scale = np.array(
-        [length if a.dimension is Dimension.LENGTH else angle for a in machine.actuators]
-    )
-    zero = np.zeros(len(scale))
-    check_jacobian(
-        by_reading,
-        known.readings[0],
-        zero,
-        scale=scale,
-        atol=1e-9 * machine.size,
-        atol_reason=reason,
-        is_batched=True,
-    )
+    check_pose_derivatives(machine, compute_readings(machine, machine.values[None], solution.state))
 
 
 def test_documentation_lists_every_robot_with_its_parameter_count() -> None:
