@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The 42-parameter hexapod study: which published numbers and claims are confirmed.
 
-Statistics are over 20 drawings (seed 0). Their bounds are written beside them and hold for seeds 0
-to 6 too. A root mean square over 20 drawings of few independent directions has an uncertainty of
+Statistics are over 10 drawings (seed 0). Their bounds are written beside them and hold for seeds 0
+to 6 too. A root mean square over 10 drawings of few independent directions has an uncertainty of
 some 15 %.
 Page: docs/papers/hexapod-42.md.
 """
@@ -14,25 +14,15 @@ import pytest
 
 import loopcal as lc
 from loopcal.estimate.published_steps import LegForm
+from loopcal.papers.hexapod_42 import steps
 from loopcal.papers.hexapod_42.results import Results, compute, find_rule, judge_claims
-from loopcal.papers.hexapod_42.steps import (
-    MM,
-    PRESUMED,
-    PRINTED,
-    STATED,
-    TO_SI,
-    Setup,
-    compute_explained_share,
-    draw_measured_poses,
-    iterate,
-    to_measurements,
-    to_si,
-    to_twists,
-)
+from loopcal.papers.paper import PAPERS
+from loopcal.papers.reproduction import write_page
 from tests.papers.random_results import collect_answers
+from tests.papers.small_reproduction import MADE_BY
 
 pytestmark = pytest.mark.slow
-TRIALS = 20
+TRIALS = 10
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +31,12 @@ def results() -> Results:
 
 
 @pytest.fixture(scope="module")
-def setup(results) -> Setup:
+def setup(results) -> steps.Setup:
     return results.setup
 
 
-def simulate_stated_noise(setup: Setup, seed: int, trials: int) -> lc.Trials:
-    noise = lc.Uniform(np.roll(to_si(STATED), 3))
+def simulate_stated_noise(setup: steps.Setup, seed: int, trials: int) -> lc.Trials:
+    noise = lc.Uniform(np.roll(steps.to_si(steps.STATED), 3))
     instrument = lc.Instrument((lc.Sensor(lc.Pose("euler-xyz"), noise),))
     truth = np.repeat(setup.truth.values[None], trials, axis=0)
     return lc.simulate_trials(setup.robot, truth, setup.commanded.T, instrument, seed)
@@ -88,20 +78,20 @@ def test_noise_free_steps_agree_with_the_paper(results, setup) -> None:
     assert (threshold, iterations) == (1e-6, 2)
     # [mm] with a new matrix in each iteration, and with one throughout
     for run, second in ((results.runs["exact"], 2e-8), (results.runs["frozen"], 3e-6)):
-        errors = np.abs(run.compute_parameter_errors(setup.truth)).max(axis=1) / MM
+        errors = np.abs(run.compute_parameter_errors(setup.truth)).max(axis=1) / steps.MM
         assert run.integrated[0] == pytest.approx(0.058938, abs=5e-7)  # [mm + rad], last digit
         assert errors[1] == pytest.approx(1.6e-3, rel=0.1)
         assert errors[2] < second
         assert run.count_needed(threshold) == iterations
         assert run.count_needed(0.0) is None
     exact = results.runs["exact"]
-    assert np.abs(exact.compute_parameter_errors(setup.truth)[3]).max() / MM < 1e-8
+    assert np.abs(exact.compute_parameter_errors(setup.truth)[3]).max() / steps.MM < 1e-8
     conditions = np.round(exact.conditions)
     np.testing.assert_array_equal(conditions, [5822, 3501, 4924, 4570, 3385, 4683])
 
 
 def test_stated_noise_prevents_the_stopping_rule_and_worsens_parameters(results) -> None:
-    stated = results.levels[STATED]
+    stated = results.levels[steps.STATED]
     assert not np.isfinite(stated.needed).any()
     assert 6e-4 < stated.median[3] < 1.2e-3  # [mm + rad]; 7.6e-4 to 9.5e-4 over seeds 0 to 6
     before, alone, together, prior = results.methods.values()
@@ -114,19 +104,19 @@ def test_stated_noise_prevents_the_stopping_rule_and_worsens_parameters(results)
 
 
 def test_per_leg_fit_has_2_4_times_the_standard_deviation_of_the_joint_fit(setup) -> None:
-    sd, legs = to_si(STATED) / np.sqrt(3.0), LegForm.at(setup.robot, setup.commanded)
+    sd, legs = steps.to_si(steps.STATED) / np.sqrt(3.0), LegForm.at(setup.robot, setup.commanded)
     unit = np.eye(60).reshape(60, 10, 6) * sd  # exact to first order: each of 60 noises on its own
-    squares = [legs.fit(to_twists(noise, setup.actual)) ** 2 for noise in unit]
+    squares = [legs.fit(steps.to_twists(noise, setup.actual)) ** 2 for noise in unit]
     trials = simulate_stated_noise(setup, 0, 2)
     fits = lc.identify_trials(setup.robot, trials, lc.LeastSquares())
     together = fits.standard_deviations()[0]
-    rms = [np.sqrt(np.mean(x)) / MM for x in (np.sum(squares, axis=0), together**2)]
+    rms = [np.sqrt(np.mean(x)) / steps.MM for x in (np.sum(squares, axis=0), together**2)]
     np.testing.assert_allclose(rms, [0.199, 0.084], rtol=0.03)  # [mm]
     assert rms[0] / rms[1] == pytest.approx(2.4, abs=0.1)
 
 
 def test_tables_5_and_6_imply_noise_1000_times_smaller_than_stated(results) -> None:
-    sizes, presumed = results.sizes, results.levels[PRESUMED]
+    sizes, presumed = results.sizes, results.levels[steps.PRESUMED]
     np.testing.assert_allclose(sizes, [3.04e-7, 9.1e-10, 2.39e-4, 7.2e-7], rtol=0.01)
     assert np.all(np.abs(np.log2(sizes / presumed.median)) < 1.0)
     for limits, level in results.levels.items():
@@ -135,14 +125,14 @@ def test_tables_5_and_6_imply_noise_1000_times_smaller_than_stated(results) -> N
 
 
 def test_table_6_contains_residuals_and_a_common_shift_leaves_none(results, setup) -> None:
-    printed = PRINTED.table("table_6", "after").values * TO_SI
-    assert compute_explained_share(setup, printed).max() < 0.1
-    noise = np.random.default_rng(0).normal(size=(10, 6)) * to_si(PRESUMED)
-    assert compute_explained_share(setup, noise).mean() > 0.7
+    printed = steps.PRINTED.table("table_6", "after").values * steps.TO_SI
+    assert steps.compute_explained_share(setup, printed).max() < 0.1
+    noise = np.random.default_rng(0).normal(size=(10, 6)) * steps.to_si(steps.PRESUMED)
+    assert steps.compute_explained_share(setup, noise).mean() > 0.7
     offset = results.noise.mean(axis=0)
-    np.testing.assert_allclose(offset[:3] / MM, [3.1e-5, -1.1e-5, -1.0e-5], atol=1e-6)  # [mm]
+    np.testing.assert_allclose(offset[:3] / steps.MM, [3.1e-5, -1.1e-5, -1.0e-5], atol=1e-6)  # [mm]
     # what is left, 3 % of 3e-5 mm at most in a leg, hides below the residuals
-    assert compute_explained_share(setup, np.tile(offset, (10, 1))).min() > 1.0 - 1e-3
+    assert steps.compute_explained_share(setup, np.tile(offset, (10, 1))).min() > 1.0 - 1e-3
 
 
 def test_method_of_the_paper_fails_for_the_rounded_poses_of_table_4(results) -> None:
@@ -156,10 +146,12 @@ def test_method_of_the_paper_fails_for_the_rounded_poses_of_table_4(results) -> 
 def test_noise_follows_from_the_seed_and_is_that_of_simulated_trials(setup) -> None:
     made = simulate_stated_noise(setup, 3, 2)
     for trial in range(2):
-        drawn = draw_measured_poses(setup, to_si(STATED), 3, trial)
-        ours = to_measurements(setup, drawn).observations[0].measured
+        drawn = steps.draw_measured_poses(setup, steps.to_si(steps.STATED), 3, trial)
+        ours = steps.to_measurements(setup, drawn).observations[0].measured
         np.testing.assert_allclose(made.measured[0][trial], ours, rtol=0, atol=1e-13)  # rounding
-    first, again, other = (draw_measured_poses(setup, to_si(STATED), seed) for seed in (7, 7, 8))
+    first, again, other = (
+        steps.draw_measured_poses(setup, steps.to_si(steps.STATED), seed) for seed in (7, 7, 8)
+    )
     np.testing.assert_array_equal(first, again)
     assert (first != other).all()
 
@@ -181,10 +173,18 @@ def test_claims_have_the_expected_verdicts_which_follow_from_the_numbers(results
     printed = next(o for o in results.orders if o.formula == "Rz(alpha) Ry(beta) Rx(gamma)")
     changed = replace(results, orders=(printed, *results.orders[1:]))
     assert next(v for v in judge_claims(changed) if v.name == "rotation").agrees
-    answers = collect_answers(judge_claims, results, keep=(Setup,))
+    answers = collect_answers(judge_claims, results, 32, keep=(steps.Setup,))
     assert len(answers) == 17
     assert [claim for claim, given in answers.items() if False not in given] == []
 
 
 def test_iteration_ends_after_its_limit(setup) -> None:
-    assert len(iterate(setup, setup.actual, 2).integrated) == 3
+    assert len(steps.iterate(setup, setup.actual, 2).integrated) == 3
+
+
+def test_page_shows_all_tables_figures_and_statements(results) -> None:
+    reproduction = PAPERS["hexapod-42"].present(results, 0, TRIALS)
+    text, content = write_page(reproduction, MADE_BY), reproduction.content
+    titles = [item.title for item in (*content.comparisons, *content.tables, *content.figures)]
+    assert [title for title in titles if f"## {title}\n" not in text] == []
+    assert all(verdict.reason in text for verdict in content.verdicts)

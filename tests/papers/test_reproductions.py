@@ -189,8 +189,8 @@ def test_reproduce_prints_tables_and_statements(capsys, monkeypatch) -> None:
         assert part in printed
 
 
-@pytest.mark.slow
-def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
+def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(Paper, "run", lambda *_: build_reproduction())
     folder = tmp_path / "out"
     assert main(["reproduce", "hexapod-42", "--trials", "2", "-o", str(folder), "--json"]) == 0
     out, err = capsys.readouterr()
@@ -198,9 +198,9 @@ def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
     document = json.loads(out, parse_constant=pytest.fail)
     written = json.loads((folder / "result.json").read_text("utf-8"))
     assert written.pop("made_by")["seeds"] == {"seed": 0}
-    assert "figures/figure_4.png" in written.pop("files")
+    assert "figures/curve.png" in written.pop("files")
     assert written == document
-    assert (folder / "figures" / "figure_4.png").is_file()
+    assert (folder / "figures" / "curve.png").is_file()
 
 
 @pytest.mark.evidence

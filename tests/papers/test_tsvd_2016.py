@@ -23,6 +23,7 @@ from loopcal.estimate.published_steps import (
 from loopcal.measure.instrument import Uniform
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.papers.published import Printed
+from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.results import (
     DIVERGED,
     Results,
@@ -32,48 +33,6 @@ from loopcal.papers.tsvd_2016.results import (
     make_median_curves,
     make_medians,
     present,
-)
-from loopcal.papers.tsvd_2016.steps import (
-    ANGLE_ERRORS,
-    BEFORE,
-    CROSS,
-    GAIN,
-    HINDSIGHT,
-    LENGTH_ERRORS,
-    LIMITS,
-    LS,
-    METHODS,
-    NARROW,
-    PRINTED,
-    PRIOR,
-    PRIOR_FIVE,
-    RANKED,
-    RAW_FIVE,
-    RAW_LS,
-    RAW_RE,
-    RAW_TSVD,
-    RE,
-    ROBOTS,
-    TRUE,
-    TSVD,
-    WHITENED,
-    WHITENED_FIVE,
-    WIDE,
-    Draws,
-    Study,
-    compute_rise,
-    draw_machines,
-    draw_true_values,
-    iterate,
-    linearize,
-    list_measured_poses,
-    list_output_range,
-    list_scales,
-    load_machine,
-    measure_case,
-    measure_machines,
-    read_noise,
-    space_lambdas,
 )
 from tests.papers.random_results import randomize
 
@@ -85,8 +44,8 @@ EXACT = np.zeros(6)
 
 
 @pytest.fixture(scope="module")
-def tripod() -> Study:
-    return measure_case("3-PRS", 0)
+def tripod() -> steps.Study:
+    return steps.measure_case("3-PRS", 0)
 
 
 @pytest.fixture(scope="module")
@@ -95,39 +54,47 @@ def results() -> Results:
 
 
 def test_appendix_1_is_read_as_printed() -> None:
-    noise = PRINTED.table("appendix_1")
+    noise = steps.PRINTED.table("appendix_1")
     assert noise.values.shape == (36, 6)
     first, last = (" ".join(noise.rows[row]) for row in ("1", "36"))
     assert first == "0.006294 -0.003925 -0.007118 0.000092 0.000087 0.000162"
     assert last == "0.008664 -0.006628 -0.004280 -0.000036 -0.000082 0.000151"
     assert np.abs(noise.values[:, :3]).max() == 0.009989
     assert np.abs(noise.values[:, 3:]).max() == 0.000174
-    assert (np.abs(read_noise()) <= LIMITS).all()
+    assert (np.abs(steps.read_noise()) <= steps.LIMITS).all()
 
 
 def test_poses_parameter_errors_and_output_range_agree_with_the_paper() -> None:
-    robot = load_machine("3-PRS")
-    z, phi, theta = list_measured_poses(robot).T
+    robot = steps.load_machine("3-PRS")
+    z, phi, theta = steps.list_measured_poses(robot).T
     assert len(z) == 36
     assert set(np.round(z, 9)) == {0.65, 0.7, 0.75}
     assert {int(x) for x in np.round(np.rad2deg(theta))} == {10, 20, 30}
     assert len(set(np.round(np.rad2deg(phi)))) == 12
-    for name in ROBOTS:
-        assert len(list_output_range(load_machine(name))) == 96
-    errors = np.abs(draw_true_values(robot, 5, 0) - robot.parameters.nominal)
-    lengths = list_scales(robot) != 1.0
-    for chosen, (low, high) in ((lengths, LENGTH_ERRORS), (~lengths, ANGLE_ERRORS)):
+    for name in steps.ROBOTS:
+        assert len(steps.list_output_range(steps.load_machine(name))) == 96
+    errors = np.abs(steps.draw_true_values(robot, 5, 0) - robot.parameters.nominal)
+    lengths = steps.list_scales(robot) != 1.0
+    for chosen, (low, high) in ((lengths, steps.LENGTH_ERRORS), (~lengths, steps.ANGLE_ERRORS)):
         assert low < errors[:, chosen].min()
         assert errors[:, chosen].max() < high
-    np.testing.assert_array_equal(draw_true_values(robot, 5, 0)[:2], draw_true_values(robot, 2, 0))
+    np.testing.assert_array_equal(
+        steps.draw_true_values(robot, 5, 0)[:2], steps.draw_true_values(robot, 2, 0)
+    )
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", steps.ROBOTS)
 def test_first_step_agrees_with_the_printed_formulas(name) -> None:
     """H (216, p) in mm and rad by central differences of the forward kinematics."""
-    measured = measure_case(name, 0)
+    measured = steps.measure_case(name, 0)
     robot, kind, readings = measured.robot, measured.kind, measured.trials.readings[None]
-    nominal, scale, p, lam, k = robot.values[None], list_scales(robot), len(robot.values), 0.01, 15
+    nominal, scale, p, lam, k = (
+        robot.values[None],
+        steps.list_scales(robot),
+        len(robot.values),
+        0.01,
+        15,
+    )
     state = forward_trials(robot, nominal, readings)
     around = kind.measure(state.T, np.zeros((1, 36, 6)))  # nominal: phi does not wrap
 
@@ -143,31 +110,31 @@ def test_first_step_agrees_with_the_printed_formulas(name) -> None:
         (penalize_ridge(np.array([lam]), p), np.linalg.solve(H.T @ H + lam * np.eye(p), H.T @ D)),
         (penalize_truncated(np.array([k]), p), Vt[:k].T @ (U[:, :k].T @ D / s[:k])),
     ):
-        step = (iterate(measured, penalty, limit=1).values - nominal)[0] / scale
+        step = (steps.iterate(measured, penalty, limit=1).values - nominal)[0] / scale
         # [mm, rad], central differences
         np.testing.assert_allclose(step, expected, rtol=0, atol=1e-5)
-    singular_values = linearize(measured).singular_values[0]
+    singular_values = steps.linearize(measured).singular_values[0]
     np.testing.assert_allclose(singular_values, s, rtol=1e-5, atol=1e-8)
 
 
 def test_repeated_ridge_steps_reduce_the_effect_of_lambda() -> None:
-    robot, lam = load_machine("3-PRS"), 0.01
+    robot, lam = steps.load_machine("3-PRS"), 0.01
     # errors so small that the problem is linear
-    small = robot.values + 1e-2 * (draw_true_values(robot, 1, 0) - robot.values)
-    measured = measure_machines("3-PRS", small).with_noise(EXACT)
-    d = linearize(measured)
+    small = robot.values + 1e-2 * (steps.draw_true_values(robot, 1, 0) - robot.values)
+    measured = steps.measure_machines("3-PRS", small).with_noise(EXACT)
+    d = steps.linearize(measured)
     for m in (1, 3, 10):
-        values = iterate(measured, penalize_ridge(np.array([lam]), 33), limit=m).values
+        values = steps.iterate(measured, penalize_ridge(np.array([lam]), 33), limit=m).values
         f = 1.0 - (lam / (d.singular_values**2 + lam)) ** m
-        expected = d.deviation(f * d.projections / d.singular_values) * list_scales(robot)
+        expected = d.deviation(f * d.projections / d.singular_values) * steps.list_scales(robot)
         # [m, rad] of 4e-6, second order
         np.testing.assert_allclose(values - robot.values, expected, rtol=0, atol=5e-10)
 
 
 def test_exact_measurements_give_the_true_parameters() -> None:
-    truth = draw_true_values(load_machine("3-PRS"), 2, 0)
-    exact = measure_machines("3-PRS", truth).with_noise(EXACT)
-    run = iterate(exact, penalize_none(33), np.arange(2))
+    truth = steps.draw_true_values(steps.load_machine("3-PRS"), 2, 0)
+    exact = steps.measure_machines("3-PRS", truth).with_noise(EXACT)
+    run = steps.iterate(exact, penalize_none(33), np.arange(2))
     assert run.is_converged.all()
     # [m, rad], rounding times 1 / 4e-4
     np.testing.assert_allclose(run.values, truth, rtol=0, atol=1e-9)
@@ -175,14 +142,14 @@ def test_exact_measurements_give_the_true_parameters() -> None:
 
 def test_tsvd_with_all_singular_values_equals_ls_in_a_batch_of_settings(tripod) -> None:
     ls, truncated = penalize_none(33), penalize_truncated(np.array([33, 22]), 33)
-    both = iterate(tripod, np.concatenate([ls, truncated])).values
+    both = steps.iterate(tripod, np.concatenate([ls, truncated])).values
     np.testing.assert_array_equal(both[0], both[1])
-    alone = iterate(tripod, truncated[1:]).values[0]
+    alone = steps.iterate(tripod, truncated[1:]).values[0]
     np.testing.assert_allclose(both[2], alone, rtol=0, atol=1e-13)
 
 
 def test_lambdas_up_to_1_have_equal_intervals_and_equal_ratios() -> None:
-    lambdas, equal = space_lambdas(1e-4)
+    lambdas, equal = steps.space_lambdas(1e-4)
     assert (lambdas[0], lambdas[-1]) == (1e-4, 1.0)
     assert np.ptp(np.diff(lambdas[equal])) < 1e-12
     assert np.ptp(np.diff(np.log(np.r_[lambdas[0], lambdas[~equal], 1.0]))) < 1e-12
@@ -192,14 +159,14 @@ def test_measurements_without_psi_keep_the_other_five_coordinates(tripod) -> Non
     five, six = (study.trials.measured[0] for study in (tripod.five, tripod))
     np.testing.assert_array_equal(five, six[..., :5])
     sigma = tripod.five.trials.instrument.sensors[0].noise.sigma
-    np.testing.assert_allclose(sigma, Uniform(LIMITS[:5]).sigma)
+    np.testing.assert_allclose(sigma, Uniform(steps.LIMITS[:5]).sigma)
 
 
 def test_ridge_steps_with_one_matrix_end_where_single_steps_do(tripod) -> None:
-    """60 steps of RE taken together give the errors of 60 single ones within a percent."""
+    """60 steps of steps.RE taken together give the errors of 60 single ones within a percent."""
     penalty = penalize_ridge(np.array([1e-3, 0.1, 10.0]), 33)
-    single = iterate(tripod, penalty, limit=60, ahead=0.0)
-    together = iterate(tripod, penalty, limit=60)
+    single = steps.iterate(tripod, penalty, limit=60, ahead=0.0)
+    together = steps.iterate(tripod, penalty, limit=60)
     assert (single.count == together.count).all()
     assert len(together.history) < 20
     first, second = (
@@ -210,7 +177,7 @@ def test_ridge_steps_with_one_matrix_end_where_single_steps_do(tripod) -> None:
 
 def test_ridge_runs_until_its_steps_are_small(tripod) -> None:
     penalty = penalize_ridge(np.array([1e-5, 1e-4, 1e-3]), 33)
-    run = iterate(tripod, penalty)
+    run = steps.iterate(tripod, penalty)
     assert run.is_converged.all()
     assert (run.count > [50, 500, 2000]).all()
     assert (run.count < LIMIT).all()
@@ -220,7 +187,7 @@ def test_ridge_runs_until_its_steps_are_small(tripod) -> None:
 
 
 def test_diverged_iteration_has_no_values_after_its_last_step(tripod) -> None:
-    run = iterate(tripod.five, penalize_none(33))
+    run = steps.iterate(tripod.five, penalize_none(33))
     assert run.is_diverged.all()
     assert np.isfinite(run.history[0]).all()
     for lost in (run.values, run.history[-1], run.steps[-1]):
@@ -245,13 +212,13 @@ def test_interior_minimum_is_lower_than_both_ends() -> None:
         ([np.inf, 2.0, 1.0, 2.0], True),  # diverged: no part of it
         ([np.inf, 1.0, 2.0], False),
     ):
-        assert (compute_rise(np.array(curve)) > GAIN) == is_inside
+        assert (steps.compute_rise(np.array(curve)) > steps.GAIN) == is_inside
 
 
 @pytest.mark.slow
 def test_same_seed_gives_the_same_numbers(results) -> None:
-    draws, again = results.draws[1], draw_machines("3-PRS", 0, 2)
-    for method in METHODS:  # a machine is the same however many there are
+    draws, again = results.draws[1], steps.draw_machines("3-PRS", 0, 2)
+    for method in steps.METHODS:  # a machine is the same however many there are
         first = draws.errors[method][:2]
         np.testing.assert_allclose(again.errors[method], first, rtol=1e-6)
 
@@ -270,23 +237,23 @@ def test_5_dof_measurement_leaves_one_combination_unidentifiable(
     assert five.singular_values[-2] > 1e-6
     (null,) = five.known.unidentifiable
     assert set(null.names) == parameters
-    assert five.answers[LS].is_diverged
+    assert five.answers[steps.LS].is_diverged
     # [mm] from an inverse that is rounding, which decides how large: 233 to more than 1,000
     assert five.normal_equations > 1e2
     assert six.normal_equations < 1e2
     # rank detection alone: as good as with 6-DOF
-    ranked, ls = five.answers[RANKED].errors[:2], six.answers[LS].errors[:2]
+    ranked, ls = five.answers[steps.RANKED].errors[:2], six.answers[steps.LS].errors[:2]
     np.testing.assert_allclose(ranked, ls, rtol=0.02)
-    assert (five.answers[PRIOR].errors[:2] < 1.2 * six.answers[PRIOR].errors[:2]).all()
+    assert (five.answers[steps.PRIOR].errors[:2] < 1.2 * six.answers[steps.PRIOR].errors[:2]).all()
 
 
 @pytest.mark.slow
 def test_tsvd_needs_fewest_iterations_and_ridge_most(results) -> None:
     for case in results.cases.values():
-        ls = case.answers[LS if case.study.freedoms == 6 else RANKED]
-        assert case.answers[TSVD].is_converged
-        assert case.answers[TSVD].iterations < ls.iterations
-        assert case.answers[RE].iterations > 100 * ls.iterations
+        ls = case.answers[steps.LS if case.study.freedoms == 6 else steps.RANKED]
+        assert case.answers[steps.TSVD].is_converged
+        assert case.answers[steps.TSVD].iterations < ls.iterations
+        assert case.answers[steps.RE].iterations > 100 * ls.iterations
     lambdas = [lam for _, lam, _ in results.ridge_steps]  # rise with the iterations
     assert lambdas == sorted(lambdas)
     assert lambdas[-1] > 5.0 * lambdas[0]
@@ -295,15 +262,17 @@ def test_tsvd_needs_fewest_iterations_and_ridge_most(results) -> None:
 @pytest.mark.slow
 def test_map_has_smaller_errors_than_raw_methods_on_drawn_machines(results) -> None:
     for drawn in results.draws:
-        for method in (RAW_LS, RAW_RE, RAW_TSVD):
-            assert (drawn.compute_ratio(PRIOR, method)[:2] < 1.1).all()
-            assert drawn.compute_ratio(PRIOR, method)[1] < 0.7  # in angle by far
+        for method in (steps.RAW_LS, steps.RAW_RE, steps.RAW_TSVD):
+            assert (drawn.compute_ratio(steps.PRIOR, method)[:2] < 1.1).all()
+            assert drawn.compute_ratio(steps.PRIOR, method)[1] < 0.7  # in angle by far
     tripod = results.draws[1]
-    assert (tripod.compute_ratio(PRIOR, CROSS)[:2] < 1.15).all()
-    assert (tripod.compute_ratio(PRIOR, HINDSIGHT)[:2] < 1.3).all()
-    np.testing.assert_allclose(tripod.compute_ratio(RAW_FIVE, RAW_LS)[:2], 1.0, rtol=0.02)
+    assert (tripod.compute_ratio(steps.PRIOR, steps.CROSS)[:2] < 1.15).all()
+    assert (tripod.compute_ratio(steps.PRIOR, steps.HINDSIGHT)[:2] < 1.3).all()
+    np.testing.assert_allclose(
+        tripod.compute_ratio(steps.RAW_FIVE, steps.RAW_LS)[:2], 1.0, rtol=0.02
+    )
     # parameters of least squares deviate although poses do not
-    ls, prior = (results.cases["3-PRS", 6].answers[m].errors for m in (WHITENED, PRIOR))
+    ls, prior = (results.cases["3-PRS", 6].answers[m].errors for m in (steps.WHITENED, steps.PRIOR))
     assert ls[0] < 0.01  # [mm]
     assert ls[3] > 10.0  # [tolerances]
     assert prior[3] < 1.0
@@ -336,7 +305,7 @@ def test_verdicts_on_curves_equal_comparisons_written_out_machine_by_machine(res
     for situation, u_shape in zip(situations, verdicts, strict=False):
         held = []
         for i in range(DRAWS):
-            ridge, truncated = (situation.curves[a][i, :, :2] for a in (RE, TSVD))
+            ridge, truncated = (situation.curves[a][i, :, :2] for a in (steps.RE, steps.TSVD))
             tsvd, re = (x[np.argmin(x[:, 0] * x[:, 1])] for x in (truncated[1:], ridge[1:]))
             best[i] &= bool((tsvd <= re).all() and (tsvd <= truncated[0]).all())
             usable = [curve[np.isfinite(curve)] for curve in (*ridge.T, *truncated.T)]
@@ -345,7 +314,7 @@ def test_verdicts_on_curves_equal_comparisons_written_out_machine_by_machine(res
     assert next(v for v in verdicts if v.name == "tsvd_best").draws == tuple(best)
 
 
-def draw_random(draws: Draws, rng: np.random.Generator, spread: float) -> Draws:
+def draw_random(draws: steps.Draws, rng: np.random.Generator, spread: float) -> steps.Draws:
     """Return random errors and iterations at the same settings."""
     made = randomize(draws, rng, spread, ())
     six, five = (
@@ -379,11 +348,11 @@ def test_tables_and_figures_show_diverged_fits_as_diverged(results) -> None:
         assert np.isfinite(cells).all(), table.name
         assert table.text()
     for name, number in (("3_prs", 8), ("ru_pus_prs", 7)):
-        end = [row for row in tables[f"history_{name}_5"].rows if row[0] == LS][-1]
+        end = [row for row in tables[f"history_{name}_5"].rows if row[0] == steps.LS][-1]
         assert set(end[2:]) == {DIVERGED}
-        (row,) = (row for row in tables[f"table_{number}"].rows if row[:2] == ("5-DOF", LS))
+        (row,) = (row for row in tables[f"table_{number}"].rows if row[:2] == ("5-DOF", steps.LS))
         assert row[3:9] == (DIVERGED,) * 6
-    assert np.isnan(collect_history(results.cases["3-PRS", 5], LS)[1][-1]).all()
+    assert np.isnan(collect_history(results.cases["3-PRS", 5], steps.LS)[1][-1]).all()
     figures = {figure.name: figure for figure in content.figures}
     assert {f"figure_{n}{part}" for n in (6, 8, 10, 11) for part in "ab"} <= set(figures)
     for figure in figures.values():
@@ -400,10 +369,10 @@ def test_tables_state_accuracy_after_commanding(results) -> None:
         table = make_medians(draws)
         place = table.columns.index("phi and theta after commanding [deg]")
         rows: dict[Any, Any] = {row[0]: row for row in table.rows}
-        assert rows[TRUE][place] < 1e-9
-        assert rows[BEFORE][place] > 10.0 * rows[PRIOR][place] > 0.0
-        assert rows[PRIOR][place - 1] == pytest.approx(rows[TRUE][place - 1], rel=0.1)
-        assert rows[HINDSIGHT][place] is None
+        assert rows[steps.TRUE][place] < 1e-9
+        assert rows[steps.BEFORE][place] > 10.0 * rows[steps.PRIOR][place] > 0.0
+        assert rows[steps.PRIOR][place - 1] == pytest.approx(rows[steps.TRUE][place - 1], rel=0.1)
+        assert rows[steps.HINDSIGHT][place] is None
         assert "true spread" in table.note
     assert make_median_curves(results.draws[0].five).rows[0][2] == DIVERGED
 
@@ -421,18 +390,20 @@ def test_evidence_map_is_better_than_raw_methods_and_near_gcv_and_hindsight() ->
     document = load_evidence("three_prs_draws")
     assert document["draws"] >= 100
     for ratio, low, high in ((1, 2, 3), (4, 5, 6)):  # position, angle
-        for method in (RAW_LS, RAW_RE, RAW_TSVD):
+        for method in (steps.RAW_LS, steps.RAW_RE, steps.RAW_TSVD):
             assert read_column(document, "ratios", high)[f"MAP over {method}"] < 1.0
-        assert read_column(document, "ratios", ratio)[f"MAP over {CROSS}"] < 1.05
-        assert read_column(document, "ratios", ratio)[f"MAP over {HINDSIGHT}"] < 1.15
+        assert read_column(document, "ratios", ratio)[f"MAP over {steps.CROSS}"] < 1.05
+        assert read_column(document, "ratios", ratio)[f"MAP over {steps.HINDSIGHT}"] < 1.15
         # nothing beats hindsight; where both are the same fit, they agree to the end of a descent
-        assert read_column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0 - 1e-9
+        assert read_column(document, "ratios", low)[f"MAP over {steps.HINDSIGHT}"] >= 1.0 - 1e-9
 
 
 @pytest.mark.evidence
 def test_evidence_map_with_tolerances_that_are_too_small_is_worse_than_raw_tsvd() -> None:
     medians = read_column(load_evidence("three_prs_draws"), "medians", 1)  # position
-    assert medians[NARROW] > medians[RAW_TSVD] > medians[WIDE] > medians[PRIOR]
+    assert (
+        medians[steps.NARROW] > medians[steps.RAW_TSVD] > medians[steps.WIDE] > medians[steps.PRIOR]
+    )
 
 
 @pytest.mark.evidence
@@ -444,18 +415,18 @@ def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_is_as_accurate() ->
             assert min(inside["machines"] for inside in algorithm.values()) > 70
     for number in (1, 3):  # position, angle
         medians = read_column(document, "medians", number)
-        assert medians[RAW_FIVE] == pytest.approx(medians[RAW_LS], rel=0.02)
-        assert medians[WHITENED_FIVE] == pytest.approx(medians[WHITENED], rel=0.05)
-        assert medians[PRIOR_FIVE] == pytest.approx(medians[PRIOR], rel=0.1)
+        assert medians[steps.RAW_FIVE] == pytest.approx(medians[steps.RAW_LS], rel=0.02)
+        assert medians[steps.WHITENED_FIVE] == pytest.approx(medians[steps.WHITENED], rel=0.05)
+        assert medians[steps.PRIOR_FIVE] == pytest.approx(medians[steps.PRIOR], rel=0.1)
 
 
 @pytest.mark.evidence
 def test_evidence_position_after_commanding_is_that_of_the_true_parameters() -> None:
     for name in ("three_prs_draws", "ru_pus_prs_draws"):
         position, angle = (read_column(load_evidence(name), "medians", i) for i in (7, 8))
-        assert position[PRIOR] == pytest.approx(position[TRUE], rel=0.01)
-        assert angle[TRUE] == 0.0
-        assert angle[PRIOR] < 0.05 * angle[BEFORE]
+        assert position[steps.PRIOR] == pytest.approx(position[steps.TRUE], rel=0.01)
+        assert angle[steps.TRUE] == 0.0
+        assert angle[steps.PRIOR] < 0.05 * angle[steps.BEFORE]
 
 
 @pytest.mark.evidence
@@ -467,5 +438,5 @@ def test_evidence_curves_of_the_ru_pus_prs_are_u_shaped_in_angle_only() -> None:
             assert algorithm["phi and theta [deg]"]["machines"] > 0.8 * document["draws"]
             assert not algorithm["position [mm]"]["median"]
             assert algorithm["position [mm]"]["machines"] < 0.3 * document["draws"]
-    for method in (RAW_LS, RAW_RE, RAW_TSVD):
+    for method in (steps.RAW_LS, steps.RAW_RE, steps.RAW_TSVD):
         assert read_column(document, "ratios", 4)[f"MAP over {method}"] < 1.0

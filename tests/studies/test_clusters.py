@@ -35,21 +35,20 @@ def compute(folder: Path, executor: Executor) -> Contents:
 
 
 @pytest.mark.slow
-def test_every_kind_of_worker_computes_identical_blocks(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")  # of the workers of ray
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+def test_dask_computes_identical_blocks(tmp_path) -> None:
     expected = compute(tmp_path / "serial", Serial())
     assert len(expected) == CELLS * 4
     assert len(set(expected.values())) == len(expected)
     with make_cluster(2) as cluster:
         assert compute(tmp_path / "dask", Dask(cluster.scheduler_address)) == expected
-    assert compute(tmp_path / "ray", Ray(processors=2)) == expected
 
 
 @pytest.mark.evidence
-def test_ray_survives_lost_workers_and_passes_errors_on(tmp_path, monkeypatch) -> None:
-    """Ray takes half a minute to replace lost workers; those of dask and of processes are lost in
-    test_execution.py.
+def test_ray_computes_identical_blocks_survives_lost_workers_and_passes_errors_on(
+    tmp_path, monkeypatch
+) -> None:
+    """Ray takes a quarter of a minute to start and half a minute to replace lost workers; those of
+    dask and of processes are lost in test_execution.py.
     """
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
@@ -57,6 +56,7 @@ def test_ray_survives_lost_workers_and_passes_errors_on(tmp_path, monkeypatch) -
 
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     try:
+        assert compute(tmp_path / "ray", Ray()) == compute(tmp_path / "serial", Serial())
         answers = collect(Ray().map_blocks(draw_numbers, list_tasks(20)))
         check_numbers(answers, 20)
         check_numbers(collect(Ray().map_blocks(die_once, list_tasks(8, tmp_path))), 8)

@@ -278,7 +278,7 @@ def test_a_study_without_threads_is_refused(tmp_path) -> None:
 @pytest.mark.slow
 def test_study_survives_killed_drivers_and_workers(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
-    counts = examine(tmp_path, Disturbance(replicates=60, block=5, kills=2), Serial())
+    counts = examine(tmp_path, Disturbance(replicates=30, block=5, kills=2), Serial())
     counts = {name: counts[name] for name in counts if name not in ("trials", "blocks")}
     assert counts == {
         "lost": 0, "doubled": 0, "different": 0, "driver_kills": 1, "worker_kills": 1,

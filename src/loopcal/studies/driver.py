@@ -206,10 +206,8 @@ def run_blocks(
     """Compute and store the blocks of a study that are missing in its store, each as soon as it is
     there; `threads` compute a block, in each worker.
 
-    Raises
-    ------
-    FileError : a block cannot be stored. StudyError, LoopcalError : see `Executor.map_blocks` and
-        `compute_block`.
+    Raises FileError: a block cannot be stored. StudyError, LoopcalError: see `Executor.map_blocks`
+    and `compute_block`.
     """
     begin = time.perf_counter()
     total, before = count_blocks(study, share), count_stored(study, store, share)
@@ -308,9 +306,7 @@ def estimate_time(
 ) -> TimeEstimate:
     """Compute a block of some cells, evenly spread over the study, and estimate the whole.
 
-    Raises
-    ------
-    LoopcalError : one of these cells cannot be computed; the text names it.
+    Raises LoopcalError: one of these cells cannot be computed; the text names it.
     """
     last = len(study.cells) - 1
     chosen = range(last + 1)

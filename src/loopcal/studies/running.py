@@ -131,10 +131,8 @@ def calibrate_trial(
     A second folder beside it, `NAME-input`, gets the robot file, the measurements and the true
     machine, for `loopcal calibrate`.
 
-    Raises
-    ------
-    DataError : the study has no such cell or trial. FileError : a folder cannot be used.
-    LoopcalError : the calibration is refused; the text says why.
+    Raises DataError: the study has no such cell or trial. FileError: a folder cannot be used.
+    LoopcalError: the calibration is refused; the text says why.
     """
     study = read_study(folder)
     simulated = replay_trial(study, cell, trial)

@@ -206,9 +206,7 @@ class StudyStore:
         """Store a block in one transaction, with its number in its cell, its scores (B, s) and the
         seconds of its computation; return whether it is new.
 
-        Raises
-        ------
-        FileError : it cannot be written, as on a full disk. Then nothing of it is stored.
+        Raises FileError: it cannot be written, as on a full disk. Then nothing of it is stored.
         """
         assert scores.shape == (len(scores), self.width), scores.shape
         content = np.ascontiguousarray(scores, dtype="<f8").tobytes()
@@ -288,9 +286,7 @@ def _name_cell(levels: Levels) -> str:
 def make_store(folder: Path, header: StoreHeader) -> None:
     """Make an empty store in a folder.
 
-    Raises
-    ------
-    FileError : it cannot be written, or the folder is on a network file system.
+    Raises FileError: it cannot be written, or the folder is on a network file system.
     """
     path = folder / NAME
     refuse_network(folder)
@@ -303,10 +299,8 @@ def make_store(folder: Path, header: StoreHeader) -> None:
 def open_store(folder: Path) -> Iterator[StudyStore]:
     """Open the store of a folder to write it, as its only driver.
 
-    Raises
-    ------
-    FileError : there is none, another driver has it, it is of another format, or on a network file
-        system.
+    Raises FileError: there is none, another driver has it, it is of another format, or on a network
+    file system.
     """
     path = _find_store(folder)
     refuse_network(folder)
@@ -328,9 +322,7 @@ def open_store(folder: Path) -> Iterator[StudyStore]:
 def read_store(folder: Path) -> Iterator[StudyStore]:
     """Open the store of a folder to read it, also while a driver writes it.
 
-    Raises
-    ------
-    FileError : there is none, or it is of another format.
+    Raises FileError: there is none, or it is of another format.
     """
     path = _find_store(folder)
     # a copy on a network file system can be read where no driver has left an unfinished log

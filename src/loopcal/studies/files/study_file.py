@@ -330,9 +330,7 @@ def _check_errors(level: ErrorsLevel, robots: Sequence[Mechanism]) -> None:
 def write_template(path: Path, robot: str) -> None:
     """Write a study file with a comment for each setting, for a shipped robot or a robot file.
 
-    Raises
-    ------
-    FileError : there is no such robot, it cannot be read, or the file cannot be written.
+    Raises FileError: there is no such robot, it cannot be read, or the file cannot be written.
     """
     load_robot(robot)
     text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")

@@ -59,10 +59,8 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
     resume : a folder of the same study is continued. The study may have more replicates or further
         levels than there.
 
-    Raises
-    ------
-    FileError : the folder contains something else, or another study, or (without `resume`) any; or
-        see `open_store`.
+    Raises FileError: the folder contains something else, or another study, or (without `resume`)
+    any; or see `open_store`.
     """
     if (folder / NAME).is_file():
         if not resume:
@@ -104,9 +102,7 @@ def _continue_study(folder: Path, source: StudySource) -> Iterator[StudyStore]:
 def extend_study(folder: Path, replicates: int | None = None) -> Iterator[StudyStore]:
     """Open the folder of a study as its driver, with more replicates where these are given.
 
-    Raises
-    ------
-    FileError : fewer replicates than before; or see `open_store`.
+    Raises FileError: fewer replicates than before; or see `open_store`.
     """
     study = read_study(folder)
     if replicates is not None:
@@ -124,9 +120,7 @@ def read_study(folder: Path) -> Study:
 def load_specification(store: StudyStore) -> Study:
     """Return the study of a store; settings that are new in this version have their defaults.
 
-    Raises
-    ------
-    FileError : another version made it, whose blocks or settings differ.
+    Raises FileError: another version made it, whose blocks or settings differ.
     """
     header, part, known = store.header, NUMERICS_PART, str(NUMERICS)
     try:
@@ -196,9 +190,7 @@ def merge_studies(
     """Copy the blocks of several folders of one study, which jobs computed, into one folder that is
     made or continued, and return how many are new.
 
-    Raises
-    ------
-    FileError : a part is of another study or damaged, or a folder cannot be used.
+    Raises FileError: a part is of another study or damaged, or a folder cannot be used.
     """
     studies = [read_study(part) for part in part_folders]
     first, largest = max(enumerate(studies), key=lambda item: item[1].replicates)

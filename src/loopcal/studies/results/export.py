@@ -29,9 +29,8 @@ def export_trials(
     ----------
     path : its ending decides the format. It is written whole or not at all.
 
-    Raises
-    ------
-    DataError : another ending. FileError : it cannot be written. StudyError : pyarrow is missing.
+    Raises DataError: another ending. FileError: it cannot be written. StudyError: pyarrow is
+    missing.
     """
     ending = path.suffix.lower()
     if ending not in (".csv", ".parquet"):

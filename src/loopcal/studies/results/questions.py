@@ -134,9 +134,7 @@ def answer_question(
 ) -> AnsweredQuestion:
     """Return the answers of the stored trials, one for each combination of the other factors.
 
-    Raises
-    ------
-    DataError : see `check_question`.
+    Raises DataError: see `check_question`.
     """
     limit, factor = check_question(study, question), question.factor
     chains = list_chains(study, factor)
@@ -320,9 +318,7 @@ UNITS = {"m": find_unit("mm"), "rad": find_unit("mrad"), "1": find_unit("1")}
 def list_shown(study: Study, summary: StudySummary, names: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the scores to show: those with these names, or `SHOWN` as far as they differ from 0.
 
-    Raises
-    ------
-    DataError : a score that the study does not have.
+    Raises DataError: a score that the study does not have.
     """
     find_columns(study, names)
 

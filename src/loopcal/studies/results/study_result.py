@@ -189,9 +189,7 @@ class StudyResult(TableResult):
 def find_columns(study: Study, names: Sequence[str] | None = None) -> tuple[int, ...]:
     """Return the places of scores by their names; of all by default.
 
-    Raises
-    ------
-    DataError : a score that the study does not have.
+    Raises DataError: a score that the study does not have.
     """
     known = [column.name for column in study.columns]
     for name in names or ():

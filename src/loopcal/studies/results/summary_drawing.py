@@ -104,9 +104,7 @@ def choose_layout(study: Study, factor: str | None = None) -> Layout:
     """Return which factor goes where; the axis is `factor`, by default the varied one with the most
     levels that have an order.
 
-    Raises
-    ------
-    DataError : an unknown factor.
+    Raises DataError: an unknown factor.
     """
     factors = tuple(study.levels)
     if factor is not None and factor not in factors:
@@ -206,9 +204,7 @@ def draw_score(
     ----------
     factor : along the axis; default: the varied one with the most levels that have an order.
 
-    Raises
-    ------
-    DataError : an unknown score or factor, or more than `MOST_PANELS` panels.
+    Raises DataError: an unknown score or factor, or more than `MOST_PANELS` panels.
     """
     (place,) = find_columns(study, [score])
     layout = choose_layout(study, factor)
@@ -244,9 +240,7 @@ def render_figures(
     """Return name of a file -> its figure, of each score; none of a study with too many cells for a
     figure, unless the factor is stated.
 
-    Raises
-    ------
-    DataError : see `draw_score`.
+    Raises DataError: see `draw_score`.
     """
     is_too_large = len(_group(summary, choose_layout(study, factor))) > MOST_PANELS
     if factor is None and is_too_large:

@@ -99,9 +99,8 @@ def compute_block(task: BlockTask, threads: int = 1) -> BlockResult:
     It is a pure function of `task.content`: the same numbers to the last bit in every process, for
     every number of threads and workers.
 
-    Raises
-    ------
-    LoopcalError : the cell cannot be simulated at all, such as a kind that the robot does not have.
+    Raises LoopcalError: the cell cannot be simulated at all, such as a kind that the robot does not
+    have.
     """
     content = json.loads(task.content)
     cell, trials, fits = calibrate_block(content, threads)
@@ -369,9 +368,7 @@ def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
     """Return a trial of a cell, to the last bit; trials of a cell are numbered from 0, over all of
     its blocks.
 
-    Raises
-    ------
-    DataError : the study has no such cell or trial.
+    Raises DataError: the study has no such cell or trial.
     """
     for name, number, count in (
         ("cell", cell, len(study.cells)),

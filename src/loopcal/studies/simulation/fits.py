@@ -161,9 +161,7 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
     """Calibrate all trials by a method of published studies, whose intervals do not exist; a trial
     that fails does not stop the others.
 
-    Raises
-    ------
-    DataError : products of points that are not held on planes and lines.
+    Raises DataError: products of points that are not held on planes and lines.
     """
     method, robot, t = cell.method, cell.robot, len(trials)
     rank = nothing = np.full(t, np.nan)

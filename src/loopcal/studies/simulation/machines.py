@@ -61,9 +61,7 @@ def build_robot_of(text: str) -> Mechanism:
 def change_tolerances(robot: Mechanism, errors: ErrorsLevel) -> Mechanism:
     """Return a robot with the tolerances of a level, which the fit knows.
 
-    Raises
-    ------
-    DataError : a pattern that no parameter has, or a quantity of another dimension.
+    Raises DataError: a pattern that no parameter has, or a quantity of another dimension.
     """
     table, factor = robot.parameters, errors.tolerance_factor
     stated = resolve_patterns(table, errors.tolerances)
@@ -101,9 +99,7 @@ def draw_machines(robot: Mechanism, errors: ErrorsLevel, n_trials: int, seed: Se
 def resolve_patterns(table: ParameterTable, values: Mapping[str, str]) -> dict[str, float]:
     """Return name -> value [SI] of quantities by name or pattern; the last that fits counts.
 
-    Raises
-    ------
-    DataError : as for `change_tolerances`.
+    Raises DataError: as for `change_tolerances`.
     """
     resolved: dict[str, float] = {}
     for pattern, text in values.items():
@@ -128,9 +124,7 @@ SURFACES = {"plane", "line"}
 def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
     """Return the instrument of a level, with its sigmas times the factor of the noise.
 
-    Raises
-    ------
-    DataError : as `build_instrument`, or an unused column that it does not measure.
+    Raises DataError: as `build_instrument`, or an unused column that it does not measure.
     """
     instrument = build_instrument(
         InstrumentDescription(
@@ -159,9 +153,7 @@ def place_instrument(
     """Return an instrument at its poses (n, c): on the planes and lines of their groups, where the
     level puts them there.
 
-    Raises
-    ------
-    DataError : points on planes and lines, and an instrument for something else.
+    Raises DataError: points on planes and lines, and an instrument for something else.
     """
     if not level.is_on_surfaces:
         return instrument

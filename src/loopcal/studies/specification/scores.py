@@ -78,10 +78,8 @@ MORE_IS_BETTER = ("covered_", "rank")
 def check_question(study: Study, question: Question) -> float:
     """Return the limit of a question [SI].
 
-    Raises
-    ------
-    DataError : a factor or a score that the study does not have, a factor whose levels have no
-        order, a score of which more is better, or a limit in another unit.
+    Raises DataError: a factor or a score that the study does not have, a factor whose levels have
+    no order, a score of which more is better, or a limit in another unit.
     """
     factors = tuple(FACTORS.values())
     if question.factor not in factors:
