@@ -17,7 +17,7 @@ from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.studies.simulation.preparation import AlteredNoise
+from loopcal.studies.simulation.machines import AlteredNoise
 from loopcal.studies.specification.levels import EffectsLevel, Outliers
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from loopcal.diagnose import residual_patterns
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.estimate import prior_conflict, residual_test
 from loopcal.measure.instrument import Gaussian
-from loopcal.studies.simulation.preparation import AlteredNoise
+from loopcal.studies.simulation.machines import AlteredNoise
 
 SCRIPTS = {"linear-delta": "delta", "five-bar": "five_bar", "hexapod-42": "hexapod"}
 

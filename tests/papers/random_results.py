@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.mechanism.model import Mechanism
-from loopcal.papers.claims import Verdict
-from loopcal.papers.published import last_digit
+from loopcal.papers.published import Verdict, last_digit
 
 SPREADS = (20.0, 1.0, 0.1, 1e-3)
 """Standard deviations of the logarithms of random factors: any numbers, and similar ones. Whole

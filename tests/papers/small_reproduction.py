@@ -3,8 +3,7 @@
 
 import numpy as np
 
-from loopcal.papers.claims import OWN_CHECK, Verdict
-from loopcal.papers.published import Comparison, Figure, Printed, Series, Table
+from loopcal.papers.published import OWN_CHECK, Comparison, Figure, Printed, Series, Table, Verdict
 from loopcal.papers.reproduction import Content, Reproduction
 
 MADE_BY = {"command": ["loopcal", "reproduce", "small"], "versions": {"loopcal": "1", "numpy": "2"}}

@@ -12,9 +12,8 @@ import pytest
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.json_text import to_json
-from loopcal.papers.claims import Claim, Verdict
 from loopcal.papers.paper import PAPERS, Paper, find_paper
-from loopcal.papers.published import Figure, Series
+from loopcal.papers.published import Claim, Figure, Series, Verdict
 from loopcal.papers.reproduction import choose_styles, draw, write_folder, write_page
 from tests.papers.small_reproduction import MADE_BY, build_reproduction
 

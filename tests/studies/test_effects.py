@@ -13,7 +13,7 @@ from loopcal.measure.instrument import Gaussian, Uniform, make_random_stream
 from loopcal.measure.simulation import Disturbance, sample_truth, simulate_trials
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.studies.simulation.preparation import (
+from loopcal.studies.simulation.machines import (
     AlteredNoise,
     alter_noise,
     draw_motion,

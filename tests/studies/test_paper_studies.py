@@ -21,8 +21,7 @@ from loopcal.studies.simulation.block import (
     set_size,
 )
 from loopcal.studies.simulation.fits import OUTCOMES
-from loopcal.studies.simulation.machines import draw_machines
-from loopcal.studies.simulation.preparation import prepare_cell
+from loopcal.studies.simulation.machines import draw_machines, prepare_cell
 from loopcal.studies.specification.levels import (
     ErrorsLevel,
     InstrumentLevel,

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.outputs import FolderKind, write_result_folder
-from loopcal.papers.claims import Verdict
-from loopcal.papers.published import Comparison, Figure, Table
+from loopcal.papers.published import Comparison, Figure, Table, Verdict
 from loopcal.report.pictures import render_figure
 from loopcal.results import serialization
 

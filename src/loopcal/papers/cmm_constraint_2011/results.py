@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.papers.claims import Verdict
 from loopcal.papers.cmm_constraint_2011 import steps
 from loopcal.papers.cmm_constraint_2011.steps import (
     ABSOLUTE,
@@ -25,7 +24,7 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     SET,
     Draw,
 )
-from loopcal.papers.published import Comparison, Figure, PaperText, Printed, Series, Table
+from loopcal.papers.published import Comparison, Figure, PaperText, Printed, Series, Table, Verdict
 from loopcal.papers.reproduction import Content
 from loopcal.typing import FloatArray
 
@@ -126,9 +125,6 @@ def present(results: Results) -> Content:
     """Return the results as tables, verdicts and figures."""
     figures = (_draw_figure_4(results), _draw_figure_5(results), _draw_table_3(results))
     return Content(_compare_tables(results), make_tables(results), judge_claims(results), figures)
-
-
-# --- tables and figures -------------------------------------------------------------------------
 
 
 def _compare_tables(results: Results) -> tuple[Comparison, Comparison]:
@@ -288,9 +284,6 @@ def _draw_table_3(results: Results) -> Figure:
             x = [c.noise / MM for c in cells]
             lines.append(Series.of(f"{method}, errors of {given} mm", x, y))
     return TEXT.figure("table_3", lines, levels, trials=results.trials)
-
-
-# --- verdicts -----------------------------------------------------------------------------------
 
 
 def judge_claims(results: Results) -> tuple[Verdict, ...]:

@@ -116,9 +116,6 @@ The first six move all points as one body, which changes no distance and no angl
 """
 
 
-# --- robot, points, true machines ---------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class HeldOutPoses:
     """Poses that were not measured, at which identified machines are compared with true ones."""
@@ -254,9 +251,6 @@ def remove_gauge(robot: Mechanism, deviation: FloatArray) -> FloatArray:
     return deviation - (deviation @ basis) @ basis.T
 
 
-# --- ranks --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class GroupRank:
     """Rank of random groups. rows : their number. singular_values : (p,)."""
@@ -309,9 +303,6 @@ def compute_pair_rank(study: Study) -> tuple[int, int]:
         for i in plane for j in plane if i < j
     ])  # fmt: skip
     return len(group), int(np.linalg.matrix_rank(rows, rtol=1e-9))
-
-
-# --- calibrations -------------------------------------------------------------------------------
 
 
 Identified = tuple[Mapping[str, FloatArray], IntArray, Mapping[str, BoolArray]]
@@ -484,9 +475,6 @@ def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyP
     return FiftyPoints(groups, iterations, converged, statistics)
 
 
-# --- open questions: number of planes, meaning of variances, gauge of errors, weights ------------
-
-
 @dataclass(frozen=True, eq=False)
 class Arrangement:
     """A way to place 100 points."""
@@ -628,9 +616,6 @@ def compute_excess(stated: str, possible: tuple[float, float]) -> float:
     """Return by how much a stated number, itself rounded, is outside of what is possible."""
     half, (low, high) = 0.5 * last_digit(stated), possible
     return max(low - half - float(stated), float(stated) - high - half, 0.0)
-
-
-# --- surfaces as unknowns of the measurement ----------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.mechanism.solutions import inverse
-from loopcal.papers.claims import Verdict
 from loopcal.papers.hexapod_42 import steps
 from loopcal.papers.hexapod_42.steps import (
     MM,
@@ -22,7 +21,16 @@ from loopcal.papers.hexapod_42.steps import (
     Setup,
     to_table,
 )
-from loopcal.papers.published import Cell, Comparison, Figure, PaperText, Printed, Series, Table
+from loopcal.papers.published import (
+    Cell,
+    Comparison,
+    Figure,
+    PaperText,
+    Printed,
+    Series,
+    Table,
+    Verdict,
+)
 from loopcal.papers.reproduction import Content
 from loopcal.typing import FloatArray
 
@@ -105,9 +113,6 @@ def present(results: Results) -> Content:
     figures = (_draw_figure_4(results), _draw_noise(results))
     verdicts = judge_claims(results)
     return Content(tuple(results.comparisons.values()), make_tables(results), verdicts, figures)
-
-
-# --- tables and figures -------------------------------------------------------------------------
 
 
 def compare_tables(
@@ -248,9 +253,6 @@ def _draw_noise(results: Results) -> Figure:
         "noise": PRINTED.number("noise", "value"),
     }
     return TEXT.figure("noise", lines, marks, **data)
-
-
-# --- verdicts -----------------------------------------------------------------------------------
 
 
 def judge_claims(results: Results) -> tuple[Verdict, ...]:

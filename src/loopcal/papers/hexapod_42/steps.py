@@ -190,9 +190,6 @@ def compute_rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-# --- the ten steps ------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Iterations:
     """Result of steps 4 to 10. Index k is the state after k iterations, 0 the nominal machine."""
@@ -258,9 +255,6 @@ def integrate_errors(errors: FloatArray) -> FloatArray:
     """
     lengths, angles = (np.linalg.norm(part, axis=2) for part in (errors[..., :3], errors[..., 3:]))
     return (lengths / MM + angles).max(axis=1)
-
-
-# --- noise, methods and poses, many draws -------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,9 +393,6 @@ def compute_explained_share(setup: Setup, residuals: FloatArray) -> FloatArray:
 
 def _linearize_truth(setup: Setup) -> LegForm:
     return LegForm.at(setup.truth, forward(setup.truth, setup.commanded.q, setup.commanded))
-
-
-# --- the origin of Table 4 ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,16 @@ import numpy as np
 
 from loopcal.estimate.published_steps import LINEARIZATIONS
 from loopcal.mechanism.model import Mechanism
-from loopcal.papers.claims import Verdict
-from loopcal.papers.published import Cell, Comparison, Figure, PaperText, Printed, Series, Table
+from loopcal.papers.published import (
+    Cell,
+    Comparison,
+    Figure,
+    PaperText,
+    Printed,
+    Series,
+    Table,
+    Verdict,
+)
 from loopcal.papers.reproduction import Content
 from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.steps import (
@@ -105,9 +113,6 @@ def present(results: Results) -> Content:
     """Return the results as tables, verdicts and figures."""
     counts = _compare_counts(results)
     return Content((counts,), make_tables(results), judge_claims(results), make_figures(results))
-
-
-# --- tables -------------------------------------------------------------------------------------
 
 
 def show_number(value: float) -> Cell:
@@ -320,9 +325,6 @@ def to_document(draws: Draws, seed: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# --- figures ------------------------------------------------------------------------------------
-
-
 def collect_history(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
     """Return iterations (k + 1,) and identified errors (k + 1, p) [mm, rad] of LS, or of RE or TSVD
     at their best setting; NaN after a step that diverged.
@@ -433,9 +435,6 @@ def _draw_steps(results: Results) -> Figure:
             longest = max(longest, int(done.max(initial=0)))
     log = "xy" if longest > LONG else "y"
     return TEXT.figure("convergence", lines, {"end of the iteration": 1e-6}, "", log)
-
-
-# --- verdicts -----------------------------------------------------------------------------------
 
 
 Numbers = Mapping[str, Any]

@@ -123,9 +123,6 @@ HINDSIGHT_LAMBDAS = np.logspace(-2.5, 2.5, 11)
 RESAMPLES = 2000
 
 
-# --- machines and measurements ------------------------------------------------------------------
-
-
 class Labelled:
     """Base of what belongs to one structure, measured in 6 or 5 coordinates of a pose."""
 
@@ -150,6 +147,7 @@ class Study(Labelled):
     name: str  # of the structure in the paper
     robot: Mechanism  # as designed
     trials: Trials  # true machines and their measurements
+    freedoms: int = len(COLUMNS)  # measured coordinates of a pose, 6 or 5
 
     @property
     def kind(self) -> Component:
@@ -158,11 +156,6 @@ class Study(Labelled):
         assert isinstance(kind, Component)
         return kind
 
-    @property
-    def freedoms(self) -> int:
-        """Measured coordinates of a pose, 6 or 5."""
-        return len(self.kind.components)
-
     @cached_property
     def five(self) -> Study:
         """The same measurements without psi."""
@@ -170,9 +163,8 @@ class Study(Labelled):
         kind = replace(self.kind, components=self.kind.components[:5])
         sensor = replace(sensor, kind=kind, noise=lc.Uniform(LIMITS[:5]))
         instrument = lc.Instrument((sensor,))
-        return replace(
-            self, trials=replace(self.trials, instrument=instrument, measured=(measured,))
-        )
+        trials = replace(self.trials, instrument=instrument, measured=(measured,))
+        return replace(self, trials=trials, freedoms=5)
 
     def with_noise(self, noise: FloatArray) -> Study:
         """Return the same poses measured with a noise (36, c) [m, rad]."""
@@ -319,9 +311,6 @@ def draw_true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
     return np.array(values)
 
 
-# --- the steps ----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Iterations(RawSteps):
     """Result of the steps for t settings. machine : (t,) which machine was measured."""
@@ -357,9 +346,6 @@ def find_bottom(errors: FloatArray) -> int:
     """Return the place of the smallest product of position and angle error in (s, 2 or more)."""
     product = errors[:, 0] * errors[:, 1]
     return int(np.argmin(np.where(np.isnan(product), np.inf, product)))
-
-
-# --- one machine with the printed noise ---------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -502,9 +488,6 @@ def follow_ridge(
         best = find_bottom(errors)
         rows.append((count, float(lambdas[best]), errors[best]))
     return rows
-
-
-# --- many drawn machines ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

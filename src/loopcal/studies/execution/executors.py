@@ -154,7 +154,10 @@ def map_in_flight(
 
 @dataclass(frozen=True)
 class Processes:
-    """So many worker processes on this computer."""
+    """Worker processes on this computer.
+
+    workers : their number.
+    """
 
     workers: int
 

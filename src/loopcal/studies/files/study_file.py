@@ -163,9 +163,9 @@ def build_study(content: StudyContent) -> Study:
     factors: dict[str, Any] = {}
     for key in (key for key in LEVELS if key in values):
         record, factors[key] = LEVELS[key], {}
-        plain = getattr(record, "PLAIN", None)
+        plain: str = getattr(record, "PLAIN", "")
         for name, value, place in _list_items(content, key):
-            if plain is None and not isinstance(value, dict):
+            if not plain and not isinstance(value, dict):
                 raise file.error(
                     f"the level {name!r} of {key!r} must state its settings; write "
                     "'name: {setting: value}' lines",

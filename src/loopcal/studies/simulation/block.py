@@ -34,13 +34,15 @@ from loopcal.studies.simulation.fits import (
 )
 from loopcal.studies.simulation.machines import (
     CellPoses,
+    PreparedCell,
     compute_poses,
     describe_poses,
     draw_machines,
     hide_columns,
+    make_disturbance,
     measure_held_points,
+    prepare_cell,
 )
-from loopcal.studies.simulation.preparation import PreparedCell, make_disturbance, prepare_cell
 from loopcal.studies.specification.levels import MethodLevel
 from loopcal.studies.specification.scores import list_columns
 from loopcal.studies.specification.study import Study, compute_key, describe_cell, format_json

@@ -40,8 +40,7 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.states import Status
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.studies.simulation.machines import make_fit_options
-from loopcal.studies.simulation.preparation import PreparedCell
+from loopcal.studies.simulation.machines import PreparedCell, make_fit_options
 from loopcal.studies.specification.levels import PER_LEG, MethodLevel
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
