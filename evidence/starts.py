@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.initial_values import evaluate_measurements, guess_nuisance_values, whiten_rows
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.directions import Autocollimation, Direction, Inclination
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.poses import Component, Pose
-from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.kinds.surfaces import Line, Plane, Sphere
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters

@@ -108,7 +108,6 @@ from .measure.instrument import Sensor as Sensor
 from .measure.instrument import Uniform as Uniform
 from .measure.kinds import KINDS as KINDS
 from .measure.kinds import register_kind as register_kind
-from .measure.kinds.bearing import Bearing as Bearing
 from .measure.kinds.directions import Autocollimation as Autocollimation
 from .measure.kinds.directions import Direction as Direction
 from .measure.kinds.directions import Inclination as Inclination
@@ -119,10 +118,11 @@ from .measure.kinds.joints import JointSensor as JointSensor
 from .measure.kinds.joints import Locked as Locked
 from .measure.kinds.kind import Column as Column
 from .measure.kinds.kind import Kind as Kind
-from .measure.kinds.points import TargetKind as TargetKind
 from .measure.kinds.poses import Component as Component
 from .measure.kinds.poses import Pose as Pose
+from .measure.kinds.position import Bearing as Bearing
 from .measure.kinds.position import Position as Position
+from .measure.kinds.position import TargetKind as TargetKind
 from .measure.kinds.surfaces import Line as Line
 from .measure.kinds.surfaces import Plane as Plane
 from .measure.kinds.surfaces import Sphere as Sphere

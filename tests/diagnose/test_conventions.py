@@ -29,13 +29,12 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.directions import Inclination
 from loopcal.measure.kinds.distance import Distance
 from loopcal.measure.kinds.joints import JointSensor
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.poses import Component, Pose
-from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import simulate
 from loopcal.mechanism.workspace import sample_workspace

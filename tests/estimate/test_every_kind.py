@@ -39,12 +39,11 @@ from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.directions import Inclination
 from loopcal.measure.kinds.distance import Separation
 from loopcal.measure.kinds.joints import Locked
 from loopcal.measure.kinds.poses import Component, Pose
-from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.solutions import inverse

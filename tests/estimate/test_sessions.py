@@ -20,9 +20,8 @@ from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import setup_parameters
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.poses import Pose
-from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import collect_nuisance_parameters

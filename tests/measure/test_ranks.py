@@ -11,11 +11,10 @@ import pytest
 from loopcal import geometry
 from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.directions import Autocollimation, Direction, Inclination
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.poses import Component, Pose
-from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.kinds.surfaces import Line, Plane, Sphere
 from loopcal.measure.simulation import simulate_trials
 from loopcal.mechanism.kinematics import forward_trials

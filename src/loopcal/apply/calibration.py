@@ -6,18 +6,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from loopcal.apply.calibration_findings import (
+from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
+from loopcal.apply.calibration_report import CalibrationReport, Provenance
+from loopcal.apply.error_budget import compute_error_budget
+from loopcal.apply.height_errors import map_height_errors
+from loopcal.apply.validation import Validation, validate
+from loopcal.apply.verdict import (
     report_fit,
     report_freedoms,
     report_scale,
     report_unexplained,
     report_validation,
 )
-from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
-from loopcal.apply.calibration_report import CalibrationReport, Provenance
-from loopcal.apply.error_budget import compute_error_budget
-from loopcal.apply.height_errors import map_height_errors
-from loopcal.apply.validation import Validation, validate
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame

@@ -8,11 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
-from loopcal.apply.calibration_findings import (
-    is_readings_alone,
-    report_readings_gauge,
-    sort_undetermined,
-)
+from loopcal.apply.verdict import is_readings_alone, report_readings_gauge, sort_undetermined
 from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
 from loopcal.diagnose.parameter_subset import (
     IdentifiableSubset,

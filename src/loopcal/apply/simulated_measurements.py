@@ -15,7 +15,7 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.measure.data_checks import check_strokes, find_outside_strokes
 from loopcal.measure.instrument import Gaussian, Instrument, Noise, Sensor, Uniform
 from loopcal.measure.kinds import KINDS
-from loopcal.measure.kinds.points import TargetKind
+from loopcal.measure.kinds.position import TargetKind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import (
     replace_measured_values,

@@ -13,8 +13,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
-from loopcal.measure.kinds.points import name_point
-from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.position import Position, name_point
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward

@@ -10,12 +10,11 @@ from loopcal.errors import DataError, LoopcalError
 from loopcal.measure.data_checks import check_duplicates, check_targets_move
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.directions import Autocollimation, Direction, Inclination
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.joints import JointSensor
 from loopcal.measure.kinds.poses import Component
-from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.kinds.surfaces import Line, Plane, Sphere
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations

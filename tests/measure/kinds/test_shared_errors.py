@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose
 from loopcal.errors import DataError
 from loopcal.measure.instrument import Gaussian, Sensor
 from loopcal.measure.kinds import KINDS
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.kind import measure_progress, update_setup_name
 from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Bearing
 from loopcal.measure.nuisance import collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from tests.measure.kinds.test_contract import (

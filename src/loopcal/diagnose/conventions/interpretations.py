@@ -19,9 +19,9 @@ import numpy as np
 from loopcal import geometry
 from loopcal.findings import Finding, report_finding
 from loopcal.geometry import OrientationForm, parse_orientation
-from loopcal.measure.kinds.bearing import Bearing
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Bearing
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.assembly import Actuator
 from loopcal.typing import BoolArray, FloatArray

@@ -29,7 +29,7 @@ from loopcal.io.data.kind_rows import KindRows, read_kinds
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export, list_headers
 from loopcal.io.exports.profile import Profile, check_columns
-from loopcal.measure.kinds.points import name_point
+from loopcal.measure.kinds.position import name_point
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism

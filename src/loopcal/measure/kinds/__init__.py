@@ -28,7 +28,7 @@ KINDS: Registry[type[Kind]] = Registry(
         "pose": "loopcal.measure.kinds.poses:Pose",
         "component": "loopcal.measure.kinds.poses:Component",
         "position": "loopcal.measure.kinds.position:Position",
-        "bearing": "loopcal.measure.kinds.bearing:Bearing",
+        "bearing": "loopcal.measure.kinds.position:Bearing",
         "distance": "loopcal.measure.kinds.distance:Distance",
         "separation": "loopcal.measure.kinds.distance:Separation",
         "plane": "loopcal.measure.kinds.surfaces:Plane",

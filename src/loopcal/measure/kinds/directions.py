@@ -26,7 +26,7 @@ from loopcal.measure.kinds.kind import (
     is_incomplete,
     list_rows,
 )
-from loopcal.measure.kinds.points import convert_camera_angles, predict_camera_angles
+from loopcal.measure.kinds.position import convert_camera_angles, predict_camera_angles
 from loopcal.measure.kinds.setup_parameters import make_perpendicular_basis
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension

@@ -25,7 +25,7 @@ from loopcal.measure.kinds.kind import (
     list_rows,
     name_shared_error,
 )
-from loopcal.measure.kinds.points import Prediction, TargetKind
+from loopcal.measure.kinds.position import Prediction, TargetKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension

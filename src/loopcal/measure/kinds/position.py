@@ -1,21 +1,201 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `position`: points of the platform in a frame, as a tracker measures reflectors or a CMM
-measures spheres.
+"""Kinds that measure points of the platform from a frame, and their base: targets, tips and probes.
+
+`position`, as a tracker measures reflectors or a CMM measures spheres; `bearing`, two angles by a
+theodolite or a camera.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
+from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.geometry import FLATNESS, align_point_sets, solve_frame_and_points, solve_least_squares
+from loopcal.geometry import (
+    FLATNESS,
+    align_point_sets,
+    solve_frame_and_points,
+    solve_least_squares,
+    solve_resection,
+)
+from loopcal.measure.array_checks import check_array, check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import POSITION_COLUMNS, Column
-from loopcal.measure.kinds.points import Prediction, TargetKind
+from loopcal.measure.kinds.kind import POSITION_COLUMNS, Column, Evaluation, Kind, checked
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
+
+# The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in the
+# frame, and (.., k, g, w) by the setup items that only this kind has.
+Prediction = tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]
+
+
+def name_point(pose: str, target: str, targets: Sequence[str]) -> str:
+    """Return the name of a measured point: POSE_TARGET, or POSE where there is one target."""
+    return f"{pose}_{target}" if len(targets) > 1 else pose
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class TargetKind(Kind):
+    """A kind that is a function of points p of the platform in a frame: `x = R_f' (R p + t - t_f)`.
+
+    With h = R p + t - t_f: `dx = R_f' (v + omega x R p) + R_f' R dp - R_f' (v_f + omega_f x h)`.
+
+    Parameters
+    ----------
+    targets : names of the k targets that one row measures. With several, columns are called `a.x`
+        and so on.
+    places : (k, 3) [m], targets on the platform; default: the origin of the robot's tool. If the
+        targets are unknown, these are their nominal values.
+    T_base_frame : (4, 4), frame of the instrument in the base; default: the base itself.
+    unknown : which of `allowed_unknown` are unknown. One value holds for a session (of a surface:
+        for a group of rows).
+    frame : name of the frame. Kinds that use the same name share its parameters.
+    of : stage of a chain on whose platform the targets are; default: the end platform. "base" (of
+        the kinds position, bearing and distance): the targets are fixed to the base. Their rows
+        belong to no pose, and unknown ones keep their places in all sessions.
+    """
+
+    targets: tuple[str, ...] = ("target",)
+    places: FloatArray | None = None
+    T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
+    unknown: tuple[str, ...] = ()
+    frame: str = "frame"
+    of: str = ""
+
+    measures_points: ClassVar[bool] = True
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "targets")
+    per_target: ClassVar[tuple[Column, ...]]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        targets = check_names(self.targets, "targets")
+        set_fields(self, targets=targets)
+        shape = (len(targets), 3)
+        if self.places is not None:
+            is_single_place = len(self.places) > 0 and np.ndim(self.places[0]) == 0
+            places = [self.places] if is_single_place else self.places
+            if len(places) != len(targets):
+                raise DataError(
+                    f"the number of places is {len(places)}, but there are {len(targets)} targets "
+                    f"({', '.join(targets)}); state one place [x, y, z] for each target"
+                )
+            set_fields(self, places=check_array(places, "the places of the targets", shape))
+        elif self.is_of_base and "targets" not in self.unknown:
+            raise DataError(
+                f"the places of {', '.join(targets)} on the base are neither stated nor unknown; "
+                "state `places` in the base frame, or list targets in `unknown`"
+            )
+        elif self.is_of_base:
+            set_fields(self, places=np.zeros(shape))
+
+    def with_tool(self, T_platform_tool: FloatArray) -> Self:
+        """Return the kind with its targets at the origin of the tool, or of the stage's platform,
+        unless it states their places.
+        """
+        if self.has_tool:
+            return self
+        origin = np.zeros(3) if self.of else T_platform_tool[:3, 3]
+        return replace(self, places=np.repeat(origin[None], len(self.targets), axis=0))
+
+    @property
+    def has_tool(self) -> bool:
+        """Whether places of the targets are stated; if they are unknown, their nominal values."""
+        return self.places is not None
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The columns of each target, with its name in front where there are several."""
+        if len(self.targets) == 1:
+            return self.per_target
+        return tuple(
+            Column(f"{target}.{column.name}", column.dimension)
+            for target in self.targets
+            for column in self.per_target
+        )
+
+    @property
+    def target_columns(self) -> Mapping[str, tuple[int, ...]]:
+        """The targets with the indices of their columns."""
+        g = len(self.per_target)
+        return {target: tuple(range(i * g, (i + 1) * g)) for i, target in enumerate(self.targets)}
+
+    @cached_property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Frame and targets; a kind adds the items that only it has."""
+        places = np.zeros((len(self.targets), 3)) if self.places is None else self.places
+        return {
+            "frame": setup.make_frame_item(self.frame, self.T_base_frame),
+            "targets": setup.make_points_item(
+                self.targets, places, "machine" if self.is_of_base else "session"
+            ),
+        }
+
+    @abstractmethod
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return the columns of targets x (.., k, 3) in the frame, and their derivatives."""
+
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
+        x, rows = self.locate_targets(T, values)
+        predicted, by_x, by_item = self.predict(x, values)
+        rows = by_x @ rows
+        if by_item:
+            rows = rows + self.join_columns(by_item, predicted.shape)
+        flat = (*predicted.shape[:-2], predicted.shape[-2] * predicted.shape[-1])
+        return self.split_columns(predicted.reshape(flat), rows.reshape(*flat, rows.shape[-1]))
+
+    def locate_targets(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return targets x (.., k, 3) in the frame and their derivative (.., k, 3, 6 + u), at poses
+        T (.., 4, 4).
+        """
+        k = len(self.targets)
+        of_frame, places = (self.item_values(values, name) for name in ("frame", "targets"))
+        frame = setup.place_frame(self.T_base_frame, of_frame)
+        p = self._stated_places() if places is None else places.reshape(*places.shape[:-1], k, 3)
+        R, Q = T[..., None, :3, :3], np.swapaxes(frame[..., None, :3, :3], -1, -2)
+        arm = (R @ p[..., None])[..., 0]
+        lever = arm + T[..., None, :3, 3] - frame[..., None, :3, 3]
+        identity = np.broadcast_to(np.eye(3), (*arm.shape, 3))
+        blocks = {"twist": Q @ np.concatenate([-geometry.hat(arm), identity], axis=-1)}
+        if of_frame is not None:
+            by_twist = Q @ np.concatenate([geometry.hat(lever), -identity], axis=-1)
+            blocks["frame"] = by_twist @ setup.linearize_frame(of_frame)[..., None, :, :]
+        if places is not None:
+            by_place = (Q @ R)[..., None, :] * np.eye(k)[:, None, :, None]
+            blocks["targets"] = by_place.reshape(*by_place.shape[:-4], k, 3, 3 * k)
+        return (Q @ lever[..., None])[..., 0], self.join_columns(blocks, lever.shape)
+
+    def collect_points(
+        self, T: FloatArray, measured: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return every measured target as a row, at nominal nuisance parameters: moving (q, 3, 3 k)
+        and origin (q, 3), by which `moving p + origin` is the point in the base with p the places
+        of all targets; these points (q, 3); and the measured columns (q, g).
+        """
+        k = len(self.targets)
+        moving = (T[:, None, :3, None, :3] * np.eye(k)[:, None, :, None]).reshape(-1, 3, 3 * k)
+        origin = np.repeat(T[:, :3, 3], k, axis=0)
+        columns = measured.reshape(-1, len(self.per_target))
+        complete = ~np.any(np.isnan(columns), axis=-1)
+        points = moving @ self._stated_places().ravel() + origin
+        return moving[complete], origin[complete], points[complete], columns[complete]
+
+    def to_frame(self, points: FloatArray) -> FloatArray:
+        """Return points (q, 3) of the base in the stated frame."""
+        return (points - self.T_base_frame[:3, 3]) @ self.T_base_frame[:3, :3]
+
+    def _stated_places(self) -> FloatArray:
+        if self.places is None:
+            raise DataError(
+                f"the kind {self.name!r} has no places of its targets: use "
+                "kind.with_tool(robot.tool), or state `places`"
+            )
+        return self.places
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -97,3 +277,110 @@ class Position(TargetKind):
             return False
         extent = np.linalg.svd(self.places - self.places.mean(axis=0), compute_uv=False)
         return len(self.places) > 2 and bool(extent[1] > FLATNESS * extent[0])
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Bearing(TargetKind):
+    """Two angles of each target. Residual: differences of angles, wrapped.
+
+    Theodolite: `azimuth = atan2(y, x)`, `elevation = atan2(z, hypot(x, y))`. Camera, whose optical
+    axis is z: `azimuth = atan2(x, z)`, `elevation = atan2(y, z)`.
+
+    Setup parameters: those of `Position`.
+
+    Parameters
+    ----------
+    form : "theodolite" or "camera".
+    Others : see `TargetKind`; "frame" (the station) and "targets" may be unknown.
+
+    Examples
+    --------
+    >>> kind = Bearing(places=np.array([[1.0, 1.0, 0.0]]))
+    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 2))).round(6)
+    array([[[0.785398, 0.      ]]])
+    """
+
+    form: str = "theodolite"
+
+    name: ClassVar[str] = "bearing"
+    per_target: ClassVar[tuple[Column, ...]] = (
+        Column("azimuth", Dimension.ANGLE),
+        Column("elevation", Dimension.ANGLE),
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.form not in ("theodolite", "camera"):
+            raise DataError(f"the form of a bearing is {self.form!r}; use theodolite or camera")
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a theodolite, a camera at an unknown station, and two targets."""
+        station = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+        behind = geometry.make_pose(np.eye(3), np.array([0.1, -0.1, -2.5]))
+        pair = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
+        return (
+            cls(T_base_frame=station),
+            cls(T_base_frame=behind, form="camera", unknown=("frame",), frame="camera"),
+            cls(
+                targets=("a", "b"),
+                places=pair,
+                T_base_frame=station,
+                unknown=("frame", "targets"),
+                frame="station",
+            ),
+        )
+
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return both angles."""
+        if self.form == "camera":
+            return (*predict_camera_angles(x), {})
+        a, b, c = x[..., 0], x[..., 1], x[..., 2]
+        flat = a * a + b * b
+        reach, level = flat + c * c, np.sqrt(flat)
+        # a target straight above or below the station has an azimuth without a slope: NaN, by
+        # which a fit refuses the row
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slopes = [
+                np.stack([-b / flat, a / flat, np.zeros_like(a)], axis=-1),
+                np.stack([-a * c / level, -b * c / level, level], axis=-1) / reach[..., None],
+            ]
+        angles = np.stack([np.arctan2(b, a), np.arctan2(c, level)], axis=-1)
+        return angles, np.stack(slopes, axis=-2), {}
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the station by resection, with the targets at their stated places."""
+        _, _, points, angles = self.collect_points(T, measured)
+        if "frame" not in self.unknown or len(angles) < 4 or self.is_of_base:
+            return self.nominal_values[None]
+        rays = convert_camera_angles(angles)
+        if self.form == "theodolite":
+            (azimuth, elevation), level = angles.T, np.cos(angles[:, 1])
+            rays = np.stack(
+                [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
+            )
+        frames = solve_resection(rays, points)
+        return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frames)})
+
+
+def predict_camera_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the angles `atan2(x, z)` and `atan2(y, z)` (.., 2) of vectors (.., 3) about an optical
+    axis z, and their derivatives (.., 2, 3).
+    """
+    a, b, c = x[..., 0], x[..., 1], x[..., 2]
+    zero = np.zeros_like(a)
+    across, up = a * a + c * c, b * b + c * c
+    slopes = [
+        np.stack([c / across, zero, -a / across], axis=-1),
+        np.stack([zero, c / up, -b / up], axis=-1),
+    ]
+    return np.stack([np.arctan2(a, c), np.arctan2(b, c)], axis=-1), np.stack(slopes, axis=-2)
+
+
+def convert_camera_angles(angles: FloatArray) -> FloatArray:
+    """Return the unit vectors (.., 3) of angles (.., 2)."""
+    first, second = angles[..., 0], angles[..., 1]
+    ray = np.stack([np.tan(first), np.tan(second), np.ones_like(first)], axis=-1)
+    # behind the camera the tangents belong to the opposite ray
+    ray = np.where((np.cos(first) < 0.0)[..., None], -ray, ray)
+    return ray / np.linalg.norm(ray, axis=-1, keepdims=True)

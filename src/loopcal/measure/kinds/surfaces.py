@@ -23,7 +23,7 @@ from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.directions import UPWARD
 from loopcal.measure.kinds.distance import measure_lengths
 from loopcal.measure.kinds.kind import Column, checked
-from loopcal.measure.kinds.points import Prediction, TargetKind
+from loopcal.measure.kinds.position import Prediction, TargetKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Length
