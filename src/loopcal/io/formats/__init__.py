@@ -24,8 +24,8 @@ FORMATS: Registry[Format] = Registry(
         "linuxcnc-ini": "loopcal.io.formats.linuxcnc:INI_FORMAT",
         "urdf": "loopcal.io.formats.urdf.urdf_format:FORMAT",
         "hangprinter": "loopcal.io.formats.hangprinter:FORMAT",
-        "json": "loopcal.io.formats.parameter_table:JSON",
-        "csv": "loopcal.io.formats.parameter_table:CSV",
+        "json": "loopcal.io.formats.import_export:JSON",
+        "csv": "loopcal.io.formats.import_export:CSV",
     },
 )
 """Name -> format, which is imported when it is looked up."""

@@ -20,12 +20,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.formats.program_format import (
+    MM,
     Exported,
     ExportSource,
     Format,
@@ -55,11 +57,11 @@ from loopcal.plain_text import quote
 if TYPE_CHECKING:
     from loopcal.measure.measurements import Measurements
 
-
-# The geometry of a linear delta in the mm and degrees of printer firmware, and its robot file.
-
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
 """Angles of the towers in firmware, before any correction [deg]."""
+
+Triple = tuple[float, ...]
+Words = dict[Name, float | str]
 
 
 @dataclass(frozen=True)
@@ -71,9 +73,9 @@ class DeltaGeometry:
     """
 
     radius: float
-    angles: tuple[float, ...]
-    arms: tuple[float, ...]
-    stops: tuple[float, ...]
+    angles: Triple
+    arms: Triple
+    stops: Triple
 
 
 ROBOT = """\
@@ -102,8 +104,8 @@ def format_robot(
         act = "the radius must be positive and every arm longer than it; correct them"
         raise FileError(f"{sentence} {min(geometry.arms):g} mm; {act}", path)
     half = round(0.5 * geometry.radius)
-    head = format_head(path, program, "linear-delta", options.name, ("mm", "deg"))
     is_taped = options.sigma_tape is not None
+    head = format_head(path, program, "linear-delta", options.name, ("mm", "deg"))
     return head + ROBOT.format(
         radius=geometry.radius,
         angles=list(geometry.angles),
@@ -119,9 +121,7 @@ def format_robot(
 def get_geometry(source: ExportSource, format_name: str, decimals: int) -> DeltaGeometry:
     """Return the geometry of a robot of the family linear-delta; DataError for another.
 
-    Parameters
-    ----------
-    decimals : that the firmware stores, the most that people type.
+    `decimals` : that the firmware stores, the most that people type.
     """
     get_record(source, LinearDelta, format_name, "a robot of the family linear-delta")
     values = source.values()
@@ -129,7 +129,7 @@ def get_geometry(source: ExportSource, format_name: str, decimals: int) -> Delta
     def convert(name: str, factor: float) -> float:
         return source.round_number(values[name] * factor, name, 1.0 / factor, decimals)
 
-    def list_towers(name: str, factor: float) -> tuple[float, ...]:
+    def list_towers(name: str, factor: float) -> Triple:
         return tuple(convert(name.format(k), factor) for k in (1, 2, 3))
 
     return DeltaGeometry(
@@ -140,8 +140,6 @@ def get_geometry(source: ExportSource, format_name: str, decimals: int) -> Delta
     )
 
 
-# Words of G-code commands in a file: read with their places, replaced, and added.
-
 COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
 FRONT = re.compile(r"\s*(?:ECHO:)?\s*(?:N\s*\d+)?")
 WORD = re.compile(r"\s*([A-Z])[ \t]*(\{[^}]*\}|[^A-Z\s{]*)")
@@ -150,10 +148,8 @@ CHECKSUM = re.compile(r"\*\s*\d*\s*$")
 UPPER = {ord(small): small.upper() for small in "abcdefghijklmnopqrstuvwxyz"}
 
 READ = ("M665", "M666", "M851")
-"""Commands whose words are read."""
-
 WITH_TEXT = ("M16", "M23", "M28", "M30", "M32", "M117", "M118")
-"""Commands that are followed by text."""
+"""Commands whose words are read, and commands that are followed by text."""
 
 
 @dataclass(frozen=True)
@@ -165,13 +161,32 @@ class GcodeFile(ValueFile):
 
     commands: Mapping[str, tuple[int, int]]
 
-    def describe_missing(self, group: str, name: str) -> str:
-        """Return the sentence about a word that does not exist."""
-        return f"{group} has no {name}; write it as {group} {name}.."
+    what = "G-code file"
+    missing = "{0} has no {1}; write it as {0} {1}.."
 
-    def with_lines(self, lines: Sequence[str]) -> GcodeFile:
-        """Return the file with other lines."""
-        return parse_gcode(lines, self.path)
+    @classmethod
+    def parse(cls, lines: Sequence[str], path: Path, is_one_in_a_line: bool = False) -> GcodeFile:
+        """Find the words; FileError for text that is not words, for a letter that occurs twice, and
+        for a second command in a line where the firmware runs only one.
+        """
+        words: dict[Name, Value] = {}
+        commands: dict[str, tuple[int, int]] = {}
+        for i, line in enumerate(lines):
+            for position, (command, letters, end, rest) in enumerate(_split_commands(line)):
+                commands[command] = (i, end)
+                if command not in READ:
+                    continue
+                if position and is_one_in_a_line:
+                    sentence = f"{command} is not the first command of this line"
+                    raise FileError(f"{sentence}; move it to its own line", path, i + 1)
+                if rest:
+                    sentence = f"{command} has {quote(rest)}, but a letter and its number are"
+                    raise FileError(f"{sentence} needed; correct it", path, i + 1)
+                for k, (letter, start, length) in enumerate(letters):
+                    if any(letter == other for other, *_ in letters[:k]):
+                        raise FileError(f"{command} has {letter} twice; remove one", path, i + 1)
+                    words[command, letter] = Value(line[start : start + length], i, start)
+        return cls(path, tuple(lines), words, commands)
 
     def insert(self, lines: list[str], name: Name, text: str) -> None:
         """Insert a new word behind the others of its command, or a new command at the end."""
@@ -193,49 +208,6 @@ class GcodeFile(ValueFile):
         return f"{text}*{reduce(xor, text.encode(), 0)}{line[len(code) :]}"
 
 
-def read_gcode(path: Path, one_in_a_line: bool = False) -> GcodeFile:
-    """Read a file.
-
-    Raises
-    ------
-    FileError : no M665, inches, or several commands in a line where the firmware runs only one.
-    """
-    file = parse_gcode(
-        read_text(path, "G-code file").splitlines(keepends=True), path, one_in_a_line
-    )
-    if "M665" not in file.commands:
-        raise FileError("no M665, the geometry of a delta, in this file; print it by M503", path)
-    if "G20" in file.commands:
-        sentence = "G20 selects inches; write the geometry in millimeters"
-        raise FileError(sentence, path, file.commands["G20"][0] + 1)
-    return file
-
-
-def parse_gcode(lines: Iterable[str], path: Path, one_in_a_line: bool = False) -> GcodeFile:
-    """Find the words; FileError for text that is not words, and for a letter that occurs twice."""
-    complete = tuple(lines)
-    words: dict[Name, Value] = {}
-    commands: dict[str, tuple[int, int]] = {}
-    for i, line in enumerate(complete):
-        for position, (command, letters, end, rest) in enumerate(_split_commands(line)):
-            commands[command] = (i, end)
-            if command not in READ:
-                continue
-            if position and one_in_a_line:
-                sentence = (
-                    f"{command} is not the first command of this line; move it to its own line"
-                )
-                raise FileError(sentence, path, i + 1)
-            if rest:
-                sentence = f"{command} has {quote(rest)}, but a letter and its number are needed"
-                raise FileError(f"{sentence}; correct it", path, i + 1)
-            for k, (letter, start, length) in enumerate(letters):
-                if any(letter == other for other, *_ in letters[:k]):
-                    raise FileError(f"{command} has {letter} twice; remove one", path, i + 1)
-                words[command, letter] = Value(line[start : start + length], i, start)
-    return GcodeFile(path, complete, words, commands)
-
-
 def _split_commands(line: str) -> Iterator[tuple[str, list[tuple[str, int, int]], int, str]]:
     """Yield the commands of a line: name, words (letter, column, length), end, other text."""
     code = CHECKSUM.sub("", _blank_asides(line).rstrip()).translate(UPPER)
@@ -254,12 +226,235 @@ def _split_commands(line: str) -> Iterator[tuple[str, list[tuple[str, int, int]]
 
 def _blank_asides(line: str) -> str:
     """Return a line of the same length, with blanks for remarks and no letters in quotes."""
+    return ASIDE.sub(
+        lambda match: ("\0" if match[0].startswith('"') else " ") * len(match[0]), line
+    )
 
-    def blank(match: re.Match[str]) -> str:
-        return ("\0" if match[0].startswith('"') else " ") * len(match[0])
 
-    return ASIDE.sub(blank, line)
+TOWERS, TRIMS = "XYZ", "ABC"
 
+
+class DeltaFirmware(ABC):
+    """Reader and writer of M665 and M666; the height of stop k is H + `sign` * adjustment_k.
+
+    `name` is that of the format, `program` that of the firmware, `remark` the first line of a new
+    file, `decimals` what the firmware keeps of a number in mm or degrees, `probe` the word that H
+    contains besides the height [mm], `others` the program, format and commands of the other one.
+    """
+
+    name: ClassVar[str]
+    program: ClassVar[str]
+    remark: ClassVar[str]
+    sign: ClassVar[float]
+    is_one_in_a_line: ClassVar[bool] = False
+    decimals: ClassVar[int]
+    probe: ClassVar[Name | None] = None
+    others: ClassVar[tuple[str, str, tuple[str, ...]]]
+
+    @abstractmethod
+    def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
+        """Yield what only the other firmware writes, with its line (from 0)."""
+
+    @abstractmethod
+    def refuse(self, file: GcodeFile) -> None:
+        """Raise FileError for words that contradict the firmware, or that loopcal lacks."""
+
+    @abstractmethod
+    def parse_arms(self, file: GcodeFile) -> Triple:
+        """Return the lengths of the arms [mm]."""
+
+    @abstractmethod
+    def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
+        """Return the words of arms, in a new file or not, and what they need."""
+
+    @abstractmethod
+    def choose_height(self, stops: Triple) -> float:
+        """Return the height of a stop without adjustment, from those of all stops [mm]."""
+
+    def load(self, path: Path) -> GcodeFile:
+        """Read a file.
+
+        Raises
+        ------
+        FileError : no M665, inches, a word that is not a number or contradicts the firmware.
+        """
+        lines = read_text(path, GcodeFile.what).splitlines(keepends=True)
+        file = GcodeFile.parse(lines, path, self.is_one_in_a_line)
+        if "M665" not in file.commands:
+            sentence = "no M665, the geometry of a delta, in this file; print it by M503"
+            raise FileError(sentence, path)
+        if "G20" in file.commands:
+            sentence = "G20 selects inches; write the geometry in millimeters"
+            raise FileError(sentence, path, file.commands["G20"][0] + 1)
+        program, format_name, commands = self.others
+        known = ((c, file.commands[c][0]) for c in commands if c in file.commands)
+        signs = (*self.find_foreign(file), *known)
+        for what, line in signs:
+            code = "files.other-firmware"
+            finding = report_finding(code, what=what, program=program, format=format_name)
+            raise FileError(finding, path, line + 1)
+        self.refuse(file)
+        return file
+
+    def read(self, path: Path, options: ImportOptions) -> Imported:
+        """Read M665 and M666, and M851 where the firmware has it; FileError as `load`."""
+        file = self.load(path)
+        turns = zip(TOWERS, NOMINAL_ANGLES, strict=True)
+        geometry = DeltaGeometry(
+            file.number("M665", "R"),
+            tuple(nominal + file.number("M665", tower, 0.0) for tower, nominal in turns),
+            self.parse_arms(file),
+            self.parse_stops(file),
+        )
+        offset = self.get_probe_offset(file)
+        findings = (report_finding("files.probe-offset", offset=offset),) if offset else ()
+        program = f"M665 and M666 of {self.program}"
+        text = format_robot(geometry, options, path, program, has_distances=False)
+        if not options.probes:
+            return Imported(text, None, findings)
+        measurements, finding = import_probes(text, path, options, self.name)
+        return Imported(text, measurements, (*findings, finding))
+
+    def write(self, source: ExportSource, into: Path | None) -> Exported:
+        """Return the corrected words in an existing file, or two lines of their own."""
+        geometry = get_geometry(source, self.name, self.decimals)
+        is_new = into is None
+        file = GcodeFile.parse([self.remark], Path("config.g")) if is_new else self.load(into)
+        arms, findings = self.list_arms(geometry.arms, is_new)
+        height = self.choose_height(geometry.stops)
+        height = source.round_number(height, "tower1.stop", MM, self.decimals)
+        turns = zip(TOWERS, geometry.angles, NOMINAL_ANGLES, strict=True)
+        words: Words = {("M665", "R"): geometry.radius}
+        words["M665", "H"] = height + self.get_probe_offset(file)
+        words |= {("M665", tower): angle - nominal for tower, angle, nominal in turns}
+        stops = zip(TOWERS, geometry.stops, strict=True)
+        # 0.0 + makes zero of a negative zero
+        words |= {("M666", tower): 0.0 + self.sign * (z - height) for tower, z in stops}
+        if not is_new and is_same(*zip(self.parse_stops(file), geometry.stops, strict=True)):
+            # the stops are these already, however the file divides them between H and M666
+            words = {n: word for n, word in words.items() if n[0] != "M666" and n[1] != "H"}
+        if is_new or not is_same(*zip(self.parse_arms(file), geometry.arms, strict=True)):
+            words = arms | words
+        zeros = {("M665", letter): 0.0 for letter in TOWERS + TRIMS}
+        zeros |= {("M666", letter): 0.0 for letter in TOWERS}
+        if source.is_for_people and is_new:
+            words = shorten_numbers(words, self.decimals)
+        return file.export(into, words, zeros, findings)
+
+    def get_probe_offset(self, file: GcodeFile) -> float:
+        """Return how much H exceeds the height of the nozzle [mm]."""
+        return file.number(*self.probe, 0.0) if self.probe is not None else 0.0
+
+    def parse_stops(self, file: GcodeFile) -> Triple:
+        """Return the heights of the nozzle at the end stops."""
+        height = file.number("M665", "H") - self.get_probe_offset(file)
+        return tuple(height + self.sign * file.number("M666", t, 0.0) for t in TOWERS)
+
+
+class Marlin(DeltaFirmware):
+    """L is one length with trims; numbers of single precision resolve 0.00003 mm of 300 mm."""
+
+    name, program = "marlin", "Marlin"
+    remark = (
+        "; Delta geometry by loopcal, for Marlin without a bed probe: with one, add its Z offset "
+        "(M851) to H\n"
+    )
+    sign, is_one_in_a_line, decimals, probe = -1.0, True, 4, ("M851", "Z")
+    others = ("RepRapFirmware", "reprap", ("M307", "M584"))
+
+    def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
+        """Yield a list of lengths."""
+        if ":" in (rod := file.values.get(("M665", "L"), Value("", 0, 0))).text:
+            yield "a list of lengths in M665 L", rod.line
+
+    def refuse(self, file: GcodeFile) -> None:
+        """Refuse a single trim B, and positive adjustments."""
+        if [letter for letter in TRIMS if file.has("M665", letter)] == ["B"]:
+            sentence = "M665 B without A and C is a radius in older Marlin and a rod trim in newer"
+            raise file.error(f"{sentence}; remove it, or write all three", "M665", "B")
+        for tower in TOWERS:
+            if (adjustment := file.number("M666", tower, 0.0)) > 0:
+                sentence = f"M666 {tower} is {adjustment:g}, but is never positive in Marlin"
+                act = "(in RepRapFirmware it may be); correct it"
+                raise file.error(f"{sentence} {act}", "M666", tower)
+
+    def parse_arms(self, file: GcodeFile) -> Triple:
+        """Return L plus each trim."""
+        rod = file.number("M665", "L")
+        return tuple(rod + file.number("M665", letter, 0.0) for letter in TRIMS)
+
+    def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
+        """Return L and the trims; L alone in a new file of equal arms."""
+        is_equal = is_same(*((arm, arms[0]) for arm in arms))
+        mean = arms[0] if is_equal else sum(arms) / 3
+        words: Words = {("M665", "L"): mean}
+        if not (is_equal and is_new):
+            words |= {("M665", t): arm - mean for t, arm in zip(TRIMS, arms, strict=True)}
+        return words, () if is_equal else (report_finding("files.marlin-rod-trims"),)
+
+    def choose_height(self, stops: Triple) -> float:
+        """Return the lowest, because adjustments are never positive."""
+        return min(stops)
+
+
+class RepRapFirmware(DeltaFirmware):
+    """L is a list of lengths; the firmware writes three decimals (M500)."""
+
+    name, program = "reprap", "RepRapFirmware"
+    remark = (
+        "; Delta geometry by loopcal; L with three lengths needs RepRapFirmware 2.03 or later\n"
+    )
+    sign, decimals = 1.0, 3
+    others = ("Marlin", "marlin", ("M851",))
+
+    def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
+        """Yield the beginning of a report of Marlin."""
+        line = file.commands["M665"][0]
+        if re.match(r"\s*echo:", file.lines[line], re.IGNORECASE):
+            yield "'echo:' in front of M665", line
+
+    def refuse(self, file: GcodeFile) -> None:
+        """Refuse a tilted bed."""
+        for letter in "AB":
+            if file.number("M666", letter, 0.0) != 0.0:
+                sentence = f"M666 {letter} tilts the bed, which a robot of the family linear-delta"
+                raise file.error(f"{sentence} lacks; set it to 0 and probe again", "M666", letter)
+
+    def parse_arms(self, file: GcodeFile) -> Triple:
+        """Return the lengths of L; the firmware uses the first for those that are left out."""
+        lengths = file.numbers("M665", "L", ":")
+        if len(lengths) > len(TOWERS):
+            sentence = f"L of M665 has {len(lengths)} lengths, but a delta of loopcal has three"
+            raise file.error(f"{sentence} towers; remove the others", "M665", "L")
+        return lengths + lengths[:1] * (3 - len(lengths))
+
+    def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
+        """Return L: one length where all arms are equal."""
+        del is_new
+        texts = [format_number(arm) for arm in arms]
+        is_equal = len(set(texts)) == 1
+        words: Words = {("M665", "L"): texts[0] if is_equal else ":".join(texts)}
+        return words, () if is_equal else (report_finding("files.reprap-rod-lengths"),)
+
+    def choose_height(self, stops: Triple) -> float:
+        """Return the mean, because the firmware keeps the mean adjustment at zero."""
+        return sum(stops) / 3
+
+
+MARLIN, REPRAP = (
+    Format(
+        firmware.name,
+        what,
+        (ending,),
+        firmware.read,
+        firmware.write,
+        read_options=("sigma_height", "sigma_tape", "probes"),
+    )
+    for firmware, what, ending in (
+        (Marlin(), "M665 and M666 of Marlin (as M503 prints them)", ".gcode"),
+        (RepRapFirmware(), "M665 and M666 of RepRapFirmware (config.g, config-override.g)", ".g"),
+    )
+)
 
 # Heights that the firmware of a delta printer reports, as measurements.
 
@@ -273,6 +468,7 @@ TOUCH = re.compile(r"\bBed X:|^.*?\bX:\s*[-+]?\d*,\d+.*\bCount\b", re.IGNORECASE
 POSITION = re.compile(rf"^.*?\bX:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}\s.*\bCount\b")
 DRY_RUN = re.compile(r"Checking\.\.\. AC(?: at radius:\s*" + NUMBER + r")?.*\(DRY-RUN\)")
 CHECKING = re.compile(r"Checking\.\.\. AC")
+SETTING = re.compile(r"Height|Radius|\b[ET][xyz]:")
 PART = re.compile(rf"(?<![A-Za-z])(yz|zx|xy|c|x|y|z):\s*{NUMBER}")
 AROUND = {"x": 210.0, "y": 330.0, "z": 90.0, "yz": 30.0, "zx": 150.0, "xy": 270.0}
 """Angles of the points of G33 around the center [deg]."""
@@ -288,12 +484,14 @@ OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b
 
 
 class ProbedPoint(NamedTuple):
-    """A probed point: coordinates of the touched point and reported height [mm], and its label."""
+    """A probed point: coordinates of the touched point and reported height [mm], and the name that
+    G33 gives it.
+    """
 
-    label: str
     x: float
     y: float
     height: float
+    name: str = ""
 
 
 def import_probes(
@@ -301,10 +499,7 @@ def import_probes(
 ) -> tuple[Measurements, Finding]:
     """Return the probed heights of the reports as measurements, and a finding about them.
 
-    Parameters
-    ----------
-    robot_text : robot file with the geometry with which the firmware probed. path : of the file
-        that states it. options : with `probes`. firmware : "marlin" or "reprap".
+    `robot_text` states the geometry with which the firmware probed, as `path` does.
 
     Raises
     ------
@@ -312,36 +507,37 @@ def import_probes(
     """
     from loopcal.measure.kinds.poses import Component
     from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
     from loopcal.mechanism.solutions import inverse
 
-    points = read_reports(options.probes, firmware)
-    first = options.probes[0]
+    points, first = read_reports(options.probes, firmware), options.probes[0]
     if len(points) < FEWEST:
         finding = report_finding("files.probes-too-few", count=len(points), least=FEWEST)
         raise FileError(finding, first)
-    dx, dy = _find_offset((path, *options.probes), firmware)
+    labels = tuple(f"{i}-{p.name}" if p.name else str(i) for i, p in enumerate(points, 1))
+    offset = {"X": 0.0, "Y": 0.0}  # of the probe beside the nozzle [mm]
+    for file in (path, *options.probes):
+        for line in read_text(file, GcodeFile.what).splitlines():
+            if match := OFFSETS[firmware].search(line.partition(";")[0].upper()):
+                words = {letter: re.search(rf"{letter}\s*{NUMBER}", match[1]) for letter in offset}
+                offset |= {letter: float(word[1]) for letter, word in words.items() if word}
     robot = build_robot(parse_yaml(robot_text, path, "robot file"))
-    target = MM * np.array([(p.x - dx, p.y - dy, p.height) for p in points])
-    solution = inverse(robot, target)
+    target = [(p.x - offset["X"], p.y - offset["Y"], p.height) for p in points]
+    solution = inverse(robot, MM * np.array(target))
     if not solution.converged.all():
-        label = points[int(np.argmin(solution.converged))].label
+        label = labels[int(np.argmin(solution.converged))]
         raise FileError(report_finding("files.probe-out-of-reach", point=label), first)
-    sigma, is_assumed = options.choose_noise("height"), options.is_noise_assumed("height")
-    kind = Component(components=("z",)).with_tool(np.eye(4))
-    rows = Observations.from_sigma(kind, range(len(points)), np.zeros((len(points), 1)), sigma)
+    kind, zeros = Component(components=("z",)), np.zeros((len(points), 1))
+    rows = options.observe(kind, range(len(points)), zeros, "height")
     heights = np.array([p.height for p in points])
     finding = report_finding(
         "files.probes-imported",
         count=len(points),
         rms=Quantity(float(np.sqrt((heights**2).mean())), "mm"),
         largest=Quantity(float(np.abs(heights).max()), "mm"),
-        sigma=Quantity(sigma / MM, "mm"),
-        assumed=is_assumed,
+        sigma=Quantity(options.choose_noise("height") / MM, "mm"),
+        assumed=rows.is_noise_assumed,
     )
-    labels = tuple(p.label for p in points)
-    observations = (replace(rows, is_noise_assumed=is_assumed),)
-    return Measurements(options.name, solution.q, observations, labels=labels), finding
+    return Measurements(options.name, solution.q, (rows,), labels=labels), finding
 
 
 def read_reports(paths: Sequence[Path], firmware: str) -> list[ProbedPoint]:
@@ -353,49 +549,39 @@ def read_reports(paths: Sequence[Path], firmware: str) -> list[ProbedPoint]:
     return points
 
 
+def _parse_point(match: re.Match[str]) -> ProbedPoint:
+    """Return the point of a line."""
+    x, y, height = (float(cell) for cell in match.groups())
+    return ProbedPoint(x, y, height)
+
+
 def _read_marlin(texts: Mapping[Path, str]) -> list[ProbedPoint]:
     """Return the points of G30 and of dry runs of G33; those of M114 where there are no others."""
     probed: list[ProbedPoint] = []
     touched: list[ProbedPoint] = []
     for path, text in texts.items():
         radius: float | None = None
-        for i, line in enumerate(text.splitlines()):
+        for i, line in enumerate(text.splitlines(), 1):
             if match := SINGLE.search(line):
-                probed.append(_label(len(probed), match))
+                probed.append(_parse_point(match))
             elif CHECKING.search(line):
                 dry = DRY_RUN.search(line)
                 if dry is None or dry[1] is None:
                     reason = "calibrates" if dry is None else "radius"
-                    raise FileError(
-                        report_finding("files.g33-unusable", reason=reason), path, i + 1
-                    )
+                    raise FileError(report_finding("files.g33-unusable", reason=reason), path, i)
                 radius = float(dry[1])
             elif TOUCH.search(line):
                 finding = report_finding("files.probe-line-unreadable", line=line.strip())
-                raise FileError(finding, path, i + 1)
+                raise FileError(finding, path, i)
             elif radius is not None and line.startswith("."):
-                probed += _read_ring(line, radius, len(probed))
+                for name, height in () if SETTING.search(line) else PART.findall(line):
+                    angle = math.radians(AROUND.get(name, 0.0))
+                    r = 0.0 if name == "c" else radius
+                    place = (r * math.cos(angle), r * math.sin(angle))
+                    probed.append(ProbedPoint(*place, float(height), name))
             elif match := POSITION.match(line):
-                touched.append(_label(len(touched), match))
+                touched.append(_parse_point(match))
     return probed or touched
-
-
-def _read_ring(line: str, radius: float, count: int) -> list[ProbedPoint]:
-    """Return the points of a line of G33; none for a line of settings."""
-    if "Height" in line or "Radius" in line or re.search(r"\b[ET][xyz]:", line):
-        return []
-    points = []
-    for name, height in PART.findall(line):
-        angle = math.radians(AROUND.get(name, 0.0))
-        r = 0.0 if name == "c" else radius
-        where = (r * math.cos(angle), r * math.sin(angle))
-        points.append(ProbedPoint(f"{count + len(points) + 1}-{name}", *where, float(height)))
-    return points
-
-
-def _label(count: int, match: re.Match[str]) -> ProbedPoint:
-    """Return a point with its number as its label."""
-    return ProbedPoint(str(count + 1), *(float(cell) for cell in match.groups()))
 
 
 def _read_reprap(texts: Mapping[Path, str]) -> list[ProbedPoint]:
@@ -405,296 +591,53 @@ def _read_reprap(texts: Mapping[Path, str]) -> list[ProbedPoint]:
     points: list[ProbedPoint] = []
     for path, text in texts.items():
         if text.lstrip().startswith(HEIGHT_MAP):
-            points += _read_height_map(path, text, len(points))
+            points += _read_height_map(path, text)
             continue
-        for i, line in enumerate(text.splitlines()):
+        for i, line in enumerate(text.splitlines(), 1):
             if match := HEIGHTS.search(line):
-                reports.append((path, i + 1, match[1]))
+                reports.append((path, i, match[1]))
             elif match := POINT.match(line.partition(";")[0].upper()):
                 places[int(match[1])] = (float(match[2]), float(match[3]))
     for path, number, cells in reports:
+        heights = cells.split()
+        wanted, finding = set(range(len(heights))), None
         if not re.fullmatch(rf"(?:\s+{NUMBER})+\s*", cells):
-            if re.search(r"not set|failed", cells, re.IGNORECASE):
-                raise FileError(report_finding("files.g32-failed"), path, number)
-            finding = report_finding("files.g32-unreadable", cells=cells.strip())
-            raise FileError(finding, path, number)
-        heights = [float(cell) for cell in cells.split()]
-        wanted = set(range(len(heights)))
-        if not wanted <= set(places):
-            missing = min(wanted - set(places))
-            finding = report_finding("files.g32-no-points", count=len(heights), missing=missing)
-            raise FileError(finding, path, number)
-        if set(places) - wanted:
+            has_failed = re.search(r"not set|failed", cells, re.IGNORECASE)
+            finding = (
+                report_finding("files.g32-failed")
+                if has_failed
+                else report_finding("files.g32-unreadable", cells=cells.strip())
+            )
+        elif missing := wanted - set(places):
+            finding = report_finding(
+                "files.g32-no-points", count=len(heights), missing=min(missing)
+            )
+        elif set(places) - wanted:
             finding = report_finding("files.g32-too-few", count=len(heights), points=len(places))
+        if finding is not None:
             raise FileError(finding, path, number)
-        start = len(points) + 1
-        points += [
-            ProbedPoint(str(start + k), *places[k], height) for k, height in enumerate(heights)
-        ]
+        points += [ProbedPoint(*places[k], float(height)) for k, height in enumerate(heights)]
     return points
 
 
-def _read_height_map(path: Path, text: str, count: int) -> list[ProbedPoint]:
+def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:
     """Return the probed cells of a height map."""
-    lines = [line for line in text.splitlines() if line.strip()]
+    lines = [
+        [cell.strip() for cell in line.split(",")] for line in text.splitlines() if line.strip()
+    ]
     try:
-        titles = [cell.strip() for cell in lines[1].split(",")]
-        stated = dict(zip(titles, (cell.strip() for cell in lines[2].split(",")), strict=True))
+        stated = dict(zip(lines[1], lines[2], strict=True))
         names = ("min0", "min1", "spacing0", "spacing1", "num0", "num1")
         if "xmin" in stated:
             names = ("xmin", "ymin", "xspacing", "yspacing", "xnum", "ynum")
         x0, y0, dx, dy, columns, rows = (float(stated[name]) for name in names)
-        cells = [[cell.strip() for cell in line.split(",")] for line in lines[3:]]
-        shape = [len(row) for row in cells]
-        if shape != [int(columns)] * int(rows):
+        if [len(row) for row in lines[3:]] != [int(columns)] * int(rows):
             raise ValueError
-        probed = [
-            (x0 + k * dx, y0 + j * dy, float(cell))
-            for j, row in enumerate(cells)
+        return [
+            ProbedPoint(x0 + k * dx, y0 + j * dy, float(cell))
+            for j, row in enumerate(lines[3:])
             for k, cell in enumerate(row)
             if cell != UNPROBED
         ]
     except (IndexError, KeyError, ValueError):
         raise FileError(report_finding("files.height-map-damaged"), path) from None
-    return [ProbedPoint(str(count + k + 1), *point) for k, point in enumerate(probed)]
-
-
-def _find_offset(paths: Sequence[Path], firmware: str) -> tuple[float, float]:
-    """Return where the probe is beside the nozzle [mm], as the files of the firmware state it."""
-    offset = [0.0, 0.0]
-    for line in "\n".join(read_text(path, "G-code file") for path in paths).splitlines():
-        if match := OFFSETS[firmware].search(line.partition(";")[0].upper()):
-            for k, letter in enumerate("XY"):
-                if word := re.search(rf"{letter}\s*{NUMBER}", match[1]):
-                    offset[k] = float(word[1])
-    return offset[0], offset[1]
-
-
-ECHO = re.compile(r"\s*echo:", re.IGNORECASE)
-MARLIN_COMMANDS, REPRAP_COMMANDS = ("M851",), ("M307", "M584")
-"""What only a report of Marlin begins with, and commands that only one of the firmwares has."""
-
-MM = 1e-3
-MARLIN_DECIMALS, REPRAP_DECIMALS = 4, 3
-"""Decimals that a firmware keeps: Marlin has numbers of single precision, which resolve 0.00003 mm
-of 300 mm; RepRapFirmware writes three decimals (M500).
-"""
-
-TOWERS, TRIMS = "XYZ", "ABC"
-Numbers = tuple[float, ...]
-Words = dict[Name, float | str]
-
-
-@dataclass(frozen=True)
-class DeltaFirmware:
-    """Reader and writer of M665 and M666; the height of stop k is H + `sign` * adjustment_k.
-
-    Attributes
-    ----------
-    name : of the format. program : of the firmware. remark : first line of a new file.
-    one_in_a_line : whether the firmware runs one command in a line.
-    decimals : that the firmware keeps of a number in mm or degrees.
-    probe : word that H contains besides the height [mm]; None without one.
-    choose_height : returns the height of a stop without adjustment, from those of all stops [mm].
-    refuse : raises FileError for words that contradict the firmware, or that loopcal lacks.
-    parse_arms : returns the lengths of the arms [mm].
-    list_arms : returns the words of arms, in a new file or not, and what they need.
-    """
-
-    name: str
-    program: str
-    remark: str
-    sign: float
-    one_in_a_line: bool
-    decimals: int
-    probe: Name | None
-    choose_height: Callable[[Numbers], float]
-    refuse: Callable[[GcodeFile], None]
-    parse_arms: Callable[[GcodeFile], Numbers]
-    list_arms: Callable[[Numbers, bool], tuple[Words, tuple[Finding, ...]]]
-
-    def read(self, path: Path, options: ImportOptions) -> Imported:
-        """Read M665 and M666, and M851 where the firmware has it.
-
-        Raises
-        ------
-        FileError : a word is missing, not a number, or contradicts the rules of the firmware.
-        """
-        file = read_gcode(path, self.one_in_a_line)
-        self.refuse(file)
-        turns = zip(TOWERS, NOMINAL_ANGLES, strict=True)
-        geometry = DeltaGeometry(
-            file.number("M665", "R"),
-            tuple(nominal + file.number("M665", tower, 0.0) for tower, nominal in turns),
-            self.parse_arms(file),
-            self._parse_stops(file),
-        )
-        offset = self._get_probe_offset(file)
-        findings = (report_finding("files.probe-offset", offset=offset),) if offset else ()
-        program = f"M665 and M666 of {self.program}"
-        text = format_robot(geometry, options, path, program, has_distances=False)
-        if not options.probes:
-            return Imported(text, None, findings)
-        measurements, finding = import_probes(text, path, options, self.name)
-        return Imported(text, measurements, (*findings, finding))
-
-    def write(self, source: ExportSource, into: Path | None) -> Exported:
-        """Return the corrected words in an existing file, or two lines of their own."""
-        geometry = get_geometry(source, self.name, self.decimals)
-        file = parse_gcode([self.remark], Path("config.g"))
-        if into is not None:
-            file = read_gcode(into, self.one_in_a_line)
-            self.refuse(file)
-        arms, findings = self.list_arms(geometry.arms, into is None)
-        height = self.choose_height(geometry.stops)
-        height = source.round_number(height, "tower1.stop", MM, self.decimals)
-        turns = zip(TOWERS, geometry.angles, NOMINAL_ANGLES, strict=True)
-        words: Words = {("M665", "R"): geometry.radius}
-        words["M665", "H"] = height + self._get_probe_offset(file)
-        words |= {("M665", tower): angle - nominal for tower, angle, nominal in turns}
-        stops = zip(TOWERS, geometry.stops, strict=True)
-        # 0.0 + makes zero of a negative zero
-        words |= {("M666", tower): 0.0 + self.sign * (z - height) for tower, z in stops}
-        if into is not None and is_same(*zip(self._parse_stops(file), geometry.stops, strict=True)):
-            # the stops are these already, however the file divides them between H and M666
-            words = {n: word for n, word in words.items() if n[0] != "M666" and n[1] != "H"}
-        if into is None or not is_same(*zip(self.parse_arms(file), geometry.arms, strict=True)):
-            words = arms | words
-        zeros = {("M665", letter): 0.0 for letter in TOWERS + TRIMS}
-        zeros |= {("M666", letter): 0.0 for letter in TOWERS}
-        if source.is_for_people and into is None:
-            words = shorten_numbers(words, self.decimals)
-        return file.export(into, words, zeros, findings)
-
-    def _get_probe_offset(self, file: GcodeFile) -> float:
-        """Return how much H exceeds the height of the nozzle [mm]."""
-        return file.number(*self.probe, 0.0) if self.probe is not None else 0.0
-
-    def _parse_stops(self, file: GcodeFile) -> Numbers:
-        """Return the heights of the nozzle at the end stops."""
-        height = file.number("M665", "H") - self._get_probe_offset(file)
-        return tuple(height + self.sign * file.number("M666", t, 0.0) for t in TOWERS)
-
-
-def _refuse_marlin(file: GcodeFile) -> None:
-    """Raise FileError for a file of RepRapFirmware, a single trim B, and positive adjustments."""
-    program, name = "RepRapFirmware", "reprap"
-    if file.has("M665", "L") and ":" in file.text("M665", "L"):
-        finding = report_finding(
-            "files.other-firmware", what="a list of lengths in M665 L", program=program, format=name
-        )
-        raise file.error(finding, "M665", "L")
-    _refuse_commands(file, REPRAP_COMMANDS, program, name)
-    if [letter for letter in TRIMS if file.has("M665", letter)] == ["B"]:
-        sentence = "M665 B without A and C is a radius in older Marlin and a rod trim in newer"
-        raise file.error(f"{sentence}; remove it, or write all three", "M665", "B")
-    for tower in TOWERS:
-        if (adjustment := file.number("M666", tower, 0.0)) > 0:
-            sentence = f"M666 {tower} is {adjustment:g}, but is never positive in Marlin"
-            act = "(in RepRapFirmware it may be); correct it"
-            raise file.error(f"{sentence} {act}", "M666", tower)
-
-
-def _refuse_commands(file: GcodeFile, commands: Sequence[str], program: str, name: str) -> None:
-    """Raise FileError for commands that only another firmware has."""
-    for command in commands:
-        if command in file.commands:
-            finding = report_finding(
-                "files.other-firmware", what=command, program=program, format=name
-            )
-            raise FileError(finding, file.path, file.commands[command][0] + 1)
-
-
-def _refuse_reprap(file: GcodeFile) -> None:
-    """Raise FileError for a file of Marlin, and for a tilted bed."""
-    program, name = "Marlin", "marlin"
-    number = file.commands["M665"][0]
-    if ECHO.match(file.lines[number]):
-        finding = report_finding(
-            "files.other-firmware", what="'echo:' in front of M665", program=program, format=name
-        )
-        raise FileError(finding, file.path, number + 1)
-    _refuse_commands(file, MARLIN_COMMANDS, program, name)
-    for letter in "AB":
-        if file.number("M666", letter, 0.0) != 0.0:
-            sentence = f"M666 {letter} tilts the bed, which a robot of the family linear-delta"
-            raise file.error(f"{sentence} lacks; set it to 0 and probe again", "M666", letter)
-
-
-def _parse_trims(file: GcodeFile) -> Numbers:
-    """Return L plus each trim."""
-    rod = file.number("M665", "L")
-    return tuple(rod + file.number("M665", letter, 0.0) for letter in TRIMS)
-
-
-def _parse_lengths(file: GcodeFile) -> Numbers:
-    """Return the lengths of L; the firmware uses the first for those that are left out."""
-    lengths = file.numbers("M665", "L", ":")
-    if len(lengths) > len(TOWERS):
-        sentence = f"L of M665 has {len(lengths)} lengths, but a delta of loopcal has three towers"
-        raise file.error(f"{sentence}; remove the others", "M665", "L")
-    return lengths + lengths[:1] * (3 - len(lengths))
-
-
-def _list_trims(arms: Numbers, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
-    """Return L and the trims; L alone in a new file of equal arms."""
-    is_equal = is_same(*((arm, arms[0]) for arm in arms))
-    mean = arms[0] if is_equal else sum(arms) / 3
-    words: Words = {("M665", "L"): mean}
-    if not (is_equal and is_new):
-        words |= {("M665", t): arm - mean for t, arm in zip(TRIMS, arms, strict=True)}
-    return words, () if is_equal else (report_finding("files.marlin-rod-trims"),)
-
-
-def _list_lengths(arms: Numbers, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
-    """Return L: one length where all arms are equal."""
-    del is_new
-    texts = [format_number(arm) for arm in arms]
-    is_equal = len(set(texts)) == 1
-    words: Words = {("M665", "L"): texts[0] if is_equal else ":".join(texts)}
-    return words, () if is_equal else (report_finding("files.reprap-rod-lengths"),)
-
-
-MARLIN_FIRMWARE = DeltaFirmware(
-    "marlin",
-    "Marlin",
-    "; Delta geometry by loopcal, for Marlin without a bed probe: with one, add its Z offset "
-    "(M851) to H\n",
-    -1.0,
-    True,
-    MARLIN_DECIMALS,
-    ("M851", "Z"),
-    min,
-    _refuse_marlin,
-    _parse_trims,
-    _list_trims,
-)
-REPRAP_FIRMWARE = DeltaFirmware(
-    "reprap",
-    "RepRapFirmware",
-    "; Delta geometry by loopcal; L with three lengths needs RepRapFirmware 2.03 or later\n",
-    1.0,
-    False,
-    REPRAP_DECIMALS,
-    None,
-    lambda stops: sum(stops) / 3,
-    _refuse_reprap,
-    _parse_lengths,
-    _list_lengths,
-)
-MARLIN = Format(
-    "marlin",
-    "M665 and M666 of Marlin (as M503 prints them)",
-    (".gcode",),
-    MARLIN_FIRMWARE.read,
-    MARLIN_FIRMWARE.write,
-    read_options=("sigma_height", "sigma_tape", "probes"),
-)
-REPRAP = Format(
-    "reprap",
-    "M665 and M666 of RepRapFirmware (config.g, config-override.g)",
-    (".g",),
-    REPRAP_FIRMWARE.read,
-    REPRAP_FIRMWARE.write,
-    read_options=("sigma_height", "sigma_tape", "probes"),
-)

@@ -18,23 +18,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.json_text import read_json
-from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
+from loopcal.io.formats.program_format import MM, Format, Imported, ImportOptions, format_head
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST
 
-if TYPE_CHECKING:
-    from loopcal.measure.measurements import Measurements
-
-MM, DEG = 1e-3, math.pi / 180.0
+DEG = math.pi / 180.0
 FREEDOMS, MOST_LINES = 3, 26
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
@@ -133,6 +130,9 @@ def read(path: Path, options: ImportOptions) -> Imported:
         Not JSON, a key is missing or has other values, or the known poses do not determine an
         anchor and the file states none.
     """
+    from loopcal.measure.kinds.position import Position
+    from loopcal.measure.measurements import Measurements
+
     samples = parse(path)
     anchors = samples.anchors if samples.anchors is not None else estimate_anchors(samples, path)
     finding = report_finding(
@@ -144,8 +144,22 @@ def read(path: Path, options: ImportOptions) -> Imported:
         sigma_position=Quantity(options.choose_noise("position") / MM, "mm"),
     )
     text = format_robot(samples, anchors, path, options)
-    findings = (finding, *_report_priors(samples, options), *samples.findings)
-    return Imported(text, _build_measurements(samples, options), findings)
+    priors = []
+    if samples.is_taped.any():
+        prior = report_finding(
+            "files.taped-prior",
+            count=int(samples.is_taped.sum()),
+            sigma=Quantity(options.choose_noise("tape") / MM, "mm"),
+            is_assumed=options.is_noise_assumed("tape"),
+        )
+        priors.append(prior)
+    # without known poses all positions are NaN, to be filled in
+    n, k = len(samples.motors), len(samples.known)
+    known = samples.known * MM if k else np.full((n, FREEDOMS), np.nan)
+    rows = options.observe(Position(), np.arange(len(known)), known, "line", "position")
+    labels = tuple(f"{'known' if i < k else 'sample'}{i + 1}" for i in range(n))
+    measurements = Measurements(options.name, samples.motors, (rows,), labels=labels)
+    return Imported(text, measurements, (finding, *priors, *samples.findings))
 
 
 def parse(path: Path) -> Samples:
@@ -164,8 +178,8 @@ def parse(path: Path) -> Samples:
     if len(known) > len(motors):
         sentence = f"{POSITIONS!r} has {len(known)} poses, but {SAMPLES!r} only {len(motors)}"
         raise FileError(f"{sentence}; remove the others", path)
-    motor_teeth, spool_teeth = (_parse_positive(content, key, path, 0) for key in TEETH)
-    radius, advantage, per_spool = (_parse_positive(content, key, path, 1, lines) for key in SPOOLS)
+    motor_teeth, spool_teeth = (_parse_numbers(content, key, path, 0) for key in TEETH)
+    radius, advantage, per_spool = (_parse_numbers(content, key, path, 1, lines) for key in SPOOLS)
     anchors = None
     if ANCHORS in content:
         anchors = _parse_numbers(content, ANCHORS, path, 2, FREEDOMS)
@@ -294,36 +308,6 @@ def _list_parameters(samples: Samples) -> Iterator[str]:
         yield PARAMETER.format(name=f"{line}.buildup", nominal=0, sd=0.3, maps=curve)
 
 
-def _build_measurements(samples: Samples, options: ImportOptions) -> Measurements:
-    """Return all readings, with the known poses as positions of the platform.
-
-    Without known poses all positions are NaN, to be filled in.
-    """
-    from loopcal.measure.kinds.position import Position
-    from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
-
-    n, k = len(samples.motors), len(samples.known)
-    known = samples.known * MM if k else np.full((n, FREEDOMS), np.nan)
-    kind = Position().with_tool(np.eye(4))
-    sigma = options.choose_noise("position")
-    rows = Observations.from_sigma(kind, np.arange(len(known)), known, sigma)
-    rows = replace(rows, is_noise_assumed=options.is_noise_assumed("line", "position"))
-    labels = tuple(f"{'known' if i < k else 'sample'}{i + 1}" for i in range(n))
-    return Measurements(options.name, samples.motors, (rows,), labels=labels)
-
-
-def _report_priors(samples: Samples, options: ImportOptions) -> Iterator[Finding]:
-    """Yield which lengths become prior knowledge, and how uncertain they are."""
-    if samples.is_taped.any():
-        yield report_finding(
-            "files.taped-prior",
-            count=int(samples.is_taped.sum()),
-            sigma=Quantity(options.choose_noise("tape") / MM, "mm"),
-            is_assumed=options.is_noise_assumed("tape"),
-        )
-
-
 def _report_ignored(content: dict[str, Any]) -> Iterator[Finding]:
     """Yield the keys that are not read."""
     for key in (key for key in IGNORED if key in content):
@@ -337,16 +321,6 @@ def _report_ignored(content: dict[str, Any]) -> Iterator[Finding]:
         yield report_finding("files.key-unknown", key=key)
 
 
-def _parse_positive(
-    content: dict[str, Any], key: str, path: Path, ndim: int, width: int | None = None
-) -> FloatArray:
-    """Return positive numbers."""
-    values = _parse_numbers(content, key, path, ndim, width)
-    if not (values > 0).all():
-        raise FileError(f"{key!r} is {content[key]}; write positive numbers", path)
-    return values
-
-
 def _parse_numbers(
     content: dict[str, Any], key: str, path: Path, ndim: int, width: int | None = None
 ) -> FloatArray:
@@ -355,8 +329,15 @@ def _parse_numbers(
     wanted += "" if width is None else f", {width} in {'all' if ndim == 1 else 'each'}"
     if key not in content:
         raise FileError(f"the key {key!r} is missing; add {wanted}", path)
-    if ndim == 2:
-        _refuse_short_row(content[key], key, path, width)
+    rows = content[key]
+    if ndim == 2 and isinstance(rows, list) and all(isinstance(row, list) for row in rows):
+        lengths = [len(row) for row in rows]
+        usual = max(lengths, key=lengths.count, default=0) if width is None else width
+        for number, length in enumerate(lengths, 1):
+            if length != usual:
+                code = "files.row-incomplete"
+                finding = report_finding(code, key=key, row=number, length=length, usual=usual)
+                raise FileError(finding, path)
     try:
         values = np.array(content[key], dtype=float)
     except (TypeError, ValueError):
@@ -366,21 +347,9 @@ def _parse_numbers(
         raise FileError(f"{key!r} is not {wanted}; correct it", path)
     if not (np.abs(values) <= LARGEST).all():
         raise FileError(f"{key!r} contains a number beyond {LARGEST:g}; correct it", path)
+    if key in (*TEETH, *SPOOLS) and not (values > 0).all():
+        raise FileError(f"{key!r} is {content[key]}; write positive numbers", path)
     return values
-
-
-def _refuse_short_row(rows: Any, key: str, path: Path, width: int | None) -> None:
-    """Raise FileError for the first row with another length than `width`, or than most rows."""
-    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-        return
-    lengths = [len(row) for row in rows]
-    usual = max(lengths, key=lengths.count, default=0) if width is None else width
-    for number, length in enumerate(lengths, 1):
-        if length != usual:
-            finding = report_finding(
-                "files.row-incomplete", key=key, row=number, length=length, usual=usual
-            )
-            raise FileError(finding, path)
 
 
 def _format(value: float, digits: int = 12) -> str:

@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a file of another program to a robot file and a measurement file, and back."""
+"""From a file of another program to a robot file and a measurement file, and back.
+
+Programs that loopcal does not know get the identified parameters as JSON or CSV: numbers in the
+units of the robot file, which read back as the same doubles. `plus_minus` is half of the 95 %
+interval, empty (null in JSON) where it is unknown or not finite.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from loopcal.errors import DataError, FileError, MechanismError
-from loopcal.findings import report_finding
+from loopcal.findings import Finding, report_finding
+from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.data.measurement_writer import save_measurements
@@ -16,6 +25,7 @@ from loopcal.io.formats.program_format import Exported, ExportSource, Format, Im
 from loopcal.io.robot.robot_file import build_robot, load_robot
 from loopcal.io.runs.run_folder import Run, load_run_or_robot
 from loopcal.mechanism.model import Mechanism
+from loopcal.units import find_unit
 
 
 def list_formats(ability: Literal["read", "write"]) -> tuple[str, ...]:
@@ -105,3 +115,56 @@ def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exp
     if into is not None and not target.takes_file:
         raise DataError(report_finding("files.format-takes-no-file", format=target.name))
     return target.write(source, into)
+
+
+COLUMNS = ("name", "nominal", "value", "plus_minus", "unit", "free")
+
+
+def _list_rows(source: ExportSource) -> list[dict[str, Any]]:
+    """Return one row for each parameter, numbers as text."""
+    robot, rows = source.robot, []
+    for parameter, value in zip(robot.parameters.entries, robot.values.tolist(), strict=True):
+        unit = find_unit(robot.units[parameter.dimension])
+        half = source.plus_minus.get(parameter.name)
+        nominal, number = (format_scaled(v, unit.factor_to_si) for v in (parameter.nominal, value))
+        free = "yes" if parameter.free else "no"
+        cells = (parameter.name, nominal, number, "" if half is None else repr(half))
+        rows.append(dict(zip(COLUMNS, (*cells, unit.symbol, free), strict=True)))
+    return rows
+
+
+def write_csv(source: ExportSource, into: Path | None) -> Exported:
+    """Return the parameters as CSV."""
+    del into
+    stream = io.StringIO()
+    writer: csv.DictWriter[str] = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(_list_rows(source))
+    return Exported(stream.getvalue(), _report_intervals(source))
+
+
+def write_json(source: ExportSource, into: Path | None) -> Exported:
+    """Return the parameters as one JSON document."""
+    del into
+    rows = [
+        {**row, "nominal": float(row["nominal"]), "value": float(row["value"])}
+        | {"plus_minus": source.plus_minus.get(row["name"]), "free": row["free"] == "yes"}
+        for row in _list_rows(source)
+    ]
+    document = {"format": 1, "robot": source.robot.name, "parameters": rows}
+    text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
+    return Exported(text + "\n", _report_intervals(source))
+
+
+def _report_intervals(source: ExportSource) -> tuple[Finding, ...]:
+    """Return which intervals are missing."""
+    if not source.plus_minus:
+        return (report_finding("files.intervals-need-run"),)
+    return tuple(
+        report_finding("files.interval-missing", name=name, reason=reason)
+        for name, reason in source.nulls.items()
+    )
+
+
+JSON = Format("json", "identified parameters as JSON", (".json",), None, write_json, False)
+CSV = Format("csv", "identified parameters as CSV", (".csv",), None, write_csv, False)

@@ -17,19 +17,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.csv_table import parse_finite
-from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.delta_gcode import NOMINAL_ANGLES, DeltaGeometry, format_robot, get_geometry
 from loopcal.io.formats.program_format import (
     DECIMALS,
+    MM,
     Exported,
     ExportSource,
     Format,
@@ -41,14 +40,8 @@ from loopcal.io.formats.program_format import (
     shorten_numbers,
 )
 
-if TYPE_CHECKING:
-    from loopcal.measure.measurements import Measurements
-
 STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
 PROBED = "delta_calibrate"
-SHOWN = 4
-"""Sections that are named of a file that is not a printer.cfg."""
-
 MARK = "#*#"
 HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
 NEW_BLOCK = (HEADER, "#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.", MARK)
@@ -61,16 +54,15 @@ COMMENT = re.compile(r"#.*|(?:^|(?<=\s));.*")
 class KlipperConfig(ValueFile):
     """A configuration file, whose values are options by section and name.
 
-    Attributes
-    ----------
-    saved : section -> line of its header in the saved part. header : first line of that part, None
-        without one. includes : files that it includes.
+    `saved` : section -> line of its header in the saved part. `header` : first line of that part,
+    None without one. `includes` : files that it includes.
     """
 
     saved: Mapping[str, int]
     header: int | None
     includes: tuple[str, ...]
 
+    what = "printer.cfg"
     title = "[{0}] {1}"
     phrase = "{1!r} of [{0}]"
 
@@ -88,9 +80,38 @@ class KlipperConfig(ValueFile):
             raise self.error(sentence, section, option)
         return value
 
-    def with_lines(self, lines: Sequence[str]) -> KlipperConfig:
-        """Return the file with other lines."""
-        return parse_config(lines, self.path)
+    @classmethod
+    def parse(cls, lines: Sequence[str], path: Path) -> KlipperConfig:
+        """Find options and sections."""
+        header = next((i for i, line in enumerate(lines) if line.rstrip() == HEADER), None)
+        options: dict[Name, Value] = {}
+        saved: dict[str, int] = {}
+        includes: list[str] = []
+        section, main_part = "", frozenset[Name]()
+        last = max((i for i, line in enumerate(lines) if line.strip()), default=0)
+        for i, line in enumerate(lines[: last + 1]):
+            if i == header:
+                section, main_part = "", frozenset(options)
+            offset = 0
+            if header is not None and i >= header:
+                if not line.startswith(MARK) or line[3:4] not in ("", " ", "\n", "\r"):
+                    sentence = f"this line below SAVE_CONFIG has no {MARK!r}, so Klipper ignores"
+                    raise FileError(f"{sentence} the block; move it up", path, i + 1)
+                offset = 4
+            content = COMMENT.sub("", line[offset:].rstrip("\r\n")).rstrip()
+            if not content or content[0].isspace():
+                continue
+            if match := SECTION.match(content):
+                section = match[1]
+                if section.startswith("include "):
+                    includes.append(section.removeprefix("include ").strip())
+                if offset:
+                    saved[section] = i
+            elif (match := OPTION.match(content)) and section:
+                key = (section, match[1].lower())
+                if key not in main_part:
+                    options[key] = Value(match[3], i, offset + match.start(3))
+        return cls(path, tuple(lines), options, saved, header, tuple(includes))
 
     def insert(self, lines: list[str], name: Name, text: str) -> None:
         """Insert a new option into the saved part, which is added where there is none."""
@@ -108,96 +129,70 @@ class KlipperConfig(ValueFile):
 
 
 def read_config(path: Path) -> KlipperConfig:
-    """Read a configuration.
-
-    Raises
-    ------
-    FileError : it is unreadable, its saved part was edited, or it is not that of a delta printer.
-    """
-    cfg = parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
+    """Read a configuration; FileError where its saved part was edited, or it is of no delta."""
+    cfg = KlipperConfig.load(path)
     is_stated = cfg.has("printer", "kinematics")
     kinematics = cfg.text("printer", "kinematics") if is_stated else ""
     sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
     if kinematics == "delta" or (not is_stated and (cfg.includes or STEPPERS[0] in sections)):
         return cfg
-    finding = report_finding(
-        "files.not-a-delta-configuration", kinematics=kinematics, sections=sections[:SHOWN]
-    )
+    code = "files.not-a-delta-configuration"
+    finding = report_finding(code, kinematics=kinematics, sections=sections[:4])
     raise cfg.error(finding, "printer", "kinematics")
 
 
-def parse_config(lines: Sequence[str], path: Path) -> KlipperConfig:
-    """Find options and sections."""
-    header = next((i for i, line in enumerate(lines) if line.rstrip() == HEADER), None)
-    options: dict[Name, Value] = {}
-    saved: dict[str, int] = {}
-    includes: list[str] = []
-    section, main_part = "", frozenset[Name]()
-    last = max((i for i, line in enumerate(lines) if line.strip()), default=0)
-    for i, line in enumerate(lines[: last + 1]):
-        if i == header:
-            section, main_part = "", frozenset(options)
-        offset = 0
-        if header is not None and i >= header:
-            if not line.startswith(MARK) or line[3:4] not in ("", " ", "\n", "\r"):
-                sentence = (
-                    f"this line below SAVE_CONFIG has no {MARK!r}, so Klipper ignores the block"
-                )
-                raise FileError(f"{sentence}; move it up", path, i + 1)
-            offset = 4
-        content = COMMENT.sub("", line[offset:].rstrip("\r\n")).rstrip()
-        if not content or content[0].isspace():
-            continue
-        if match := SECTION.match(content):
-            section = match[1]
-            if section.startswith("include "):
-                includes.append(section.removeprefix("include ").strip())
-            if offset:
-                saved[section] = i
-        elif (match := OPTION.match(content)) and section:
-            key = (section, match[1].lower())
-            if key not in main_part:
-                options[key] = Value(match[3], i, offset + match.start(3))
-    return KlipperConfig(path, tuple(lines), options, saved, header, tuple(includes))
-
-
-FULL_STEPS = 200.0
-MM = 1e-3
-
-
-@dataclass(frozen=True)
-class _Probes:
-    """Stable positions [steps] by label, heights (label, value) and distances (label, label, value)
-    in mm.
-    """
-
-    positions: dict[str, tuple[float, ...]]
-    heights: list[tuple[str, float]]
-    distances: list[tuple[str, str, float]]
-
-
 def read(path: Path, options: ImportOptions) -> Imported:
-    """Read geometry and measurements.
+    """Read geometry and measurements: heights as the component z, distances as separations of two
+    poses.
 
     Raises
     ------
     FileError : an option is missing or not a number, or the printer is not a delta.
     """
+    from loopcal.measure.kinds.distance import Separation
+    from loopcal.measure.kinds.poses import Component
+    from loopcal.measure.measurements import Measurements
+
     cfg = read_config(path)
-    probes = _parse_probes(cfg)
-    program, has_distances = "a printer.cfg of Klipper", bool(probes.distances)
-    text = format_robot(parse_geometry(cfg), options, path, program, has_distances)
-    if not probes.positions:
+    heights = [
+        (record, f"{record}_pos")
+        for name in ("height", "manual_height")
+        for record in _list_records(cfg, name, ("", "_pos"))
+    ]
+    distances = [
+        (record, f"{record}_pos1", f"{record}_pos2")
+        for record in _list_records(cfg, "distance", ("", "_pos1", "_pos2"))
+    ]
+    positions = {record: _parse_steps(cfg, position) for record, position in heights}
+    values = {record: cfg.number(PROBED, record) for record, _ in heights}
+    for record, *ends in distances:
+        positions |= {end: _parse_steps(cfg, end) for end in ends}
+        values[record] = cfg.number(PROBED, record)
+    program = "a printer.cfg of Klipper"
+    text = format_robot(parse_geometry(cfg), options, path, program, bool(distances))
+    if not positions:
         return Imported(text, None, (report_finding("files.no-probed-heights"),))
     steps = [get_step_distance(cfg, section) for section in STEPPERS]
     finding = report_finding(
         "files.probe-noise-assumed",
-        heights=len(probes.heights),
-        distances=len(probes.distances),
+        heights=len(heights),
+        distances=len(distances),
         sigma_height=Quantity(options.choose_noise("height") / MM, "mm"),
         sigma_distance=Quantity(options.choose_noise("distance") / MM, "mm"),
     )
-    return Imported(text, _build_measurements(probes, steps, options), (finding,))
+    labels, observations = tuple(positions), []
+    if heights:
+        rows = [labels.index(record) for record, _ in heights]
+        measured = np.array([[values[record] * MM] for record, _ in heights])
+        kind = Component(components=("z",))
+        observations.append(options.observe(kind, rows, measured, "height"))
+    if distances:
+        pairs = [(labels.index(a), labels.index(b)) for _, a, b in distances]
+        measured = np.array([[values[record] * MM] for record, *_ in distances])
+        observations.append(options.observe(Separation(), pairs, measured, "distance"))
+    readings = np.array(list(positions.values())) * np.array(steps) * MM
+    measurements = Measurements(options.name, readings, tuple(observations), labels=labels)
+    return Imported(text, measurements, (finding,))
 
 
 def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
@@ -214,62 +209,23 @@ def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
 
 
 def get_step_distance(cfg: KlipperConfig, section: str) -> float:
-    """Return the length of one motor step [mm]."""
+    """Return the length of one motor step [mm]; the gear ratio `57:11, 2:1` is 57 / 11 * 2."""
     has_rotation = cfg.has(section, "rotation_distance")
     if not has_rotation and cfg.has(section, "step_distance"):
         return cfg.positive(section, "step_distance")
     rotation = cfg.positive(section, "rotation_distance")
     steps = cfg.positive(section, "microsteps")
-    steps *= cfg.positive(section, "full_steps_per_rotation", FULL_STEPS)
-    return rotation / (steps * _parse_gear_ratio(cfg, section))
-
-
-def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the corrected numbers in an existing printer.cfg, or a saved block to paste."""
-    geometry = get_geometry(source, "klipper", DECIMALS)
-    wanted: dict[Name, float | str] = {("printer", "delta_radius"): geometry.radius}
-    defaults: dict[Name, float] = {}
-    for k, section in enumerate(STEPPERS):
-        wanted[section, "angle"] = geometry.angles[k]
-        defaults[section, "angle"] = NOMINAL_ANGLES[k]
-        for option, values in (("arm_length", geometry.arms), ("position_endstop", geometry.stops)):
-            wanted[section, option] = values[k]
-            if k:  # left out, it is that of tower a
-                defaults[section, option] = values[0]
-    if into is not None:
-        return read_config(into).export(into, wanted, defaults)
-    if source.is_for_people:
-        return _list_options(shorten_numbers(wanted, DECIMALS))
-    new = parse_config((), Path("printer.cfg"))
-    return new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
-
-
-def _list_options(wanted: Mapping[Name, float | str]) -> Exported:
-    """Return options for people: they change them where they are, because an option of the main
-    part would hide one of a pasted block.
-    """
-    lines: list[str] = []
-    for (section, option), text in wanted.items():
-        header = f"[{section}]"
-        lines += [header] if header not in lines else []
-        lines.append(f"{option}: {text}")
-    content = "\n".join(lines) + "\n"
-    return Exported(content, (report_finding("files.options-to-change"),))
-
-
-def _parse_probes(cfg: KlipperConfig) -> _Probes:
-    """Return the probes of [delta_calibrate]; FileError for a record that lacks a part."""
-    probes = _Probes({}, [], [])
-    for name in ("height", "manual_height"):
-        for record in _list_records(cfg, name, ("", "_pos")):
-            probes.positions[record] = _parse_steps(cfg, f"{record}_pos")
-            probes.heights.append((record, cfg.number(PROBED, record)))
-    for record in _list_records(cfg, "distance", ("", "_pos1", "_pos2")):
-        ends = (f"{record}_pos1", f"{record}_pos2")
-        for end in ends:
-            probes.positions[end] = _parse_steps(cfg, end)
-        probes.distances.append((*ends, cfg.number(PROBED, record)))
-    return probes
+    steps *= cfg.positive(section, "full_steps_per_rotation", 200.0)
+    if not cfg.has(section, "gear_ratio"):
+        return rotation / steps
+    text, ratio = cfg.text(section, "gear_ratio"), 1.0
+    for pair in text.split(","):
+        teeth = [parse_finite(part.strip()) or 0.0 for part in pair.split(":")]
+        ratio *= teeth[0] / teeth[1] if len(teeth) == 2 and teeth[1] else 0.0
+    if not ratio > 0:
+        sentence = f"gear_ratio is {text!r}; write it as 80:16, or 57:11, 2:1 for several gears"
+        raise cfg.error(sentence, section, "gear_ratio")
+    return rotation / (steps * ratio)
 
 
 def _list_records(cfg: KlipperConfig, name: str, suffixes: Sequence[str]) -> list[str]:
@@ -279,8 +235,7 @@ def _list_records(cfg: KlipperConfig, name: str, suffixes: Sequence[str]) -> lis
 
     Raises
     ------
-    FileError : a record lacks one of its parts (suffixes of its name), or a number is left out; at
-        a line of the record, or of the next one.
+    FileError : a record lacks one of its parts (suffixes of its name), or a number is left out.
     """
     pattern = re.compile(rf"{name}(\d+)({'|'.join(suffixes)})")
     records: dict[int, list[str]] = {}
@@ -307,47 +262,33 @@ def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:
     return steps
 
 
-def _build_measurements(
-    probes: _Probes, steps: list[float], options: ImportOptions
-) -> Measurements:
-    """Return heights as the component z, distances as separations of two poses."""
-    from loopcal.measure.kinds.distance import Separation
-    from loopcal.measure.kinds.poses import Component
-    from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
+def write(source: ExportSource, into: Path | None) -> Exported:
+    """Return the corrected numbers in an existing printer.cfg, or a saved block to paste.
 
-    labels = tuple(probes.positions)
-    readings = np.array([probes.positions[label] for label in labels]) * np.array(steps) * MM
-    observations = []
-    if probes.heights:
-        kind = Component(components=("z",)).with_tool(np.eye(4))
-        rows = [labels.index(label) for label, _ in probes.heights]
-        measured = np.array([[value * MM] for _, value in probes.heights])
-        sigma, is_assumed = options.choose_noise("height"), options.is_noise_assumed("height")
-        heights = Observations.from_sigma(kind, rows, measured, sigma)
-        observations.append(replace(heights, is_noise_assumed=is_assumed))
-    if probes.distances:
-        kind = Separation().with_tool(np.eye(4))
-        pairs = [(labels.index(a), labels.index(b)) for a, b, _ in probes.distances]
-        measured = np.array([[value * MM] for *_, value in probes.distances])
-        sigma, is_assumed = options.choose_noise("distance"), options.is_noise_assumed("distance")
-        distances = Observations.from_sigma(kind, pairs, measured, sigma)
-        observations.append(replace(distances, is_noise_assumed=is_assumed))
-    return Measurements(options.name, readings, tuple(observations), labels=labels)
-
-
-def _parse_gear_ratio(cfg: KlipperConfig, section: str) -> float:
-    """Return the turns of the motor for one of the last gear: `57:11, 2:1` is 57 / 11 * 2."""
-    if not cfg.has(section, "gear_ratio"):
-        return 1.0
-    text, ratio = cfg.text(section, "gear_ratio"), 1.0
-    for pair in text.split(","):
-        teeth = [parse_finite(part.strip()) or 0.0 for part in pair.split(":")]
-        ratio *= teeth[0] / teeth[1] if len(teeth) == 2 and teeth[1] else 0.0
-    if not ratio > 0:
-        sentence = f"gear_ratio is {text!r}; write it as 80:16, or 57:11, 2:1 for several gears"
-        raise cfg.error(sentence, section, "gear_ratio")
-    return ratio
+    People change options where they are, because an option of the main part would hide one of a
+    pasted block.
+    """
+    geometry = get_geometry(source, "klipper", DECIMALS)
+    wanted: dict[Name, float | str] = {("printer", "delta_radius"): geometry.radius}
+    defaults: dict[Name, float] = {}
+    for k, section in enumerate(STEPPERS):
+        wanted[section, "angle"] = geometry.angles[k]
+        defaults[section, "angle"] = NOMINAL_ANGLES[k]
+        for option, values in (("arm_length", geometry.arms), ("position_endstop", geometry.stops)):
+            wanted[section, option] = values[k]
+            if k:  # left out, it is that of tower a
+                defaults[section, option] = values[0]
+    if into is not None:
+        return read_config(into).export(into, wanted, defaults)
+    if source.is_for_people:
+        lines: list[str] = []
+        for (section, option), text in shorten_numbers(wanted, DECIMALS).items():
+            header = f"[{section}]"
+            lines += [header] if header not in lines else []
+            lines.append(f"{option}: {text}")
+        return Exported("\n".join(lines) + "\n", (report_finding("files.options-to-change"),))
+    new = KlipperConfig.parse((), Path("printer.cfg"))
+    return new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
 
 
 FORMAT = Format(

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,6 @@ import numpy as np
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import format_scaled
-from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import (
     DECIMALS,
     Exported,
@@ -79,15 +78,16 @@ screw:
 class HalFile(ValueFile):
     """A HAL file, whose values are pins of genhexkins."""
 
+    what = "HAL file"
     title = phrase = "{0}.{1}"
+    missing = "'setp {0}.{1} ..' is missing, and loopcal assumes no default; add it"
 
-    def describe_missing(self, group: str, name: str) -> str:
-        """Return the sentence about a pin that is not set."""
-        return f"'setp {group}.{name} ..' is missing, and loopcal assumes no default; add it"
-
-    def with_lines(self, lines: Sequence[str]) -> HalFile:
-        """Return the file with other lines."""
-        return _parse_hal(lines, self.path)
+    @classmethod
+    def parse(cls, lines: Sequence[str], path: Path) -> HalFile:
+        """Find the pins."""
+        matches = ((i, SETP.match(line)) for i, line in enumerate(lines))
+        pins = {(COMPONENT, m[1]): Value(m[3], i, m.start(3)) for i, m in matches if m is not None}
+        return cls(path, tuple(lines), pins)
 
     def insert(self, lines: list[str], name: Name, text: str) -> None:
         """Insert a line for a new pin at the end."""
@@ -102,7 +102,7 @@ class HalFile(ValueFile):
         return abs(a - b) <= ROUNDING * max(1.0, abs(b))
 
     def pin(self, name: str, default: float | None = None) -> float:
-        """Return the number of a pin, or the default; FileError where there is neither."""
+        """Return the number of a pin, or the default."""
         return self.number(COMPONENT, name, default)
 
     def points(self, kind: str) -> FloatArray:
@@ -139,7 +139,11 @@ def read(path: Path, options: ImportOptions) -> Imported:
     screw = ""
     if lead:
         low, high = hal.points("base-n"), hal.points("platform-n")
-        hands = _get_hands(platform + home * UP - base, low, high)
+        struts = platform + home * UP - base
+        across = (low * high).sum(1) * (struts * struts).sum(1)
+        across -= (low * struts).sum(1) * (high * struts).sum(1)
+        # of the other hand where the axes are beyond a quarter turn about the strut at home
+        hands = np.where(across < 0, -1.0, 1.0)
         leads = lead if min(hands) > 0 else (hands * lead).tolist()
         turned = hands[:, None] * high
         screw = SCREW.format(
@@ -164,7 +168,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     """Return the corrected pins in an existing HAL file, or `setp` lines of their own."""
     record: Gough = get_record(source, Gough, "linuxcnc", "a hexapod of the family gough")
     unit = find_unit(source.robot.units[Dimension.LENGTH])
-    hal = _parse_hal((), Path("hexapod.hal")) if into is None else _read_hal(into)
+    hal = HalFile.parse((), Path("hexapod.hal")) if into is None else _read_hal(into)
     lead = hal.pin(LEAD) if hal.has(COMPONENT, LEAD) else None
     wanted = _list_pins(source, record, unit.factor_to_si, hal.lift, lead)
     findings = _report_inexpressible(source, unit.factor_to_si, unit.symbol)
@@ -221,25 +225,11 @@ def _report_inexpressible(source: ExportSource, factor: float, symbol: str) -> I
 
 def _read_hal(path: Path) -> HalFile:
     """Read the pins of a file; FileError where it has none."""
-    hal = _parse_hal(read_text(path, "HAL file").splitlines(keepends=True), path)
+    hal = HalFile.load(path)
     if not hal.values:
         sentence = f"this file has no 'setp {COMPONENT}...'"
         raise FileError(f"{sentence}; name the HAL file that sets the geometry", path)
     return hal
-
-
-def _parse_hal(lines: Sequence[str], path: Path) -> HalFile:
-    """Find the pins."""
-    matches = ((i, SETP.match(line)) for i, line in enumerate(lines))
-    pins = {(COMPONENT, m[1]): Value(m[3], i, m.start(3)) for i, m in matches if m is not None}
-    return HalFile(path, tuple(lines), pins)
-
-
-def _get_hands(struts: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return (6,) -1 where the axes are beyond a quarter turn about the strut at home, else 1."""
-    across = (low * high).sum(1) * (struts * struts).sum(1)
-    across -= (low * struts).sum(1) * (high * struts).sum(1)
-    return np.where(across < 0, -1.0, 1.0)
 
 
 def _format_list(points: FloatArray, indent: int) -> str:
@@ -262,7 +252,6 @@ STRUTS = 6
 OFFSET = "HOME_OFFSET"
 UNITS_NAME = ("TRAJ", "LINEAR_UNITS")
 LINEAR_UNITS = {"mm": "mm", "metric": "mm", "in": "in", "inch": "in", "imperial": "in"}
-"""Word of LINEAR_UNITS -> our unit."""
 
 _SECTION = re.compile(r"\s*\[(\w+)\]")
 _ENTRY = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
@@ -272,16 +261,21 @@ _ENTRY = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
 class IniFile(ValueFile):
     """An INI file, whose values are entries by section; of equal ones the first counts."""
 
+    what = "INI file"
     title = "[{0}]{1}"
     phrase = "{1} of [{0}]"
+    missing = "[{0}] has no {1}; add the one of the machine"
 
-    def describe_missing(self, group: str, name: str) -> str:
-        """Return the sentence about an entry that does not exist."""
-        return f"[{group}] has no {name}; add the one of the machine"
-
-    def with_lines(self, lines: Sequence[str]) -> IniFile:
-        """Return the file with other lines."""
-        return _parse_ini(lines, self.path)
+    @classmethod
+    def parse(cls, lines: Sequence[str], path: Path) -> IniFile:
+        """Find the entries."""
+        section, values = "", dict[Name, Value]()
+        for i, line in enumerate(lines):
+            if match := _SECTION.match(line):
+                section = match[1]
+            elif match := _ENTRY.match(line):
+                values.setdefault((section, match[1]), Value(match[2], i, match.start(2)))
+        return cls(path, tuple(lines), values)
 
     def insert(self, lines: list[str], name: Name, text: str) -> None:
         """Insert an entry with its section at the end."""
@@ -289,81 +283,46 @@ class IniFile(ValueFile):
 
 
 def write_ini(source: ExportSource, into: Path | None) -> Exported:
-    """Return an INI file with corrected offsets, or entries of their own."""
+    """Return an INI file with corrected offsets, or entries of their own; for people what to add to
+    each offset.
+    """
     get_record(source, Gough, "linuxcnc-ini", "a hexapod of the family gough")
     values, table = source.values(), source.robot.parameters
     nominal = dict(zip(table.names, table.nominal.tolist(), strict=True))
-    lengths = [f"leg{n + 1}.length" for n in range(STRUTS)]
-    own = source.robot.units[Dimension.LENGTH]
-    if into is None:
-        if source.is_for_people:
-            return _list_changes(source, lengths, nominal, own)
-        if not all(nominal[name] for name in lengths):
-            raise DataError(report_finding("files.ini-needed", robot=source.robot.name))
-        factor = find_unit(own).factor_to_si
-        wanted: dict[Name, float | str] = {
-            (f"JOINT_{n}", OFFSET): source.round_number(
-                values[name] / factor, name, factor, DECIMALS
-            )
-            for n, name in enumerate(lengths)
-        }
-        notes = (
-            report_finding("files.machine-unit", unit=own),
-            report_finding("files.offset-at-reading-zero"),
-        )
-        return _parse_ini((), Path("machine.ini")).export(None, wanted, {}, notes)
-    ini = _parse_ini(read_text(into, "INI file").splitlines(keepends=True), into)
-    unit = _read_unit(ini, own)
+    lengths = {f"JOINT_{n}": f"leg{n + 1}.length" for n in range(STRUTS)}
+    unit = source.robot.units[Dimension.LENGTH]
+    ini = None if into is None else IniFile.load(into)
+    findings = [report_finding("files.machine-unit", unit=unit)]
+    if ini is not None and ini.has(*UNITS_NAME):
+        text, findings = ini.text(*UNITS_NAME), []
+        if text.lower() not in LINEAR_UNITS:
+            allowed = ", ".join(LINEAR_UNITS)
+            raise ini.error(f"{UNITS_NAME[1]} is {text!r}; allowed: {allowed}", *UNITS_NAME)
+        unit = LINEAR_UNITS[text.lower()]
     factor = find_unit(unit).factor_to_si
-    wanted = {
-        (f"JOINT_{n}", OFFSET): source.round_number(
-            ini.number(f"JOINT_{n}", OFFSET) + (values[name] - nominal[name]) / factor,
-            name,
-            factor,
-            DECIMALS,
-        )
-        for n, name in enumerate(lengths)
-    }
-    findings: tuple[Finding, ...] = ()
-    if not ini.has(*UNITS_NAME):
-        findings = (report_finding("files.machine-unit", unit=unit),)
-    return ini.export(into, wanted, {}, findings)
 
+    def scale(name: str, start: float, origin: float) -> float:
+        number = start + (values[name] - origin) / factor
+        return source.round_number(number, name, factor, DECIMALS)
 
-def _list_changes(
-    source: ExportSource, lengths: Sequence[str], nominal: Mapping[str, float], unit: str
-) -> Exported:
-    """Return what to add to each offset, as lines for people."""
-    factor, values = find_unit(unit).factor_to_si, source.values()
-    lines = []
-    for n, name in enumerate(lengths):
-        added = (values[name] - nominal[name]) / factor
-        number = f"{source.round_number(added, name, factor, DECIMALS) + 0.0:+.{DECIMALS}f}"
-        shown = number.rstrip("0").rstrip(".")
-        lines += [f"[JOINT_{n}]", f"# add {shown} {unit} to {OFFSET}"]
-    return Exported("\n".join(lines) + "\n")
-
-
-def _read_unit(ini: IniFile, own: str) -> str:
-    """Return the unit of lengths of the machine; the robot's where the file states none."""
-    if not ini.has(*UNITS_NAME):
-        return own
-    text = ini.text(*UNITS_NAME)
-    if text.lower() not in LINEAR_UNITS:
-        allowed = ", ".join(LINEAR_UNITS)
-        raise ini.error(f"{UNITS_NAME[1]} is {text!r}; allowed: {allowed}", *UNITS_NAME)
-    return LINEAR_UNITS[text.lower()]
-
-
-def _parse_ini(lines: Sequence[str], path: Path) -> IniFile:
-    """Find the entries."""
-    section, values = "", dict[Name, Value]()
-    for i, line in enumerate(lines):
-        if match := _SECTION.match(line):
-            section = match[1]
-        elif match := _ENTRY.match(line):
-            values.setdefault((section, match[1]), Value(match[2], i, match.start(2)))
-    return IniFile(path, tuple(lines), values)
+    if ini is not None:
+        wanted: dict[Name, float | str] = {
+            (joint, OFFSET): scale(name, ini.number(joint, OFFSET), nominal[name])
+            for joint, name in lengths.items()
+        }
+        return ini.export(into, wanted, {}, findings)
+    if source.is_for_people:
+        lines = []
+        for joint, name in lengths.items():
+            number = f"{scale(name, 0.0, nominal[name]) + 0.0:+.{DECIMALS}f}"
+            shown = number.rstrip("0").rstrip(".")
+            lines += [f"[{joint}]", f"# add {shown} {unit} to {OFFSET}"]
+        return Exported("\n".join(lines) + "\n")
+    if not all(nominal[name] for name in lengths.values()):
+        raise DataError(report_finding("files.ini-needed", robot=source.robot.name))
+    wanted = {(joint, OFFSET): scale(name, 0.0, 0.0) for joint, name in lengths.items()}
+    notes = (*findings, report_finding("files.offset-at-reading-zero"))
+    return IniFile.parse((), Path("machine.ini")).export(None, wanted, {}, notes)
 
 
 INI_FORMAT = Format(

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of a format of another program: options, imported content, exported text."""
+"""The interface of a format of another program: options, imported content, exported text.
+
+`ValueFile` is the general form of a text file whose values are read and replaced by name.
+"""
 
 from __future__ import annotations
 
@@ -7,34 +10,34 @@ import math
 import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import count_decimals
 from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.core.limits import format_comment
-from loopcal.io.core.text_file import read_bytes
+from loopcal.io.core.text_file import read_bytes, read_text
 from loopcal.io.core.yaml_file import quote_scalar
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
 from loopcal.units import LARGEST
 
 if TYPE_CHECKING:
+    from loopcal.measure.kinds.kind import Kind
     from loopcal.measure.measurements import Measurements
+    from loopcal.measure.observations import Observations
 
-ASSUMED_NOISE: Mapping[str, float] = {
-    "height": 20e-6,
-    "distance": 0.1e-3,
-    "line": 1e-3,
-    "position": 1e-3,
-    "tape": 10e-3,
-}
+MM = 1e-3
+
+ASSUMED_NOISE = {"height": 20e-6, "distance": 0.1e-3, "line": 1e-3, "position": 1e-3, "tape": 10e-3}
 """Standard deviations [m] that are assumed where nobody states them: of a probed height, of a
-distance on a printed part, of line lengths, of known positions and of taped lengths of a cable
-robot.
+distance on a printed part, of line lengths, known positions and taped lengths of a cable robot.
 """
 
 
@@ -45,15 +48,14 @@ class ImportOptions:
     Attributes
     ----------
     name : of the robot.
-    sigma_height, sigma_distance : noise of probed heights and distances [m], which no format
-        states. sigma_line, sigma_position : noise of lines and known positions of a cable robot
-        [m]. sigma_tape : of lengths that were measured by hand [m], which are prior knowledge.
-        Where one is None it is assumed, see `choose_noise`.
+    sigma_height, sigma_distance, sigma_line, sigma_position : noise [m] of probed heights and
+        distances, and of lines and known positions of a cable robot, which no format states.
+    sigma_tape : of lengths that were measured by hand [m], which are prior knowledge. Where one of
+        these is None it is assumed, see `choose_noise`.
     sigma_anchor : of anchors that the file states [m]; None leaves them to the data.
     length_unit : symbol of the unit of lengths, for formats that state none.
     home_height : z of the home pose [m].
-    closures : file of loop closures, for formats that keep them apart.
-    platform : the link that is the platform.
+    closures, platform : file of loop closures, and link that is the platform, of a URDF.
     probes : files with the heights that a firmware reported, and with their points.
     """
 
@@ -78,6 +80,16 @@ class ImportOptions:
     def is_noise_assumed(self, *what: str) -> bool:
         """Return whether any of these is assumed."""
         return any(getattr(self, f"sigma_{of}") is None for of in what)
+
+    def observe(self, kind: Kind, rows: ArrayLike, measured: ArrayLike, *what: str) -> Observations:
+        """Return values measured in the platform frame, with the noise of the last of `what`; it is
+        marked as assumed where any of them is.
+        """
+        from loopcal.measure.observations import Observations
+
+        sigma = self.choose_noise(what[-1])
+        observed = Observations.from_sigma(kind.with_tool(np.eye(4)), rows, measured, sigma)
+        return replace(observed, is_noise_assumed=self.is_noise_assumed(*what))
 
 
 @dataclass(frozen=True)
@@ -115,12 +127,8 @@ class ExportSource:
     is_for_people: bool = False
 
     def round_number(self, number: float, name: str, factor: float, most: int) -> float:
-        """Return a number as it is written: for people to the third digit of the interval of a
-        parameter, with at most `most` decimals; for programs as it is.
-
-        Parameters
-        ----------
-        name : of the parameter. factor : from the unit in which the number is written to SI.
+        """Return a number as it is written, in a unit of `factor` to SI: for people to the third
+        digit of the interval of parameter `name`, with at most `most` decimals.
         """
         half = self.plus_minus.get(name)
         if not self.is_for_people or half is None or not 0.0 < half < math.inf:
@@ -136,12 +144,7 @@ class ExportSource:
 
 @dataclass(frozen=True)
 class Exported:
-    """The text of a file of another program.
-
-    Attributes
-    ----------
-    findings : changes, and what it cannot express.
-    """
+    """The text of a file of another program; findings are changes, and what it cannot express."""
 
     text: str
     findings: tuple[Finding, ...] = ()
@@ -178,22 +181,15 @@ def get_record(
     """Return the family's record of a robot; DataError where it is not `needed`."""
     record = getattr(source.robot.record, "record", None)
     if not isinstance(record, family):
-        sentence = (
-            f"{source.robot.name} is not {needed}, and the format {format_name} holds no other"
-        )
-        raise DataError(f"{sentence}; use json or csv")
+        sentence = f"{source.robot.name} is not {needed}, and the format {format_name} holds no"
+        raise DataError(f"{sentence} other; use json or csv")
     return record
 
 
 def format_head(
     path: Path, what: str, family: str, name: str, units: tuple[str, str], remark: str = ""
 ) -> str:
-    """Return the first lines of a robot file that is read from `path`.
-
-    Parameters
-    ----------
-    what : the content of that file. units : of length and angle. remark : for people.
-    """
+    """Return the first lines of a robot file that is read from `path`, whose content is `what`."""
     origin = format_comment(f"{path.name}, {what}")
     return "\n".join(
         [
@@ -210,13 +206,10 @@ def format_head(
 def parse_number(text: str, what: str, path: Path, line: int) -> float:
     """Return a number of a file; FileError with its line for other text, or beyond `LARGEST`."""
     value = parse_finite(text)
-    if value is None:
-        sentence = f"{what} is {quote(text)}, but a finite number is needed; correct it"
-        raise FileError(sentence, path, line)
-    if not abs(value) <= LARGEST:
-        sentence = f"{what} is {quote(text)}, beyond {LARGEST:g}; correct it"
-        raise FileError(sentence, path, line)
-    return value
+    if value is not None and abs(value) <= LARGEST:
+        return value
+    reason = ", but a finite number is needed" if value is None else f", beyond {LARGEST:g}"
+    raise FileError(f"{what} is {quote(text)}{reason}; correct it", path, line)
 
 
 def report_changes(changes: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -229,13 +222,11 @@ def get_byte_order_mark(path: Path) -> str:
     return "\ufeff" if read_bytes(path, "file").startswith(b"\xef\xbb\xbf") else ""
 
 
-# Text files of controllers whose values are read and replaced by name, and nothing else in
-# them.
-
 DECIMALS = 6
 """Decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometer."""
 
 Name = tuple[str, str]
+Numbers = Mapping[Name, float | str]
 
 
 @dataclass(frozen=True)
@@ -249,29 +240,39 @@ class Value:
 
 @dataclass(frozen=True)
 class ValueFile(ABC):
-    """A file: its lines with their ends, and the values that count.
+    """A text file of a controller: its lines with their ends, and the values that count, by group
+    and name; nothing else in it is changed.
 
-    `title` and `phrase` word a name in a list of changes and in sentences.
+    `what` names the sort of file; `title` and `phrase` word a name in a list of changes and in
+    sentences, `missing` is the sentence about a value that does not exist.
     """
 
     path: Path
     lines: tuple[str, ...]
     values: Mapping[Name, Value]
 
+    what: ClassVar[str]
     title: ClassVar[str] = "{0} {1}"
     phrase: ClassVar[str] = "{1} of {0}"
+    missing: ClassVar[str]
 
+    @classmethod
     @abstractmethod
-    def describe_missing(self, group: str, name: str) -> str:
-        """Return the sentence about a value that does not exist."""
-
-    @abstractmethod
-    def with_lines(self, lines: Sequence[str]) -> Self:
-        """Return the file with other lines."""
+    def parse(cls, lines: Sequence[str], path: Path) -> Self:
+        """Find the values in complete lines."""
 
     @abstractmethod
     def insert(self, lines: list[str], name: Name, text: str) -> None:
         """Insert a new value into complete lines."""
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file and find its values."""
+        return cls.parse(read_text(path, cls.what).splitlines(keepends=True), path)
+
+    def describe_missing(self, group: str, name: str) -> str:
+        """Return the sentence about a value that does not exist."""
+        return self.missing.format(group, name)
 
     def finish_line(self, line: str) -> str:
         """Return a line after a change of a value."""
@@ -329,10 +330,10 @@ class ValueFile(ABC):
             if lines and not lines[-1].endswith("\n"):
                 lines[-1] += self.line_end
             self.insert(lines, name, text)
-        return self.with_lines(lines)
+        return self.parse(lines, self.path)
 
     def correct(
-        self, wanted: Mapping[Name, float | str], defaults: Mapping[Name, float]
+        self, wanted: Numbers, defaults: Mapping[Name, float]
     ) -> tuple[Self, tuple[Finding, ...]]:
         """Return the file with other numbers (or texts), and the changes.
 
@@ -361,7 +362,7 @@ class ValueFile(ABC):
     def export(
         self,
         into: Path | None,
-        wanted: Mapping[Name, float | str],
+        wanted: Numbers,
         defaults: Mapping[Name, float],
         findings: Sequence[Finding] = (),
     ) -> Exported:
@@ -379,15 +380,9 @@ def format_number(value: float) -> str:
     return f"{value:.{DECIMALS}f}"
 
 
-def shorten_numbers(wanted: Mapping[Name, float | str], decimals: int) -> dict[Name, float | str]:
-    """Return numbers as texts for people, without zeros at their ends; lists are `a:b:c`."""
-    return {
-        name: ":".join(
-            format_short(float(number), decimals)
-            for number in (value.split(":") if isinstance(value, str) else (value,))
-        )
-        for name, value in wanted.items()
-    }
+def is_same(*pairs: tuple[float, float]) -> bool:
+    """Return whether the two numbers of each pair are written alike."""
+    return all(format_number(a) == format_number(b) for a, b in pairs)
 
 
 def format_short(number: float, decimals: int) -> str:
@@ -397,6 +392,12 @@ def format_short(number: float, decimals: int) -> str:
     return "0" if text == "-0" else text
 
 
-def is_same(*pairs: tuple[float, float]) -> bool:
-    """Return whether the two numbers of each pair are written alike."""
-    return all(format_number(a) == format_number(b) for a, b in pairs)
+def shorten_numbers(wanted: Numbers, decimals: int) -> dict[Name, float | str]:
+    """Return numbers as texts for people, without zeros at their ends; lists are `a:b:c`."""
+    return {
+        name: ":".join(
+            format_short(float(number), decimals)
+            for number in (value.split(":") if isinstance(value, str) else (value,))
+        )
+        for name, value in wanted.items()
+    }
