@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
-from loopcal.errors import DataError
 from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.observations import Observations
 
@@ -87,67 +86,6 @@ def test_arrays_are_read_only_copies():
     for name in ("rows", "measured", "covariance", "weight", "present", "whitener"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(data, name)[0] = 1
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (
-            {"measured": np.zeros((2, 4))},
-            r"measured values of kind 'component' has shape \(2, 4\); give .*\(2, 3\)",
-        ),
-        (
-            {"measured": [[1.0, np.inf, 0.0], [0.0] * 3]},
-            "row 1, column 2 is inf; give a finite number or NaN",
-        ),
-        ({"rows": [0.5, 1.0]}, "give whole numbers of shape"),
-        ({"rows": [0]}, "has shape"),
-        (
-            {"covariance": np.diag([1.0, 0.0, 1.0])},
-            "covariance of row 1 has a variance that is not above 0",
-        ),
-        (
-            {"covariance": [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
-            "row 1 is not positive definite",
-        ),
-        (
-            {"covariance": [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
-            "row 1 is not positive definite",
-        ),
-        (
-            {"covariance": [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
-            "row 1 is not symmetric",
-        ),
-        ({"weight": [1.0, -1.0]}, "weight of row 2 is -1"),
-        ({"weight": [1.0, np.nan]}, "the weight: row 2 is nan"),
-        ({"covariance": np.eye(2)}, r"covariance has shape \(2, 2\); give \(2, 3, 3\) or \(3, 3\)"),
-        (
-            {"weight": [1.0, 1.0, 1.0]},
-            r"the weight has shape \(3,\); give one number for each of 2 rows",
-        ),
-    ],
-)
-def test_invalid_observations_are_refused_in_one_sentence(change, sentence):
-    right = {"kind": POINT, "rows": [0, 1], "measured": np.zeros((2, 3)), "covariance": np.eye(3)}
-    with pytest.raises(DataError, match=sentence):
-        Observations(**(right | change))
-
-
-def test_row_with_an_invalid_covariance_is_named():
-    C = np.repeat(np.eye(3)[None], 5, axis=0)
-    C[3, 0, 1] = C[3, 1, 0] = 1.5
-    with pytest.raises(DataError, match="covariance of row 4 is not positive definite"):
-        Observations(POINT, np.arange(5), np.zeros((5, 3)), C)
-
-
-def test_sigma_of_the_wrong_length_is_refused_with_the_columns():
-    with pytest.raises(
-        DataError,
-        match=r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z",
-    ):
-        Observations.from_sigma(POSE, [0], np.zeros((1, 6)), [1.0, 2.0])
-    with pytest.raises(DataError, match=r"give \(r, 6\): rx, ry, rz, x, y, z"):
-        Observations.from_sigma(POSE, [0], np.zeros((1, 5)), 1.0)
 
 
 @pytest.mark.slow

@@ -6,14 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopcal.errors import DataError
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor, Uniform
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import Observations
-from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.measure.simulation import simulate, simulate_trials
 from tests import zoo
 
 LINES, CHARACTERS = 20, 1600  # of a screen
@@ -68,50 +66,3 @@ def test_text_of_measurements_counts_poses_and_rows(robot, instrument, poses):
     text = repr(simulate(robot, poses, instrument, seed=1))
     assert "40 poses, 6 actuator readings each" in text
     assert "40 rows; 240 residuals" in text
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "words"),
-    [
-        (
-            lambda: Measurements("r", "data.csv", ()),  # type: ignore[arg-type]
-            DataError,
-            "'data.csv'.*load_measurements",
-        ),
-        (
-            lambda: Measurements("r", np.zeros((1, 1)), ("rows.csv",)),  # type: ignore[arg-type]
-            DataError,
-            "observations: got the text 'rows.csv'; give Observations",
-        ),
-        (
-            lambda: Observations("pose", [0], [[0.0]], 1.0),  # type: ignore[arg-type]
-            DataError,
-            "kind: got the text 'pose'; give Kind, such as",
-        ),
-        (
-            lambda: Observations.from_sigma(Position(), [0], "data.csv", 1.0),  # type: ignore[arg-type]
-            DataError,
-            "measured: got the text 'data.csv'; give an array",
-        ),
-        (
-            lambda: Sensor(Pose(), 1e-5),  # type: ignore[arg-type]
-            DataError,
-            "noise: got a float; give Noise, such as",
-        ),
-        (lambda: Instrument(Sensor(Pose(), Gaussian(np.ones(6)))), DataError, "give a tuple"),  # type: ignore[arg-type]
-        (
-            lambda: sample_truth("hexapod-42", 1, 0),  # type: ignore[arg-type]
-            DataError,
-            "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot",
-        ),
-        (
-            lambda: simulate(zoo.hexapod(), zoo.make_poses(np.zeros((1, 6))), "pose", 1),  # type: ignore[arg-type]
-            DataError,
-            "instrument: got the text 'pose'; give Instrument",
-        ),
-        (lambda: Gaussian("1 um"), DataError, "got the text '1 um'; give an array"),  # type: ignore[arg-type]
-    ],
-)
-def test_wrong_argument_type_is_refused_with_advice(call, error, words):
-    with pytest.raises(error, match=words):
-        call()

@@ -13,15 +13,17 @@ from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.directions import Autocollimation, Direction, Inclination
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.joints import JointSensor
-from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.kinds.surfaces import Line, Plane, Sphere
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.simulation import simulate
+from loopcal.measure.simulation import sample_truth, simulate
 from tests import zoo
 
 POINT = np.zeros((1, 3))
+POSE = Pose(T_platform_tool=np.eye(4))
+BAR = Separation(places=POINT)
 EXAMPLES = [
     pytest.param(kind, id=f"{name}-{i}")
     for name, cls in KINDS.items()
@@ -30,80 +32,164 @@ EXAMPLES = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: Position(targets=()), "the targets are empty; name at least one"),
-        (
-            lambda: Position(targets=("a", "a")),
-            "the targets are a, a; name at least one, and each once",
-        ),
-        (
-            lambda: Position(targets=("a", "b"), places=POINT),
-            r"number of places is 1, but there are 2 targets \(a, b\); state one place",
-        ),
-        (
-            lambda: Position(unknown=("tracker",)),
-            "'tracker' cannot be unknown in the kind 'position'; allowed are frame, targets",
-        ),
-        (lambda: Position(T_base_frame=2.0 * np.eye(4)), "T_base_frame is not a pose"),
-        (
-            lambda: Bearing(form="telescope"),
-            "the form of a bearing is 'telescope'; use theodolite or camera",
-        ),
-        (
-            lambda: Distance(anchor=np.array([0.0, np.nan, 0.0])),
-            "the anchor: row 2 is nan; give a finite number",
-        ),
-        (lambda: Plane(along=np.zeros(3)), "the direction of the surface is 0, 0, 0"),
-        (lambda: Sphere(radius=0.0), "the radius of a sphere is 0.0 m; give a length above 0"),
-        (lambda: Direction(axis=np.zeros(3)), "the axis is 0, 0, 0"),
-        (lambda: Inclination(unknown=("frame",)), "allowed are mounting, gravity"),
-        (lambda: JointSensor(joints=()), "the joints are empty; name at least one"),
-        (lambda: JointSensor(measures="force"), "the joints measure 'force'; use length or angle"),
-    ],
-)
-def test_invalid_settings_of_a_kind_are_refused(make, sentence):
+POINTS = Component(("x", "y", "z"), T_platform_tool=np.eye(4))
+HEIGHT = Component(("z",), T_platform_tool=np.eye(4))
+POSES = zoo.make_poses(np.zeros((1, 6)))
+
+
+def observe(*rows, kind=POINTS, poses=None, sigma=1e-4):
+    """Return observations of the first poses."""
+    poses = range(len(rows)) if poses is None else poses
+    return Observations.from_sigma(kind, poses, rows, sigma)
+
+
+def observe_points(**change):
+    right = {"kind": POINTS, "rows": [0, 1], "measured": np.zeros((2, 3)), "covariance": np.eye(3)}
+    return Observations(**(right | change))
+
+
+def record(**change):
+    rows = observe([0.0], [0.0], kind=HEIGHT)
+    right = {"robot_name": "toy", "readings": np.zeros((2, 2)), "observations": (rows,)}
+    return Measurements(**(right | change))
+
+
+def record_readings(sigma, first=(1.0, 1.0)):
+    readings = [first, (1.0, 1.0), (1.0, 1.0)]
+    return record(readings=readings, observations=(), reading_sigma=sigma)
+
+
+def observe_correlated(a, b=None):
+    """Return points whose x and y have a correlation, which may be asymmetric."""
+    covariance = np.eye(3)
+    covariance[0, 1], covariance[1, 0] = a, a if b is None else b
+    return observe_points(covariance=covariance)
+
+
+REFUSED = {
+    # settings of kinds
+    "the targets are empty; name at least one": lambda: Position(targets=()),
+    "the targets are a, a; name at least one, and each once": lambda: Position(targets=("a", "a")),
+    r"number of places is 1, but there are 2 targets \(a, b\); state one place": lambda: Position(
+        targets=("a", "b"), places=POINT
+    ),
+    "'tracker' cannot be unknown in the kind 'position'; allowed are frame, targets": (
+        lambda: Position(unknown=("tracker",))
+    ),
+    "T_base_frame is not a pose": lambda: Position(T_base_frame=2.0 * np.eye(4)),
+    "the form of a bearing is 'telescope'; use theodolite or camera": (
+        lambda: Bearing(form="telescope")
+    ),
+    "the anchor: row 2 is nan; give a finite number": lambda: Distance(anchor=(0.0, np.nan, 0.0)),
+    "the direction of the surface is 0, 0, 0": lambda: Plane(along=np.zeros(3)),
+    "the radius of a sphere is 0.0 m; give a length above 0": lambda: Sphere(radius=0.0),
+    "the axis is 0, 0, 0": lambda: Direction(axis=np.zeros(3)),
+    "allowed are mounting, gravity": lambda: Inclination(unknown=("frame",)),
+    "the joints are empty; name at least one": lambda: JointSensor(joints=()),
+    "the joints measure 'force'; use length or angle": lambda: JointSensor(measures="force"),
+    # values of rows
+    "row 2 of kind 'distance' has a distance of 0 m; a distance is above 0": (
+        lambda: observe([1.0], [0.0], kind=Distance(places=POINT))
+    ),
+    "has a distance of -0.1 m": lambda: observe([1.0], [-0.1], kind=BAR, poses=[[0, 1], [1, 0]]),
+    "row 2 of kind 'separation' compares pose 3 with itself": lambda: observe(
+        [1.0], [1.0], kind=BAR, poses=[[0, 1], [3, 3]]
+    ),
+    "has a direction of length 0.921954; the length must be 1 to 1e-3": (
+        lambda: observe([0.0, 0.6, 0.7], kind=Direction())
+    ),
+    "has an incomplete direction": lambda: observe([0.0, np.nan, 1.0], kind=Direction()),
+    "has tilts of 51.5662 and 51.5662 deg, which are impossible": (
+        lambda: observe([0.9, 0.9], kind=Inclination())
+    ),
+    "has tilts of 114.592 and 0 deg": lambda: observe([2.0, 0.0], kind=Inclination()),
+    "has an angle of 91.6732 deg, at which the mirror faces away": (
+        lambda: observe([0.0, 1.6], kind=Autocollimation())
+    ),
+    # shapes and numbers of observations
+    r"measured values of kind 'component' has shape \(2, 4\); give .*\(2, 3\)": (
+        lambda: observe_points(measured=np.zeros((2, 4)))
+    ),
+    "row 1, column 2 is inf; give a finite number or NaN": (
+        lambda: observe_points(measured=[[1.0, np.inf, 0.0], [0.0] * 3])
+    ),
+    "give whole numbers of shape": lambda: observe_points(rows=[0.5, 1.0]),
+    r"has shape \(2, 3\)": lambda: observe_points(rows=[0]),
+    "covariance of row 1 has a variance that is not above 0": (
+        lambda: observe_points(covariance=np.diag([1.0, 0.0, 1.0]))
+    ),
+    "covariance of row 1 is not positive definite": lambda: observe_correlated(2.0),
+    "row 1 is not positive definite": lambda: observe_correlated(1.0),
+    "row 1 is not symmetric": lambda: observe_correlated(0.5, 0.0),
+    "covariance of row 2 is not positive definite": lambda: observe_points(
+        covariance=[np.eye(3), np.eye(3) + 1.5 * np.eye(3)[[1, 0, 2]] * [1, 1, 0]]
+    ),
+    "weight of row 2 is -1": lambda: observe_points(weight=[1.0, -1.0]),
+    "the weight: row 2 is nan": lambda: observe_points(weight=[1.0, np.nan]),
+    r"covariance has shape \(2, 2\); give \(2, 3, 3\) or \(3, 3\)": (
+        lambda: observe_points(covariance=np.eye(2))
+    ),
+    r"the weight has shape \(3,\); give one number for each of 2 rows": (
+        lambda: observe_points(weight=[1.0, 1.0, 1.0])
+    ),
+    r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z": (
+        lambda: observe([0.0] * 6, kind=POSE, sigma=[1.0, 2.0])
+    ),
+    r"give \(r, 6\): rx, ry, rz, x, y, z": lambda: observe([0.0] * 5, kind=POSE),
+    # measurements and their readings
+    "readings: row 1, column 2 is nan; give a finite number": (
+        lambda: record(readings=[[1.0, np.nan], [0.0, 0.0]])
+    ),
+    r"readings has shape \(2,\)": lambda: record(readings=[1.0, 2.0]),
+    "have no pose": lambda: record(readings=np.empty((0, 2))),
+    "row 2 of kind 'component' refers to pose 1, but the 1 poses are 0 to 0": (
+        lambda: record(readings=[[1.0, 2.0]])
+    ),
+    "give one whole number for each pose": lambda: record(block=np.array([1])),
+    "1 labels for 2 poses": lambda: record(labels=("a",)),
+    "sigma -1e-06 .* not a standard deviation": lambda: record_readings(-1e-6),
+    "sigma nan .* not a standard deviation": lambda: record_readings(np.nan),
+    "missing reading": lambda: record_readings(1e-6, (1.0, np.nan)),
+    "one for each of the 2 actuators": lambda: record_readings(np.ones(3)),
+    "column 2 is nan; give a finite number, or": lambda: record_readings(None, (1.0, np.nan)),
+    "column 2 is inf; give a finite": lambda: record_readings(np.inf, (1.0, np.inf)),
+    # sensors and their noise
+    "the sigma of the noise contains 0": lambda: Gaussian(np.array([0.0])),
+    "the sigma of the noise contains -1": lambda: Gaussian(np.array([-1.0])),
+    "the sigma of the noise: row 1 is nan": lambda: Gaussian(np.array([np.nan])),
+    "give one for each of rx, ry, rz, x, y, z": lambda: Sensor(POSE, Gaussian(np.ones(1))),
+    "at least one sensor": lambda: Instrument(()),
+    "refer to pose 7, but the 4 poses are 0 to 3": (
+        lambda: Sensor(BAR, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).assign_rows(4)
+    ),
+    "compares two poses, but the number of poses is 1": (
+        lambda: Sensor(BAR, Gaussian(np.ones(1))).assign_rows(1)
+    ),
+    # arguments of another type
+    "'data.csv'.*load_measurements": lambda: record(readings="data.csv"),
+    "observations: got the text 'rows.csv'; give Observations": (
+        lambda: record(observations=("rows.csv",))
+    ),
+    "kind: got the text 'pose'; give Kind, such as": lambda: observe_points(kind="pose"),
+    "measured: got the text 'data.csv'; give an array": (
+        lambda: Observations.from_sigma(POINTS, [0], "data.csv", 1.0)
+    ),
+    "noise: got a float; give Noise, such as": lambda: Sensor(POSE, 1e-5),
+    "give a tuple": lambda: Instrument(Sensor(POSE, Gaussian(np.ones(6)))),
+    "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot": (
+        lambda: sample_truth("hexapod-42", 1, 0)
+    ),
+    "instrument: got the text 'pose'; give Instrument": (
+        lambda: simulate(zoo.hexapod(), POSES, "pose", 1)
+    ),
+    "got the text '1 um'; give an array": lambda: Gaussian("1 um"),
+}
+
+
+@pytest.mark.parametrize("sentence", REFUSED)
+def test_invalid_input_is_refused_in_one_sentence(sentence):
     with pytest.raises(DataError, match=sentence):
-        make()
-
-
-@pytest.mark.parametrize(
-    ("kind", "row", "sentence"),
-    [
-        (
-            Distance(places=POINT),
-            [0.0],
-            "row 2 of kind 'distance' has a distance of 0 m; a distance is above 0",
-        ),
-        (Separation(places=POINT), [-0.1], "has a distance of -0.1 m"),
-        (
-            Direction(),
-            [0.0, 0.6, 0.7],
-            "has a direction of length 0.921954; the length must be 1 to 1e-3",
-        ),
-        (Direction(), [0.0, np.nan, 1.0], "has an incomplete direction"),
-        (Inclination(), [0.9, 0.9], "has tilts of 51.5662 and 51.5662 deg, which are impossible"),
-        (Inclination(), [2.0, 0.0], "has tilts of 114.592 and 0 deg"),
-        (
-            Autocollimation(),
-            [0.0, 1.6],
-            "has an angle of 91.6732 deg, at which the mirror faces away",
-        ),
-    ],
-)
-def test_impossible_rows_are_refused(kind, row, sentence):
-    good = {"distance": [1.0], "separation": [1.0], "direction": [0.0, 0.0, 1.0]}.get(
-        kind.name, [0.0, 0.0]
-    )
-    poses = np.arange(2) if kind.poses_per_row == 1 else np.array([[0, 1], [1, 0]])
-    with pytest.raises(DataError, match=sentence):
-        Observations.from_sigma(kind, poses, [good, row], 1e-4)
-
-
-def test_row_that_compares_a_pose_with_itself_is_refused():
-    with pytest.raises(DataError, match="row 2 of kind 'separation' compares pose 3 with itself"):
-        Observations.from_sigma(Separation(places=POINT), [[0, 1], [3, 3]], np.ones((2, 1)), 1e-4)
+        REFUSED[sentence]()
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
@@ -290,11 +376,3 @@ def test_constant_values_are_accepted_for_surfaces_and_joints(kind):
     rows = Observations.from_sigma(kind, np.arange(8), np.zeros((8, len(kind.columns))), 1e-5)
     data = Measurements("toy", np.arange(8.0)[:, None], (rows,))
     assert check_targets_move(data, T, SIZE) is None
-
-
-def test_sensor_rows_of_missing_poses_are_refused():
-    kind = Separation(places=POINT)
-    with pytest.raises(DataError, match="refer to pose 7, but the 4 poses are 0 to 3"):
-        Sensor(kind, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).assign_rows(4)
-    with pytest.raises(DataError, match="compares two poses, but the number of poses is 1"):
-        Sensor(kind, Gaussian(np.ones(1))).assign_rows(1)
