@@ -53,7 +53,7 @@ from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import SI_SYMBOLS, Dimension, Unit
+from loopcal.units import SI_SYMBOLS, Unit
 
 # Number of rows below which an error cannot be judged. At 4 rows the rms of noise alone varies by
 # a third.
@@ -670,8 +670,13 @@ def restore_validation(
     }
     rest = content["without_blunders"]
     if rest is not None:
-        unknown = {"commanded_before": {}, "commanded_after": {}, "not_compensable": {}}
-        unknown |= {"blunders": (), "without_blunders": None, "failed": ()}
+        names = ("commanded_before", "commanded_after", "not_compensable")
+        unknown = {
+            "blunders": (),
+            "without_blunders": None,
+            "failed": (),
+            **dict.fromkeys(names, {}),
+        }
         rest = restore_validation({**content, **unknown, **rest}, {}, robot)
     return restore(
         Validation,
@@ -698,11 +703,8 @@ def _restore_errors(
         if components is None:
             size = np.array(stored["errors"], dtype=float)
             components = np.column_stack([size, np.full((len(size), 2), np.nan)])
-        quantities[quantity] = QuantityErrors(
-            Dimension[stored["dimension"].upper()],
-            components,
-            np.array(stored["rows"], dtype=np.intp),
-            tuple(stored["targets"]),
-            tuple(stored["components"]),
+        measured = tuple(stored["components"])
+        quantities[quantity] = restore(
+            QuantityErrors, stored, components=components, measured=measured
         )
     return PoseErrors(quantities)

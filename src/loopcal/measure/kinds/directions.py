@@ -161,12 +161,6 @@ class Direction(AxisKind):
     axis : (3,), the axis on the platform, of any length. If the axis is unknown, its nominal value.
     axis_name : name of the axis; its parameters begin with it.
     Others : see `AxisKind`; "frame" and "axis" may be unknown.
-
-    Examples
-    --------
-    >>> kind = Direction(axis=np.array([0.0, 0.0, 1.0]))
-    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 2)))
-    array([[[0., 0., 1.]]])
     """
 
     axis: FloatArray = checked(check_direction, "the axis", UPWARD)
@@ -265,13 +259,6 @@ class Inclination(DirectionKind):
     T_platform_sensor : (4, 4), mounting of the sensor; only its orientation matters.
     sensor : name of the sensor; the parameters of its mounting begin with it.
     unknown : which of "mounting" and "gravity" are unknown.
-
-    Examples
-    --------
-    >>> from loopcal.geometry import make_pose, rotation_about_axis
-    >>> T = make_pose(rotation_about_axis(0.1, 0), np.zeros(3))
-    >>> Inclination().measure(T[None, None], noise=np.zeros((1, 1, 2))).round(6)
-    array([[[0. , 0.1]]])
     """
 
     up: FloatArray = checked(check_direction, "the vertical", UPWARD)
@@ -348,13 +335,6 @@ class Autocollimation(AxisKind):
         its nominal value.
     mirror : name of the mirror; its parameters begin with it.
     Others : see `AxisKind`; "frame" and "mirror" may be unknown.
-
-    Examples
-    --------
-    >>> from loopcal.geometry import make_pose, rotation_about_axis
-    >>> T = make_pose(rotation_about_axis(0.01, 1), np.zeros(3))
-    >>> Autocollimation().measure(T[None, None], noise=np.zeros((1, 1, 2))).round(6)
-    array([[[0.01, 0.  ]]])
     """
 
     normal: FloatArray = checked(check_direction, "the normal of the mirror", UPWARD)

@@ -83,12 +83,6 @@ class Distance(LengthKind):
     anchor : (3,) [m], the fixed point in the frame. If the anchor is unknown, its nominal value.
     anchor_name : name of the fixed point. Kinds that use the same name share its parameters.
     Others : see `TargetKind`; "anchor", "targets" and "offset" (the zero of a wire) may be unknown.
-
-    Examples
-    --------
-    >>> kind = Distance(anchor=np.array([0.0, 0.0, 2.0]), places=np.zeros((1, 3)))
-    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 1)))
-    array([[[2.]]])
     """
 
     anchor: FloatArray = checked(check_point, "the anchor", np.zeros(3))
@@ -163,14 +157,6 @@ class Separation(LengthKind):
     ----------
     See `TargetKind`; "targets" and "offset" (the zero of the calipers, the width of a printed
     line) may be unknown.
-
-    Examples
-    --------
-    >>> kind = Separation(places=np.zeros((1, 3)))
-    >>> T = np.tile(np.eye(4), (1, 1, 2, 1, 1))
-    >>> T[0, 0, 1, :3, 3] = 3.0, 4.0, 0.0
-    >>> kind.measure(T, noise=np.zeros((1, 1, 1)))
-    array([[[5.]]])
     """
 
     name: ClassVar[str] = "separation"

@@ -39,12 +39,6 @@ class JointSensor(Kind):
         have the same names.
     measures : "length" or "angle": the dimension of the joints.
     unknown : "offset": the value that each sensor shows where its joint is zero.
-
-    Examples
-    --------
-    >>> kind = JointSensor(joints=("limb1.pin",), measures="angle", unknown=("offset",))
-    >>> [parameter.name for parameter in kind.nuisance_parameters]
-    ['limb1.pin.joint']
     """
 
     joints: tuple[str, ...] = ("q1",)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of measurement kinds: columns, residuals and their derivatives.
 
-A new kind is one file with one frozen dataclass, and one entry in `KINDS`. Files, templates and
-contract tests follow from this class. A kind receives platform poses, not the robot. It states
+A new kind is one frozen dataclass and one entry in `KINDS`; files, templates and contract tests
+follow. A kind receives platform poses, not the robot. It states
 
 * `columns`, as written in files;
 * `possible_setup`: frames, targets, surfaces and offsets that may be unknown;
@@ -322,9 +322,7 @@ class Kind(ABC):
 
     @cached_property
     def setup_items(self) -> Mapping[str, SetupItem]:
-        """The setup items that are unknown, in order. Errors that rows share come last: one
-        parameter for each component.
-        """
+        """The unknown setup items in order, shared errors last: a parameter for each component."""
         items = dict(self.own_items)
         for item in self.shared_errors:
             named = [(name_shared_error(self, item, name), d) for name, d in list_components(self)]
@@ -357,9 +355,7 @@ class Kind(ABC):
         return matrix
 
     def _sum_shared_errors(self, values: FloatArray) -> FloatArray:
-        """Return bias plus drift (.., b) of the components, at values (.., u), which for a drift
-        are the parts that the rows take.
-        """
+        """Return bias plus drift (.., b) of the components; of a drift, the parts of the rows."""
         items = [self.item_values(values, name) for name in self.shared_errors]
         return np.asarray(sum(item for item in items if item is not None))
 
@@ -394,9 +390,7 @@ class Kind(ABC):
         return np.array([parameter.nominal for parameter in self.possible_setup[name].parameters])
 
     def assemble_values(self, items: Mapping[str, FloatArray]) -> FloatArray:
-        """Return candidates (k, u) from values (k, w) or (w,) of some setup items; the other items
-        stay nominal.
-        """
+        """Return candidates (k, u) from values (k, w) or (w,) of some items, others nominal."""
         nominal = self.nominal_values
         columns = [
             np.atleast_2d(items.get(name, nominal[used])) for name, used in self._slices.items()
@@ -426,7 +420,7 @@ class Kind(ABC):
         return np.zeros(1)
 
     def prepare_columns(self, measured: FloatArray) -> MeasuredColumns:
-        """Return columns (.., r, c) as `evaluate` needs them, to evaluate the same rows often."""
+        """Return columns (.., r, c) as `evaluate` needs them."""
         missing = np.isnan(measured)
         columns = np.where(missing, self.placeholder, measured) if np.any(missing) else measured
         present, reference = self.detect_present(measured), self._compute_reference(columns)
@@ -493,9 +487,7 @@ class Kind(ABC):
         return Evaluation(residual, jacobian, by_nuisance, by_joints)
 
     def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
-        """Return the measured bodies (.., 4, 4): the end platforms T, those of a stage from their
-        numbers (.., 12), or the base.
-        """
+        """Return the measured bodies (.., 4, 4): end platforms T, those of a stage, or the base."""
         if not self.of:
             return T
         if self.is_of_base:
@@ -546,9 +538,7 @@ class Kind(ABC):
     def _evaluate(
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
-        """Return `evaluate` for complete arrays, `measured` from `_compute_reference`; it may have
-        any finite value where nothing was measured.
-        """
+        """Return `evaluate` for complete arrays; `measured` is from `_compute_reference`."""
         predicted = self._predict(T, values, joints)
         return predicted._replace(residual=self._subtract(predicted.residual, measured))
 

@@ -209,14 +209,6 @@ class Position(TargetKind):
     Parameters
     ----------
     Those of `TargetKind`; "frame" and "targets" may be unknown.
-
-    Examples
-    --------
-    >>> kind = Position(targets=("ball",), places=np.array([[0.0, 0.0, 0.1]]), unknown=("targets",))
-    >>> [parameter.name for parameter in kind.nuisance_parameters]
-    ['ball.x', 'ball.y', 'ball.z']
-    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 3)))
-    array([[[0. , 0. , 0.1]]])
     """
 
     name: ClassVar[str] = "position"
@@ -292,12 +284,6 @@ class Bearing(TargetKind):
     ----------
     form : "theodolite" or "camera".
     Others : see `TargetKind`; "frame" (the station) and "targets" may be unknown.
-
-    Examples
-    --------
-    >>> kind = Bearing(places=np.array([[1.0, 1.0, 0.0]]))
-    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 2))).round(6)
-    array([[[0.785398, 0.      ]]])
     """
 
     form: str = "theodolite"

@@ -158,14 +158,6 @@ class Line(SurfaceKind):
 
     Setup parameters: `line.u`, `line.v` [rad], `line.a` and `line.b` [m], and `target.x` to
     `target.z` [m] of each target.
-
-    Examples
-    --------
-    >>> kind = Line(surface="ruler", unknown=("surface",))
-    >>> [column.name for column in kind.columns]
-    ['gap_a', 'gap_b']
-    >>> [parameter.name for parameter in kind.nuisance_parameters]
-    ['ruler.u', 'ruler.v', 'ruler.a', 'ruler.b']
     """
 
     surface: str = "line"
@@ -224,12 +216,6 @@ class Sphere(SurfaceKind):
     ----------
     radius : sum of the radii of ball and probe [m]. If the surface is unknown, its nominal value.
     Others : see `SurfaceKind`; `through` is the center, and `along` does not matter.
-
-    Examples
-    --------
-    >>> kind = Sphere(through=np.array([0.0, 0.0, 0.5]), radius=0.1, places=np.zeros((1, 3)))
-    >>> kind.evaluate(np.eye(4)[None, None], np.zeros((1, 1, 1))).residual
-    array([[[0.4]]])
     """
 
     surface: str = "sphere"
