@@ -670,13 +670,8 @@ def restore_validation(
     }
     rest = content["without_blunders"]
     if rest is not None:
-        names = ("commanded_before", "commanded_after", "not_compensable")
-        unknown = {
-            "blunders": (),
-            "without_blunders": None,
-            "failed": (),
-            **dict.fromkeys(names, {}),
-        }
+        unknown = {"commanded_before": {}, "commanded_after": {}, "not_compensable": {}}
+        unknown |= {"blunders": (), "without_blunders": None, "failed": ()}
         rest = restore_validation({**content, **unknown, **rest}, {}, robot)
     return restore(
         Validation,

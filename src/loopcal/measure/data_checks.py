@@ -54,7 +54,10 @@ def check_closure(
 def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
     """Refuse the kind `closure` for a robot that does not have more actuators than freedoms."""
     if robot.program.sigma is None and any(kind.name == CLOSURE for kind in kinds):
-        counts = {"actuators": len(robot.actuators), "freedoms": len(robot.freedoms)}
+        counts: dict[str, Any] = {
+            "actuators": len(robot.actuators),
+            "freedoms": len(robot.freedoms),
+        }
         code = "data.closure-without-redundancy"
         raise DataError(report_finding(code, robot=robot.name, **counts))
 
