@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -24,14 +26,25 @@ from loopcal.units import Dimension
 from tests.studies.studies import compute_cells, make_study
 
 SIGMA = np.array([1e-5, 2e-5])
+NORMAL, UNIFORM = Gaussian(SIGMA), Uniform(SIGMA * np.sqrt(3.0))
 POSES = 10
 EXACT = build_instrument(InstrumentDescription(sigma_position=1e-12, sigma_angle=1e-12))
 
 
-def draw(effects: EffectsLevel, n: int = 40_000, stated=Gaussian) -> np.ndarray:
-    """Return noise (n, 2) in stated sigmas."""
-    noise = AlteredNoise(stated(SIGMA), effects)
+def draw(effects: EffectsLevel, n: int = 40_000, stated=NORMAL) -> np.ndarray:
+    """Return noise (n, 2) in stated sigmas, which are those that the fit is told."""
+    noise = AlteredNoise(stated, effects)
+    assert_array_equal(noise.sigma, stated.sigma)
     return noise.draw(make_random_stream(1, 0), n) / SIGMA
+
+
+def disturb(effects: EffectsLevel, name: str = "linear-delta") -> tuple[Any, ...]:
+    """Return robot, disturbance, trials with it, and trials without it."""
+    robot = lc.load_robot(name)
+    poses, truth = sample_workspace(robot, POSES, 1).coordinates, sample_truth(robot, 3, 1)
+    disturbance = make_disturbance(robot, truth, poses, effects, 1)
+    moved = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=disturbance)
+    return robot, disturbance, moved, simulate_trials(robot, truth, poses, EXACT, 1)
 
 
 def test_without_effects_the_noise_is_the_stated_one():
@@ -41,28 +54,25 @@ def test_without_effects_the_noise_is_the_stated_one():
     assert alter_noise(instrument, EffectsLevel(drift=1.0)) is instrument
 
 
-def test_noise_is_larger_than_stated_but_the_fit_is_told_the_stated_one():
-    assert_allclose(draw(EffectsLevel(noise=2.5)).std(axis=0), 2.5, rtol=0.02)
-    assert_array_equal(AlteredNoise(Gaussian(SIGMA), EffectsLevel(noise=2.5)).sigma, SIGMA)
-
-
-def test_uniform_noise_stays_uniform():
-    noise = AlteredNoise(Uniform(SIGMA * np.sqrt(3.0)), EffectsLevel(noise=2.0))
-    drawn = noise.draw(make_random_stream(1, 0), 40_000) / SIGMA
-    assert np.abs(drawn).max() <= 2.0 * np.sqrt(3.0)
-    assert_allclose(drawn.std(axis=0), 2.0, rtol=0.02)
-
-
-def test_student_t_has_the_stated_sigma_and_heavy_tails():
-    drawn = draw(EffectsLevel(degrees=4.0))
-    assert_allclose(drawn.std(axis=0), 1.0, rtol=0.05)
-    assert np.mean(np.abs(drawn) > 4.0) > 20 * np.mean(np.abs(draw(EffectsLevel())) > 4.0)
-
-
-def test_neighbors_have_the_stated_correlation_and_sigma():
-    drawn = draw(EffectsLevel(correlation=0.7))
-    assert_allclose(np.mean(drawn[1:] * drawn[:-1], axis=0), 0.7, rtol=0.03)
-    assert_allclose(drawn.std(axis=0), 1.0, rtol=0.03)
+@pytest.mark.parametrize(
+    ("effects", "stated", "sd", "rtol"),
+    [
+        (EffectsLevel(noise=2.5), NORMAL, 2.5, 0.02),
+        (EffectsLevel(noise=2.0), UNIFORM, 2.0, 0.02),
+        (EffectsLevel(degrees=4.0), NORMAL, 1.0, 0.05),
+        (EffectsLevel(correlation=0.7), NORMAL, 1.0, 0.03),
+    ],
+)
+def test_altered_noise_has_the_standard_deviation_that_is_asked_for(effects, stated, sd, rtol):
+    drawn = draw(effects, stated=stated)
+    assert_allclose(drawn.std(axis=0), sd, rtol=rtol)
+    if stated is UNIFORM:  # it stays uniform
+        assert np.abs(drawn).max() <= 2.0 * np.sqrt(3.0)
+    if effects.degrees is not None:  # it has heavy tails
+        assert np.mean(np.abs(drawn) > 4.0) > 20 * np.mean(np.abs(draw(EffectsLevel())) > 4.0)
+    if effects.correlation:
+        neighbors = np.mean(drawn[1:] * drawn[:-1], axis=0)
+        assert_allclose(neighbors, effects.correlation, rtol=0.03)
 
 
 def test_the_stated_share_of_rows_is_far_off():
@@ -91,27 +101,18 @@ def test_drift_and_jump_have_the_stated_size_and_no_mean():
 
 @pytest.mark.parametrize("name", ["linear-delta", "hexapod-42"])
 def test_drift_moves_what_is_measured_and_not_the_machine(name):
-    robot = lc.load_robot(name)
-    poses, truth = sample_workspace(robot, POSES, 1).coordinates, sample_truth(robot, 3, 1)
-    effects = EffectsLevel(drift=1e-4)
-    disturbance = make_disturbance(robot, truth, poses, effects, 1)
-    plain = simulate_trials(robot, truth, poses, EXACT, 1)
-    moved = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=disturbance)
+    _, disturbance, moved, plain = disturb(EffectsLevel(drift=1e-4), name)
     assert_array_equal(moved.T, plain.T)
-    assert disturbance.motion is not None
     shift = (moved.measured[0] - plain.measured[0])[..., 3:]
     assert_allclose(shift, disturbance.motion, atol=1e-15)
 
 
 def test_lengths_grow_with_the_temperature():
-    robot = lc.load_robot("linear-delta")
-    poses, truth = sample_workspace(robot, POSES, 1).coordinates, sample_truth(robot, 3, 1)
-    effects = EffectsLevel(thermal=ThermalGrowth(expansion=1e-5, rise=4.0))
-    disturbance = make_disturbance(robot, truth, poses, effects, 1)
-    trials = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=disturbance)
+    thermal = ThermalGrowth(expansion=1e-5, rise=4.0)
+    robot, _, trials, _ = disturb(EffectsLevel(thermal=thermal))
     is_length = np.array([d is Dimension.LENGTH for d in robot.parameters.dimensions])
     for pose, growth in enumerate(np.linspace(-2e-5, 2e-5, POSES)):
-        warm = truth * np.where(is_length, 1.0 + growth, 1.0)
+        warm = trials.truth * np.where(is_length, 1.0 + growth, 1.0)
         T = forward_trials(robot, warm, trials.readings[None, [pose]]).T
         assert_allclose(trials.T[:, pose], T[:, 0], atol=1e-12)
 
@@ -126,16 +127,10 @@ def test_every_pose_of_a_disturbed_machine_may_be_another_machine():
 
 
 def test_backlash_lags_behind_the_direction_of_motion():
-    robot = lc.load_robot("linear-delta")
-    poses, truth = sample_workspace(robot, POSES, 1).coordinates, sample_truth(robot, 3, 1)
-    effects = EffectsLevel(backlash=Backlash(length=2e-5))
-    disturbance = make_disturbance(robot, truth, poses, effects, 1)
-    trials = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=disturbance)
-    plain = simulate_trials(robot, truth, poses, EXACT, 1)
+    robot, disturbance, trials, plain = disturb(EffectsLevel(backlash=Backlash(length=2e-5)))
     direction = np.sign(np.diff(trials.readings, axis=0))
-    assert disturbance.readings is not None
     assert_allclose(disturbance.readings[0, 1:], -1e-5 * direction)
-    T = forward_trials(robot, truth, trials.readings[None] + disturbance.readings).T
+    T = forward_trials(robot, trials.truth, trials.readings[None] + disturbance.readings).T
     assert_allclose(trials.T, T, atol=1e-12)
     assert_array_equal(trials.readings, plain.readings)  # the controller does not know it
 

@@ -62,40 +62,29 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
     Raises FileError: the folder contains something else, or another study, or (without `resume`)
     any; or see `open_store`.
     """
-    if (folder / NAME).is_file():
-        if not resume:
-            raise FileError(report_finding("store.in-use"), folder)
-        with _continue_study(folder, source) as store:
-            yield store
-        return
-    is_empty_folder = folder.is_dir()
-    _make_folder(folder, source)
-    is_used = True
+    is_new, was_folder, is_used = not (folder / NAME).is_file(), folder.is_dir(), True
+    if is_new:
+        _make_folder(folder, source)
+    elif not resume:
+        raise FileError(report_finding("store.in-use"), folder)
     try:
-        with _continue_study(folder, source) as store:
+        with open_store(folder) as store:
+            header, study = store.header, source.study
+            if changes := list_conflicts(load_specification(store).to_json(), study.to_json()):
+                finding = report_finding("store.specification-changed", changes=changes)
+                raise FileError(finding, folder)
+            if header.specification != study.to_json():
+                store.set_header(replace(header, specification=study.to_json()))
             try:
                 yield store
             except LoopcalError:
-                is_used = any(store.ask("SELECT 1 FROM blocks LIMIT 1"))
+                is_used = not is_new or any(store.ask("SELECT 1 FROM blocks LIMIT 1"))
                 raise
     finally:
         if not is_used:
             shutil.rmtree(folder, ignore_errors=True)
-            if is_empty_folder:
+            if was_folder:
                 folder.mkdir(exist_ok=True)
-
-
-@contextmanager
-def _continue_study(folder: Path, source: StudySource) -> Iterator[StudyStore]:
-    """Open the folder of the same study as its driver, and store its further levels."""
-    with open_store(folder) as store:
-        header, study = store.header, source.study
-        if changes := list_conflicts(load_specification(store).to_json(), study.to_json()):
-            finding = report_finding("store.specification-changed", changes=changes)
-            raise FileError(finding, folder)
-        if header.specification != study.to_json():
-            store.set_header(replace(header, specification=study.to_json()))
-        yield store
 
 
 @contextmanager

@@ -25,7 +25,6 @@ from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status
 from loopcal.studies.simulation.fits import (
-    DIVERGED,
     NOT_REACHED,
     FittedTrials,
     fit_trials,
@@ -107,10 +106,10 @@ def compute_block(task: BlockTask, threads: int = 1) -> BlockResult:
     content = json.loads(task.content)
     cell, trials, fits = calibrate_block(content, threads)
     stream = make_stream(cell.seed, content["block"])
-    scores = score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
-    for name in ("rank", "condition", "iterations", "noise_scale", "verdict"):
-        scores[name] = getattr(fits, name)
-    columns = [scores[column.name] for column in list_columns(cell.scores)]
+    names = (column.name for column in list_columns(cell.scores))
+    scores: dict[str, Any] = dict.fromkeys(names, np.nan)
+    scores |= score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
+    columns = np.broadcast_arrays(*{**scores, **fits.scores}.values())
     return BlockResult(task.key, np.stack(columns, axis=1))
 
 
@@ -304,11 +303,6 @@ class CalibratedCell:
         """(t,) which fits converged."""
         return self.outcome == 0
 
-    @property
-    def is_diverged(self) -> BoolArray:
-        """(t,) which fits have no values because they diverged."""
-        return self.outcome == DIVERGED
-
 
 def calibrate_cells(study: Study, cells: Sequence[int] | None = None) -> Iterator[CalibratedCell]:
     """Yield the calibrations of these cells, of all by default, one cell after the other."""
@@ -321,6 +315,7 @@ def calibrate_cells(study: Study, cells: Sequence[int] | None = None) -> Iterato
         def join(arrays: Iterable[np.ndarray]) -> np.ndarray:
             return np.concatenate(list(arrays))[: study.replicates]
 
+        iterations = join(f.scores.get("iterations", 0 * f.outcome) for f in fits)
         yield CalibratedCell(
             study.cells[number].levels,
             prepared[0].robot,
@@ -329,7 +324,7 @@ def calibrate_cells(study: Study, cells: Sequence[int] | None = None) -> Iterato
             join(f.values for f in fits),
             tuple(join(measured) for measured in zip(*(t.measured for t in trials), strict=True)),
             join(f.outcome for f in fits),
-            np.nan_to_num(join(f.iterations for f in fits)).astype(np.int64),
+            np.nan_to_num(iterations).astype(np.int64),
         )
 
 

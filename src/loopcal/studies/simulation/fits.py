@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,8 +91,8 @@ class FittedTrials:
     T_measured : (t, n, 4, 4) at those of the measured poses; n = 0 where no frame is fitted.
     half_width : (t, p free) of 95 % intervals [SI]. expanded : (t, h, 2) position and rotation
         errors that 95 % of the errors of held-out poses do not exceed [m], [rad].
-    rank, condition, iterations : (t,). noise_scale : (t,) residuals over stated noise.
-    verdict : (t,) numbers of VERDICTS.
+    scores : name -> (t,) of further scores that the method has: rank, condition, iterations,
+        residuals over the stated noise, numbers of VERDICTS.
     """
 
     values: FloatArray
@@ -100,11 +102,7 @@ class FittedTrials:
     T_measured: FloatArray
     half_width: FloatArray
     expanded: FloatArray
-    rank: FloatArray
-    condition: FloatArray
-    iterations: FloatArray
-    noise_scale: FloatArray
-    verdict: FloatArray
+    scores: Mapping[str, Any]
 
 
 def fit_trials(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
@@ -136,11 +134,12 @@ def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> Fitted
         T_measured=measured.T,
         half_width=LEVEL_95 * fits.standard_deviations(),
         expanded=_expand_errors(cell, fits, state, measured),
-        rank=plain.rank.astype(float),
-        condition=plain.condition,
-        iterations=fits.iterations.astype(float),
-        noise_scale=compute_noise(plain.unexplained, plain.rows - plain.rank),
-        verdict=np.full(len(trials), np.nan),
+        scores={
+            "rank": plain.rank.astype(float),
+            "condition": plain.condition,
+            "iterations": fits.iterations.astype(float),
+            "noise_scale": compute_noise(plain.unexplained, plain.rows - plain.rank),
+        },
     )
 
 
@@ -163,9 +162,9 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
     Raises DataError: products of points that are not held on planes and lines.
     """
     method, robot, t = cell.method, cell.robot, len(trials)
-    rank = nothing = np.full(t, np.nan)
+    scores: dict[str, Any] = {}
     if method.is_of_products:
-        values, outcome, iterations, rank = _fit_products(cell, trials)
+        values, outcome, iterations, scores["rank"] = _fit_products(cell, trials)
     elif method.method == PER_LEG:
         values = np.full((t, len(robot.parameters)), np.nan)
         outcome, iterations = np.full(t, REFUSED), np.zeros(t, dtype=np.int64)
@@ -198,11 +197,7 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
         T_measured=np.where(lost, np.nan, measured.T),
         half_width=np.full((t, len(select_free_parameters(robot))), np.nan),
         expanded=np.full((*state.T.shape[:2], 2), np.nan),
-        rank=rank,
-        condition=nothing,
-        iterations=iterations.astype(float),
-        noise_scale=nothing,
-        verdict=nothing,
+        scores=scores | {"iterations": iterations.astype(float)},
     )
 
 
@@ -305,9 +300,7 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
         T_measured=np.full((n, 4, 4), np.nan),
         half_width=np.full(len(free), np.nan),
         expanded=np.full((h, 2), np.nan),
-        **dict.fromkeys(
-            ("rank", "condition", "iterations", "noise_scale", "verdict"), np.array(np.nan)
-        ),
+        scores={},
     )
     single = []
     for i in range(len(trials)):
@@ -315,7 +308,10 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
             single.append(_fit_one(cell, state_times(trials.trial(i))))
         except (EstimationError, DataError):
             single.append(nothing)
-    return FittedTrials(**{n: np.stack([getattr(f, n) for f in single]) for n in vars(nothing)})
+    arrays = {n: np.stack([getattr(f, n) for f in single]) for n in vars(nothing) if n != "scores"}
+    names = dict.fromkeys(name for fit in single for name in fit.scores)
+    scores = {name: np.array([f.scores.get(name, np.nan) for f in single]) for name in names}
+    return FittedTrials(**arrays, scores=scores)
 
 
 def state_times(data: Measurements) -> Measurements:
@@ -332,7 +328,7 @@ def state_times(data: Measurements) -> Measurements:
 
 def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
     """Return the calibration of one trial, without the axis of trials."""
-    verdict = np.nan
+    scores: dict[str, Any] = {}
     if cell.scores.verdict:
         options = CalibrationOptions(
             fit=cell.fit_options,
@@ -340,7 +336,7 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
             limit_angle=cell.scores.limit_angle,
         )
         report = calibrate(cell.robot, cell.hold_out(data), options)
-        fit, verdict = report.identification, float(VERDICTS.index(report.verdict))
+        fit, scores["verdict"] = report.identification, float(VERDICTS.index(report.verdict))
     else:
         fit = identify(cell.robot, data, options=cell.fit_options)
         if cell.scores.intervals == "adjusted":
@@ -356,9 +352,11 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
         T_measured=measured.T[0],
         half_width=fit.interval(),
         expanded=np.stack([U.expanded_position, U.expanded_orientation], axis=-1),
-        rank=np.array(float(fit.rank)),
-        condition=np.array(fit.spectrum.condition),
-        iterations=np.array(float(fit.history.iterations)),
-        noise_scale=compute_noise(test.chi_square, test.degrees),
-        verdict=np.array(verdict),
+        scores=scores
+        | {
+            "rank": float(fit.rank),
+            "condition": fit.spectrum.condition,
+            "iterations": float(fit.history.iterations),
+            "noise_scale": float(compute_noise(test.chi_square, test.degrees)),
+        },
     )
