@@ -19,6 +19,8 @@ from loopcal.studies.files.store import read_store
 from loopcal.studies.results.questions import list_shown, view_summary, write_summary
 from loopcal.studies.results.study_result import (
     MEMORY,
+    CellSummary,
+    Interval,
     StudyResult,
     compute_binomial_interval,
     estimate_mean,
@@ -49,6 +51,13 @@ def draw_scores(cell: Cell) -> Scores:
     position[outcome != 0.0] = np.nan
     covered = stream.binomial(10, 0.95, t) / 10.0
     return {"outcome": outcome, "position": position, "covered_parameters": covered}
+
+
+def find(cell: CellSummary, score: str, kind: str) -> Interval:
+    """Return a statistic of a cell, which must have it."""
+    interval = getattr(cell.find_score(score), kind)
+    assert isinstance(interval, Interval)
+    return interval
 
 
 @pytest.fixture(scope="module")
@@ -107,21 +116,17 @@ def test_every_cell_has_its_numbers_and_its_failed_trials_by_code(result: StudyR
         failed = int((scores["outcome"] == FAILED).sum())
         assert summarized.failed == {OUTCOMES[FAILED]: failed}
         assert summarized.converged.value == pytest.approx(1.0 - failed / 400)
-        position = summarized.find_score("position")
         good = scores["position"][scores["outcome"] == 0.0]
-        assert position is not None
-        assert position.median is not None
-        assert position.high is not None
-        assert position.mean is not None
-        assert position.median.value == np.median(good)
-        assert position.high.value == np.quantile(good, 0.95)
-        assert position.mean.value == pytest.approx(good.mean())
-        medians_in += position.median.low <= median_error(cell) <= position.median.high
+        median = find(summarized, "position", "median")
+        assert median.value == np.median(good)
+        assert find(summarized, "position", "high").value == np.quantile(good, 0.95)
+        assert find(summarized, "position", "mean").value == pytest.approx(good.mean())
+        medians_in += median.low <= median_error(cell) <= median.high
         covered = summarized.find_score("covered_parameters")
         assert covered is not None
         assert covered.median is None
-        assert covered.mean is not None
-        shares_in += covered.mean.low < 0.95 < covered.mean.high
+        share = find(summarized, "covered_parameters", "mean")
+        shares_in += share.low < 0.95 < share.high
     assert min(medians_in, shares_in) >= binom.ppf(0.001, 12, 0.95)
 
 
@@ -145,13 +150,10 @@ def test_files_have_every_factor_as_a_column_and_are_read_back(result: StudyResu
     assert len(rows) == 12
     for row, cell in zip(rows, summary.cells, strict=True):
         assert {name: row[name] for name in cell.levels} == cell.levels
-        position = cell.find_score("position")
-        assert position is not None
-        assert position.median is not None
-        assert position.mean is not None
-        assert float(row["position median [m]"]) == position.median.value
-        assert float(row["position median low [m]"]) == position.median.low
-        assert float(row["position mean high [m]"]) == position.mean.high
+        median = find(cell, "position", "median")
+        assert float(row["position median [m]"]) == median.value
+        assert float(row["position median low [m]"]) == median.low
+        assert float(row["position mean high [m]"]) == find(cell, "position", "mean").high
     document = json.loads((result.folder / "summary.json").read_text("utf-8"))
     assert [cell["levels"] for cell in document["cells"]] == [c.levels for c in summary.cells]
     assert document["questions"] == []
@@ -168,7 +170,7 @@ def test_figures_show_medians_against_poses_with_their_intervals(result: StudyRe
     first.sort(key=lambda cell: float(cell.levels["poses"]))
     line, _, (bars,) = panels[0].containers[0]
     assert list(line.get_xdata()) == [10.0, 20.0, 40.0]
-    medians = [s.median for c in first if (s := c.find_score("position")) and s.median]
+    medians = [find(cell, "position", "median") for cell in first]
     np.testing.assert_allclose(line.get_ydata(), [1e3 * m.value for m in medians])  # in mm
     ends = [segment[:, 1] for segment in bars.get_segments()]
     np.testing.assert_allclose(ends, [[1e3 * m.low, 1e3 * m.high] for m in medians])
@@ -193,10 +195,8 @@ def test_a_cell_without_trials_and_one_with_few_have_no_false_bounds(tmp_path: P
     few = store_scores(tmp_path / "few", make_study(replicates=3), draw_scores)
     summary = few.summarize()
     assert {cell.trials for cell in summary.cells} == {3}
-    position = summary.cells[0].find_score("position")
-    assert position is not None
-    assert position.high is not None
-    assert position.high.high == np.inf  # three trials bound no 95 % quantile
+    # three trials bound no 95 % quantile
+    assert find(summary.cells[0], "position", "high").high == np.inf
     assert len(render_figure(few.draw("position"), ".svg")) > 1000
 
 
