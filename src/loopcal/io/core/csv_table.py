@@ -60,22 +60,18 @@ SPLITTER = 2.0**27 + 1.0
 
 
 def parse_decimals(cells: Sequence[str], factor: float) -> tuple[FloatArray, BoolArray]:
-    """Return the products of plain decimals and a factor, each rounded once.
-
-    Parameters
-    ----------
-    cells : (n,) texts without surrounding blanks. factor : positive, SI per unit of the text.
-
-    Returns
-    -------
-    values : (n,) as `parse_exact` returns them; zero for the other cells.
-    is_plain : (n,) whether a cell is a plain decimal whose product is certain.
+    """Return products of plain decimals (n,) with a factor, each rounded once as by `parse_exact`,
+    and which cells are plain decimals with a certain product; others are zero.
     """
     values, is_plain = np.zeros(len(cells)), np.zeros(len(cells), dtype=bool)
-    high, low = _scale_factor(factor)
+    # factor / 10^k as sums of two doubles
+    exact = [Fraction(repr(factor)) / 10**k for k in range(MOST_DIGITS + 1)]
+    doubles = [float(value) for value in exact]
+    rests = [float(value - Fraction(h)) for value, h in zip(exact, doubles, strict=True)]
+    high, low = np.array(doubles), np.array(rests)
     for begin in range(0, len(cells), COLUMN_CHUNK):
         part = slice(begin, begin + COLUMN_CHUNK)
-        whole, decimals, is_negative, is_decimal = _read_digits(_encode(cells[part]))
+        whole, decimals, is_negative, is_decimal = _read_digits(cells[part])
         product, is_certain = _multiply(whole, high[decimals], low[decimals])
         is_plain[part] = is_decimal & is_certain
         signed = np.where(is_negative, -product, product)
@@ -83,21 +79,16 @@ def parse_decimals(cells: Sequence[str], factor: float) -> tuple[FloatArray, Boo
     return values, is_plain
 
 
-def _encode(cells: Sequence[str]) -> np.ndarray:
-    """Return the characters (WIDTH + 1, n) of texts, 0 behind their end."""
-    size = WIDTH + 1  # one more, so that a longer text is noticed
+def _read_digits(cells: Sequence[str]) -> tuple[IntArray, IntArray, BoolArray, BoolArray]:
+    """Return the whole numbers (n,), their decimals (n,), whether they are negative, and whether
+    the texts are plain decimals; numbers of others mean nothing.
+    """
+    n, size = len(cells), WIDTH + 1  # one more, so that a longer text is noticed
     try:
         texts = np.array(cells, dtype=f"S{size}")
     except UnicodeEncodeError:
         texts = np.array([cell.encode("ascii", "replace") for cell in cells], dtype=f"S{size}")
-    return np.ascontiguousarray(texts.view(np.uint8).reshape(len(cells), size).T)
-
-
-def _read_digits(characters: np.ndarray) -> tuple[IntArray, IntArray, BoolArray, BoolArray]:
-    """Return the whole numbers (n,), their decimals (n,), whether they are negative, and whether
-    the texts with these characters (c, n) are plain decimals; numbers of others mean nothing.
-    """
-    n = characters.shape[1]
+    characters = np.ascontiguousarray(texts.view(np.uint8).reshape(n, size).T)
     whole, digits, decimals = (np.zeros(n, dtype=np.int64) for _ in range(3))
     is_negative = characters[0] == ord("-")
     is_decimal = characters[-1] == 0
@@ -119,32 +110,20 @@ def _read_digits(characters: np.ndarray) -> tuple[IntArray, IntArray, BoolArray,
     return whole, np.minimum(decimals, MOST_DIGITS), is_negative, is_decimal
 
 
-def _scale_factor(factor: float) -> tuple[FloatArray, FloatArray]:
-    """Return factor / 10^k for k = 0..MOST_DIGITS as sums of two doubles (k,)."""
-    exact = [Fraction(repr(factor)) / 10**k for k in range(MOST_DIGITS + 1)]
-    high = [float(value) for value in exact]
-    low = [float(value - Fraction(h)) for value, h in zip(exact, high, strict=True)]
-    return np.array(high), np.array(low)
-
-
 def _multiply(whole: IntArray, high: FloatArray, low: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the doubles nearest to whole * (high + low), and where they are certain."""
     m = whole.astype(np.float64)
     rest = (whole - m.astype(np.int64)).astype(np.float64)
     product = m * high
-    left = _find_rounding(m, high, product) + (m * low + rest * high)
+    # the rounding error of the product, exactly (Dekker)
+    (m_high, f_high) = (x * SPLITTER - (x * SPLITTER - x) for x in (m, high))
+    m_low, f_low = m - m_high, high - f_high
+    error = m_high * f_high - product + m_high * f_low + m_low * f_high
+    left = (error + m_low * f_low) + (m * low + rest * high)
     nearest = product + left
     left -= nearest - product
     half = 0.5 * np.abs(np.nextafter(nearest, np.where(left < 0.0, -np.inf, np.inf)) - nearest)
     return nearest, half - np.abs(left) >= UNDECIDED * half
-
-
-def _find_rounding(a: FloatArray, b: FloatArray, product: FloatArray) -> FloatArray:
-    """Return a * b - product exactly, where `product` is a * b rounded."""
-    a_high, b_high = (x * SPLITTER - (x * SPLITTER - x) for x in (a, b))
-    a_low, b_low = a - a_high, b - b_high
-    error = a_high * b_high - product + a_high * b_low + a_low * b_high
-    return np.asarray(error + a_low * b_low)
 
 
 # Numbers as text: the fewest digits that read back as the same double.
@@ -154,15 +133,8 @@ DIGITS = range(12, 18)
 
 
 def format_scaled(value: float, factor: float) -> str:
-    """Return value / factor with the fewest digits whose double times `factor` is `value` again.
-
-    Parameters
-    ----------
-    value : in SI. factor : SI per unit of the text.
-
-    Returns
-    -------
-    All 17 digits where rounding prevents that any shorter text returns the value.
+    """Return value / factor with the fewest digits whose double times `factor` (SI per unit) is
+    `value` again; all 17 digits where no shorter text returns it.
     """
     scaled = value / factor
     texts = (f"{scaled:.{digits}g}" for digits in DIGITS)
@@ -183,11 +155,8 @@ def format_exact(value: float, factor: float) -> str:
 
 
 def parse_exact(text: str, factor: float) -> float:
-    """Return the double nearest to the decimal product of a text and a factor, rounded once.
-
-    Raises
-    ------
-    decimal.InvalidOperation : the text is not a number.
+    """Return the double nearest to the decimal product of a text and a factor, rounded once;
+    decimal.InvalidOperation for other text.
     """
     return float(Decimal(text) * Decimal(repr(factor)))
 
@@ -222,13 +191,9 @@ _ROUND_BRACKETS = re.compile(r"^(?P<name>[^()]*[^()\s])\s*\((?P<unit>[^()]*)\)$"
 class Table:
     """Cells of a CSV file as text, with their lines.
 
-    Parameters
-    ----------
-    path : the file. settings : front matter or sidecar; without content where there is neither.
-    header_line : line of the header.
-    units : column -> unit symbol as written, None where there is none.
-    columns : column -> cells without surrounding blanks, one for each row. Columns, since a million
-        rows would take time and memory as objects of their own. lines : line of each row.
+    `units` : column -> unit symbol as written, None where there is none. `columns` : column ->
+    cells without surrounding blanks (a million rows as objects of their own would take time and
+    memory). `lines` : line of each row. `settings` are empty where the file has none.
     """
 
     path: Path
@@ -268,15 +233,8 @@ class Table:
     ) -> FloatArray:
         """Return a column (n,) [SI], NaN where a cell is empty.
 
-        Parameters
-        ----------
-        name : of the column. dimension : of its unit.
-        empty, infinite : whether empty cells, and cells `inf`, are allowed.
-
-        Raises
-        ------
-        FileError
-            No unit or one of another dimension, a cell that is not a finite number, or is empty.
+        FileError : no unit or one of another dimension, a cell that is not a finite number (or
+        `inf`, where `infinite` cells are allowed), or is empty where it must not be.
         """
         factor, cells = self.factor(name, dimension), self.text(name)
         values, is_plain = parse_decimals(cells, factor)
@@ -316,15 +274,12 @@ class Table:
         except ValueError:
             value = None
         if value is None or "_" in cell:
-            sentence = (
-                f"column {name!r} is {quote(cell)}, but a number is needed, such as 12.5 or 1e-3"
-            )
-            raise self.row_error(row, sentence)
+            sentence = f"column {name!r} is {quote(cell)}, but a number is needed"
+            raise self.row_error(row, f"{sentence}, such as 12.5 or 1e-3")
         if not math.isfinite(value):
+            sentence = f"column {name!r} is {quote(cell)}, which is not finite"
             act = "leave the cell empty where nothing was measured"
-            raise self.row_error(
-                row, f"column {name!r} is {quote(cell)}, which is not finite; {act}"
-            )
+            raise self.row_error(row, f"{sentence}; {act}")
         return value
 
     def header_error(self, sentence: str) -> FileError:
@@ -346,12 +301,8 @@ class Table:
 
 
 def read_table(path: str | Path) -> Table:
-    """Read a CSV table with its settings.
-
-    Raises
-    ------
-    FileError
-        Unreadable file, bad settings, no header, a bad header, no rows, rows of the wrong length.
+    """Read a CSV table with its settings; FileError for a bad header, bad settings, no rows, or
+    rows of the wrong length.
     """
     table = read_template(path)
     if not len(table):
@@ -384,8 +335,18 @@ def read_template(path: str | Path) -> Table:
         sentence = f"columns are separated by {separator}; use commas, and decimal points"
         raise FileError(sentence + CONVERT_HINT, path, header_line)
     units = _parse_header(path, header_line, header)
-    cells = _parse_columns(path, numbers[1:], texts[1:], len(units))
-    columns = dict(zip(units, cells, strict=True))
+    cells: list[list[str]] = [[] for _ in units]
+    for begin in range(1, len(texts), CHUNK):
+        part = slice(begin, begin + CHUNK)
+        rows = [_split_cells(path, *line) for line in zip(numbers[part], texts[part], strict=True)]
+        for number, row in zip(numbers[part], rows, strict=True):
+            if len(row) != len(units):
+                sentence = f"this row has {len(row)} cells, but the header has {len(units)} columns"
+                act = "write one cell for each column, empty where not measured, and decimal points"
+                raise FileError(f"{sentence}; {act}", path, number)
+        for column, of_chunk in zip(cells, zip(*rows, strict=True), strict=True):
+            column.extend(of_chunk)
+    columns = dict(zip(units, map(tuple, cells), strict=True))
     table = Table(path, settings, header_line, units, columns, tuple(numbers[1:]))
     for column in (name for name in NAME_COLUMNS if name in units):
         longest = LONGEST_COMPOSED if column == "pose" else LONGEST_NAME
@@ -505,29 +466,6 @@ def _parse_header(path: Path, line: int, text: str) -> dict[str, str | None]:
         assert match is not None
         units[name] = match["unit"].strip() if match["unit"] is not None else None
     return units
-
-
-def _parse_columns(
-    path: Path, numbers: Sequence[int], texts: Sequence[str], count: int
-) -> list[tuple[str, ...]]:
-    """Return the cells of each of the header's `count` columns.
-
-    Parameters
-    ----------
-    numbers : of the lines of the rows. texts : these lines.
-    """
-    columns: list[list[str]] = [[] for _ in range(count)]
-    for begin in range(0, len(texts), CHUNK):
-        part = slice(begin, begin + CHUNK)
-        rows = [_split_cells(path, *line) for line in zip(numbers[part], texts[part], strict=True)]
-        for number, row in zip(numbers[part], rows, strict=True):
-            if len(row) != count:
-                sentence = f"this row has {len(row)} cells, but the header has {count} columns"
-                act = "write one cell for each column, empty where not measured, and decimal points"
-                raise FileError(f"{sentence}; {act}", path, number)
-        for column, cells in zip(columns, zip(*rows, strict=True), strict=True):
-            column.extend(cells)
-    return list(map(tuple, columns))
 
 
 def _split_cells(path: Path, line: int, text: str) -> tuple[str, ...]:

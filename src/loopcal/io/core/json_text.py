@@ -27,14 +27,9 @@ LONGEST_WHOLE = 400
 
 
 def to_json(document: Mapping[str, Any]) -> str:
-    """Return a document as JSON text that ends with a line break.
+    """Return a document (dataclasses, arrays, enums, paths, numbers, text, lists, mappings) as
+    JSON text that ends with a line break.
 
-    Parameters
-    ----------
-    document : values may be dataclasses, arrays, enums, paths, numbers, text, lists and mappings.
-
-    Returns
-    -------
     A number that is not finite becomes null. The key `nulls` then maps its place, such as
     `parameters/3/plus_minus`, to the reason.
     """
@@ -54,17 +49,11 @@ def format_content(content: Mapping[str, Any]) -> str:
 
 
 def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGRAM_SIZE) -> Any:
-    """Return the content of a JSON file.
+    """Return the content of a JSON file; `what` it should be and the `action` to take are for
+    messages.
 
-    Parameters
-    ----------
-    path : the file. what : it should be, for messages. action : what to do about text that is not
-        JSON. limit : of its size.
-
-    Raises
-    ------
     FileError : see `read_text`; or not JSON, a number that is not finite, a key that is there
-        twice, or nested too deeply.
+    twice, or nested too deeply.
     """
     text = read_text(path, what, limit=limit)
     JSON_VALUES.check(sum(text.count(sign) for sign in ",:[{"), what, path)

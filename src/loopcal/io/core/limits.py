@@ -31,13 +31,10 @@ MEGABYTE = 10**6
 
 @dataclass(frozen=True)
 class FileLimit:
-    """The most that a file may contain of one thing.
+    """The most that a file may contain of one thing: `most` times `scale` of it, in `unit`.
 
-    Parameters
-    ----------
-    of : the thing, for documentation. most : the largest count that is allowed, in `scale` units.
-    unit : noun for messages, such as `rows`. meaning : where it applies.
-    action : what a user who meets it does. scale : counts in one unit.
+    `of` and `meaning` say what is limited and where, for documentation; `action` is what a user
+    who meets the limit does.
     """
 
     of: str
@@ -58,12 +55,8 @@ class FileLimit:
     def make_error(
         self, what: str, path: str | Path, count: float | None = None, line: int | None = None
     ) -> FileError:
-        """Return the error for a file beyond this limit.
-
-        Parameters
-        ----------
-        what : kind of file, for the message. path : the file.
-        count : what it contains; None where it was not counted to the end. line : of the excess.
+        """Return the error for a file beyond this limit; `count` is None where it was not counted
+        to the end.
         """
         finding = report_finding(
             "files.limit-exceeded",
@@ -249,12 +242,8 @@ LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit
 
 
 class CountLimit(NamedTuple):
-    """The largest number that an option takes.
-
-    Parameters
-    ----------
-    most : this number. unit : noun for messages, such as `poses`.
-    meaning : commands and options to which it applies, for documentation.
+    """The largest number that an option takes; `meaning` names commands and options, for
+    documentation.
     """
 
     most: int

@@ -39,20 +39,11 @@ FILES = "files"
 def refuse_outputs(
     outputs: Sequence[Path | None], inputs: Sequence[Path | None], force: bool
 ) -> None:
-    """Refuse outputs that cannot or should not be written.
+    """Refuse outputs that cannot or should not be written; None is skipped.
 
-    Parameters
-    ----------
-    outputs : files to write; None is skipped.
-    inputs : files that are read, or folders whose files are read; None is skipped.
-    force : existing files may be replaced, except those that are read and the documents of result
-        folders, without which nothing else in the folder can be read.
-
-    Raises
-    ------
-    FileError
-        An output is an input or another output, exists (without `force`), is a folder or a device,
-        or its folder does not exist or is not writable. A symbolic link stands for its target.
+    FileError : an output is an input (or in a folder of inputs) or another output, exists (without
+    `force`), is a folder, a device or the document of a result folder, or its folder does not
+    exist or is not writable. A symbolic link stands for its target.
     """
     read = [
         file
@@ -110,11 +101,8 @@ def _is_same_file(path: Path, other: Path) -> bool:
 
 
 def resolve_folder(path: Path) -> Path:
-    """Return the folder that a write to `path` makes or replaces, without links and dots.
-
-    Raises
-    ------
-    FileError : the path is a circular link.
+    """Return the folder that a write to `path` makes or replaces, without links and dots;
+    FileError for a circular link.
     """
     try:
         return path.resolve()
@@ -127,15 +115,8 @@ def replace_folder(path: Path, check: Callable[[Path], None] | None = None) -> I
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
 
     At every moment, `path` is the old or the new folder, complete. A symbolic link to a folder
-    stays a link.
-
-    Parameters
-    ----------
-    check : raises FileError where a folder that is in use must not be replaced.
-
-    Raises
-    ------
-    FileError : in place of every OSError.
+    stays a link. `check` raises FileError where a folder must not be replaced, as every OSError
+    does.
     """
     with report_write_errors(path):
         target = resolve_folder(path)
@@ -150,15 +131,10 @@ _BLANK = "0" * 64
 
 
 class FolderKind(NamedTuple):
-    """What a command writes as a folder, and by what it is recognized.
+    """What a command writes as a folder: `content`, such as "run", for messages.
 
-    Parameters
-    ----------
-    content : what the folder contains, for messages, such as "run".
-    document : name of the file that lists the others.
-    keys : of the document, by which it differs from those of others.
-    names : patterns of the other files, such as `tables/*.csv`.
-    filled_in : of these, the files that users fill in.
+    It is recognized by the file `document`, which lists the others, and the `keys` in it. `names`
+    are patterns of the other files, such as `tables/*.csv`; users fill in those in `filled_in`.
     """
 
     content: str
@@ -178,16 +154,9 @@ class FolderKind(NamedTuple):
 def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Path] = ()) -> None:
     """Refuse a folder that cannot or must not be written; a folder set aside gets its name again.
 
-    Parameters
-    ----------
-    force : a folder that loopcal made may be replaced. inputs : files that the command reads.
-
-    Raises
-    ------
-    FileError
-        The path is a file, or the working folder; its place is not writable; the folder is in use
-        (without `force`), or protected; or it contains an input, or anything but an unchanged
-        result of this kind.
+    FileError : the path is a file, or the working folder; its place is not writable; the folder is
+    in use (without `force`), or protected; or it contains an input of the command, or anything but
+    an unchanged result of this kind.
     """
     target = resolve_folder(path)
     with report_write_errors(path):
@@ -271,17 +240,8 @@ def write_result_folder(
     files: Mapping[str, bytes],
     force: bool = False,
 ) -> None:
-    """Write a folder whole or not at all.
-
-    Parameters
-    ----------
-    document : content of the document, to which the list of files is added.
-    files : name -> content.
-    force : see `refuse_folder`.
-
-    Raises
-    ------
-    FileError : see `refuse_folder`; or the folder cannot be written.
+    """Write a folder whole or not at all: `files` by name, and the document with their digests;
+    FileError as `refuse_folder`, or where the folder cannot be written.
     """
     digests = dict.fromkeys((*sorted(files), kind.document), _BLANK)
     computed = convert_document({**document, FILES: digests})

@@ -45,20 +45,13 @@ def read_record(
     location: Location = (),
     word: Callable[[Path, str], FileError] | None = None,
 ) -> T:
-    """Return a record built from the content of a file.
+    """Return a record (a dataclass with annotated fields) from plain `content` at a location of a
+    file.
 
-    Parameters
-    ----------
-    file : source of `content`, for lines.
-    content : plain values as written in the file.
-    record : a dataclass with annotated fields.
-    units : of the numbers in the file; None where each number states its own, as in `5 um`.
-    location : of `content` in the file.
-    word : makes the error from the file and what does not fit, for files that nobody edits; by
-        default it names the line and says what to write.
+    `units` are those of the numbers in the file; None where each number states its own, as in `5
+    um`. `word` makes the error from the file and what does not fit, for files that nobody edits;
+    by default it names the line and says what to write.
 
-    Raises
-    ------
     FileError : the first value that does not fit, at its line.
     """
     try:
@@ -71,11 +64,8 @@ def read_record(
 
 
 def read_units(file: YamlFile) -> dict[Dimension, Unit]:
-    """Return the units that a file states under `units:`, which is mandatory; ratios have unit 1.
-
-    Raises
-    ------
-    FileError : no units, or an unknown dimension or unit, or a unit of another dimension.
+    """Return the units that a file must state under `units:`; ratios have unit 1. FileError where
+    they are missing, unknown, or of another dimension.
     """
     example = "write for example 'units: {length: mm, angle: deg}'"
     stated = file.content.get("units")

@@ -68,9 +68,8 @@ def sync_folder(path: Path) -> None:
 
 
 def lock(descriptor: int) -> bool | None:
-    """Lock a file or folder until it is closed; return whether it is locked.
-
-    False where another process has the lock, None where locks are not supported.
+    """Lock a file or folder until it is closed; return whether it is locked, False where another
+    process has the lock, None where locks are not supported.
     """
     if fcntl is None:
         return None
@@ -155,10 +154,8 @@ def place_folder(
 ) -> None:
     """Give a complete folder its name, and remove the folder that had it.
 
-    Parameters
-    ----------
-    check : is called with a folder that is to be replaced, and raises where it must stay. It is
-        called again with what was replaced, which another program may have changed.
+    `check` is called with a folder that is to be replaced, and raises where it must stay. It is
+    called again with what was replaced, which another program may have changed.
     """
     for place, _, names in os.walk(temporary):
         for name in names:
@@ -189,14 +186,9 @@ def place_folder(
 
 @contextmanager
 def _lock_folder(path: Path) -> Iterator[bool]:
-    """Lock a folder that is to be replaced, so that no other command replaces it meanwhile.
+    """Lock a folder that is to be replaced, so that no other command replaces it meanwhile; yield
+    whether it is locked, False where the name belongs to another folder now.
 
-    Yields
-    ------
-    Whether the folder of this name is locked; if not, the name belongs to another folder now.
-
-    Raises
-    ------
     OSError : another command has the lock for `PATIENCE` seconds.
     """
     descriptor = open_folder(path)
@@ -289,11 +281,8 @@ def _exchange(new: Path, old: Path) -> bool:
 
 
 def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
-    """Return what killed writers have left of `target`, oldest first.
-
-    Parameters
-    ----------
-    state : NEW or OLD; both where None.
+    """Return what killed writers have left of `target` in a state (NEW, OLD, or both), oldest
+    first.
     """
     name = _shorten(target.name)
     leftovers = []
@@ -306,11 +295,8 @@ def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
 
 
 def remove_leftovers(target: Path, is_own: Callable[[Path], bool]) -> None:
-    """Remove what killed writers have left of `target`, and return a folder set aside to its name.
-
-    Parameters
-    ----------
-    is_own : whether loopcal made the file or folder; others stay.
+    """Remove what killed writers have left of `target` and `is_own`, and return a folder set aside
+    to its name.
     """
     for path in reversed(list_leftovers(target, OLD)):
         with _lock_leftover(path) as is_abandoned:

@@ -31,12 +31,7 @@ ACTIONS = {
 
 
 def as_path(path: Any, what: str) -> Path:
-    """Return a path given as text or Path.
-
-    Raises
-    ------
-    DataError : no file can have this name; `what` says what the file should be.
-    """
+    """Return a path given as text or Path; DataError where no file can have this name."""
     try:
         name = os.fsencode(path)
     except UnicodeEncodeError:
@@ -50,15 +45,8 @@ def as_path(path: Any, what: str) -> Path:
 def read_text(path: str | Path, what: str, hint: str = "", limit: FileLimit = PROGRAM_SIZE) -> str:
     """Return the text of a UTF-8 file without a byte order mark.
 
-    Parameters
-    ----------
-    path : the file. what : what it should be, for messages, such as "robot file".
-    hint : what else helps, besides saving the file as UTF-8; closes that message.
-    limit : of its size.
-
-    Raises
-    ------
-    FileError : see `read_bytes`; or the file is not UTF-8, or is empty.
+    `what` it should be, such as "robot file", and a `hint` beside saving it as UTF-8 are for
+    messages. FileError : see `read_bytes`; or the file is not UTF-8, or is empty.
     """
     raw = read_bytes(path, what, limit)
     try:
@@ -80,11 +68,8 @@ def read_text(path: str | Path, what: str, hint: str = "", limit: FileLimit = PR
 def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> bytes:
     """Return the content of an ordinary file; `what` it should be is for messages.
 
-    Raises
-    ------
-    FileError
-        The file does not exist, is a folder, a device or a pipe, is not readable, or is larger than
-        the limit.
+    FileError : the file does not exist, is a folder, a device or a pipe, is not readable, or too
+    large.
     """
     with open_bytes(path, what) as stream:
         limit.check(os.fstat(stream.fileno()).st_size, what, path)
@@ -135,8 +120,6 @@ def sha256(path: str | Path) -> str:
 def resolve_target(path: str | Path) -> Path:
     """Return the file that a write to `path` changes: `path`, or the target of a symbolic link.
 
-    Raises
-    ------
     FileError : the path is a folder, a device or a pipe, or a link without a target.
     """
     path = as_path(path, "file to write")
@@ -168,9 +151,6 @@ def replace_file(path: str | Path) -> Iterator[Path]:
     """Yield an empty temporary file that takes the place of `path` where the body succeeds.
 
     A symbolic link stays a link; its target is written. An old file keeps its permissions.
-
-    Raises
-    ------
     FileError : see `resolve_target`; the folder does not exist, no permission, or a full disk.
     """
     target = resolve_target(path)

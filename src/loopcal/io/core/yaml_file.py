@@ -44,12 +44,9 @@ _KNOWN_KEY = re.compile(
 class YamlFile:
     """A mapping read from a YAML file.
 
-    Parameters
-    ----------
-    path : the file, for messages. text : its text without a byte order mark.
-    tree : ruamel.yaml's round-trip tree, which keeps lines and comments.
-    content : the same as plain dicts, lists, text, finite numbers, booleans and None.
-    first_line : line of the file at which the YAML text begins; front matter begins later than 1.
+    `tree` is ruamel.yaml's round-trip tree, which keeps lines and comments; `content` the same as
+    plain dicts, lists, text, finite numbers, booleans and None. The YAML text begins at
+    `first_line`, which is later than 1 for front matter.
     """
 
     path: Path
@@ -76,12 +73,7 @@ class YamlFile:
         return FileError(sentence, self.path, self.line(location) if exists else None)
 
     def quantity(self, node: Any, dimension: Dimension, location: Location) -> float:
-        """Return the SI value of a number with its unit, such as `5 um`.
-
-        Raises
-        ------
-        FileError : not a number with a unit of this dimension; at its line.
-        """
+        """Return the SI value of a number with its unit, such as `5 um`; else FileError."""
         try:
             return parse_quantity(str(node), dimension)
         except UnitError as error:
@@ -89,19 +81,11 @@ class YamlFile:
 
 
 def read_yaml(path: str | Path, what: str, has_names: bool = True) -> YamlFile:
-    """Read one mapping from a YAML 1.2 file.
+    """Read one mapping from a YAML 1.2 file, whose keys and texts are names unless not
+    `has_names`.
 
-    Parameters
-    ----------
-    path : the file. what : what it should be, for messages.
-    has_names : whether its keys and texts are names (`loopcal.io.core.limits`), not prose.
-
-    Raises
-    ------
-    FileError
-        Unreadable file, YAML syntax, duplicate key, a key that is not text, a number that is not
-        finite, a name that a file must not contain, a YAML tag, or more than the limits of
-        `loopcal.io.core.limits` allow.
+    FileError : unreadable file, YAML syntax, duplicate key, a key that is not text, a number that
+    is not finite, a name that a file must not contain, a YAML tag, or more than the limits allow.
     """
     return parse_yaml(read_text(path, what, limit=YAML_SIZE), path, what, has_names=has_names)
 
@@ -149,10 +133,11 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
         key = str(error.problem).split('"')[1] if '"' in str(error.problem) else "?"
         line = error.problem_mark.line + first_line if error.problem_mark else None
         raise FileError(f"duplicate key {quote(key)}; remove one", path, line) from None
-    except LimitError as error:
-        raise error.limit.make_error(what, path, line=error.line + first_line) from None
-    except KeyTypeError as error:
-        raise FileError(f"{error}; write text there", path, error.line + first_line) from None
+    except _RefusedError as error:
+        line = error.line + first_line
+        if error.limit is not None:
+            raise error.limit.make_error(what, path, line=line) from None
+        raise FileError("a key is a list or a mapping; write text there", path, line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = _shorten(error.problem or error.context or "not YAML")
@@ -176,7 +161,7 @@ def make_round_trip_yaml() -> Any:
     from ruamel.yaml import YAML
 
     yaml = YAML(typ="rt", pure=True)
-    yaml.Composer = make_bounded_composer
+    yaml.Composer = _make_bounded_composer
     yaml.preserve_quotes = True
     yaml.width = 120
     return yaml
@@ -265,31 +250,21 @@ def _refuse_names(node: Any, file: YamlFile, location: Location) -> None:
 # keys that are lists or mappings.
 
 
-class LimitError(Exception):
-    """A document beyond `limit`, at a line that is counted from 0."""
+class _RefusedError(Exception):
+    """A document beyond a limit, or (None) a key that is a list or a mapping; the line is counted
+    from 0.
+    """
 
-    def __init__(self, limit: FileLimit, line: int) -> None:
-        super().__init__(limit.of)
-        self.limit = limit
-        self.line = line
-
-
-class KeyTypeError(Exception):
-    """A key that is a list or a mapping, at a line that is counted from 0."""
-
-    def __init__(self, line: int) -> None:
-        super().__init__("a key is a list or a mapping")
-        self.line = line
+    def __init__(self, limit: FileLimit | None, line: int) -> None:
+        super().__init__(limit, line)
+        self.limit, self.line = limit, line
 
 
-def make_bounded_composer(loader: Any) -> Any:
+def _make_bounded_composer(loader: Any) -> Any:
     """Return a composer of ruamel.yaml that counts values and levels, and checks keys.
 
-    Raises
-    ------
-    LimitError, KeyTypeError, MarkedYAMLError : while it composes, as soon as a limit is exceeded;
-        a key that is no scalar, which ruamel.yaml cannot always store; or an alias that stands for
-        a value that contains it.
+    It raises _RefusedError, also for a key that is no scalar, which ruamel.yaml cannot always
+    store, and MarkedYAMLError for an alias that stands for a value that contains it.
     """
     from ruamel.yaml.composer import Composer
     from ruamel.yaml.error import MarkedYAMLError
@@ -319,7 +294,7 @@ def make_bounded_composer(loader: Any) -> Any:
             node = self._compose_counted(parent, index, event)
             is_key = parent is not None and index is None
             if is_key and not isinstance(node, ScalarNode):
-                raise KeyTypeError(line)
+                raise _RefusedError(None, line)
             return node
 
         def _compose_counted(self, parent: Any, index: Any, event: Any) -> Any:
@@ -334,7 +309,7 @@ def make_bounded_composer(loader: Any) -> Any:
             self._add(1, event)
             self._level += 1
             if self._level > YAML_DEPTH.count:
-                raise LimitError(YAML_DEPTH, event.start_mark.line)
+                raise _RefusedError(YAML_DEPTH, event.start_mark.line)
             # YAML allows an anchor again, for another value; ruamel.yaml warns where it is known
             self.anchors.pop(event.anchor, None)
             self._sizes.pop(event.anchor, None)
@@ -348,7 +323,7 @@ def make_bounded_composer(loader: Any) -> Any:
             """Count values; raise LimitError where they are too many."""
             self._count += values
             if self._count > YAML_NODES.count:
-                raise LimitError(YAML_NODES, event.start_mark.line)
+                raise _RefusedError(YAML_NODES, event.start_mark.line)
 
     return BoundedComposer()
 
@@ -373,11 +348,9 @@ def format_flow_mapping(texts: Mapping[str, str]) -> str:
 def add_key(file: YamlFile, entry: str, content: Mapping[str, Any] | None = None) -> YamlFile:
     """Return a file with one more key.
 
-    Parameters
-    ----------
-    file : without the key. entry : the key and its value in block style at the left margin, in
-        complete lines; a comment in them is lost where the file is in flow style.
-    content : what the entry says, as far as the caller knows; otherwise it is parsed.
+    `entry` is the key and its value in block style at the left margin, in complete lines; a
+    comment in them is lost where the file is in flow style. `content` is what it says, as far as
+    known.
     """
     added = _parse(entry, file).content if content is None else dict(content)
     return _choose(file, _list_additions(file, entry, added), file.content | added)
@@ -482,21 +455,13 @@ KEYS = ("poses", "controller")
 
 
 def find_reference(file: YamlFile, key: str) -> Path | None:
-    """Return the file that the setting `key` names; None where there is no such file.
-
-    Raises
-    ------
-    FileError : the path leaves the folder of `file`; at its line.
-    """
+    """Return the file that the setting `key` names, see `find_file_beside`."""
     return find_file_beside(file, str(file.content[key]), (key,))
 
 
 def find_file_beside(file: YamlFile, name: str, location: Location) -> Path | None:
-    """Return the file that `file` names at a location; None where there is no such file.
-
-    Raises
-    ------
-    FileError : the path leaves the folder of `file`; at its line.
+    """Return the file that `file` names at a location; None where there is no such file, FileError
+    where the path leaves the folder.
     """
     path, is_inside = file.path.parent / name, False
     with suppress(OSError, RuntimeError):  # a loop of links

@@ -96,9 +96,8 @@ class TextColumn(Column):
 
 @dataclass(frozen=True)
 class NumberColumn(Column):
-    """A column of numbers of a dimension, written in the unit `symbol`.
-
-    `allows_infinity` : the cell `inf` is allowed, for a reading that is not trusted.
+    """A column of numbers of a dimension, written in the unit `symbol`; `inf` where it
+    `allows_infinity`, for a reading that is not trusted.
     """
 
     dimension: Dimension
@@ -184,7 +183,7 @@ class ContextColumn(Column):
         """Return the values [s] or [degC], NaN where a cell is empty."""
         symbol, cells = table.units[self.name], table.text(self.name)
         if self.name == TIME and symbol is None:
-            return np.array([_parse_date(table, row, cell) for row, cell in enumerate(cells)])
+            return np.array([self._parse_date(table, row, cell) for row, cell in enumerate(cells)])
         if symbol is None or symbol not in self.units:
             stated = "no unit" if symbol is None else f"the unit {symbol!r}"
             allowed = ", ".join(f"[{s}]" for s in self.units)
@@ -201,22 +200,22 @@ class ContextColumn(Column):
                 raise table.row_error(row, f"{sentence}; correct it, or leave the cell empty")
         return values
 
+    @staticmethod
+    def _parse_date(table: Table, row: int, cell: str) -> float:
+        """Return seconds since 1970-01-01 UTC of a date and time; NaN for an empty cell."""
+        try:
+            moment = datetime.fromisoformat(cell) if cell else None
+        except ValueError:
+            sentence = f"column 'time' is {cell!r}, but a date and time is needed, such as"
+            act = "or give the column a unit, as 'time [s]'"
+            raise table.row_error(row, f"{sentence} 2026-05-04T10:22:31; {act}") from None
+        if moment is None:
+            return math.nan
+        return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
+
     def format(self, value: Any) -> str:
         """Return the number [s] or [degC]; nothing for NaN."""
         return "" if math.isnan(float(value)) else format_exact(float(value), 1.0)
-
-
-def _parse_date(table: Table, row: int, cell: str) -> float:
-    """Return seconds since 1970-01-01 UTC of a date and time."""
-    if not cell:
-        return math.nan
-    try:
-        moment = datetime.fromisoformat(cell)
-    except ValueError:
-        sentence = f"column 'time' is {cell!r}, but a date and time is needed, such as"
-        act = "or give the column a unit, as 'time [s]'"
-        raise table.row_error(row, f"{sentence} 2026-05-04T10:22:31; {act}") from None
-    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
 
 
 USE_COLUMN = TextColumn("use", (FIT, HELD_OUT))
@@ -228,11 +227,9 @@ so that the choice does not depend on the results.
 class ColumnRule(NamedTuple):
     """An entry of the registry: one sort of columns.
 
-    Parameters
-    ----------
-    pattern : how the file reference names it. unit : as shown there. meaning : as shown there.
-    list_columns : the columns of this sort that a file on a robot, with some kinds, may have.
-    match : an open-ended column by its name, None where the name is of another sort.
+    `pattern`, `unit` and `meaning` are shown in the file reference. `list_columns` returns those
+    that a file on a robot, with some kinds, may have; `match` an open-ended column by its name, or
+    None.
     """
 
     pattern: str
@@ -252,38 +249,8 @@ def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[NumberColumn]
         yield NumberColumn(a.name, a.dimension, robot.units[a.dimension])
 
 
-def _commanded(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
-    del kinds
-    for name in robot.controlled:
-        yield _number(COMMANDED + name, get_dimension(name))
-
-
-def _measured(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
-    for kind in kinds:
-        for column in kind.columns:
-            yield _number(name_measured(column.name, robot), column.dimension)
-
-
-def _sigmas(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
-    for reading in _readings(robot, kinds):
-        yield replace(reading, name=SIGMA + reading.name, allows_infinity=True)
-    for kind in kinds:
-        for column in kind.noise_columns:
-            yield _number(SIGMA + name_measured(column.name, robot), column.dimension)
-
-
-def _covariances(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
-    for kind in kinds:
-        for a, b in permutations(kind.noise_columns, 2):
-            yield ProductColumn(name_covariance(a.name, b.name, robot), (a.dimension, b.dimension))
-
-
-def _always(*columns: Column) -> Callable[[Mechanism, Sequence[Kind]], Iterable[Column]]:
-    return lambda _robot, _kinds: columns
-
-
 def _text_rule(meaning: str, column: TextColumn) -> ColumnRule:
-    return ColumnRule(column.name, "", meaning, _always(column))
+    return ColumnRule(column.name, "", meaning, lambda _robot, _kinds: (column,))
 
 
 RULES: tuple[ColumnRule, ...] = (
@@ -306,45 +273,63 @@ RULES: tuple[ColumnRule, ...] = (
         f"{COMMANDED}COORDINATE",
         "[mm] or [deg]",
         "commanded coordinate, in place of the readings",
-        _commanded,
+        lambda robot, _: [_number(COMMANDED + c, get_dimension(c)) for c in robot.controlled],
     ),
     ColumnRule(
         "COLUMN",
         "of the kind",
         f"measured value; `{MEASURED}COLUMN` where a reading has the same name",
-        _measured,
+        lambda robot, kinds: [
+            _number(name_measured(c.name, robot), c.dimension)
+            for kind in kinds
+            for c in kind.columns
+        ],
     ),
     ColumnRule(
         f"{SIGMA}NAME",
         "of NAME",
         "standard deviation of a measured value or reading in this row; `inf` marks a reading "
         "that is not trusted",
-        _sigmas,
+        lambda robot, kinds: [
+            *(
+                replace(reading, name=SIGMA + reading.name, allows_infinity=True)
+                for reading in _readings(robot, kinds)
+            ),
+            *(
+                _number(SIGMA + name_measured(column.name, robot), column.dimension)
+                for kind in kinds
+                for column in kind.noise_columns
+            ),
+        ],
     ),
     ColumnRule(
         f"{COVARIANCE}A.B",
         "[mm*mrad]",
         "covariance of two measured values in this row",
-        _covariances,
+        lambda robot, kinds: [
+            ProductColumn(name_covariance(a.name, b.name, robot), (a.dimension, b.dimension))
+            for kind in kinds
+            for a, b in permutations(kind.noise_columns, 2)
+        ],
     ),
     ColumnRule(
         TIME,
         "[s], [ms], [min], [h] or none",
         "time of the row; date and time of ISO 8601 without a unit",
-        _always(ContextColumn(TIME)),
+        lambda _robot, _kinds: (ContextColumn(TIME),),
     ),
     ColumnRule(
         f"{TEMPERATURE}, {TEMPERATURE}.PLACE",
         "[degC], [K] or [degF]",
         "temperature of the room, or of what PLACE names",
-        _always(ContextColumn(TEMPERATURE)),
+        lambda _robot, _kinds: (ContextColumn(TEMPERATURE),),
         lambda name: ContextColumn(name) if is_context(name) else None,
     ),
     ColumnRule(
         f"{NOTE}...",
         "any",
         "a remark; ignored",
-        _always(),
+        lambda _robot, _kinds: (),
         lambda name: TextColumn(name) if name.startswith(NOTE) else None,
     ),
 )
@@ -405,18 +390,13 @@ def get_dimension(coordinate: str) -> Dimension:
     return Dimension.LENGTH if coordinate in ("x", "y", "z") else Dimension.ANGLE
 
 
-# Names that files of measurements, poses and plans cannot have as a column.
-
 SHEET_COLUMNS = ("step", "role", "hold", "tolerance")
 """Further columns of the operator's sheet of a plan."""
 
 
 def find_column_fault(name: str, what: str) -> Finding | None:
-    """Return why a column cannot have this name; None where it can.
-
-    Parameters
-    ----------
-    name : of an actuator or of a measured column. what : what has this name, for the message.
+    """Return why a column cannot have the name of an actuator or measured column; None where it
+    can.
     """
     if "[" in name or "]" in name or name != name.strip():
         return report_finding("files.name-not-a-column", what=what, name=name)

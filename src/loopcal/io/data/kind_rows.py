@@ -73,9 +73,7 @@ POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
 class KindRows:
     """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
 
-    `is_noise_assumed` where the settings say that nobody stated the noise. `shared_errors` are
-    standard deviations of biases and drifts, see `read_shared_errors`. `instrument` is what
-    measured them.
+    `is_noise_assumed` where nobody stated the noise; `shared_errors` as of `read_shared_errors`.
     """
 
     kind: Kind
@@ -95,11 +93,8 @@ def has_measured_values(table: Table) -> bool:
 def read_kinds(table: Table, robot: Mechanism, several: bool = False) -> tuple[KindRows, ...]:
     """Return the kinds of a file, mounted on the robot's tool, with the indices of their rows.
 
-    One of `several` files may have none, and then only holds readings of poses.
-
-    Raises
-    ------
-    FileError : settings or columns without a meaning.
+    One of `several` files may have none, and then only holds readings of poses. FileError :
+    settings or columns without a meaning.
     """
     if several and not has_measured_values(table):
         refuse_unknown_keys(table.settings, list(table.settings.content), POSE_SETTINGS)
@@ -120,17 +115,10 @@ def read_observations(
 ) -> tuple[Observations, tuple[str, ...]]:
     """Read the rows of one kind; return them with file and line of each.
 
-    Parameters
-    ----------
-    table, robot, entry : file, measured robot, and one of `read_kinds`.
-    members : the poses of each row of the file.
-    context : name -> (rows,) times and temperatures of the file.
-    pose_context : name -> (n,) those of the poses, for rows that state none.
+    `members` are the poses of each row of the file; `context` and `pose_context` times and
+    temperatures of its rows (rows,) and of the poses (n,), for rows that state none.
 
-    Raises
-    ------
-    FileError : a cell that does not fit, at its line.
-    DataError : noise that is not a covariance; with the file.
+    FileError : a cell that does not fit. DataError : noise that is not a covariance.
     """
     from loopcal.measure.observations import Observations
 

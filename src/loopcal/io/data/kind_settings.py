@@ -71,22 +71,15 @@ MANY_SIGMAS = 3
 """Number of columns above which an equal noise is written once."""
 
 LENGTHS = Annotated[list[Any], Dimension.LENGTH]
-LENGTH = Annotated[float, Dimension.LENGTH]
 NUMBERS = Annotated[list[Any], Dimension.RATIO]
 
 
 def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
-    """Return the kind that settings describe.
+    """Return the kind that settings (`node` at a location of the file) describe; keys of others
+    are ignored.
 
-    Parameters
-    ----------
-    file : for lines. node : settings; keys of others than the kind are left to the caller.
-    location : of `node` in the file.
-
-    Raises
-    ------
-    FileError : no or an unknown kind, a setting that does not fit it, or a name of a target that no
-        column can have.
+    FileError : no or an unknown kind, a setting that does not fit it, or a name of a target that
+    no column can have.
     """
     from loopcal.measure.kinds import KINDS
 
@@ -129,11 +122,8 @@ def list_kind_settings(kind: type[Kind]) -> dict[str, Any]:
 def read_noise(
     file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Location
 ) -> dict[str, float]:
-    """Return noise column -> standard deviation [SI], of the columns for which one is stated.
-
-    Raises
-    ------
-    FileError : an unknown column, a missing or wrong unit, a number that is not positive.
+    """Return noise column -> standard deviation [SI], of the columns for which one is stated;
+    FileError for an unknown column or a bad number.
     """
     stated, place = node.get("noise", {}), (*location, "noise")
     dimensions = {column.name: column.dimension for column in kind.noise_columns}
@@ -155,12 +145,7 @@ def read_noise(
 
 
 def read_noise_source(file: YamlFile, node: Mapping[str, Any], location: Location) -> bool:
-    """Return whether settings say that the noise is assumed.
-
-    Raises
-    ------
-    FileError : another word than `stated` or `assumed`.
-    """
+    """Return whether settings say that the noise is assumed; FileError for other words."""
     source = node.get("noise_source", "stated")
     if source not in (ASSUMED, "stated"):
         sentence = f"noise_source is {source!r}; write {ASSUMED} where nobody stated the noise"
@@ -209,21 +194,18 @@ def format_quantity(value: float, dimension: Dimension) -> str:
 @cache
 def _make_record(kind: type[Kind]) -> type:
     """Return a record of the settings of a kind (cached); all may be left out."""
-    types = {name: _setting_type(name, a) for name, a in list_kind_settings(kind).items()}
-    fields = [(name, annotation, None) for name, annotation in types.items()]
-    return dataclasses.make_dataclass(f"{kind.__name__}Settings", fields, frozen=True)
-
-
-def _setting_type(name: str, annotation: Any) -> Any:
-    """Return the annotation of a setting in a file, from that of the kind's field."""
-    text = str(annotation)
-    if "ndarray" in text:
-        if name.startswith("T_"):
-            return PoseRecord
-        return NUMBERS if name in DIRECTIONS else LENGTHS
-    if annotation is float:
-        return LENGTH
-    return tuple[str, ...] | str if "tuple" in text else str
+    fields: list[tuple[str, Any, None]] = []
+    for name, annotation in list_kind_settings(kind).items():
+        text, in_file = str(annotation), cast(Any, str)
+        if "ndarray" in text:
+            in_file = NUMBERS if name in DIRECTIONS else LENGTHS
+            in_file = PoseRecord if name.startswith("T_") else in_file
+        elif annotation is float:
+            in_file = Annotated[float, Dimension.LENGTH]
+        elif "tuple" in text:
+            in_file = tuple[str, ...] | str
+        fields.append((name, in_file, None))
+    return make_dataclass(f"{kind.__name__}Settings", fields, frozen=True)
 
 
 def _is_array(value: list[Any]) -> bool:
@@ -253,8 +235,7 @@ def _format_setting(key: str, value: Any) -> str:
     return f"[{', '.join(_format_setting(key, item) for item in items)}]"
 
 
-# Prior knowledge of setup parameters (frames, targets, surfaces, offsets) in measurement
-# files.
+# Prior knowledge of setup parameters (frames, targets, surfaces, offsets).
 
 KEY, FIXED = "unknowns", "fixed"
 EXAMPLE = (
@@ -262,18 +243,16 @@ EXAMPLE = (
 )
 
 
-KNOWN_NUMBERS: Mapping[Dimension, Any] = {
-    Dimension.LENGTH: Length,
-    Dimension.ANGLE: Angle,
-    Dimension.RATIO: Ratio,
-}
+_NUMBERS: tuple[Any, ...] = (Length, Angle, Ratio)
 RECORDS = {
     dimension: make_dataclass(
         "KnownParameter",
         [("start", number | None, None), ("sd", number | None, None), ("fixed", bool, False)],
         frozen=True,
     )
-    for dimension, number in KNOWN_NUMBERS.items()
+    for dimension, number in zip(
+        (Dimension.LENGTH, Dimension.ANGLE, Dimension.RATIO), _NUMBERS, strict=True
+    )
 }
 """Dimension -> record of the knowledge of a parameter."""
 
@@ -284,13 +263,9 @@ def read_stated_values(
 ) -> tuple[StatedValue, ...]:
     """Return the knowledge that files state of the setup parameters of their own rows.
 
-    Parameters
-    ----------
-    files : settings of each file, its rows, and the standard deviations of their biases and drifts
-        by name without the session, 0 where there is none. labels : names of the poses.
+    `files` : settings of each file, its rows, and the standard deviations of their biases and
+    drifts by name without the session, 0 where there is none. `labels` : names of the poses.
 
-    Raises
-    ------
     FileError : a name that is not a parameter of the file, a bad statement, contradicting files.
     DataError : two kinds of a file state one parameter differently.
     """
@@ -383,34 +358,22 @@ def _read_one(
     return [StatedValue(entry.name, sd, stated.start) for entry in matching]
 
 
-# The instrument in the settings of a measurement file: a name, or facts for traceability.
-
-INSTRUMENT_KEY = "instrument"
-
-
 def read_instrument(
     file: YamlFile, node: Mapping[str, Any], location: Location
 ) -> InstrumentRecord | None:
-    """Return the instrument that settings state; None where they state none.
-
-    Raises
-    ------
-    FileError : an unknown key, a number without quotes, or not a date, at its line.
+    """Return the instrument that settings state, None where they state none; FileError for other
+    keys or values.
     """
     from loopcal.measure.observations import InstrumentRecord
 
-    stated, place = node.get(INSTRUMENT_KEY), (*location, INSTRUMENT_KEY)
+    stated, place = node.get("instrument"), (*location, "instrument")
     if stated is None:
         return None
     if isinstance(stated, str):
         return InstrumentRecord(name=stated)
     if not isinstance(stated, dict) or not stated:
-        sentence = (
-            f"{INSTRUMENT_KEY!r} is neither a name nor facts of an instrument; write its name, or"
-        )
-        example = (
-            f'{INSTRUMENT_KEY}: {{name: AT960, serial_number: "750123", certificate: D-K-15123}}'
-        )
+        sentence = "'instrument' is neither a name nor facts of an instrument; write its name, or"
+        example = 'instrument: {name: AT960, serial_number: "750123", certificate: D-K-15123}'
         raise file.error(f"{sentence} '{example}'", place)
     try:
         return read_record(file, stated, InstrumentRecord, None, place)
@@ -441,12 +404,9 @@ ITEMS: Mapping[str, str] = {"session_bias": "bias", "session_drift": "drift"}
 def read_shared_errors(
     file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Location
 ) -> tuple[Kind, dict[str, float]]:
-    """Return a kind with its shared errors as unknowns, and parameter -> standard deviation [SI] of
-    those with a prior; 0 where a component has no such error.
-
-    Raises
-    ------
-    FileError : an unknown component, or not a standard deviation.
+    """Return a kind with its shared errors as unknowns, and parameter -> standard deviation [SI]
+    of those with a prior; 0 where a component has no such error. FileError : an unknown component,
+    or no number.
     """
     from loopcal.measure.kinds.kind import list_components, name_shared_error
 

@@ -52,27 +52,15 @@ if TYPE_CHECKING:
     from loopcal.measure.measurements import Measurements
 
 
-# Rows of measurement files that measure targets on the base, and checks of these targets.
-
 FEWEST = 2
 """Fewest targets on the base that may determine the frame of an instrument. A single one shows no
 rotation, and no other target would reveal its error.
 """
 
 
-def check_base_targets(tables: Sequence[Table], kinds: Sequence[Sequence[KindRows]]) -> None:
+def _check_base_targets(tables: Sequence[Table], kinds: Sequence[Sequence[KindRows]]) -> None:
     """Refuse a target on the base that is also on a platform, a single target on the base, and
-    targets in a frame in which no pose is measured.
-
-    Parameters
-    ----------
-    tables : of all files. kinds : of each file.
-
-    Raises
-    ------
-    FileError
-        `data.target-on-two-bodies`, `data.base-frame-known`, `data.base-frame-unused` or
-        `data.single-base-target`, at the settings of the kind.
+    targets in a frame in which no pose is measured; FileError at the settings of the kind.
     """
     from loopcal.measure.measurements import list_moving_targets
 
@@ -105,23 +93,17 @@ def _find_frame(kind: Kind) -> str:
     return str(getattr(kind, "frame", "")) if "frame" in kind.unknown else ""
 
 
-# The poses of measurement files: their names, readings, reading noise and blocks.
-
 READING_NOISE = "reading_noise"
-RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12
-"""Differences [1] and [m or rad] up to which readings in different units are the same."""
+ROUNDING = 1e-12
+"""Difference, relative or in m or rad, up to which readings in different units are the same."""
 
 
 class PoseRows(NamedTuple):
     """The n poses of some files.
 
-    Parameters
-    ----------
-    labels : names of the poses.
-    readings : (n, a) [SI], NaN where not read.
-    sigma : (n, a) standard deviations of the readings [SI]; None where no file states any.
-    block : (n,) poses with the same number are never split.
-    members : the poses of each row of each file.
+    `readings` and their standard deviations `sigma` are (n, a) [SI], NaN where not read; `sigma`
+    is None where no file states any. Poses with the same number in `block` (n,) are never split.
+    `members` are the poses of each row of each file.
     """
 
     labels: tuple[str, ...]
@@ -148,27 +130,22 @@ class _FilePoses(NamedTuple):
     unread: frozenset[str]
 
 
-def read_pose_rows(
+def _read_pose_rows(
     tables: Sequence[Table], robot: Mechanism, of_base: Sequence[BoolArray]
 ) -> PoseRows:
     """Read the columns `pose` and `block`, and those of readings or commanded coordinates.
 
-    Parameters
-    ----------
-    tables : of all files. robot : its actuators name the readings.
-    of_base : (rows,) of each file, rows that measure the base and belong to no pose.
+    `of_base` : (rows,) of each file, rows that measure the base and belong to no pose.
 
-    Raises
-    ------
-    FileError : a pose without readings or with contradicting ones, an unknown pose in a comparison.
-    DataError : a commanded pose that the controller cannot reach.
+    FileError : a pose without readings or with contradicting ones, an unknown pose in a
+    comparison. DataError : a commanded pose that the controller cannot reach.
     """
     several = len(tables) > 1
     files = [_read_file(*each, robot, several) for each in zip(tables, of_base, strict=True)]
     read = frozenset().union(*(file.read for file in files))
     origin: dict[str, tuple[int, int]] = {}
     for i, file in enumerate(files):
-        states_readings = has_readings(file.table, robot)
+        states_readings = _has_readings(file.table, robot)
         repeated: dict[int, tuple[int, int]] = {}
         for name, row in file.first.items():
             if name in file.read or (name in file.unread and name not in read):
@@ -183,15 +160,24 @@ def read_pose_rows(
     if not origin:
         why = "no row has readings; add a row with readings for each pose"
         if all(rows.all() for rows in of_base):
-            why = (
-                "all rows measure targets on the base, so that there is no pose; give the file of "
-                "the poses, too"
-            )
+            why = "all rows measure targets on the base, so that there is no pose"
+            why += "; give the file of the poses, too"
         raise tables[0].row_error(0, why)
-    alone = {name: (i,) for i, name in enumerate(origin)}
+    number = {name: i for i, name in enumerate(origin)}
+
+    def find_members(table: Table, row: int, cell: str) -> tuple[int, ...]:
+        if cell in number:
+            return (number[cell],)
+        names = [part.strip() for part in cell.split(LINK)]
+        for name in names:
+            if name not in number:
+                sentence = f"unknown pose {name!r}{suggest_names(name, number)}"
+                raise table.row_error(row, f"{sentence}; add a row with its readings")
+        return tuple(number[name] for name in names)
+
     members = tuple(
         tuple(
-            () if is_base[row] else alone.get(cell) or _find_members(file.table, row, cell, alone)
+            () if is_base[row] else find_members(file.table, row, cell)
             for row, cell in enumerate(file.names)
         )
         for file, is_base in zip(files, of_base, strict=True)
@@ -201,13 +187,13 @@ def read_pose_rows(
     places = begin[file] + row
     readings = np.concatenate([file.readings for file in files])[places]
     sigma = None
-    if any(states_reading_noise(table, robot) for table in tables):
+    if any(_states_reading_noise(table, robot) for table in tables):
         stated = np.concatenate([file.sigma for file in files])[places]
         sigma = np.where(np.isnan(stated), robot.stated_sigma, stated)
     return PoseRows(tuple(origin), readings, sigma, _number_blocks(files, list(origin)), members)
 
 
-def has_readings(table: Table, robot: Mechanism) -> bool:
+def _has_readings(table: Table, robot: Mechanism) -> bool:
     """Return whether a file has columns of readings, or of commanded coordinates."""
     names = {actuator.name for actuator in robot.actuators}
     return any(column in names or column.startswith(COMMANDED) for column in table.names)
@@ -233,14 +219,14 @@ def _read_file(table: Table, is_base: BoolArray, robot: Mechanism, several: bool
         sentence = "files are joined by the names of poses, and this file names none"
         raise table.header_error(f"{sentence}; add a column 'pose'")
     names = TextColumn("pose").parse(table) if "pose" in table.units else table.pose_names()
-    first = _find_first_rows(table, names, is_base)
+    first = _find_first_rows(table, names, np.flatnonzero(~is_base))
     blank = np.full((len(names), len(robot.actuators)), np.nan)
-    if several and not has_readings(table, robot):
+    if several and not _has_readings(table, robot):
         return _FilePoses(table, names, first, blank, blank, frozenset(), frozenset())
     controller = _load_controller(table, robot)
     columns = _reading_columns(table, robot, controller)
     rows = np.column_stack([column.parse(table) for column in columns])
-    may_be_absent = controller is None and states_reading_noise(table, robot)
+    may_be_absent = controller is None and _states_reading_noise(table, robot)
     begin = np.array(
         [-1 if base else first.get(name, -1) for name, base in zip(names, is_base, strict=True)]
     )
@@ -262,7 +248,7 @@ def _read_file(table: Table, is_base: BoolArray, robot: Mechanism, several: bool
             poses, places = [names[row] for row in chosen], [table.place(row) for row in chosen]
             blank[chosen] = solve_commanded_poses(controller, rows[chosen], poses, places).q
         rows = blank
-    sigma = read_reading_sigma(table, robot, rows)
+    sigma = _read_reading_sigma(table, robot, rows)
     return _FilePoses(
         table, names, first, rows, sigma, read, unread if may_be_absent else frozenset()
     )
@@ -286,29 +272,15 @@ def _refuse_other_readings(
         raise table.row_error(int(row), f"{sentence}; correct them, or rename one of the two poses")
 
 
-def _find_first_rows(table: Table, names: tuple[str, ...], is_base: BoolArray) -> dict[str, int]:
-    """Return pose -> its first row, in the order of the file; rows of the base name none."""
+def _find_first_rows(table: Table, names: tuple[str, ...], rows: IntArray) -> dict[str, int]:
+    """Return pose -> its first row, in the order of the file."""
     first: dict[str, int] = {}
-    for row, name in enumerate(names):
-        if is_base[row]:
-            continue
-        if not name:
+    for row in rows.tolist():
+        if not names[row]:
             raise table.row_error(row, "column 'pose' is empty; write a name or a number")
-        if LINK not in name:
-            first.setdefault(name, row)
+        if LINK not in names[row]:
+            first.setdefault(names[row], row)
     return first
-
-
-def _find_members(
-    table: Table, row: int, cell: str, alone: Mapping[str, tuple[int]]
-) -> tuple[int, ...]:
-    """Return the poses of a row; `alone` are those of a row that names one pose."""
-    names = [part.strip() for part in cell.split(LINK)]
-    for name in names:
-        if name not in alone:
-            sentence = f"unknown pose {name!r}{suggest_names(name, alone)}"
-            raise table.row_error(row, f"{sentence}; add a row with its readings")
-    return tuple(pose for name in names for pose in alone[name])
 
 
 def _reading_columns(
@@ -351,22 +323,18 @@ def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:
     return load_robot(beside)
 
 
-def states_reading_noise(table: Table, robot: Mechanism) -> bool:
+def _states_reading_noise(table: Table, robot: Mechanism) -> bool:
     """Return whether a file states the noise of its readings."""
     names = (SIGMA + actuator.name for actuator in robot.actuators)
     return READING_NOISE in table.settings.content or any(name in table.units for name in names)
 
 
-def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Return the standard deviations (rows, a) [SI] of readings (rows, a).
+def _read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> FloatArray:
+    """Return the standard deviations (rows, a) [SI] of readings (rows, a): NaN where the file
+    states none, and infinite where a reading was not taken.
 
-    They are NaN where the file states none for a reading, and infinite where it was not taken.
-
-    Raises
-    ------
-    FileError
-        An unknown actuator, a missing or wrong unit, a negative number, or an empty cell where no
-        setting and no robot file states the noise.
+    FileError : an unknown actuator, a wrong unit, a negative number, or an empty cell where
+    nothing else states the noise.
     """
     file, node = table.settings, table.settings.content.get(READING_NOISE, {})
     dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
@@ -417,7 +385,7 @@ def _refuse_contradictions(
     for what in ("readings", "sigma"):
         a = getattr(file, what)[rows]
         b = np.concatenate([getattr(each, what) for each in files])[begin[number] + other]
-        same = np.isclose(a, b, rtol=RELATIVE_ROUNDING, atol=ABSOLUTE_ROUNDING, equal_nan=True)
+        same = np.isclose(a, b, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
         unstated = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
         for i in np.flatnonzero(~(same | unstated).all(axis=1)):
             row, place = int(rows[i]), files[number[i]].table.place(int(other[i]))
@@ -445,20 +413,8 @@ def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArr
     return np.array([numbers[key] for key in keys])
 
 
-# The column `use`: which poses are held out for validation.
-
-
-def read_held_out(tables: Sequence[Table], poses: PoseRows) -> BoolArray:
-    """Return which poses (n,) the files hold out.
-
-    Parameters
-    ----------
-    tables : of all files. poses : the poses of their rows.
-
-    Raises
-    ------
-    FileError : another cell, or two different uses of one pose, with file and line of both.
-    """
+def _read_held_out(tables: Sequence[Table], poses: PoseRows) -> BoolArray:
+    """Return which poses (n,) the files hold out; FileError for two different uses of one pose."""
     stated: dict[int, tuple[str, str]] = {}
     for table, members in zip(tables, poses.members, strict=True):
         for row, cell in enumerate(USE_COLUMN.parse(table)):
@@ -516,15 +472,9 @@ def load_measurements(
 
 
 def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) -> Measurements:
-    """Read a planned sheet whose readings are still to be measured, with those of the plan.
+    """Read a planned sheet (of planes and lines, or of readings alone) whose readings are still to
+    be measured, with the nominal readings of the operator's sheet `plan` beside it.
 
-    Parameters
-    ----------
-    sheet : data file of a plan of planes and lines, or of readings alone.
-    plan : the operator's sheet beside it, with the nominal reading of each pose.
-
-    Raises
-    ------
     FileError, DataError : as `load_measurements`, or the plan lacks a pose of the sheet.
     """
     table, planned = read_table(sheet), read_table(plan)
@@ -550,12 +500,12 @@ def _join_tables(
     if not any(kinds):
         sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
         raise FileError(sentence, tables[0].path)
-    check_base_targets(tables, kinds)
+    _check_base_targets(tables, kinds)
     of_base = [np.zeros(len(table), dtype=bool) for table in tables]
     for is_base, of_file in zip(of_base, kinds, strict=True):
         for entry in (entry for entry in of_file if entry.kind.is_of_base):
             is_base[entry.rows] = True
-    poses = read_pose_rows(tables, robot, of_base)
+    poses = _read_pose_rows(tables, robot, of_base)
     context = [read_context(table) for table in tables]
     beside_poses = _collect_pose_context(tables, kinds, poses.members, context, len(poses.labels))
     read = [
@@ -592,13 +542,15 @@ def _join_tables(
             poses.labels,
             poses.sigma,
             read_stated_values(settings, poses.labels),
-            read_held_out(tables, poses),
+            _read_held_out(tables, poses),
             tuple(rows for rows, _ in on_base),
         )
-        places = [places for _, places in of_poses]
-        check_strokes(data, robot, allow=allow_outside_stroke, places=_place_poses(data, places))
-        places += [places_of_base for _, places_of_base in on_base]
-        check_duplicates(data, allow=allow_duplicates, places=places)
+        first: dict[int, str] = {}  # place of the first row of each pose, such as `data.csv:12`
+        for rows, places in reversed(of_poses):
+            repeated = [place for place in places for _ in range(rows.kind.poses_per_row)]
+            first |= zip(rows.rows.ravel()[::-1].tolist(), reversed(repeated), strict=True)
+        check_strokes(data, robot, allow=allow_outside_stroke, places=first)
+        check_duplicates(data, allow=allow_duplicates, places=[at for _, at in of_poses + on_base])
     # Poses that only an unfilled sheet names were planned, not measured.
     is_named = np.zeros(len(poses.labels), dtype=bool)
     for of_file, left, of_rows in zip(kinds, read, poses.members, strict=True):
@@ -607,36 +559,17 @@ def _join_tables(
     return data if is_named.all() else data.take(is_named)
 
 
-def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Return the place of the first row of each pose, such as `data.csv:12`."""
-    first: dict[int, str] = {}
-    for rows, of_rows in zip(reversed(data.observations), reversed(places), strict=True):
-        repeated = [place for place in of_rows for _ in range(rows.kind.poses_per_row)]
-        first |= zip(rows.rows.ravel()[::-1].tolist(), reversed(repeated), strict=True)
-    return first
-
-
 def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
-    """Return the files of `load_measurements` that state a kind, but only hold poses and readings.
-
-    Parameters
-    ----------
-    path : the files. data : that were read from them.
-    """
+    """Return the files that state a kind, but only hold poses and readings."""
     sources = {rows.source for rows in data.all_observations}
     tables = (table for table in _read_tables(path) if has_measured_values(table))
     return tuple(table.path for table in tables if str(table.path) not in sources)
 
 
 def list_measurement_files(path: Paths) -> dict[str, Path]:
-    """Return role -> file of all files that `load_measurements` reads.
-
-    Files with measured values are called `data`, `data-2` and so on, files that only hold readings
-    of poses `poses`.
-
-    Raises
-    ------
-    FileError : one of them cannot be read, or is given twice.
+    """Return role -> file of all files that `load_measurements` reads: `data`, `data-2` and so on
+    with measured values, `poses` with readings alone. FileError : one is given twice, or
+    unreadable.
     """
     tables = _read_tables(path)
     files: dict[str, Path] = {}
@@ -648,12 +581,7 @@ def list_measurement_files(path: Paths) -> dict[str, Path]:
 
 
 def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
-    """Read commanded poses (n, c) [m, rad]: one column for each controlled coordinate.
-
-    Raises
-    ------
-    FileError : a value that does not fit, at its line.
-    """
+    """Read commanded poses (n, c) [m, rad]: one column for each controlled coordinate."""
     table = read_table(path)
     require_columns(table, robot.controlled, f"a coordinate of {robot.name}")
     return np.column_stack(
@@ -662,13 +590,8 @@ def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
 
 
 def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Read the names of commanded poses (n,), and their places such as `poses.csv:12`.
-
-    The names are "1", "2", ... without a column `pose`.
-
-    Raises
-    ------
-    FileError : a name occurs twice.
+    """Read the names of commanded poses (n,), "1", "2", ... without a column `pose`, and their
+    places such as `poses.csv:12`; FileError where a name occurs twice.
     """
     table = read_table(path)
     names = table.pose_names()
@@ -739,24 +662,14 @@ def _collect_pose_context(
 
 
 def load_instrument(path: str | Path, robot: Mechanism) -> Instrument:
-    """Return the instrument of a measurement file, which measures every pose.
-
-    Raises
-    ------
-    FileError : a value that does not fit, at its line; noise that the settings do not state.
-    """
+    """Return the instrument of a measurement file, which measures every pose."""
     table = read_table(path)
-    return build_instrument(table, read_kinds(table, robot))
+    return _build_instrument(table, read_kinds(table, robot))
 
 
 def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
-    """Return the instrument of a measurement file for planning poses.
-
-    Raises
-    ------
-    FileError
-        As `load_instrument`; or each group of rows has setup parameters of its own, such as a
-        surface, which a choice of poses does not determine.
+    """Return the instrument of a measurement file for planning poses; FileError where each group
+    of rows has setup parameters of its own, such as a surface, which poses do not determine.
     """
     table = read_template(path)
     kinds = read_kinds(table, robot)
@@ -776,7 +689,7 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
                 report_finding(code, kind=entry.kind.name, parameters=tuple(parameters)),
                 entry.location,
             )
-    return build_instrument(table, kinds)
+    return _build_instrument(table, kinds)
 
 
 def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
@@ -787,11 +700,11 @@ def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
     return bool(columns and len(table)) and not any(cells)
 
 
-def build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
+def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     """Return the instrument with the noise that the settings of a table state."""
     from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 
-    check_base_targets((table,), (kinds,))
+    _check_base_targets((table,), (kinds,))
     sensors = []
     for entry in kinds:
         for column in entry.kind.noise_columns:

@@ -101,12 +101,7 @@ def save_measurements(
 def format_measurements(
     data: Measurements, robot: Mechanism, remark: str = "", states_use: bool = False
 ) -> str:
-    """Return the text of a measurement file; see `save_measurements`.
-
-    Parameters
-    ----------
-    states_use : write the column `use` also where no pose is held out.
-    """
+    """Return the text of a measurement file; `states_use` also where no pose is held out."""
     from loopcal.measure.data_checks import check_redundancy
 
     _refuse_names(data)
@@ -165,12 +160,7 @@ def format_measurements(
 
 
 def format_template(robot: Mechanism, instrument: Instrument) -> str:
-    """Return settings and header of a measurement file, to be filled in by hand.
-
-    Parameters
-    ----------
-    robot : its actuators become columns. instrument : its kinds become columns.
-    """
+    """Return settings and header of a measurement file, to be filled in by hand."""
     kinds = [sensor.kind for sensor in instrument.sensors]
     noise = [
         dict(zip((c.name for c in s.kind.noise_columns), s.noise.sigma.tolist(), strict=True))
@@ -201,19 +191,10 @@ def format_data_sheet(
     labels: Sequence[str] = (),
     is_held_out: ArrayLike | None = None,
 ) -> str:
-    """Return a measurement file with poses and empty measured values, to be filled in.
+    """Return a measurement file with poses, readings (n, a) [SI] and empty measured values.
 
-    Parameters
-    ----------
-    robot : its actuators become columns.
-    instrument : states the poses, session and group of each kind.
-    readings : (n, a) [SI] of the poses to be measured.
-    labels : names of the poses; default "1", "2", ...
-    is_held_out : (n,) poses to hold out; without it, the file has no column `use`.
-
-    Raises
-    ------
-    DataError : the instrument measures a pose that does not exist, or the number of names is wrong.
+    `instrument` states the poses, session and group of each kind. Without `is_held_out` (n,), the
+    file has no column `use`. DataError : a pose that does not exist, or a wrong number of names.
     """
     from loopcal.measure.measurements import Measurements
     from loopcal.measure.observations import Observations

@@ -49,11 +49,9 @@ UNIT_CODES = {"mm": "G21", "in": "G20"}
 class GcodeSettings:
     """Settings of a program.
 
-    Attributes
-    ----------
-    feed : of moves [m/s]; of moves that only rotate the same number in degrees per minute.
-    pause : time at each pose [s]; None stops until the operator continues.
-    unit : of lengths in the program.
+    `feed` is that of moves [m/s], and of moves that only rotate the same number in degrees per
+    minute; `pause` the time at each pose [s], None until the operator continues; `unit` that of
+    lengths.
     """
 
     feed: float
@@ -68,11 +66,8 @@ class GcodeSettings:
 
 @dataclass(frozen=True, eq=False)
 class PlannedStops:
-    """The stops of an operator's sheet.
-
-    Attributes
-    ----------
-    labels : of the poses, or "home". uses : fit, held-out or via. coordinates : (n, c) [m, rad].
+    """The stops of an operator's sheet: labels of the poses (or "home"), uses (fit, held-out or
+    via), and coordinates (n, c) [m, rad].
     """
 
     labels: tuple[str, ...]
@@ -81,11 +76,8 @@ class PlannedStops:
 
 
 def read_stops(path: str | Path, robot: Mechanism) -> PlannedStops:
-    """Read the stops of a plan: its folder, or its sheet plan.csv.
-
-    Raises
-    ------
-    FileError : there is no sheet of this robot.
+    """Read the stops of a plan: its folder, or its sheet plan.csv; FileError where it is of
+    another robot.
     """
     path = Path(path)
     file = path / SHEET if path.is_dir() else path

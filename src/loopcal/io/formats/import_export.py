@@ -34,11 +34,8 @@ def list_formats(ability: Literal["read", "write"]) -> tuple[str, ...]:
 
 
 def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> Format:
-    """Return the format of this name, or the one with the ending of a file to read or to write.
-
-    Raises
-    ------
-    DataError : there is no format of this name. FileError : no format has this ending.
+    """Return the format of this name (DataError for another), or the one with the ending of a file
+    to read or to write (FileError for another).
     """
     if name is not None:
         return FORMATS[name]
@@ -50,12 +47,8 @@ def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> 
 
 
 def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
-    """Build the imported robot before anything is written.
-
-    Raises
-    ------
-    FileError, MechanismError : it cannot be built; with the name of the file that it came from. The
-        lines of its text are not those of that file.
+    """Build the imported robot before anything is written; errors name the file that it came from,
+    as the lines of its text are not those of that file.
     """
     try:
         return build_robot(parse_yaml(imported.robot_text, path, "robot file"))
@@ -68,12 +61,8 @@ def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
 
 
 def save_imported(path: Path, imported: Imported, output: Path, data: Path | None) -> Mechanism:
-    """Write the robot file and, where `data` names one, the measurement file; return the robot.
-
-    Raises
-    ------
-    DataError : there are no measurements to write.
-    FileError, MechanismError : a file cannot be written, or the robot cannot be built.
+    """Write the robot file and, where `data` names one, the measurement file (DataError where
+    nothing was measured); return the robot.
     """
     robot = build_imported_robot(path, imported)
     if data is not None:
@@ -102,12 +91,8 @@ def build_source(run: Run) -> ExportSource:
 
 
 def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exported:
-    """Return the text of a source in a format.
-
-    Raises
-    ------
-    DataError : the format is read only, or cannot correct an existing file.
-    FileError : the file to correct cannot be read, or is of another kind.
+    """Return the text of a source in a format; DataError where it is read only, or cannot correct
+    an existing file.
     """
     if target.write is None:
         known = ", ".join(list_formats("write"))

@@ -49,12 +49,8 @@ BALL_NAME = "_ball"
 
 @dataclass(frozen=True)
 class Closures:
-    """The content of a closure file.
-
-    Attributes
-    ----------
-    file : None without one. pairs : names of the two frames of each closure. kinds : WELD or BALL.
-    motors : driven joints. overrides : joint -> type, of OVERRIDES.
+    """The content of a closure file: pairs of frames with their kinds (WELD or BALL), driven
+    joints, and joint -> type of OVERRIDES.
     """
 
     file: YamlFile | None = None
@@ -66,13 +62,10 @@ class Closures:
 
 @dataclass(frozen=True)
 class UrdfMechanism:
-    """A URDF with its loops closed.
+    """A URDF with its loops closed, as a graph of bodies and joints.
 
-    Attributes
-    ----------
-    urdf : with the joints that the closure file fixes. graph : bodies and joints.
-    bodies : rigid bodies that closures make of links. frames : links that close loops only.
-    rigid_closures : frames of the closures of type 6d at whose ends no joint moves.
+    `bodies` are the rigid bodies that closures make of links, `frames` links that close loops
+    only, `rigid_closures` the frames of the closures of type 6d at whose ends no joint moves.
     """
 
     urdf: Urdf
@@ -106,10 +99,8 @@ class UrdfMechanism:
 def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
     """Return the mechanism of a URDF with its closures.
 
-    Raises
-    ------
     FileError : an unknown frame or joint, a closure of a rigid body with itself, a motor that is
-        not a movable joint.
+    not a movable joint.
     """
     closures = Closures() if path is None else _read_closures(path, urdf)
     fixed = {name for name, kind in closures.overrides.items() if kind == "FIXED"}

@@ -53,15 +53,12 @@ CONSTRAINTS = {
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """A joint.
+    """A joint from link `parent` to `child`: R, P, or "" for a fixed one.
 
-    Attributes
-    ----------
-    kind : R, P, or "" for a fixed joint. parent, child : links.
-    origin : (4, 4) T_parent_joint [m]. axis : (3,) unit vector. limits : [rad or m].
-    line : of the joint, from 1. start, end : bytes of its origin's tag, -1 without.
-    mimic : the joint that it follows, factor and offset [rad or m]; None without.
-    rounding : error of its origin and axis by the rounding of their numbers [m, rad].
+    `origin` : (4, 4) T_parent_joint [m]. `axis` : (3,) unit vector. `limits` : [rad or m]. `line`
+    : from 1. `start`, `end` : bytes of its origin's tag, -1 without. `mimic` : the joint that it
+    follows, factor and offset [rad or m]; None without. `rounding` : error of origin and axis by
+    the rounding of their numbers [m, rad].
     """
 
     name: str
@@ -80,12 +77,10 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class UrdfConstraint:
-    """A constraint between two links.
+    """A constraint between two links: R, S, U, or "" for a rigid link that was cut.
 
-    Attributes
-    ----------
-    kind : R, S, U, or "" for a rigid link that was cut. ends : its frames on the parent and on the
-        child link, as fixed joints without a child. axes : (3,) unit vector in each of the frames.
+    `ends` are its frames on the parent and on the child link, as fixed joints without a child;
+    `axes` (3,) unit vectors in each of the frames.
     """
 
     name: str
@@ -258,12 +253,8 @@ OTHER_LOOPS = ("loop_joint", "loop")
 
 @dataclass(frozen=True)
 class Urdf:
-    """A file.
-
-    Attributes
-    ----------
-    joints : by name. root : the link that no joint carries. carrier : link -> joint that carries
-        it. constraints : that close loops. motors : joint -> line, of transmissions.
+    """A file: joints by name, the link `root` that no joint carries, `carrier` link -> joint that
+    carries it, constraints that close loops, and `motors` joint -> line, of transmissions.
     """
 
     path: Path
@@ -309,9 +300,6 @@ class Urdf:
 
     def with_origin(self, joint: str, origin: FloatArray, turned: bool) -> Urdf:
         """Return the file with another origin of a place; its rpy changes only where it `turned`.
-
-        Raises
-        ------
         FileError : the joint has no origin in the text, or the attribute is missing.
         """
         old = self.places[joint]

@@ -58,11 +58,8 @@ PLACED = 1e-9
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the URDF with corrected origins.
-
-    Raises
-    ------
-    DataError : no URDF is given. FileError : its joints have other places than the robot's.
+    """Return the URDF with corrected origins; DataError where none is given, FileError where its
+    joints have other places.
     """
     record = get_record(
         source, (Limbs, PlacedStages), "urdf", "a robot of the family limbs or stages"
@@ -102,11 +99,8 @@ def write(source: ExportSource, into: Path | None) -> Exported:
 
 
 def _list_origins(record: Limbs | PlacedStages, urdf: Urdf) -> Iterator[tuple[str, list[str], str]]:
-    """Yield URDF joint, names of the shifts along its axes, and of the offset of its motor.
-
-    Raises
-    ------
-    FileError : a limb begins at another place than in the robot file.
+    """Yield URDF joint, names of the shifts along its axes, and of the offset of its motor;
+    FileError where a limb begins at another place than in the robot file.
     """
     if isinstance(record, Limbs):
         yield from _list_limb_origins(record, urdf, "", np.eye(4))
@@ -127,10 +121,8 @@ def _list_origins(record: Limbs | PlacedStages, urdf: Urdf) -> Iterator[tuple[st
 def _list_limb_origins(
     record: Limbs, urdf: Urdf, prefix: str, mount: FloatArray | None
 ) -> Iterator[tuple[str, list[str], str]]:
-    """Yield the same of one robot of limbs.
-
-    `prefix` begins the names of its parameters; mount (4, 4) is its base in the root of the URDF,
-    None where another stage carries it.
+    """Yield the same of one robot of limbs; `prefix` begins the names of its parameters, mount (4,
+    4) is its base in the root of the URDF, None where another stage carries it.
     """
     named = [parameter.name for parameter in record.parameters]
     for limb in record.limbs:
@@ -176,11 +168,8 @@ REMARKS = {
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
-    """Read a URDF and its closures.
-
-    Raises
-    ------
-    FileError : the file is not valid, its loops do not close, or its limbs branch.
+    """Read a URDF and its closures; FileError where it is not valid, its loops do not close, or
+    its limbs branch.
     """
     urdf = urdf_tree.read(path)
     closures: Path | None = options.closures or path.with_suffix(".yaml")
