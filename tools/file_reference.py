@@ -18,8 +18,7 @@ from typing import Any, get_args
 from loopcal.io.core.limits import COUNT_LIMITS, LIMITS
 from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
-from loopcal.io.data.kind_rows import SETTINGS
-from loopcal.io.data.kind_settings import list_kind_settings
+from loopcal.io.data.kind_settings import SETTINGS, list_kind_settings
 from loopcal.io.exports.profile import ColumnSource, ProfileRecord, list_shipped_profiles
 from loopcal.io.robot import robot_file as file_reference
 from loopcal.io.runs.run_folder import MADE_BY

@@ -19,9 +19,8 @@ from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
-from loopcal.io.core.json_text import to_json
 from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-from loopcal.io.core.text_file import as_path, write_bytes, write_text
+from loopcal.io.core.text_file import as_path, to_json, write_bytes, write_text
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_source, export_robot
 from loopcal.io.formats.program_format import ExportSource

@@ -20,7 +20,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.penalties import MAP
 from loopcal.estimate.pose_blocks import BLOCK, EXACT_BLOCK
 from loopcal.findings import Quantity, Severity, report_finding
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.io.runs.run_folder import load_run, save_run
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

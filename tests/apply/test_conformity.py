@@ -19,7 +19,7 @@ from loopcal.apply.validation import validate
 from loopcal.errors import EstimationError
 from loopcal.estimate.identification import identify
 from loopcal.findings import Severity
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.poses import Component

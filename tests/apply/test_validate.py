@@ -13,7 +13,7 @@ from loopcal.diagnose.conventions.convention_check import find_moved_setups
 from loopcal.diagnose.row_errors import METRICS, Metric, compute_noise_floor, compute_row_errors
 from loopcal.errors import DataError
 from loopcal.estimate.identification import identify
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS

@@ -13,7 +13,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.null_space import Combination, describe_null_space
 from loopcal.findings import Finding
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.directions import Inclination

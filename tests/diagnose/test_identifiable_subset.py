@@ -13,7 +13,7 @@ from loopcal.diagnose.parameter_subset import choose_identifiable_subset
 from loopcal.errors import MechanismError
 from loopcal.estimate.information import observe_poses
 from loopcal.findings import Finding
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.io.robot.robot_file import format_reduced_robot, list_shipped_robots, load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

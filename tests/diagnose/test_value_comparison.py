@@ -17,7 +17,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, TruncatedSVD
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Noise, Sensor
 from loopcal.measure.kinds.poses import Component, Pose

@@ -14,7 +14,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
 from loopcal.estimate.trial_identification import identify_trials
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.gauss_newton import DescentStatus

@@ -17,8 +17,7 @@ from loopcal.cli.options import Count
 from loopcal.errors import FileError, MechanismError
 from loopcal.io.core import limits
 from loopcal.io.core.csv_table import read_table
-from loopcal.io.core.json_text import read_json
-from loopcal.io.core.text_file import read_bytes, read_text, sha256
+from loopcal.io.core.text_file import read_bytes, read_json, read_text, sha256
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
 from loopcal.io.runs.run_result import read_arrays

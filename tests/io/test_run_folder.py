@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.io.runs.run_folder import (
     MADE_BY,
     collect_provenance,

@@ -11,7 +11,7 @@ import pytest
 
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.papers.paper import PAPERS, Paper, find_paper
 from loopcal.papers.published import Claim, Figure, Series, Verdict
 from loopcal.papers.reproduction import choose_styles, draw, write_folder, write_page

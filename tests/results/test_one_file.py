@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import to_json
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.presenters import register
 from loopcal.results.result import DrawnResult

@@ -91,7 +91,7 @@ def print_page(blocks: Iterable[Block]) -> None:
 
 def print_json(document: Any) -> None:
     """Print one JSON document."""
-    from loopcal.io.core.json_text import to_json
+    from loopcal.io.core.text_file import to_json
 
     print_text(to_json(document))
 

@@ -17,8 +17,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from loopcal.io.core.json_text import to_json
 from loopcal.io.core.outputs import FolderKind, write_result_folder
+from loopcal.io.core.text_file import to_json
 from loopcal.papers.published import Comparison, Figure, Table, Verdict
 from loopcal.report.pictures import render_figure
 from loopcal.results import serialization

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.json_text import convert_document, format_content, read_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.replacement import (
     create_temporary,
@@ -30,7 +29,14 @@ from loopcal.io.core.replacement import (
     restore_files,
     watch_folder,
 )
-from loopcal.io.core.text_file import report_write_errors, resolve_target, sha256
+from loopcal.io.core.text_file import (
+    convert_document,
+    format_content,
+    read_json,
+    report_write_errors,
+    resolve_target,
+    sha256,
+)
 
 FILES = "files"
 """Key of the list of files in the document of a result folder."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurement files: CSV rows of readings (or commanded coordinates) and measured values.
 
-    # kind: pose                                       settings: `kind_rows.SETTINGS`
+    # kind: pose                                       settings: `kind_settings.SETTINGS`
     # noise: {rx: 5 urad, ry: 5 urad, rz: 5 urad, x: 1 um, y: 1 um, z: 1 um}
     pose,q1 [mm],..,q6 [mm],rx [mrad],..,z [mm]        columns: `columns.RULES`
 
@@ -39,8 +39,13 @@ from loopcal.io.data.columns import (
     list_columns,
     read_context,
 )
-from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds, read_observations
-from loopcal.io.data.kind_settings import read_stated_values
+from loopcal.io.data.kind_settings import (
+    KindRows,
+    has_measured_values,
+    read_kinds,
+    read_observations,
+    read_stated_values,
+)
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray

@@ -36,8 +36,7 @@ from loopcal.io.data.columns import (
     USE_COLUMN,
     is_context,
 )
-from loopcal.io.data.kind_rows import POSE_SETTINGS, SETTINGS
-from loopcal.io.data.kind_settings import list_kind_settings, read_kind
+from loopcal.io.data.kind_settings import POSE_SETTINGS, SETTINGS, list_kind_settings, read_kind
 from loopcal.io.robot.robot_file import check_format
 from loopcal.plain_text import quote
 from loopcal.units import Dimension, find_unit, list_symbols, parse_quantity

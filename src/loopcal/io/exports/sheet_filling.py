@@ -25,7 +25,7 @@ from loopcal.io.core.csv_table import (
     refuse_settings_beside,
 )
 from loopcal.io.core.text_file import read_text, write_text
-from loopcal.io.data.kind_rows import KindRows, read_kinds
+from loopcal.io.data.kind_settings import KindRows, read_kinds
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export, list_headers
 from loopcal.io.exports.profile import Profile, check_columns

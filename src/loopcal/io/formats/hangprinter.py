@@ -26,7 +26,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.io.core.json_text import read_json
+from loopcal.io.core.text_file import read_json
 from loopcal.io.formats.program_format import MM, Format, Imported, ImportOptions, format_head
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST

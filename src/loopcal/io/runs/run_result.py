@@ -24,10 +24,9 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.json_text import read_json
 from loopcal.io.core.limits import ARRAYS_COUNT, ARRAYS_SIZE, TABLE_SIZE, FileLimit
 from loopcal.io.core.records import read_record
-from loopcal.io.core.text_file import open_bytes, sha256
+from loopcal.io.core.text_file import open_bytes, read_json, sha256
 from loopcal.io.core.yaml_file import YamlFile
 from loopcal.mechanism.model import Mechanism
 from loopcal.units import UNITS

@@ -24,8 +24,7 @@ import numpy as np
 
 from loopcal.findings import report_finding
 from loopcal.findings.catalog import find_entry
-from loopcal.io.core.json_text import to_json
-from loopcal.io.core.text_file import write_bytes, write_text
+from loopcal.io.core.text_file import to_json, write_bytes, write_text
 from loopcal.results.tables import ABSENT, Block, Column, Table, format_number, word_column
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import (
