@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.core import limits
@@ -43,17 +43,18 @@ from loopcal.studies.specification.levels import (
     EffectsLevel,
     ErrorsLevel,
     InstrumentLevel,
+    Limit,
+    Limited,
     MethodLevel,
     NoiseLevel,
     PosesLevel,
     Question,
     Robot,
     Scores,
+    whole_numbers,
 )
 from loopcal.studies.specification.scores import check_question
 from loopcal.studies.specification.study import BLOCK, REPLICATES, Study
-
-WHAT, FORMAT = "study file", 1
 
 LEVELS: Mapping[str, type] = {
     "instruments": InstrumentLevel,
@@ -66,8 +67,12 @@ LEVELS: Mapping[str, type] = {
 """Factor -> record of its levels."""
 
 
+MOST_TRIALS = 2000
+"""Largest number of trials of a block."""
+
+
 @dataclass(frozen=True)
-class StudySettings:
+class StudySettings(Limited):
     """The settings of a study file beside its factors.
 
     Parameters
@@ -78,6 +83,11 @@ class StudySettings:
     scores : what is computed of every trial. questions : name -> what the summary answers.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "seed": whole_numbers(0, 2**63, "from {} to {}"),
+        "replicates": whole_numbers(1, limits.REPLICATES.most, "from {} to {}"),
+        "block": whole_numbers(1, MOST_TRIALS, "from {} to {}"),
+    }
     title: str
     seed: int = 1
     replicates: int = REPLICATES
@@ -85,19 +95,6 @@ class StudySettings:
     scores: Scores = field(default_factory=Scores)
     questions: dict[str, Question] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for key, lowest, highest in (
-            ("seed", 0, 2**63),
-            ("replicates", 1, limits.REPLICATES.most),
-            ("block", 1, MOST_TRIALS),
-        ):
-            value = getattr(self, key)
-            if not lowest <= value <= highest:
-                raise ValueError(f"{key} is {value}; it must be from {lowest} to {highest}")
-
-
-MOST_TRIALS = 2000
-"""Largest number of trials of a block."""
 
 SETTINGS = ("title", "seed", "replicates", "block", "scores", "questions")
 QUICK = "quick"
@@ -126,8 +123,8 @@ def load_study(path: str | Path, quick: bool = False) -> Study:
     ------
     FileError : what does not fit, at its line.
     """
-    file = read_yaml(path, WHAT)
-    check_format(file, FORMAT)
+    file = read_yaml(path, "study file")
+    check_format(file, 1)
     refuse_unknown_keys(file, list(file.content), ["format", *SETTINGS, *FACTORS, QUICK])
     full = {key: value for key, value in file.content.items() if key not in ("format", QUICK)}
     whole = StudyContent(file, full, {key: (key,) for key in full})
@@ -173,17 +170,9 @@ def build_study(content: StudyContent) -> Study:
                 )
             stated = value if isinstance(value, dict) else {plain: value}
             factors[key][name] = read_record(file, stated, record, None, place)
-    study = Study(
-        title=settings.title,
-        robots={name: robot for name, (robot, _) in robots.items()},
-        seed=settings.seed,
-        replicates=settings.replicates,
-        block=settings.block,
-        order=tuple(FACTORS[key] for key in values if key in FACTORS),
-        scores=settings.scores,
-        questions=settings.questions,
-        **factors,
-    )
+    factors["robots"] = {name: robot for name, (robot, _) in robots.items()}
+    order = tuple(FACTORS[key] for key in values if key in FACTORS)
+    study = Study(**vars(settings), **factors, order=order)
     machines = [robot for _, robot in robots.values()]
     study = replace(study, poses=_load_pose_files(study, machines, content))
     check_levels(study, machines, content)

@@ -141,19 +141,15 @@ class StudyResult(TableResult):
         StudyError : pandas is not installed.
         """
         pandas = import_optional("pandas", "tables", StudyError)
-        study, names = self.study, tuple(self.study.levels)
+        study = self.study
         with read_store(self.folder) as store:
-            read = [(cell, *read_trials(study, store, cell)) for cell in study.cells]
-        counts = [len(trials) for _, trials, _ in read]
-        factors = {
-            name: pandas.Categorical(
-                np.repeat([cell.levels[name] for cell, _, _ in read], counts),
-                list(dict.fromkeys(cell.levels[name] for cell in study.cells)),
-            )
-            for name in names
-        }
-        trials = np.concatenate([trials for _, trials, _ in read])
-        scores = np.concatenate([scores for _, _, scores in read])
+            read = [read_trials(study, store, cell) for cell in study.cells]
+        counts = [len(trials) for trials, _ in read]
+        factors = {}
+        for name, levels in study.levels.items():
+            words = np.repeat([cell.levels[name] for cell in study.cells], counts)
+            factors[name] = pandas.Categorical(words, list(levels))
+        trials, scores = (np.concatenate(part) for part in zip(*read, strict=True))
         columns = {column.name: scores[:, i] for i, column in enumerate(study.columns)}
         return pandas.DataFrame({**factors, "trial": trials, **columns})
 
@@ -167,18 +163,17 @@ class StudyResult(TableResult):
         StudyError : xarray is not installed.
         """
         xarray = import_optional("xarray", "tables", StudyError)
-        study, names = self.study, tuple(self.study.levels)
-        levels = {n: list(dict.fromkeys(cell.levels[n] for cell in study.cells)) for n in names}
-        shape = (*(len(level) for level in levels.values()), study.replicates)
-        scores = np.full((*shape, len(study.columns)), np.nan)
+        study, levels = self.study, {name: list(of) for name, of in self.study.levels.items()}
+        shape = tuple(map(len, levels.values()))
+        scores = np.full((len(study.cells), study.replicates, len(study.columns)), np.nan)
         with read_store(self.folder) as store:
             for cell in study.cells:
-                place = tuple(levels[name].index(cell.levels[name]) for name in names)
                 trials, values = read_trials(study, store, cell)
-                scores[(*place, trials)] = values
+                scores[cell.number, trials] = values
+        scores = scores.reshape(*shape, *scores.shape[1:])  # the last factor varies fastest
         return xarray.Dataset(
             {
-                column.name: ((*names, "trial"), scores[..., i], {"units": column.unit})
+                column.name: ((*levels, "trial"), scores[..., i], {"units": column.unit})
                 for i, column in enumerate(study.columns)
             },
             coords={**levels, "trial": np.arange(study.replicates)},
