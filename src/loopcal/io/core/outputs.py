@@ -166,7 +166,8 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
     """
     target = resolve_folder(path)
     with report_write_errors(path):
-        restore_leftovers(path, kind)
+        # what killed commands left beside a folder; one that was set aside is renamed back
+        remove_leftovers(target, lambda folder: _is_own(folder, kind))
         if target.exists() and not target.is_dir():
             sentence = f"this is a file, but the {kind.content} is a folder; choose another name"
             raise FileError(sentence, path)
@@ -179,7 +180,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
             if not force:
                 finding = report_finding("files.folder-in-use", content=kind.content)
                 raise FileError(finding, path)
-            refuse_other_content(path, kind)
+            _refuse_other_content(path, kind)
             if not all(os.access(place, os.W_OK | os.X_OK) for place, _, _ in os.walk(target)):
                 sentence = "this folder is protected against changes, so it cannot be replaced"
                 raise FileError(f"{sentence}; choose another name, or permit writing in it", path)
@@ -199,32 +200,28 @@ def _refuse_place(path: Path, target: Path) -> None:
         raise FileError("cannot write here (permission denied); choose another folder", path)
 
 
-def refuse_other_content(path: Path, kind: FolderKind) -> None:
+def _refuse_other_content(path: Path, kind: FolderKind) -> None:
     """Raise FileError where a folder is not an unchanged result of this kind, and nothing else."""
     while True:
         with watch_folder(path.resolve()) as is_same:
             try:
-                _check_content(path, kind)
+                document = _read_document(path / kind.document)
+                if document is None or any(key not in document for key in kind.keys):
+                    finding = report_finding("files.folder-of-others", content=kind.content)
+                    raise FileError(finding, path)
+                listed, names = _list_digests(document), list(_list_entries(path))
+                foreign = [name for name in names if not _is_expected(path, name, kind, listed)]
+                code, wrong = "files.foreign-files", foreign
+                if not foreign:
+                    code = "files.changed-files"
+                    wrong = [name for name in names if _is_changed(path, name, kind, listed)]
+                if wrong:
+                    finding = report_finding(code, content=kind.content, files=tuple(wrong))
+                    raise FileError(finding, path)
                 return
             except (FileError, OSError):
                 if is_same():
                     raise  # otherwise another command has replaced the folder meanwhile
-
-
-def _check_content(path: Path, kind: FolderKind) -> None:
-    """Raise FileError as `refuse_other_content`."""
-    document = _read_document(path / kind.document)
-    if document is None or any(key not in document for key in kind.keys):
-        raise FileError(report_finding("files.folder-of-others", content=kind.content), path)
-    listed = _list_digests(document)
-    names = list(_list_entries(path))
-    if foreign := tuple(name for name in names if not _is_expected(path, name, kind, listed)):
-        code = "files.foreign-files"
-        raise FileError(report_finding(code, content=kind.content, files=foreign), path)
-    changed = tuple(name for name in names if _is_changed(path, name, kind, listed))
-    if changed:
-        code = "files.changed-files"
-        raise FileError(report_finding(code, content=kind.content, files=changed), path)
 
 
 def list_changed_files(path: Path, kind: FolderKind) -> tuple[str, ...]:
@@ -263,11 +260,6 @@ def write_result_folder(
         digest = hashlib.sha256(text.encode()).hexdigest()
         text = text.replace(_quote(kind, _BLANK), _quote(kind, digest))
         (folder / kind.document).write_bytes(text.encode())
-
-
-def restore_leftovers(path: Path, kind: FolderKind) -> None:
-    """Remove what killed commands left beside a folder; one that was set aside is renamed back."""
-    remove_leftovers(resolve_folder(path), lambda folder: _is_own(folder, kind))
 
 
 def describe_leftover(path: Path, document: str) -> str:

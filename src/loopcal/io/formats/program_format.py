@@ -319,19 +319,6 @@ class ValueFile(ABC):
         number_texts = [text] if separator is None else text.split(separator)
         return tuple(parse_number(part.strip(), what, self.path, line) for part in number_texts)
 
-    def replace(self, name: Name, text: str) -> Self:
-        """Return the file with another text of a value, which is added where it does not exist."""
-        lines = list(self.lines)
-        if name in self.values:
-            value = self.values[name]
-            line, end = lines[value.line], value.column + len(value.text)
-            lines[value.line] = self.finish_line(line[: value.column] + text + line[end:])
-        else:
-            if lines and not lines[-1].endswith("\n"):
-                lines[-1] += self.line_end
-            self.insert(lines, name, text)
-        return self.parse(lines, self.path)
-
     def correct(
         self, wanted: Numbers, defaults: Mapping[Name, float]
     ) -> tuple[Self, tuple[Finding, ...]]:
@@ -347,7 +334,16 @@ class ValueFile(ABC):
                 if present is not None and self.is_same(present, number):
                     continue
             text = number if isinstance(number, str) else self.format(number)
-            file = file.replace(name, text)
+            lines = list(file.lines)
+            if before is not None:
+                line, end = lines[before.line], before.column + len(before.text)
+                changed = line[: before.column] + text + line[end:]
+                lines[before.line] = self.finish_line(changed)
+            else:
+                if lines and not lines[-1].endswith("\n"):
+                    lines[-1] += file.line_end
+                file.insert(lines, name, text)
+            file = self.parse(lines, self.path)
             changes.append(
                 report_finding(
                     "files.value-changed",

@@ -192,18 +192,16 @@ def _measure_rounding(
     """
     place, direction = elements.get(origin, {}), elements.get(axis, {})
     lengths, angles = (place.get("xyz", ""),), (place.get("rpy", ""), direction.get("xyz", ""))
-    length, angle = (
-        math.hypot(*(_get_unit(number) for text in texts for number in text.split()))
-        for texts in (lengths, angles)
-    )
-    return length, angle
 
+    def measure(texts: tuple[str, ...]) -> float:
+        units = []
+        for number in " ".join(texts).lower().split():
+            mantissa, _, exponent = number.partition("e")
+            decimals = len(mantissa.partition(".")[2]) - int(exponent or 0)
+            units.append(10.0**-decimals if decimals >= ROUNDED else 0.0)
+        return math.hypot(*units)
 
-def _get_unit(number: str) -> float:
-    """Return the unit of the last digit of a number; 0 where it has few decimals."""
-    mantissa, _, exponent = number.lower().partition("e")
-    decimals = len(mantissa.partition(".")[2]) - int(exponent or 0)
-    return 10.0**-decimals if decimals >= ROUNDED else 0.0
+    return measure(lengths), measure(angles)
 
 
 def _find_tag(element: OpenElement, name: str, raw: bytes) -> tuple[int, int]:
