@@ -177,6 +177,7 @@ class Drawing:
     limits : of the score, which the questions of the study state [SI].
     """
 
+    summary: StudySummary
     layout: Layout
     column: ScoreColumn
     unit: Unit
@@ -189,6 +190,13 @@ class Drawing:
         if summary is None or (kind == "mean" and summary.median is not None):
             return None
         return getattr(summary, kind)
+
+    @property
+    def kinds(self) -> dict[str, list[Interval]]:
+        """Statistic -> those of the cells that have it, for the statistics that some cell has."""
+        found = {k: [self.find_interval(c, k) for c in self.summary.cells] for k in STYLES}
+        kept = {kind: [x for x in intervals if x is not None] for kind, intervals in found.items()}
+        return {kind: intervals for kind, intervals in kept.items() if intervals}
 
 
 def draw_score(
@@ -219,7 +227,7 @@ def draw_score(
     limits = tuple(dict.fromkeys(check_question(study, question) for question in asked))
     levels = dict.fromkeys(layout.find_level(cell, layout.color) for cell in summary.cells)
     colors = dict(zip(levels, COLORS, strict=False))  # the same in all panels
-    drawing = Drawing(layout, column, UNITS[column.unit], colors, limits)
+    drawing = Drawing(summary, layout, column, UNITS[column.unit], colors, limits)
     columns = min(len(groups), 3)
     rows = -(-len(groups) // columns)
     figure = start_figure(1.4 + 4.2 * columns, 1.2 + 3.4 * rows)
@@ -229,9 +237,9 @@ def draw_score(
         axes.set_title(title, fontsize=LABEL)
     for axes in axes_grid.flat[len(groups) :]:
         axes.set_visible(False)
-    _scale_axes(axes_grid, summary, drawing)
-    add_legend(figure, _label(axes_grid, summary, drawing), 3 if columns == 1 else 5)
-    return finish_figure(figure, "\n".join(_list_titles(study, summary, drawing, columns)))
+    _scale_axes(axes_grid, drawing)
+    add_legend(figure, _label(axes_grid, drawing), 3 if columns == 1 else 5)
+    return finish_figure(figure, "\n".join(_list_titles(study, drawing, columns)))
 
 
 def render_figures(
@@ -308,24 +316,10 @@ def _draw_points(
             )
 
 
-def _list_kinds(summary: StudySummary, drawing: Drawing) -> list[str]:
-    """Return the statistics that some cell has."""
-    return [
-        kind
-        for kind in STYLES
-        if any(drawing.find_interval(cell, kind) is not None for cell in summary.cells)
-    ]
-
-
-def _scale_axes(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> None:
+def _scale_axes(axes_grid: Any, drawing: Drawing) -> None:
     """Choose the scales and the ticks of the axes."""
-    kinds, along = _list_kinds(summary, drawing), drawing.layout.along
-    ends = [
-        interval.value
-        for kind in kinds
-        for cell in summary.cells
-        if (interval := drawing.find_interval(cell, kind)) is not None
-    ]
+    kinds, along = drawing.kinds, drawing.layout.along
+    ends = [interval.value for intervals in kinds.values() for interval in intervals]
     if ends and min(ends) > 0.0 and max(ends) > WIDE * min(ends) and "mean" not in kinds:
         axes_grid[0, 0].set_yscale("log")
         label_logarithmic(axes_grid[0, 0].yaxis)
@@ -342,7 +336,7 @@ def _scale_axes(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> None
             axes.set_xlim(-0.5, len(ticks) - 0.5)
 
 
-def _label(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> list[Any]:
+def _label(axes_grid: Any, drawing: Drawing) -> list[Any]:
     """Write the labels of axes; return the entries of the legend."""
     from matplotlib.lines import Line2D
 
@@ -360,7 +354,7 @@ def _label(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> list[Any]
     handles += [
         Line2D([], [], color="0.3", marker=style[0], ls=style[1:], ms=4.0, label=words)
         for kind, (style, words) in STYLES.items()
-        if kind in _list_kinds(summary, drawing)
+        if kind in drawing.kinds
     ]
     if drawing.limits:
         words = "limit of the question"
@@ -368,9 +362,9 @@ def _label(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> list[Any]
     return handles
 
 
-def _list_titles(study: Study, summary: StudySummary, drawing: Drawing, columns: int) -> list[str]:
+def _list_titles(study: Study, drawing: Drawing, columns: int) -> list[str]:
     """Return the lines above all panels: what is drawn, in which frame, of how many trials."""
-    column = drawing.column
+    column, summary = drawing.column, drawing.summary
     counts = [cell.trials - sum(cell.failed.values()) for cell in summary.cells]
     low, high = min(counts), max(counts)
     trials = f"{low}" if low == high else f"{low} to {high}"
