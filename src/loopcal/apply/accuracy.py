@@ -361,9 +361,8 @@ class AccuracyMap(DrawnResult):
 
     @property
     def position_ratio(self) -> FloatArray:
-        """(n,) position uncertainty divided by the largest at the measured poses.
-
-        Above 1 the map extrapolates.
+        """(n,) position uncertainty over the largest at the measured poses; above 1 the map
+        extrapolates.
         """
         return _ratio(self.uncertainty.position, self.measured.position)
 

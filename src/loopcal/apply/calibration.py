@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
 from loopcal.apply.calibration_report import CalibrationReport, Provenance
@@ -113,12 +113,9 @@ def calibrate(
                 raise DataError(report_moved_targets(shape))
     count = StepCounter(progress, STEPS)
     count.begin("checking conventions")
-    conventions = check_conventions(
-        robot,
-        data,
-        allow_still=options.allow_still,
-        allow_implausible=not options.check_conventions,
-    )
+    allowed = {"allow_still": options.allow_still}
+    allowed["allow_implausible"] = not options.check_conventions
+    conventions = check_conventions(robot, data, **allowed)
     # every fold without the far rows would be fitted well and predict them badly, and every fit
     # with them takes all of its iterations
     finding = conventions.finding
@@ -143,8 +140,8 @@ def _fit(
     count: StepCounter,
     held_out: int = 0,
 ) -> tuple[Identification, ModelChoice | None, Change | None]:
-    """Identify from the tolerances, or again with an earlier calibration as the prior: the fit, the
-    choice of its parameters, and the comparison with the earlier calibration.
+    """Return the fit from the tolerances, or with an earlier calibration as the prior; the choice
+    of its parameters; and the comparison with the earlier calibration.
     """
     excluded = tuple(p for p in options.fit.excluded_poses if p in data.labels)
     fit_options = replace(options.fit, excluded_poses=excluded)
@@ -153,14 +150,8 @@ def _fit(
         from loopcal.estimate.recalibration import recalibrate
 
         count.begin("fitting")
-        fit, change = recalibrate(
-            robot,
-            data,
-            options.prior,
-            options.free_limb,
-            options=fit_options,
-            progress=count.progress,
-        )
+        how = {"options": fit_options, "progress": count.progress}
+        fit, change = recalibrate(robot, data, options.prior, options.free_limb, **how)
         return fit, None, change
     choice = None
     if options.choose_model:
@@ -175,15 +166,10 @@ def _fit(
     if fit_options.method is None and available < free:
         from loopcal.diagnose.suggestions import describe_missing_equations
 
-        raise DataError(
-            report_finding(
-                "workflow.too-few-equations",
-                equations=available,
-                parameters=free,
-                held_out=held_out,
-                suggestions=describe_missing_equations(chosen, data) or "",
-            )
-        )
+        missing = describe_missing_equations(chosen, data) or ""
+        counts: dict[str, Any] = {"equations": available, "parameters": free}
+        counts |= {"held_out": held_out, "suggestions": missing}
+        raise DataError(report_finding("workflow.too-few-equations", **counts))
     count.begin(f"fitting {free} parameters")
     fit = identify(chosen, data, options=fit_options, progress=count.progress)
     return fit, choice, None

@@ -257,9 +257,8 @@ def _collect_covariance(observations: Sequence[Observations], quantity: str) -> 
 
 
 def _rotate(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return errors (e, c) and variances (e, c) in the axes in which the noise is independent.
-
-    Components that are not measured have zero for both, and a variance of NaN.
+    """Return errors (e, c) and variances (e, c) in the axes in which the noise is independent; 0
+    and NaN for components that are not measured.
     """
     present = np.isfinite(components)
     both = present[:, :, None] & present[:, None, :]
@@ -277,9 +276,8 @@ def _rotate(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray,
 
 
 def _find_distribution(errors: FloatArray, noise: FloatArray) -> Callable[[float], float]:
-    """Return the distribution function of the largest true error.
-
-    errors : (e, c). noise : (e, c) variances, NaN where not measured.
+    """Return the distribution function of the largest true error, from errors (e, c) and the
+    variances (e, c) of their noise, NaN where not measured.
     """
     tau, weight = _weigh_scales(errors, noise)
     is_absent, scale = np.isnan(noise), tau[:, None, None] ** 2
@@ -295,7 +293,6 @@ def _find_distribution(errors: FloatArray, noise: FloatArray) -> Callable[[float
     unit = np.where(is_exact, 1.0, np.sqrt(second / degrees))
 
     def probability(limit: float) -> float:
-        """Return the probability that the largest true error is at most a limit."""
         tail = compute_chi_square_tail(degrees, np.maximum((limit**2 - mean) / unit + degrees, 0.0))
         tail = np.where(is_exact, mean > limit**2, tail)
         with np.errstate(divide="ignore"):
@@ -306,9 +303,8 @@ def _find_distribution(errors: FloatArray, noise: FloatArray) -> Callable[[float
 
 
 def _group_similar(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return moments (3, k, g) of squared errors, with groups of similar ones, and their counts.
-
-    The largest errors stay single; only beyond `MOST` errors are there groups.
+    """Return moments (3, k, g) of squared errors and their counts: beyond `MOST` errors there are
+    groups of similar ones, but the largest errors stay single.
     """
     e = moments.shape[2]
     if e <= MOST:
@@ -322,9 +318,8 @@ def _group_similar(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _weigh_scales(errors: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return values (k,) of tau and their posterior probabilities (k,).
-
-    The first search finds where the density is, the second one resolves it.
+    """Return values (k,) of tau and their posterior probabilities (k,), by a search that finds
+    where the density is, and one that resolves it.
     """
     typical = float(np.sqrt(np.nanmean(noise)))
     largest = 10.0 * (float(np.abs(errors).max()) + typical)

@@ -198,9 +198,7 @@ def _halve_instrument(rows: Observations, name: str, data: Measurements) -> Obse
 
 
 def _name(rows: Observations, session: str, data: Measurements) -> str:
-    """Return the name of a kind of measurement with its session, and its frame where several
-    instruments measure the same.
-    """
+    """Return a kind with its session, and its frame where several instruments measure the same."""
     name = rows.kind.name
     alike = [o for o in data.observations if len(o) and o.kind.name == name and o is not rows]
     frame = getattr(rows.kind, "frame", None)

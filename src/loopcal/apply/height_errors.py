@@ -78,7 +78,12 @@ class HeightErrors(DrawnResult):
         Field("before", axes="row", unit="m", key="before", is_stored=True),
         Field("after", axes="row", unit="m", key="after", is_stored=True),
         Field("held_out", "is_held_out", "row", key="held_out", is_stored=True),
-        *fields(statistics=lambda heights: heights.list_statistics()),
+        *fields(
+            statistics=lambda heights: {
+                name: {e: heights.statistics(e, is_held_out) for e in ("before", "after")}
+                for name, is_held_out in heights.list_sets()
+            }
+        ),
     )
 
     def statistics(self, errors: str, held_out: bool) -> Statistics:
@@ -92,13 +97,6 @@ class HeightErrors(DrawnResult):
         for name, is_held_out in (("fitted", False), ("held-out", True)):
             if (self.is_held_out == is_held_out).any():
                 yield name, is_held_out
-
-    def list_statistics(self) -> dict[str, dict[str, Statistics]]:
-        """Return the statistics of the errors before and after, of the fitted and the held-out."""
-        return {
-            name: {e: self.statistics(e, is_held_out) for e in ("before", "after")}
-            for name, is_held_out in self.list_sets()
-        }
 
     def __str__(self) -> str:
         """Return one line for the fitted and one for the held-out heights."""
@@ -138,13 +136,12 @@ def map_height_errors(
     if sum(len(labels) for labels, *_ in listed) < FEWEST:
         return None
     labels, points, before, after, is_held_out = zip(*listed, strict=True)
-    counts = [len(of_kind) for of_kind in labels]
     return HeightErrors(
         tuple(label for of_kind in labels for label in of_kind),
         np.concatenate(points),
         np.concatenate(before),
         np.concatenate(after),
-        np.repeat(np.array(is_held_out, dtype=bool), counts),
+        np.repeat(np.array(is_held_out, dtype=bool), [len(of_kind) for of_kind in labels]),
         unit,
     )
 
@@ -185,20 +182,16 @@ def _list_heights(
     for i, o in enumerate(rows):
         if not _measures_height(o):
             continue
-        points = _locate_points(compared.after.T[0, o.rows.reshape(len(o))], o, robot)
+        # the tool or target as stated
+        kind, place = o.kind, robot.tool[:3, 3]
+        if isinstance(kind, Component) and kind.T_platform_tool is not None:
+            place = kind.T_platform_tool[:3, 3]
+        if isinstance(kind, Plane) and kind.places is not None:
+            place = kind.places[0]
+        T = compared.after.T[0, o.rows.reshape(len(o))]
+        points = T[:, :3, :3] @ place + T[:, :3, 3]
         extent = np.ptp(points, axis=0)
-        if isinstance(o.kind, Plane) and extent[2] > LEVEL * extent[:2].max():
+        if isinstance(kind, Plane) and extent[2] > LEVEL * extent[:2].max():
             continue  # a wall
         labels = tuple(compared.data.labels[k] for k in o.rows.reshape(len(o)))
         yield labels, points[:, :2], before[i][:, 0], after[i][:, 0]
-
-
-def _locate_points(T: FloatArray, rows: Observations, robot: Mechanism) -> FloatArray:
-    """Return the touching points (r, 3) [m] in the base, with the tool or target as stated."""
-    kind = rows.kind
-    place = robot.tool[:3, 3]
-    if isinstance(kind, Component) and kind.T_platform_tool is not None:
-        place = kind.T_platform_tool[:3, 3]
-    if isinstance(kind, Plane) and kind.places is not None:
-        place = kind.places[0]
-    return T[:, :3, :3] @ place + T[:, :3, 3]
