@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import TypeVar
 
 from loopcal.output_record import identify, note_output
 
@@ -31,6 +32,19 @@ except ImportError:  # Windows: no locks, so leftovers are never removed
     fcntl = None
 
 
+Descriptor = TypeVar("Descriptor", int, int | None)
+
+
+@contextmanager
+def _opened(descriptor: Descriptor) -> Iterator[Descriptor]:
+    """Close a descriptor, where there is one, behind the body."""
+    try:
+        yield descriptor
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
 @contextmanager
 def watch_folder(path: Path) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether `path` still names the same folder.
@@ -38,33 +52,22 @@ def watch_folder(path: Path) -> Iterator[Callable[[], bool]]:
     The folder stays open meanwhile, because a system gives the number of a removed folder to the
     next one.
     """
-    descriptor = open_folder(path)
-    try:
+    with _opened(open_folder(path)) as descriptor:
         yield lambda: descriptor is None or is_open(path, descriptor)
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
 
 
 def sync_file(path: Path) -> None:
     """Write the content of a file to the disk."""
-    descriptor = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
-    try:
+    with _opened(os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))) as descriptor:
         os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def sync_folder(path: Path) -> None:
     """Write the names in a folder to the disk, where the file system can."""
-    descriptor = open_folder(path)
-    if descriptor is None:
-        return
-    try:
-        with suppress(OSError):  # the names are in place, even if not yet on the disk
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with _opened(open_folder(path)) as descriptor:
+        if descriptor is not None:
+            with suppress(OSError):  # the names are in place, even if not yet on the disk
+                os.fsync(descriptor)
 
 
 def lock(descriptor: int) -> bool | None:
@@ -191,19 +194,16 @@ def _lock_folder(path: Path) -> Iterator[bool]:
 
     OSError : another command has the lock for `PATIENCE` seconds.
     """
-    descriptor = open_folder(path)
-    if descriptor is None:
-        yield path.is_dir()  # without a lock, such as on Windows
-        return
-    try:
+    with _opened(open_folder(path)) as descriptor:
+        if descriptor is None:
+            yield path.is_dir()  # without a lock, such as on Windows
+            return
         end = time.monotonic() + PATIENCE
         while lock(descriptor) is False:
             if time.monotonic() > end:
                 raise OSError(errno.EBUSY, "another command writes this folder", str(path))
             time.sleep(0.01)
         yield is_open(path, descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _take_free_name(temporary: Path, target: Path) -> bool:
@@ -226,13 +226,10 @@ def _hold(path: Path) -> Iterator[None]:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError:
         descriptor = None
-    try:
+    with _opened(descriptor):
         if descriptor is not None:
             lock(descriptor)
         yield
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
 
 
 @contextmanager
@@ -316,10 +313,8 @@ def _lock_leftover(path: Path) -> Iterator[bool]:
     except (OSError, AttributeError):
         yield False
         return
-    try:
+    with _opened(descriptor):
         yield lock(descriptor) is True and is_open(path, descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _remove(path: Path) -> None:
