@@ -13,7 +13,6 @@ move, as on the paths that a plan checks. Source: LinuxCNC, "G-Codes" (G4, G53, 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -24,7 +23,7 @@ from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
-from loopcal.io.formats.program_format import format_short
+from loopcal.io.formats.program_format import DECIMALS, format_short
 from loopcal.io.runs.plan_folder import SHEET, VIA
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
@@ -35,12 +34,6 @@ WORDS = {"x": "X", "y": "Y", "z": "Z", "roll": "A", "pitch": "B", "yaw": "C"}
 
 DEFAULT_FEED = 0.005
 """Feed of moves [m/s], 300 mm per minute, whatever the unit of the program is."""
-
-DECIMALS = 6
-"""Decimals of coordinates: a nanometer, a microdegree."""
-
-ANGLES = "(A B C: roll, pitch, yaw in degrees, R = Rz Ry Rx.)"
-"""Comment on the words of angles."""
 
 UNIT_CODES = {"mm": "G21", "in": "G20"}
 
@@ -112,14 +105,23 @@ def format_gcode(
     feed = settings.feed * 60.0 / find_unit(settings.unit).factor_to_si
     wait = "M0" if settings.pause is None else f"G4 P{format_short(settings.pause, 3)}"
 
+    symbols = {Dimension.LENGTH: settings.unit, Dimension.ANGLE: "deg"}
+    factors = [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
+
     def move(coordinates: FloatArray) -> str:
-        return f"G53 G1 {_format_words(robot, coordinates, settings.unit)} F{format_short(feed, 3)}"
+        triples = zip(robot.controlled, coordinates.tolist(), factors, strict=True)
+        words = (f"{WORDS[name]}{format_short(value / f, DECIMALS)}" for name, value, f in triples)
+        return f"G53 G1 {' '.join(words)} F{format_short(feed, 3)}"
 
     lines = [
         f"({_clean(robot.name)}: {poses} poses of a plan, in its order, and back to home)",
         "(X Y Z: origin of the platform frame in the base frame, in machine coordinates, G53.)",
         "(Work offsets and the tool length do not count.)",
-        *([ANGLES] if "roll" in robot.controlled else []),
+        *(
+            ["(A B C: roll, pitch, yaw in degrees, R = Rz Ry Rx.)"]
+            if "roll" in robot.controlled
+            else []
+        ),
         f"(Lengths in {settings.unit}. The paths from home are checked; the way to home is not.)",
         f"{UNIT_CODES[settings.unit]} G90 G94 G40 G49 G61",
         "(MSG, the next move goes to home: check that the way is free)",
@@ -133,17 +135,6 @@ def format_gcode(
         lines += [f"(pose {_clean(label)})", move(coordinates)]
         lines += [f"(MSG, measure pose {_clean(label)})", wait]
     return "\n".join([*lines, "(back to home)", move(home), "M2"]) + "\n"
-
-
-def _format_words(robot: Mechanism, coordinates: FloatArray, unit: str) -> str:
-    """Return the words of a move."""
-    symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
-    factors = [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
-    numbers: Sequence[float] = coordinates.tolist()
-    triples = zip(robot.controlled, numbers, factors, strict=True)
-    return " ".join(
-        f"{WORDS[name]}{format_short(value / f, DECIMALS)}" for name, value, f in triples
-    )
 
 
 def _clean(text: str) -> str:
