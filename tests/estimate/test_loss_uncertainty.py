@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopcal.estimate.identification import identify
-from loopcal.estimate.loss_uncertainty import compute_loss_variance
+from loopcal.estimate.robust_descent import compute_loss_variance
 from loopcal.estimate.losses import Huber, Tukey
 from loopcal.estimate.penalties import LeastSquares
 from tests.estimate.test_machine_change import DELTA, measure

@@ -30,8 +30,6 @@ from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
-# --- A start for fits of very many poses: the estimate of a small part of them.
-
 SHARE = 16
 """A part has one of so many poses. Its estimate is about four standard deviations of all poses
 away: from there, one step of all poses is enough for noise of 1e-5 m and rad, too."""
@@ -166,7 +164,11 @@ def fit_rows(
     if options.begin == "kinematics":
         return descend(with_prior, z, method, control, tolerance, start, progress)
 
-    z, first = descend_from_closure(problem, z, method, control, tolerance)
+    located, first = locate_measured_poses(problem), None
+    if located is not None:
+        coarse = replace(control, relative=max(control.relative, RELATIVE))
+        first = descend(problem.at_measured_poses(located), z, method, coarse, tolerance)
+        z = np.where((first.status == DescentStatus.CONVERGED)[:, None], first.deviation, z)
     fit = descend(with_prior, z, method, control, tolerance, start, progress)
     if first is None:
         return fit
@@ -192,20 +194,6 @@ def fit_with_loss(
     return robust.fit, robust.weight, robust.problem
 
 
-def _fit_part_first(
-    problem: Problem, z: FloatArray, options: FitOptions, progress: Progress
-) -> Descent | None:
-    """Descend first with a part of very many poses; None where this is of no use or not possible.
-
-    A loss needs all poses to tell which of them are far off, and the rows of an earlier calibration
-    would outweigh a part.
-    """
-    if options.begin != "kinematics" or options.loss is not None or options.prior is not None:
-        return None
-    control, tolerance = options.control, options.rank_tolerance
-    return fit_part_first(problem, z, get_method(options), control, tolerance, progress)
-
-
 def fit_with_tolerances(
     problem: Problem,
     data: Measurements,
@@ -217,7 +205,12 @@ def fit_with_tolerances(
     """Descend, and again as long as the data ask for other components of the tolerances; return
     also the options with these.
     """
-    first = _fit_part_first(problem, z, options, progress)
+    first = None
+    # a loss needs all poses to tell which of them are far off, and the rows of an earlier
+    # calibration would outweigh a part
+    if options.begin == "kinematics" and options.loss is None and options.prior is None:
+        method, tolerance = get_method(options), options.rank_tolerance
+        first = fit_part_first(problem, z, method, options.control, tolerance, progress)
     if first is None:
         fit, weights, weighted = fit_with_loss(problem, data, z, options, progress)
     else:
@@ -261,8 +254,6 @@ def get_method(options: FitOptions) -> Method:
     return options.method
 
 
-# --- A start for geometries that are far off: closure linearized at the measured poses.
-
 RELATIVE = 1e-3
 """Share of the residual by which a step may still change it when the exact descent takes over."""
 
@@ -270,29 +261,19 @@ STEPS = 20
 """Newton steps by which a pose is located; a rotation vector takes one, angles a few."""
 
 
-def descend_from_closure(
-    problem: Problem, deviation: FloatArray, method: Method, control: StepControl, tolerance: float
-) -> tuple[FloatArray, Descent | None]:
-    """Return the deviation (t, p) to which linearized closure leads, and the descent to it.
-
-    Where closure cannot be used this is the deviation that was given, and None.
+def report_closure_start(problem: Problem, options: FitOptions, fit: Descent) -> list[Finding]:
+    """Return why the fit did not begin with the closure, where the options ask for it, or that
+    the steps of this start ran out.
     """
-    located = locate_measured_poses(problem)
-    if located is None:
-        return deviation, None
-    coarse = replace(control, relative=max(control.relative, RELATIVE))
-    fit = descend(problem.at_measured_poses(located), deviation, method, coarse, tolerance)
-    good = fit.status == DescentStatus.CONVERGED
-    return np.where(good[:, None], fit.deviation, deviation), fit
-
-
-def report_unused_closure(problem: Problem) -> Finding | None:
-    """Return why closure cannot be linearized at the measured poses; None where it can."""
+    if fit.is_start_exhausted:
+        return [report_finding("poses.closure-start-exhausted", steps=options.control.iterations)]
+    if options.begin != "closure":
+        return []
     if problem.is_uncertain:
-        return report_finding("poses.closure-start-uncertain-readings")
+        return [report_finding("poses.closure-start-uncertain-readings")]
     if locate_measured_poses(problem) is None:
-        return report_finding("poses.closure-start-incomplete-poses")
-    return None
+        return [report_finding("poses.closure-start-incomplete-poses")]
+    return []
 
 
 def locate_measured_poses(problem: Problem) -> FloatArray | None:

@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.descent import Descent
-from loopcal.estimate.fit_descent import fit_with_tolerances, get_method
+from loopcal.estimate.fit_descent import fit_with_tolerances, get_method, report_closure_start
 from loopcal.estimate.fit_input import (
     check_count,
     check_rows,
@@ -24,7 +23,6 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.losses import Loss
 from loopcal.estimate.nuisance_estimate import (
-    NuisanceEstimate,
     add_followers,
     empty_nuisance_estimate,
     estimate_nuisance,
@@ -33,12 +31,18 @@ from loopcal.estimate.null_space import describe_null_space
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import LeastSquares, Method, adapt_method, describe_regularization
-from loopcal.estimate.pose_estimate import find_unclosed_poses, predict_from_readings
+from loopcal.estimate.pose_estimate import (
+    estimate_poses,
+    find_unclosed_poses,
+    predict_from_readings,
+    report_doubtful_readings,
+    report_uneven_sigmas,
+)
 from loopcal.estimate.pose_linearization import PoseEstimates
 from loopcal.estimate.posterior import (
-    VarianceSources,
-    add_data,
+    collect_information,
     compute_posterior,
+    find_shown_noise,
     find_variance_sources,
 )
 from loopcal.estimate.prior import collect_used_rows, refuse_reused_rows, report_unknown_rows
@@ -55,6 +59,7 @@ from loopcal.estimate.result import (
     report_unknown_bias,
     report_used_poses,
 )
+from loopcal.estimate.robust_descent import add_loss_uncertainty
 from loopcal.estimate.unfixed_motions import FrameRows, describe_frames
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.kind import list_error_groups
@@ -66,39 +71,6 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, Progress, report_no_progress
-
-if TYPE_CHECKING:
-    from loopcal.estimate.pose_estimate import EstimatedPoses
-
-
-# --- Frames, targets, surfaces and offsets that fit measurements best at a given geometry.
-
-
-def fit_setup_before(
-    problem: Problem,
-    robot: Mechanism,
-    options: FitOptions,
-    data: Measurements,
-    weights: FloatArray,
-    fit: Descent,
-) -> FloatArray | None:
-    """Return the nuisance parameters (U,) that fit the robot from which a fit starts.
-
-    Parameters
-    ----------
-    weights : (n,) of the poses in the fit.
-
-    Returns
-    -------
-    None without nuisance parameters, or where the fit began with these values: at this robot, with
-    these weights, and with all poses.
-    """
-    is_first = (
-        options.start is None and options.loss is None and np.isfinite(fit.cost_history[0, 0])
-    )
-    if problem.nuisance is None or is_first:
-        return None
-    return fit_setup_alone(robot, data.with_weights(weights), problem.nuisance.local)
 
 
 def fit_setup_alone(
@@ -131,28 +103,18 @@ def fit_setup_alone(
     return np.array([values.get(name, unknown[i]) for i, name in enumerate(table.names)])
 
 
-# --- Noise that nobody stated: a program that wrote the measurements assumed it.
-
 ASSUMED = "assumed"
+"""Noise that nobody stated: a program that wrote the measurements assumed it."""
 
 
 def choose_noise(options: FitOptions, data: Measurements, left: int) -> FitOptions:
-    """Return options that estimate the noise where all of it is assumed.
-
-    Parameters
-    ----------
-    options : of the fit. left : equations less all unknowns of the fit.
+    """Return options that estimate the noise where all of it is assumed; `left` is the number of
+    equations less that of all unknowns.
     """
     is_free = options.noise == "given" and options.prior is None
     if is_free and data.noise_source == ASSUMED and left >= FEWEST_DEGREES:
         return replace(options, noise="estimated")
     return options
-
-
-def name_noise(options: FitOptions, data: Measurements) -> str:
-    """Return how the noise of a fit is known: "given", "estimated" or "assumed"."""
-    is_assumed = options.noise == "given" and data.noise_source != "stated"
-    return ASSUMED if is_assumed else options.noise
 
 
 def report_noise(data: Measurements, robot: Mechanism, test: ResidualTest) -> Finding:
@@ -248,37 +210,29 @@ def identify(
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
     result = add_factor_uncertainty(result, fit)
     if options.loss is not None:
-        from loopcal.estimate.loss_uncertainty import add_loss_uncertainty
-
         result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
     findings = [*result.findings, *report_unknown_rows(options.prior)]
     if unclosed.poses:
         findings.append(unclosed.report("fit.poses-open-at-start"))
     rows = collect_used_rows(robot, data, options.prior)
-    posterior = add_data(result.posterior, free, fit.decomposition, result.residual_test, rows)
+    d, test = fit.decomposition, result.residual_test
+    posterior = replace(
+        result.posterior,
+        fitted_rows=rows,
+        shown_noise=find_shown_noise(d, test),
+        information=collect_information(free, d, test),
+    )
     return replace(result, posterior=posterior, findings=tuple(findings))
 
 
-class _Estimate(NamedTuple):
-    """The rows of a fit at its estimate.
-
-    Attributes
-    ----------
-    poses : estimates of the poses without weights of a loss; None where readings are exact.
-    residuals : without these weights. linearization : with them; None without setup parameters.
-    unfixed : from `FrameRows.find_unfixed`.
-    """
-
-    poses: PoseEstimates | None
-    residuals: tuple[Residuals, ...]
-    linearization: Linearization | None
-    unfixed: FloatArray | None
-
-
-def _examine_estimate(problem: Problem, weighted: Problem, fit: Descent) -> _Estimate:
+def _examine_estimate(
+    problem: Problem, weighted: Problem, fit: Descent
+) -> tuple[PoseEstimates | None, tuple[Residuals, ...], Linearization | None, FloatArray | None]:
     """Solve and evaluate the rows of a fit once more, where its last step ended.
 
-    Poses are those of the rows without weights, at the setup parameters of the weighted ones.
+    Poses and residuals are those of the rows without weights of a loss, at the setup parameters of
+    the weighted ones; None: exact readings. The linearization is that of the weighted rows; None
+    without setup parameters. The last are the unfixed motions, see `FrameRows.find_unfixed`.
     """
     z, start = fit.deviation, fit.start
     solution, linearization, nuisance = None, None, None
@@ -289,7 +243,7 @@ def _examine_estimate(problem: Problem, weighted: Problem, fit: Descent) -> _Est
         solution = problem.solve(z, start, nuisance)
     rows = FrameRows(weighted, nuisance)
     residuals = problem.residuals(z, solution, rows.add)
-    return _Estimate(solution.estimates, residuals, linearization, rows.find_unfixed())
+    return solution.estimates, residuals, linearization, rows.find_unfixed()
 
 
 def _assemble(
@@ -305,22 +259,41 @@ def _assemble(
     """Return the result of a fit with all diagnostics."""
     converged = bool(fit.status[0] == DescentStatus.CONVERGED.value)
     d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
-    test, sources = _test_noise(free, fit, options, data)
-    estimate = _examine_estimate(problem, weighted, fit)
+    is_assumed = options.noise == "given" and data.noise_source != "stated"
+    noise, is_weighted = ASSUMED if is_assumed else options.noise, options.loss is not None
+    test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, is_weighted, converged)
+    sources = find_variance_sources(d, penalty, test, method, free)
+    test = replace(test, intervals=bool(np.isfinite(sources.noise)))
+    estimates, residuals, linearization, unfixed = _examine_estimate(problem, weighted, fit)
     conflict, on_prior = run_prior_tests(free, fit, method)
     plain, values = d.plain(), free.values(fit.deviation)[0]
-    corrected = robot.with_values(values)
-    linearization = estimate.linearization
-    baseline = fit_setup_before(problem, robot, options, data, weights, fit)
-    nuisance = _estimate_nuisance(weighted, linearization, robot, fit, sources, baseline)
-    frames = describe_frames(
-        weighted, data, estimate.unfixed, options.prior, linearization, sources.noise
-    )
+    corrected, setup = robot.with_values(values), weighted.nuisance
+    nuisance = empty_nuisance_estimate(problem.parameters)
+    if setup is not None and linearization is not None:
+        # a fit begins with the setup that fits its first robot best, with all poses and no weights
+        began_there = options.start is None and not is_weighted
+        baseline = None
+        if not (began_there and np.isfinite(fit.cost_history[0, 0])):
+            baseline = fit_setup_alone(robot, data.with_weights(weights), setup.local)
+        variance = d.variances(penalty, *sources)[0]
+        nuisance = estimate_nuisance(
+            setup, linearization, robot, d, variance, sources.noise, baseline
+        )
+    frames = describe_frames(weighted, data, unfixed, options.prior, linearization, sources.noise)
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
     excluded = tuple(options.excluded_poses)
-    poses = _estimate_poses(estimate.poses, data, excluded)
-    history = _record_history(free, fit)
+    poses, on_poses = None, []
+    if estimates is not None:
+        poses = estimate_poses(estimates, data, excluded)
+        doubtful = report_doubtful_readings(corrected, poses)
+        on_poses = [*poses.report(), *doubtful, *report_uneven_sigmas(problem)]
+    history = History(
+        status=DescentStatus(int(fit.status[0])),
+        iterations=int(fit.iterations[0]),
+        cost=fit.cost_history[:, 0],
+        estimate=free.nominal + free.tolerance * fit.deviation_history[:, 0],
+    )
     regularization = describe_regularization(method, d, penalty)
     findings = [
         *([] if converged else [history.finding]),
@@ -331,12 +304,12 @@ def _assemble(
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),
         *free.findings(),
-        *_report_closure(problem, options, fit),
+        *report_closure_start(problem, options, fit),
         *([] if regularization is None else [regularization.finding]),
         *report_unknown_bias(free, method, sources.prior),
         *report_equations(int(problem.equations[0]), problem.parameters, method),
         *report_used_poses(data, weights, options.loss, excluded),
-        *_report_poses(problem, corrected, poses),
+        *on_poses,
     ]
     return Identification(
         robot=corrected,
@@ -354,83 +327,10 @@ def _assemble(
         unidentifiable=unidentifiable,
         residual_test=test,
         prior_conflict=conflict,
-        residuals=label_residuals(estimate.residuals, data, problem),
+        residuals=label_residuals(residuals, data, problem),
         pose_weights=weights,
         history=history,
         nuisance=nuisance,
         poses=poses,
         findings=tuple(findings),
     )
-
-
-def _test_noise(
-    free: FreeParameters, fit: Descent, options: FitOptions, data: Measurements
-) -> tuple[ResidualTest, VarianceSources]:
-    """Return the test of the residuals, and what the variances of the fit are made of."""
-    d, penalty, noise = fit.decomposition, fit.penalty, name_noise(options, data)
-    converged = bool(fit.status[0] == DescentStatus.CONVERGED.value)
-    is_weighted = options.loss is not None
-    test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, is_weighted, converged)
-    sources = find_variance_sources(d, penalty, test, get_method(options), free)
-    return replace(test, intervals=bool(np.isfinite(sources.noise))), sources
-
-
-def _record_history(free: FreeParameters, fit: Descent) -> History:
-    """Return the iteration of the first trial."""
-    status, steps = DescentStatus(int(fit.status[0])), int(fit.iterations[0])
-    values = free.nominal + free.tolerance * fit.deviation_history[:, 0]
-    return History(status, steps, fit.cost_history[:, 0], values)
-
-
-def _estimate_nuisance(
-    problem: Problem,
-    linearization: Linearization | None,
-    robot: Mechanism,
-    fit: Descent,
-    sources: VarianceSources,
-    baseline: FloatArray | None,
-) -> NuisanceEstimate:
-    """Return the nuisance parameters at the estimate, where the rows are linearized."""
-    if problem.nuisance is None or linearization is None:
-        return empty_nuisance_estimate(problem.parameters)
-    variance = fit.decomposition.variances(fit.penalty, *sources)[0]
-    return estimate_nuisance(
-        problem.nuisance, linearization, robot, fit.decomposition, variance, sources.noise, baseline
-    )
-
-
-def _report_closure(problem: Problem, options: FitOptions, fit: Descent) -> list[Finding]:
-    """Return why the fit did not begin with the closure, where the options ask for it, or that
-    the steps of this start ran out.
-    """
-    if fit.is_start_exhausted:
-        return [report_finding("poses.closure-start-exhausted", steps=options.control.iterations)]
-    if options.begin != "closure":
-        return []
-    from loopcal.estimate.fit_descent import report_unused_closure
-
-    unused = report_unused_closure(problem)
-    return [] if unused is None else [unused]
-
-
-def _estimate_poses(
-    estimates: PoseEstimates | None, data: Measurements, excluded: Sequence[str]
-) -> EstimatedPoses | None:
-    """Return the poses that were estimated; None where the readings are exact."""
-    if estimates is None:
-        return None
-    from loopcal.estimate.pose_estimate import estimate_poses
-
-    return estimate_poses(estimates, data, excluded)
-
-
-def _report_poses(
-    problem: Problem, robot: Mechanism, poses: EstimatedPoses | None
-) -> list[Finding]:
-    """Return findings on poses and readings that were estimated."""
-    if poses is None:
-        return []
-    from loopcal.estimate.pose_estimate import report_doubtful_readings, report_uneven_sigmas
-
-    doubtful = report_doubtful_readings(robot, poses)
-    return [*poses.report(), *doubtful, *report_uneven_sigmas(problem)]

@@ -8,9 +8,9 @@ docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -18,29 +18,28 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.penalties import Method
 from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest
-from loopcal.estimate.smooth_errors import DISCREPANCY_PREFIX, SmoothErrors
+from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.results.description import Field
+from loopcal.results.storage import restore_arrays, store_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- Parts of a covariance whose size was estimated from data, each with its degrees of freedom.
+PREFIX, DISCREPANCY_PREFIX = "posterior_", "discrepancy_"
+"""Beginnings of the names of the arrays of a run folder."""
 
-PREFIX = "posterior_"
-"""Beginning of the names of the arrays of a run folder."""
+SHOWN_NOISE = "posterior_shown_noise"
+INFORMATION = ("information_rows", "information_deviations", "information_noise")
+"""Names of arrays of a run folder."""
 
 NOISE = "noise"
 """Source of the part of the covariance that the noise of the rows causes."""
 
 TOLERANCES = "tolerances"
 """Source of the part that the deviations from nominal cause, where their size was estimated."""
-
-PARTS = ("source", "degrees", "root", "part")
-"""Arrays of a run folder (after `PREFIX`) with the parts of the covariance: the source and the
-degrees of freedom of each, the roots beside each other, and the number of the part of each column.
-"""
 
 
 class CovariancePart(NamedTuple):
@@ -86,38 +85,9 @@ def combine_degrees(total: FloatArray, squares: Iterable[tuple[FloatArray, float
     return np.divide(square, spread, out=np.full_like(total, np.inf), where=is_estimated)
 
 
-def store_parts(parts: Sequence[CovariancePart], parameters: int) -> dict[str, np.ndarray]:
-    """Return the arrays of a run folder, which `parts_from_arrays` reads, for p parameters."""
-    roots = [part.root for part in parts]
-    content = (
-        np.array([part.source for part in parts], dtype=np.str_),
-        np.array([part.degrees for part in parts]),
-        np.concatenate([np.zeros((parameters, 0)), *roots], axis=1),
-        np.repeat(np.arange(len(parts)), [root.shape[1] for root in roots]),
-    )
-    return {PREFIX + name: array for name, array in zip(PARTS, content, strict=True)}
-
-
-def parts_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[CovariancePart, ...]:
-    """Return the parts of a covariance in a run folder; none in those of earlier versions."""
-    if any(PREFIX + name not in arrays for name in PARTS):
-        return ()
-    sources, degrees, roots, number = (arrays[PREFIX + name] for name in PARTS)
-    return tuple(
-        CovariancePart(str(source), roots[:, number == i], float(degrees[i]))
-        for i, source in enumerate(sources.tolist())
-    )
-
-
-# --- The noise that residuals alone show, without the stated sigma.
-
-NAME = "posterior_shown_noise"
-"""Name of the stored array."""
-
-
 @dataclass(frozen=True)
 class ShownNoise:
-    """The variance of whitened rows, in units of the stated one.
+    """The variance of whitened rows that residuals alone show, in units of the stated one.
 
     Attributes
     ----------
@@ -134,10 +104,6 @@ class ShownNoise:
         """Whether at least five degrees of freedom determine it."""
         return self.degrees >= FEWEST_DEGREES and self.variance > 0.0
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return the numbers by name, to be stored."""
-        return {NAME: np.array([self.variance, self.degrees, self.used])}
-
 
 def find_shown_noise(decomposition: Decomposition, test: ResidualTest) -> ShownNoise | None:
     """Return the noise that the residuals of a fit show (t = 1); None without intervals, or where
@@ -150,20 +116,10 @@ def find_shown_noise(decomposition: Decomposition, test: ResidualTest) -> ShownN
     return ShownNoise(variance, degrees, test.sigma_scale**2)
 
 
-def shown_noise_from_arrays(arrays: Mapping[str, np.ndarray]) -> ShownNoise | None:
-    """Return the noise in the arrays of a run folder; None where it is not known."""
-    return ShownNoise(*arrays[NAME].tolist()) if NAME in arrays else None
-
-
-# --- What the data of a fit say of its parameters, without any tolerance or penalty.
-
-ROWS, DEVIATIONS, NOISE_SOURCE = "information_rows", "information_deviations", "information_noise"
-"""Names of the stored arrays."""
-
-
 @dataclass(frozen=True, eq=False)
 class DataInformation:
-    """Rows B (e - nominal) = deviations + noise; what lies outside their range says nothing of e.
+    """What the data of a fit say of its parameters, without any tolerance or penalty: rows
+    B (e - nominal) = deviations + noise. What lies outside their range says nothing of e.
 
     Attributes
     ----------
@@ -180,11 +136,6 @@ class DataInformation:
     def __repr__(self) -> str:
         """Return the numbers of rows and parameters."""
         return f"<DataInformation: {len(self.rows)} rows on {self.rows.shape[1]} parameters>"
-
-    def arrays(self) -> dict[str, FloatArray]:
-        """Return the arrays of a run folder."""
-        noise = np.array([self.variance, self.degrees])
-        return {ROWS: self.rows, DEVIATIONS: self.deviations, NOISE_SOURCE: noise}
 
 
 def collect_information(
@@ -210,28 +161,13 @@ def fold_information(
     return DataInformation(rows, d.projections[0][is_used], variance, degrees)
 
 
-def information_from_arrays(arrays: Mapping[str, np.ndarray]) -> DataInformation | None:
-    """Return the information in the arrays of a run folder; None where an older version wrote
-    it.
-    """
-    if ROWS not in arrays:
-        return None
-    variance, degrees = arrays[NOISE_SOURCE].tolist()
-    return DataInformation(arrays[ROWS], arrays[DEVIATIONS], variance, degrees)
-
-
-# --- The model discrepancy of a fit: slow errors of the poses that no geometry explains.
-
 DISCREPANCY = "residuals.model-discrepancy"
 """Source of the part of the covariance that the discrepancy causes, and code of its finding."""
-
-STORED_DISCREPANCY = ("root", "degrees", "directions", "variance")
-"""Arrays of a run folder (after `PREFIX`), beside those of the errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModelDiscrepancy:
-    """Slow errors of the poses of a calibrated machine.
+    """Slow errors of the poses of a calibrated machine that no geometry explains.
 
     Attributes
     ----------
@@ -272,27 +208,6 @@ class ModelDiscrepancy:
             for half, degrees in zip(halves, self.degrees, strict=True)
         ]
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of the run folder, which `discrepancy_from_arrays` reads."""
-        own = {
-            DISCREPANCY_PREFIX + name: np.asarray(getattr(self, name))
-            for name in STORED_DISCREPANCY
-        }
-        return {**own, **self.errors.arrays()}
-
-
-def discrepancy_from_arrays(arrays: Mapping[str, np.ndarray]) -> ModelDiscrepancy | None:
-    """Return the discrepancy in the arrays of a run folder; None where it holds none."""
-    if DISCREPANCY_PREFIX + STORED_DISCREPANCY[0] not in arrays:
-        return None
-    own = (arrays[DISCREPANCY_PREFIX + name] for name in STORED_DISCREPANCY)
-    return ModelDiscrepancy(SmoothErrors.from_arrays(arrays), *own)
-
-
-# --- Which frames the measurements of a fit determine, and where the instruments stand.
-
-FRAME_PREFIX = "frames_"
-"""Beginning of the names of the arrays of a run folder."""
 
 COMMON = 1.0 - 1e-9
 """Cosine of the angle above which motions of two sets are the same motion."""
@@ -339,28 +254,28 @@ class FrameKnowledge:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder, which `frames_from_arrays` reads."""
-        p = next((f.by_parameters.shape[1] for f in self.instruments.values()), 0)
-        of_frames = {"T": (4, 4), "by_parameters": (6, p), "own": (6, 6)}
-        count = len(self.instruments)
-        stacked = {
-            name: np.reshape([getattr(f, name) for f in self.instruments.values()], (count, *size))
-            for name, size in of_frames.items()
+        frames, count = self.instruments.values(), len(self.instruments)
+        p = next((frame.by_parameters.shape[1] for frame in frames), 0)
+        shapes = {"T": (4, 4), "by_parameters": (6, p), "own": (6, 6)}
+        return {
+            "frames_unfixed": self.unfixed,
+            "frames_readings": self.readings,
+            **{
+                f"frames_{name}": np.reshape([getattr(f, name) for f in frames], (count, *shape))
+                for name, shape in shapes.items()
+            },
+            "frames_names": np.array(tuple(self.instruments), dtype=np.str_),
         }
-        content = {"unfixed": self.unfixed, "readings": self.readings, **stacked}
-        content["names"] = np.array(tuple(self.instruments), dtype=np.str_)
-        return {FRAME_PREFIX + name: array for name, array in content.items()}
 
 
 def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> FrameKnowledge | None:
     """Return the frames in the arrays of a run folder; None where it does not hold them."""
     names = ("unfixed", "readings", "names", "T", "by_parameters", "own")
-    if any(FRAME_PREFIX + name not in arrays for name in names):
+    if any(f"frames_{name}" not in arrays for name in names):
         return None
-    unfixed, readings, labels, *stacked = (arrays[FRAME_PREFIX + name] for name in names)
-    frames = {
-        str(name): InstrumentFrame(*fields)
-        for name, *fields in zip(labels.tolist(), *stacked, strict=True)
-    }
+    unfixed, readings, labels, *stacked = (arrays[f"frames_{name}"] for name in names)
+    instruments = map(InstrumentFrame, *stacked)
+    frames = dict(zip(map(str, labels.tolist()), instruments, strict=True))
     return FrameKnowledge(unfixed, readings, frames)
 
 
@@ -368,10 +283,6 @@ def intersect_motions(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return an orthonormal basis (12, k) of the motions that two bases (12, ..) have in common."""
     u, cosine, _ = np.linalg.svd(first.T @ second, full_matrices=False)
     return first @ u[:, cosine > COMMON]
-
-
-STORED = {"unit": "unit", "directions": "directions", "variance": "variance", "seen": "determined"}
-"""Arrays of a run folder (after `PREFIX`), and the attributes that they hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,6 +321,11 @@ class Posterior:
     discrepancy: ModelDiscrepancy | None = None
     shown_noise: ShownNoise | None = None
     information: DataInformation | None = None
+
+    FIELDS: ClassVar[tuple[Field, ...]] = (
+        *(Field(name, is_stored=True) for name in ("unit", "directions", "variance")),
+        Field("seen", "determined", is_stored=True),
+    )
 
     def __repr__(self) -> str:
         """Return the robot's name and the numbers of parameters and of determined directions."""
@@ -461,21 +377,28 @@ class Posterior:
         return combine_degrees(_sum_squares(effect @ self.root), squares)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of the run folder, which `posterior_from_arrays` reads."""
-        own = {
-            PREFIX + name: np.asarray(getattr(self, attribute))
-            for name, attribute in STORED.items()
+        """Return the arrays of the run folder, which `posterior_from_arrays` reads: of the parts of
+        the covariance the roots beside each other, and the number of the part of each column.
+        """
+        roots = [part.root for part in self.parts]
+        stored = store_arrays(self, PREFIX) | {
+            PREFIX + "source": np.array([part.source for part in self.parts], dtype=np.str_),
+            PREFIX + "degrees": np.array([part.degrees for part in self.parts]),
+            PREFIX + "root": np.concatenate([np.zeros((len(self.unit), 0)), *roots], axis=1),
+            PREFIX + "part": np.repeat(np.arange(len(roots)), [root.shape[1] for root in roots]),
         }
-        own |= store_parts(self.parts, len(self.unit))
-        for value in (
-            self.frames,
-            self.fitted_rows,
-            self.discrepancy,
-            self.shown_noise,
-            self.information,
-        ):
-            own |= {} if value is None else value.arrays()
-        return own
+        for value in (self.frames, self.fitted_rows):
+            stored |= {} if value is None else value.arrays()
+        if (own := self.discrepancy) is not None:
+            stored |= store_arrays(own, DISCREPANCY_PREFIX)
+            stored |= store_arrays(own.errors, DISCREPANCY_PREFIX)
+        if (shown := self.shown_noise) is not None:
+            stored[SHOWN_NOISE] = np.array([shown.variance, shown.degrees, shown.used])
+        if (data := self.information) is not None:
+            noise = np.array([data.variance, data.degrees])
+            arrays = (data.rows, data.deviations, noise)
+            stored |= dict(zip(INFORMATION, arrays, strict=True))
+        return stored
 
 
 class VarianceSources(NamedTuple):
@@ -502,15 +425,9 @@ def compute_posterior(
     frames: FrameKnowledge | None = None,
     degrees: float = np.inf,
 ) -> Posterior:
-    """Return the posterior of trial 0 of a decomposition.
+    """Return the posterior of trial 0 of a decomposition, whose columns are scaled by tolerance.
 
-    Parameters
-    ----------
-    robot : at the estimate. places, tolerance : (p,) of the free parameters.
-    decomposition, penalty : of the fit; columns scaled by tolerance.
-    sources : of the variances; default: stated noise, and a prior that is the penalty.
-    frames : which frames the measurements determine.
-    degrees : degrees of freedom of the noise variance; infinite where it is known.
+    `degrees` of freedom of the noise variance are infinite where it is known.
     """
     directions, variance, determined = decomposition.knowledge(penalty, *sources)
     unit = tolerance * decomposition.scale
@@ -542,47 +459,38 @@ def find_variance_sources(
     return VarianceSources(test.sigma_scale**2 if is_known else np.nan, prior)
 
 
-def add_data(
-    posterior: Posterior,
-    free: FreeParameters,
-    decomposition: Decomposition,
-    test: ResidualTest,
-    rows: FittedRows | None,
-) -> Posterior:
-    """Return a posterior with what is known of its data: rows, noise and information.
-
-    Parameters
-    ----------
-    free, decomposition, test : of the fit (t = 1). rows : see `Posterior.fitted_rows`.
-    """
-    return replace(
-        posterior,
-        fitted_rows=rows,
-        shown_noise=find_shown_noise(decomposition, test),
-        information=collect_information(free, decomposition, test),
-    )
-
-
 def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) -> Posterior:
-    """Return the posterior in the arrays of a run folder.
+    """Return the posterior in the arrays of a run folder with this corrected robot.
 
-    Parameters
-    ----------
-    robot : the corrected robot of the run. arrays : of the run folder.
-
-    Raises
-    ------
-    EstimationError : the run has no posterior, or its robot now has other free parameters.
+    What an older version did not write is None. EstimationError: the run has no posterior, or its
+    robot now has other free parameters.
     """
-    missing = [PREFIX + name for name in STORED if PREFIX + name not in arrays]
+    names = [field.name for field in Posterior.FIELDS]
+    missing = [PREFIX + name for name in names if PREFIX + name not in arrays]
     if missing:
         raise EstimationError(report_finding("prior.no-posterior", array=missing[0]))
-    unit, directions, variance, determined = (arrays[PREFIX + name] for name in STORED)
+    unit, directions, variance, determined = (arrays[PREFIX + name] for name in names)
     places = np.flatnonzero(robot.parameters.free)
     if len(places) != len(unit):
         raise EstimationError(
             report_finding("prior.other-count", identified=len(unit), free=len(places))
         )
+    parts: tuple[CovariancePart, ...] = ()
+    if all(PREFIX + name in arrays for name in ("source", "degrees", "root", "part")):
+        roots, number = arrays[PREFIX + "root"], arrays[PREFIX + "part"]
+        stated = zip(arrays[PREFIX + "source"].tolist(), arrays[PREFIX + "degrees"], strict=True)
+        parts = tuple(
+            CovariancePart(str(source), roots[:, number == i], float(degrees))
+            for i, (source, degrees) in enumerate(stated)
+        )
+    errors = restore_arrays(SmoothErrors, arrays, DISCREPANCY_PREFIX)
+    discrepancy = errors and restore_arrays(
+        ModelDiscrepancy, arrays, DISCREPANCY_PREFIX, errors=errors
+    )
+    information = None
+    if INFORMATION[0] in arrays:
+        rows, deviations, noise = (arrays[name] for name in INFORMATION)
+        information = DataInformation(rows, deviations, *noise.tolist())
     return Posterior(
         robot,
         places,
@@ -591,11 +499,11 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         variance,
         determined.astype(bool),
         frames_from_arrays(arrays),
-        parts_from_arrays(arrays),
+        parts,
         fitted_rows_from_arrays(arrays),
-        discrepancy_from_arrays(arrays),
-        shown_noise_from_arrays(arrays),
-        information_from_arrays(arrays),
+        discrepancy,
+        ShownNoise(*arrays[SHOWN_NOISE].tolist()) if SHOWN_NOISE in arrays else None,
+        information,
     )
 
 

@@ -5,6 +5,15 @@ The weights are determined outside the descent and enter it as weights of the ro
 method, decomposition and covariance is used as it is. Blocks are the poses that
 `Measurements.block` declares to belong together, joined where a row links them; never a single
 component.
+
+The uncertainty of a fit with a loss, where its residuals exceed the stated noise: with the weight
+w(d) of a block of m residuals at distance d, the estimate solves sum A' w r = 0. Its covariance is
+(Huber, Robust Statistics, 1981, section 7.6)
+
+    K^2 (sum w^2 d^2 / (N - p)) / h^2 (A'A)^-1        h = sum (m w + d w'(d)) / N
+
+with N residuals, p parameters, and K = 1 + p / N var((m w + d w') / m) / h^2. The weighted rows
+give (A'WA)^-1 = (A'A)^-1 / mean w, for unit noise. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -14,13 +23,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.estimate.added_covariance import add_covariance
 from loopcal.estimate.descent import Descent
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.losses import Huber, Loss, Tukey, weigh_blocks
+from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.problem import Problem
+from loopcal.estimate.residual_test import SIGNIFICANCE
+from loopcal.estimate.result import Identification
+from loopcal.findings import report_finding
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.numerics.statistics import compute_chi_square_quantile, compute_median
+from loopcal.numerics.statistics import (
+    compute_chi_square_quantile,
+    compute_chi_square_tail,
+    compute_median,
+)
 from loopcal.typing import FloatArray, IntArray
 
 ROUNDS = 50
@@ -72,12 +90,24 @@ def descend_robustly(
     member = np.unique(block, return_inverse=True)[1]
     fit = RobustFit(run(problem, deviation, None), problem, np.ones(len(block)))
     if fit.fit.status[0] not in (DescentStatus.CONVERGED, DescentStatus.BAD_START):
-        fit = _begin_without_far_blocks(problem, member, fit, deviation, run)
+        # one row that is far off can prevent every step: blocks far from the start, whose error the
+        # distance of the median block shows, are left out first
+        start = problem.start(deviation)
+        distance, degrees = measure_block_distances(problem, deviation, start, member, problem)
+        weight = Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)[member]
+        weighted = problem.weighted(weight)
+        fit = RobustFit(run(weighted, deviation, None), weighted, weight)
     if isinstance(loss, Tukey):
         coarse = 100.0 * CONVERGED_CHANGE
         fit = _reweight(problem, member, Huber(), fit, estimate_scale, run, coarse)
     fit = _reweight(problem, member, loss, fit, estimate_scale, run, CONVERGED_CHANGE)
-    return _with_comparable_start(fit, problem, deviation, prior)
+    if fit.problem is problem:
+        return fit
+    # the first cost is weighted as the last one, so that both compare
+    whole = fit.problem if prior is None else prior.added(fit.problem)
+    costs = fit.fit.cost_history.copy()
+    costs[0] = whole.linearize(deviation, fit.fit.start).cost
+    return replace(fit, fit=replace(fit.fit, cost_history=costs))
 
 
 def measure_block_distances(
@@ -115,32 +145,6 @@ def estimate_scale_of(distance: FloatArray, degrees: FloatArray) -> float:
     return middle if middle > 0.0 else 1.0
 
 
-def _with_comparable_start(
-    robust: RobustFit, problem: Problem, deviation: FloatArray, prior: Prior | None
-) -> RobustFit:
-    """Return the fit with the first cost weighted as the last one, so that both compare."""
-    if robust.problem is problem:
-        return robust
-    whole = robust.problem if prior is None else prior.added(robust.problem)
-    costs = robust.fit.cost_history.copy()
-    costs[0] = whole.linearize(deviation, robust.fit.start).cost
-    return replace(robust, fit=replace(robust.fit, cost_history=costs))
-
-
-def _begin_without_far_blocks(
-    problem: Problem, member: IntArray, failed: RobustFit, deviation: FloatArray, run: Run
-) -> RobustFit:
-    """Return a fit without the blocks that lie far from the start, where the fit to all of them
-    did not converge: one row that is far off can prevent every step. The scale is that of the
-    median block, whose distance is the error of the start.
-    """
-    start = problem.start(deviation)
-    distance, degrees = measure_block_distances(problem, deviation, start, member, problem)
-    weight = Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)[member]
-    weighted = problem.weighted(weight)
-    return RobustFit(run(weighted, deviation, None), weighted, weight)
-
-
 def _reweight(
     problem: Problem,
     member: IntArray,
@@ -167,3 +171,61 @@ def _reweight(
         again = run(weighted, fit.deviation, fit.start).after(fit)
         robust = RobustFit(again, weighted, weight)
     return robust
+
+
+STEP = 1e-4
+"""Relative change of a distance for the derivative of a weight."""
+
+
+def add_loss_uncertainty(
+    result: Identification, fit: Descent, problem: Problem, weighted: Problem, blocks: IntArray
+) -> Identification:
+    """Return a fit with a loss whose covariance allows for residuals that exceed the noise in it.
+
+    Without a loss, or where the residuals agree with the noise (p > 0.001), it stays as it is.
+
+    Parameters
+    ----------
+    result, fit : of the weighted problem. problem : unweighted. blocks : (n,) of each pose.
+    """
+    loss, test = result.options.loss, result.residual_test
+    if loss is None or not (result.converged and test.intervals):
+        return result
+    member = np.unique(blocks, return_inverse=True)[1]
+    distance, counts = measure_block_distances(problem, fit.deviation, fit.start, member, weighted)
+    unit = estimate_scale_of(distance, counts) if test.noise == "estimated" else 1.0
+    variance, left = compute_loss_variance(loss, distance, counts, result.rank, unit)
+    times = variance / test.sigma_scale**2
+    if left < 1.0 or compute_chi_square_tail(left, left * times) >= SIGNIFICANCE:
+        return result
+    roots = [part.root for part in result.posterior.parts if part.source == NOISE]
+    root = np.sqrt(times - 1.0) * np.concatenate(roots, axis=1)
+    finding = report_finding("noise.loss-contradicted", ratio=float(np.sqrt(times)))
+    return add_covariance(result, root, left, finding)
+
+
+def compute_loss_variance(
+    loss: Loss, distance: FloatArray, counts: FloatArray, rank: int, unit: float = 1.0
+) -> tuple[float, float]:
+    """Return the variance of the noise that the covariance of the weighted rows must contain, and
+    its degrees of freedom.
+
+    Parameters
+    ----------
+    distance, counts : (u,) norm and number of whitened residuals of each block. rank : of the rows.
+    unit : noise by which the loss divides distances.
+    """
+    weight = loss.weight(distance / unit, counts)
+    longer = loss.weight(distance * (1.0 + STEP) / unit, counts)
+    slope = (longer - loss.weight(distance * (1.0 - STEP) / unit, counts)) / (2.0 * STEP)
+    total, is_tested = float(counts.sum()), counts > 0.0
+    left = total - rank
+    influence = counts * weight + slope
+    gain = float(influence.sum()) / total
+    mean_weight = float((counts * weight).sum()) / total
+    if left < 1.0 or gain <= 0.0:
+        return np.nan, 0.0
+    each = influence[is_tested] / counts[is_tested]
+    correction = 1.0 + rank / total * float(np.var(each)) / gain**2
+    square = float(((weight * distance) ** 2).sum()) / left
+    return correction**2 * square * mean_weight / gain**2, left

@@ -17,16 +17,12 @@ Gaussian Processes for Machine Learning, 2006, sections 2.2 and 8.1.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.typing import FloatArray
-
-DISCREPANCY_PREFIX = "discrepancy_"
-"""Beginning of the names of the arrays of a run folder."""
 
 CENTERS = 40
 """Largest number of centers: more of them are closer to each other than the error varies."""
@@ -91,17 +87,6 @@ class SmoothErrors:
         known = ((self._correlate(T) @ self.whitening) ** 2).sum(axis=-1)
         left = np.sqrt(np.maximum(1.0 - known, 0.0))
         return self._at_origin(T) * (left[..., None, None] * self.amplitude)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of the run folder."""
-        return {
-            DISCREPANCY_PREFIX + field.name: getattr(self, field.name) for field in fields(self)
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> SmoothErrors:
-        """Return the errors in the arrays of a run folder."""
-        return cls(*(arrays[DISCREPANCY_PREFIX + field.name] for field in fields(cls)))
 
     def _correlate(self, T: FloatArray) -> FloatArray:
         """Return the correlations (.., k) of errors at poses with those at the centers."""

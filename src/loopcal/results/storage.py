@@ -61,9 +61,17 @@ def _restore_value(hint: Any, value: Any) -> Any:
     return value
 
 
+def _list_stored(of_class: type[Any]) -> list[Field]:
+    """Return the fields that a class marks as stored; of one without fields, all its arrays."""
+    if hasattr(of_class, "FIELDS"):
+        return [field for field in of_class.FIELDS if field.is_stored]
+    hints = get_type_hints(of_class)
+    return [Field(name) for name, hint in hints.items() if get_origin(hint) is np.ndarray]
+
+
 def store_arrays(result: Any, prefix: str) -> dict[str, np.ndarray]:
-    """Return the fields that a class marks as stored, by name after `prefix`."""
-    stored = (field for field in type(result).FIELDS if field.is_stored)
+    """Return the stored fields of a result, by name after `prefix`."""
+    stored = _list_stored(type(result))
     return {prefix + field.name: np.asarray(field.get(result)) for field in stored}
 
 
@@ -76,7 +84,7 @@ def restore_arrays(
     ----------
     given : the attributes that are not stored.
     """
-    stored: list[Field] = [field for field in getattr(of_class, "FIELDS", ()) if field.is_stored]
+    stored = _list_stored(of_class)
     if any(prefix + field.name not in arrays for field in stored):
         return None
     hints = get_type_hints(of_class)
