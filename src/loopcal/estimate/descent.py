@@ -29,11 +29,9 @@ from loopcal.numerics.decomposition import (
     empty_factor,
     solve_regular,
 )
-from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
+from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, Model, minimize
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
-
-# --- One step towards the filtered solution, damped where the full step is too long.
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +63,11 @@ def propose_step(
     current = decomposition.coordinates(deviation)
     solution = decomposition.solution(penalty)
     full = solution - current
-    curvature = _curvature(s, penalty)
+    # a direction that is not used is as stiff as the weakest one that is
+    used, stiffness = np.isfinite(penalty), s**2 + _finite(penalty)
+    weakest = np.where(used, stiffness, np.inf).min(axis=1, initial=np.inf)
+    others = np.where(np.isfinite(weakest), weakest, 1.0)[:, None]
+    curvature = np.where(used, stiffness, others)
     new = current + curvature / (curvature + damping[:, None]) * full
     # differences of squares as products, so that a small decrease is not lost in a large sum
     data = s * (current - new) * (s * (current + new) - 2.0 * c)
@@ -97,20 +99,6 @@ def penalize(
 def _finite(penalty: FloatArray) -> FloatArray:
     """Return the penalty with zero for directions that are not used."""
     return np.where(np.isfinite(penalty), penalty, 0.0)
-
-
-def _curvature(s: FloatArray, penalty: FloatArray) -> FloatArray:
-    """Return the curvature h (a, p) of each direction.
-
-    A direction that is not used is as stiff as the weakest one that is.
-    """
-    used = np.isfinite(penalty)
-    h = s**2 + _finite(penalty)
-    weakest = np.where(used, h, np.inf).min(axis=1, initial=np.inf)
-    return np.where(used, h, np.where(np.isfinite(weakest), weakest, 1.0)[:, None])
-
-
-# --- The linear model at a point of a descent: it proposes steps, and is decomposed when asked.
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,23 +398,18 @@ def descend(
 ) -> Descent:
     """Minimize the whitened sum of squares, filtered by the method.
 
+    A trial that fails is marked in `status` and never stops the others.
+
     Parameters
     ----------
-    problem : of t trials. deviation : (t, p) where to begin, in tolerances.
-    method : how directions are penalized. control : settings of the steps.
-    tolerance : relative rank tolerance.
+    deviation : (t, p) where to begin, in tolerances. tolerance : relative rank tolerance.
     start : warm start; default: the first one of the problem.
-    progress : receives each step with the sum of squares of the first trial; how many there will be
-        is not known.
+    progress : receives each step with the sum of squares of the first trial.
     arrival : (t,), optional; by how much the step that led to `deviation` changed the whitened
         residuals.
     sufficient : a trial has also converged where this step and all further ones together would
         change the whitened residuals by less than that, apart from the step itself, which is taken.
         They become shorter at least by the ratio of the last two.
-
-    Returns
-    -------
-    Descent; a trial that fails is marked in `status` and never stops the others.
     """
     control = control or StepControl()
     fixed = fix_penalty(method, problem.parameters)
@@ -518,7 +501,8 @@ class _Candidate(NamedTuple):
         return self.model.locate(needed.take(trials), self.arrival[trials])
 
 
-class _FilteredDescent(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _FilteredDescent(Model):
     """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
 
     problem: LeastSquaresProblem

@@ -52,39 +52,54 @@ LOWEST, HIGHEST = 1e-12, 1e4
 """Range of lam in units of the largest squared singular value: no effect to hardly any data."""
 
 
+class _LowestScore:
+    """A rule that chooses the ridge parameter lam of lowest score."""
+
+    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+        """Return what is minimized (t,) at lam (t,)."""
+        raise NotImplementedError
+
+    def __call__(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam (t,): the parabola through the best grid point and its neighbors refines the
+        minimum.
+        """
+        reference = _find_largest_square(decomposition)
+        decades = np.log10(HIGHEST / LOWEST)
+        grid = np.linspace(np.log10(LOWEST), np.log10(HIGHEST), int(PER_DECADE * decades) + 1)
+        values = np.stack([self.score(decomposition, reference * 10.0**g) for g in grid])
+        best = np.clip(np.argmin(values, axis=0), 1, len(grid) - 2)
+        trial = np.arange(values.shape[1])
+        low, middle, high = (values[best + shift, trial] for shift in (-1, 0, 1))
+        curvature = low - 2.0 * middle + high
+        with np.errstate(invalid="ignore"):
+            safe = np.where(curvature > 0.0, curvature, 1.0)
+            shift = np.where(curvature > 0.0, 0.5 * (low - high) / safe, 0.0)
+        shift = np.clip(np.nan_to_num(shift), -1.0, 1.0)
+        return reference * 10.0 ** (grid[best] + shift * (grid[1] - grid[0]))
+
+    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+        """Return which lam (t,) are within one grid point of an end of the range."""
+        reference, point = _find_largest_square(decomposition), 10.0 ** (1.0 / PER_DECADE)
+        return (lam <= LOWEST * reference * point) | (lam >= HIGHEST * reference / point)
+
+
 @dataclass(frozen=True)
-class GCV:
+class GCV(_LowestScore):
     """Choose the ridge parameter that minimizes generalized cross-validation."""
 
     name: ClassVar[str] = "gcv"
-
-    def __call__(self, decomposition: Decomposition) -> FloatArray:
-        """Return lam (t,)."""
-        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
 
     def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
         """Return RSS / (m - sum f)^2 (t,) at lam (t,)."""
         penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
         return _gcv(decomposition, penalty)
 
-    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
-        """Return which lam (t,) are ends of the range."""
-        return _is_end_of_range(decomposition, lam)
-
 
 @dataclass(frozen=True)
-class MarginalLikelihood:
+class MarginalLikelihood(_LowestScore):
     """Choose the ridge parameter under which the whitened data are most probable."""
 
     name: ClassVar[str] = "marginal-likelihood"
-
-    def __call__(self, decomposition: Decomposition) -> FloatArray:
-        """Return lam (t,)."""
-        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
-
-    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
-        """Return which lam (t,) are ends of the range."""
-        return _is_end_of_range(decomposition, lam)
 
     def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
         """Return minus twice the log density of the data at lam (t,), up to a constant."""
@@ -118,11 +133,9 @@ class TruncationGCV:
         return _gcv(decomposition, np.where(kept, 0.0, np.inf))
 
 
-def _is_end_of_range(decomposition: Decomposition, lam: FloatArray) -> BoolArray:
-    """Return which lam (t,) are within one grid point of an end of the grid."""
-    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
-    point = 10.0 ** (1.0 / PER_DECADE)
-    return (lam <= LOWEST * reference * point) | (lam >= HIGHEST * reference / point)
+def _find_largest_square(decomposition: Decomposition) -> FloatArray:
+    """Return the largest squared singular values (t,), never zero."""
+    return np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
 
 
 def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
@@ -132,29 +145,6 @@ def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
     return np.where(
         spare, decomposition.remaining(penalty) / np.where(spare, left, 1.0) ** 2, np.inf
     )
-
-
-def _minimize(
-    criterion: Callable[[FloatArray], FloatArray], decomposition: Decomposition
-) -> FloatArray:
-    """Minimize a criterion of lam (t,) over the grid.
-
-    The parabola through the best grid point and its neighbors refines the minimum.
-    """
-    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
-    decades = np.log10(HIGHEST / LOWEST)
-    grid = np.linspace(np.log10(LOWEST), np.log10(HIGHEST), int(PER_DECADE * decades) + 1)
-    values = np.stack([criterion(reference * 10.0**g) for g in grid])
-    best = np.clip(np.argmin(values, axis=0), 1, len(grid) - 2)
-    trial = np.arange(values.shape[1])
-    low, middle, high = (values[best + shift, trial] for shift in (-1, 0, 1))
-    curvature = low - 2.0 * middle + high
-    with np.errstate(invalid="ignore"):
-        shift = np.where(
-            curvature > 0.0, 0.5 * (low - high) / np.where(curvature > 0.0, curvature, 1.0), 0.0
-        )
-    shift = np.clip(np.nan_to_num(shift), -1.0, 1.0)
-    return reference * 10.0 ** (grid[best] + shift * (grid[1] - grid[0]))
 
 
 # The methods.
@@ -516,12 +506,6 @@ def adapt_method(
     return replace(method, free=free, noise=noise, correlation=correlation)
 
 
-# --- The regularization that a fit used: its parameter, how it was chosen, and how much it leaves.
-
-FIXED = "fixed"
-"""Rule of a parameter that was given."""
-
-
 @dataclass(frozen=True)
 class Regularization:
     """Ridge parameter or truncation of a fit.
@@ -557,19 +541,14 @@ class Regularization:
 def describe_regularization(
     method: Method, decomposition: Decomposition, penalty: FloatArray
 ) -> Regularization | None:
-    """Return the regularization of trial 0; None for methods without a parameter to choose.
-
-    Parameters
-    ----------
-    decomposition, penalty : of the fit.
-    """
+    """Return the regularization of trial 0; None for methods without a parameter to choose."""
     if isinstance(method, Ridge):
         name, stated = "lam", method.lam
     elif isinstance(method, TruncatedSVD):
         name, stated = "k", method.k
     else:
         return None
-    score, is_at_limit, rule = None, False, FIXED
+    score, is_at_limit, rule = None, False, "fixed"
     if callable(stated):
         value = float(np.atleast_1d(np.asarray(stated(decomposition)))[0])
         rule = getattr(stated, "__name__", type(stated).__name__)
@@ -589,9 +568,6 @@ def describe_regularization(
         rank=int(decomposition.rank[0]),
         is_at_limit=is_at_limit,
     )
-
-
-# --- The penalty of a method as rows beside the measured ones, where it does not depend on these.
 
 
 class FixedPenalty(NamedTuple):
@@ -635,9 +611,18 @@ class FixedPenalty(NamedTuple):
 
 
 def fix_penalty(method: Method, parameters: int) -> FixedPenalty | None:
-    """Return the penalty of a method for p parameters where it does not depend on the rows."""
-    value = _find_fixed_penalty(method)
-    if value is None:
+    """Return the penalty of a method for p parameters where the method states it; None where it
+    chooses it from the decomposition.
+
+    Of another class, which may inherit from these, only its penalties of decompositions are known.
+    """
+    if type(method) is LeastSquares:
+        value = 0.0
+    elif type(method) is Ridge and not callable(method.lam):
+        value = 1.0 if isinstance(method.lam, tuple) else float(method.lam)
+    elif type(method) is MAP and not callable(method.inflation) and method.noise == "given":
+        value = 1.0 / method.inflation**2
+    else:
         return None
     scale, root = method.scale(parameters), method.root(parameters)
     unpenalized = method.unpenalized(parameters)
@@ -652,18 +637,3 @@ def fix_penalty(method: Method, parameters: int) -> FixedPenalty | None:
     if scale is not None:
         matrix = matrix / scale
     return FixedPenalty(unit, rows, matrix)
-
-
-def _find_fixed_penalty(method: Method) -> float | None:
-    """Return the penalty of all penalized directions where the method states it, which is 0 for
-    least squares; None where the method chooses it from the decomposition.
-
-    Of another class, which may inherit from these, only its penalties of decompositions are known.
-    """
-    if type(method) is LeastSquares:
-        return 0.0
-    if type(method) is Ridge and not callable(method.lam):
-        return 1.0 if isinstance(method.lam, tuple) else float(method.lam)
-    if type(method) is MAP and not callable(method.inflation) and method.noise == "given":
-        return 1.0 / method.inflation**2
-    return None

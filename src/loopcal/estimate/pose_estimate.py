@@ -93,10 +93,7 @@ class EstimatedPoses:
 def estimate_poses(
     estimates: PoseEstimates, data: Measurements, drop: Sequence[str] = ()
 ) -> EstimatedPoses:
-    """Return the estimated poses of measurements (one trial).
-
-    `drop` are labels of poses that were excluded: nothing is reported of them.
-    """
+    """Return the estimated poses of measurements (one trial), nothing of the labels `drop`."""
     kept = ~np.isin(data.labels, drop)
     known = estimates.is_reached[0] & kept
     T = np.where(known[:, None, None], estimates.states.state.T[0], np.nan)
@@ -122,12 +119,16 @@ def report_doubtful_readings(robot: Mechanism, poses: EstimatedPoses) -> tuple[F
     estimated = np.isinf(poses.sigma) & known[:, None]
     outside = estimated & (find_outside_strokes(poses.readings, robot) > 0.0)
     beside = estimated & _is_on_other_branch(robot, poses, np.asarray(estimated.any(axis=1)))
-    codes = (("poses.outside-stroke", outside), ("poses.other-branch", beside))
-    return tuple(
-        report_finding(code, readings=_describe_readings(robot, poses, chosen))
-        for code, chosen in codes
-        if chosen.any()
-    )
+    findings = []
+    for code, chosen in (("poses.outside-stroke", outside), ("poses.other-branch", beside)):
+        readings = []
+        for pose, column in np.argwhere(chosen):
+            actuator = robot.actuators[column]
+            value = robot.to_quantity(float(poses.readings[pose, column]), actuator.dimension)
+            readings.append({"actuator": actuator.name, "pose": poses.labels[pose], "value": value})
+        if readings:
+            findings.append(report_finding(code, readings=readings))
+    return tuple(findings)
 
 
 def report_uneven_sigmas(problem: Problem) -> tuple[Finding, ...]:
@@ -165,24 +166,10 @@ def _is_on_other_branch(robot: Mechanism, poses: EstimatedPoses, chosen: BoolArr
     return other
 
 
-def _describe_readings(
-    robot: Mechanism, poses: EstimatedPoses, chosen: BoolArray
-) -> list[dict[str, Any]]:
-    """Return actuator, pose and value of chosen readings (n, actuators)."""
-    described = []
-    for pose, column in np.argwhere(chosen):
-        actuator = robot.actuators[column]
-        value = robot.to_quantity(float(poses.readings[pose, column]), actuator.dimension)
-        described.append({"actuator": actuator.name, "pose": poses.labels[pose], "value": value})
-    return described
-
-
 def _labels_of(labels: Sequence[str], chosen: BoolArray) -> list[str]:
     """Return the labels of chosen poses."""
     return [label for label, is_chosen in zip(labels, chosen, strict=True) if is_chosen]
 
-
-# --- Poses that a geometry predicts from readings, as far as each reading is believed.
 
 SAME_RATIO = 1e-9
 """Relative difference of sigma ratios below which a pose's readings are weighted as the robot
@@ -278,8 +265,6 @@ def fit_poses(
         problem.residuals(z, fitted)[-1].whitened[0],
     )
 
-
-# --- Poses that do not close at a robot's values: which, and by how much.
 
 MOST = 0.5
 """Share of open poses above which a geometry is not one to begin with."""

@@ -23,7 +23,7 @@ from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import differentiate_by_coordinates, inverse
 from loopcal.mechanism.states import Status
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
+from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, Model, minimize
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -127,7 +127,7 @@ class _FullStep:
 
 
 @dataclass(frozen=True, eq=False)
-class _MeasuredPoses:
+class _MeasuredPoses(Model):
     """Gauss-Newton by full steps over what the platform can do: every step is accepted."""
 
     robot: Mechanism
@@ -186,10 +186,6 @@ class _MeasuredPoses:
         """Accept every step."""
         del point, candidate
         return np.ones(len(step.T), dtype=bool), np.ones(len(step.T))
-
-    def objective(self, point: _Point) -> FloatArray:
-        """Return the cost of the points, which full steps do not look at."""
-        return point.cost
 
     def ending(
         self, point: _Point, step: _FullStep, candidate: _Point, accepted: BoolArray

@@ -45,8 +45,6 @@ from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.numerics.statistics import compute_chi_square_quantile, compute_single_level
 from loopcal.typing import FloatArray
 
-# --- Choose by evidence which parts of the tolerances are wider than stated.
-
 PRIOR_ODDS: Mapping[Kind, float] = {"shift": 1.0, "group": 1.0 / 3.0, "single": 1.0 / 3.0}
 """Odds of each kind of component against none, before the data: parts of one batch and common zeros
 are frequent, the others less so. With these odds and right tolerances about 4 % of data sets get a
@@ -257,8 +255,6 @@ def restate(
     )
 
 
-# --- Which deviations from the tolerances the data could not show.
-
 POWER_QUANTILE = 0.8416212335729143
 """Normal quantile of the power 0.8."""
 
@@ -341,21 +337,27 @@ def choose_methods(
     converged = np.flatnonzero(fit.status == DescentStatus.CONVERGED.value)
     if not candidates or not len(converged):
         return {}
+    asked, rows = converged, _divide(fit.decomposition, method)
+    if not method.components:
+        # those in which any component has more evidence than none, besides the stated tolerances or
+        # the inflated ones
+        shown = rows.take(converged)
+        factor = method.read_inflation(fit.decomposition, fit.penalty)[converged]
+        evidence = compute_evidence(predict(shown, np.ones(len(factor))), candidates)
+        if (factor > 1.0).any():
+            evidence = np.maximum(evidence, compute_evidence(predict(shown, factor), candidates))
+        asked = converged[(evidence > 0.0).any(axis=1)]
     chosen: dict[int, MAP] = {}
-    rows = _divide(fit.decomposition, method)
-    for i in (
-        converged
-        if method.components
-        else _screen(
-            rows, method.read_inflation(fit.decomposition, fit.penalty), candidates, converged
+    before = {(c.kind, c.places): c.factor for c in method.components}
+    for i in asked:
+        trial, unpenalized = rows.take(np.array([i])), method.unpenalized(len(free))
+        search = ComponentSearch(trial, method.correlation, unpenalized, candidates)
+        components = search.choose()
+        factors = {(c.kind, c.places): c.factor for c in components}
+        is_same = factors.keys() == before.keys() and all(
+            abs(value / before[key] - 1.0) <= SAME_FACTOR for key, value in factors.items()
         )
-    ):
-        unpenalized = method.unpenalized(len(free))
-        trial_rows = rows.take(np.array([i]))
-        components = ComponentSearch(
-            trial_rows, method.correlation, unpenalized, candidates
-        ).choose()
-        if not _are_same(components, method.components):
+        if not is_same:
             chosen[int(i)] = replace(method, components=components)
     return chosen
 
@@ -368,20 +370,16 @@ def run_prior_tests(
     """
     if not isinstance(method, MAP):
         return None, []
-    rows = _divide(_restate_as_stated(free, fit, method), method)
+    rows = fit.decomposition
+    if method.components:
+        stated = compute_prior_covariance(len(free), method.correlation, ())
+        rows = restate(rows, stated, method.unpenalized(len(free)))
+    rows = _divide(rows, method)
     inflation = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     conflict = assess_prior_conflict(free, rows, inflation, fit.deviation[0], method.components)
     if fit.status[0] != DescentStatus.CONVERGED.value:
         return conflict, []
     return conflict, [*conflict.report(), *report_undetectable(free, rows)]
-
-
-def _restate_as_stated(free: FreeParameters, fit: Descent, method: MAP) -> Decomposition:
-    """Return the decomposition of the rows for the tolerances as stated."""
-    if not method.components:
-        return fit.decomposition
-    stated = compute_prior_covariance(len(free), method.correlation, ())
-    return restate(fit.decomposition, stated, method.unpenalized(len(free)))
 
 
 def add_factor_uncertainty(result: Identification, fit: Descent) -> Identification:
@@ -396,46 +394,35 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     factor = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     if factor <= 1.0 and not method.components:
         return result
-    errors = [_estimate_factor_error(result, fit, factor)] if factor > 1.0 else []
+    errors = [_estimate_factor_error(result, fit, method, factor)] if factor > 1.0 else []
     errors += _estimate_component_errors(fit, method, factor)
     scale = result.tolerance[:, None]
     component_rows = tuple(component.to_row(result.names) for component in method.components)
     finding = report_finding("prior.inflation", factor=factor, parts=component_rows)
-    change = np.concatenate([error.change[:, None] for error in errors], axis=1)
+    change = np.stack([error[0] for error in errors], axis=1)
     inflated = add_covariance(result, scale * change, np.inf, finding)
-    uncertain = [CovariancePart(TOLERANCES, scale * e.caused, e.degrees) for e in errors]
+    uncertain = [
+        CovariancePart(TOLERANCES, scale * caused, 0.5 / spread**2) for _, caused, spread in errors
+    ]
     posterior = inflated.posterior
     return replace(inflated, posterior=replace(posterior, parts=(*posterior.parts, *uncertain)))
 
 
-class _FactorError(NamedTuple):
-    """What an error of a factor does.
-
-    Attributes
-    ----------
-    change : (p,) of the estimate, in tolerances, by one standard deviation of the log factor.
-    caused : (p, k) root of the covariance, in tolerances, that the inflated deviations cause.
-    spread : standard deviation of the log factor.
-    """
-
-    change: FloatArray
-    caused: FloatArray
-    spread: float
-
-    @property
-    def degrees(self) -> float:
-        """Degrees of freedom of the variance that the deviations cause."""
-        return 0.5 / self.spread**2
+_FactorError = tuple[FloatArray, FloatArray, float]
+"""What an error of a factor does: the change (p,) of the estimate, in tolerances, by one standard
+deviation of the log factor; a root (p, k) of the covariance that the inflated deviations cause; and
+this standard deviation.
+"""
 
 
-def _estimate_factor_error(result: Identification, fit: Descent, factor: float) -> _FactorError:
+def _estimate_factor_error(
+    result: Identification, fit: Descent, method: MAP, factor: float
+) -> _FactorError:
     """Return what the error of the factor on all tolerances does.
 
     In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i; deviations
     of the variance tau_i^2 cause the error (1 - f_i) tau_i.
     """
-    method = result.method
-    assert isinstance(method, MAP)
     d, penalty = fit.decomposition, np.where(np.isfinite(fit.penalty), fit.penalty, 0.0)
     spread = float(estimate_factor_spread(_divide(d, method), np.array([factor]))[0])
     change = 2.0 * (1.0 - d.filter_factors(penalty)) * d.solution(fit.penalty)
@@ -446,7 +433,7 @@ def _estimate_factor_error(result: Identification, fit: Descent, factor: float) 
     variance = inverse if prior is None else np.where(penalty > 0.0, prior, 0.0)
     left = (1.0 - d.filter_factors(penalty)) * np.sqrt(variance)
     caused = d.scale[:, None] * d.directions[0] * left[0]
-    return _FactorError(d.deviation(change * spread)[0], caused, spread)
+    return d.deviation(change * spread)[0], caused, spread
 
 
 def _estimate_component_errors(fit: Descent, method: MAP, factor: float) -> list[_FactorError]:
@@ -473,7 +460,7 @@ def _estimate_component_errors(fit: Descent, method: MAP, factor: float) -> list
         left = E - S @ (Q @ E)
         left = rows.deviation(np.where(penalized, rows.coordinates(left.T), 0.0)).T
         change = left @ (E.T @ h) * (2.0 * (1.0 + variance) * spread)
-        errors.append(_FactorError(change, left * np.sqrt(variance), spread))
+        errors.append((change, left * np.sqrt(variance), spread))
     return errors
 
 
@@ -481,31 +468,3 @@ def _divide(decomposition: Decomposition, method: MAP) -> Decomposition:
     """Return the decomposition of the rows divided by the noise that they show."""
     divided = decomposition.divided(method.sigma(decomposition))
     return divided.divided(estimate_excess_noise(divided))
-
-
-def _screen(
-    rows: Decomposition,
-    factor: FloatArray,
-    candidates: tuple[ToleranceComponent, ...],
-    converged: np.ndarray,
-) -> np.ndarray:
-    """Return the converged trials in which any component has more evidence than none, besides the
-    stated or the inflated tolerances.
-    """
-    rows, factor = rows.take(converged), factor[converged]
-    evidence = compute_evidence(predict(rows, np.ones(len(factor))), candidates)
-    if (factor > 1.0).any():
-        evidence = np.maximum(evidence, compute_evidence(predict(rows, factor), candidates))
-    return np.asarray(converged[(evidence > 0.0).any(axis=1)])
-
-
-def _are_same(
-    first: tuple[ToleranceComponent, ...], second: tuple[ToleranceComponent, ...]
-) -> bool:
-    """Return whether components are the same and their factors nearly so."""
-    factors, other_factors = (
-        {(c.kind, c.places): c.factor for c in components} for components in (first, second)
-    )
-    return factors.keys() == other_factors.keys() and all(
-        abs(factor / other_factors[key] - 1.0) <= SAME_FACTOR for key, factor in factors.items()
-    )

@@ -38,9 +38,6 @@ if TYPE_CHECKING:
     from loopcal.estimate.problem import Problem
 
 
-# --- Residuals of a fit with their labels, also as arrays of a run folder.
-
-
 @dataclass(frozen=True, eq=False)
 class KindResiduals:
     """Residuals (predicted - measured) of the rows of one kind after the fit.
@@ -134,16 +131,11 @@ def label_residuals(
             whitened=r.whitened[0],
             context=columns,
             dimensions=tuple(column.dimension for column in s.kind.noise_columns),
-            readings=_take_readings(s, data.readings),
+            # of the first pose of each row; targets on the base have none
+            readings=np.where(s.kind.is_of_base, np.nan, data.readings[s.poses_by_link[:, 0]]),
         )
         for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
     )
-
-
-def _take_readings(rows: ObservationRows, readings: FloatArray) -> FloatArray:
-    """Return the readings (r, a) of the first pose of each row; NaN for targets on the base."""
-    of_first = readings[rows.poses_by_link[:, 0]]
-    return np.full_like(of_first, np.nan) if rows.kind.is_of_base else of_first
 
 
 def _label_rows(rows: ObservationRows, labels: tuple[str, ...]) -> tuple[str, ...]:
@@ -155,9 +147,6 @@ def _label_rows(rows: ObservationRows, labels: tuple[str, ...]) -> tuple[str, ..
         return tuple(map(labels.__getitem__, poses[:, 0].tolist()))
     return tuple("/".join(labels[i] for i in members) for members in poses.tolist())
 
-
-# --- Findings of a fit: how the iteration ended, poses with low weight, estimates beyond
-# tolerance.
 
 FAR = 10.0
 """Deviation from nominal, in stated tolerances (standard deviations), that contradicts the
@@ -212,30 +201,23 @@ def report_divergence(
     ]
 
 
-def report_weights(data: Measurements, weights: FloatArray, loss: Loss | None) -> list[Finding]:
-    """Return which poses a loss gave less than half of their weight.
-
-    Parameters
-    ----------
-    weights : (n,) of the poses. loss : None reports nothing.
-    """
-    if loss is None:
-        return []
-    low = tuple(data.labels[i] for i in np.flatnonzero(weights < LOW_WEIGHT))
-    name, total = describe_loss(loss), data.n_poses
-    if not low:
-        return [report_finding("fit.full-weights", loss=name, total=total)]
-    return [report_finding("fit.low-weights", loss=name, count=len(low), total=total, poses=low)]
-
-
 def report_used_poses(
     data: Measurements, weights: FloatArray, loss: Loss | None, excluded: tuple[str, ...]
 ) -> list[Finding]:
-    """Return which poses the loss gives little weight, and which ones the options exclude."""
-    findings = report_weights(data, weights, loss)
-    return (
-        [*findings, report_finding("fit.excluded-poses", poses=excluded)] if excluded else findings
-    )
+    """Return which poses, of weights (n,), a loss gave less than half of their weight, and which
+    ones the options exclude.
+    """
+    findings = []
+    if loss is not None:
+        low = tuple(data.labels[i] for i in np.flatnonzero(weights < LOW_WEIGHT))
+        stated: dict[str, Any] = {"loss": describe_loss(loss), "total": data.n_poses}
+        code = "fit.low-weights" if low else "fit.full-weights"
+        if low:
+            stated |= {"count": len(low), "poses": low}
+        findings.append(report_finding(code, **stated))
+    if excluded:
+        findings.append(report_finding("fit.excluded-poses", poses=excluded))
+    return findings
 
 
 def report_equations(equations: int, parameters: int, method: Method) -> list[Finding]:

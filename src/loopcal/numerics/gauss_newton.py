@@ -26,8 +26,6 @@ import numpy as np
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- Damping of Gauss-Newton steps, and the test of progress: working memory of one iteration.
-
 PATIENCE = 20
 """Evaluations without progress after which a trial ends. One whose result is not finite, such as
 that of poses out of reach, counts `NOT_FINITE` times: it takes the longest and says the least."""
@@ -81,8 +79,6 @@ class Damping:
 class FixedFactors:
     """Damping that is divided by ten after an accepted step and multiplied by ten otherwise."""
 
-    value: FloatArray
-
     def __init__(self, first: FloatArray) -> None:
         self.value = np.array(first)
 
@@ -102,9 +98,6 @@ class Progress:
     A trial that makes none within `PATIENCE` evaluations ends. Nothing is recorded before that many
     evaluations, in which most trials converge.
     """
-
-    marks: FloatArray
-    age: IntArray
 
     def __init__(self, trials: int) -> None:
         self.marks = np.full((trials, 3), np.inf)
@@ -126,9 +119,6 @@ class Progress:
         self.age[trials] = age + np.where(is_finite, 1, NOT_FINITE)
         return self.age[trials] >= PATIENCE
 
-
-# --- Chains of full Gauss-Newton steps that may raise the sum of squares on their way to the
-# solution.
 
 CONTRACTION = 0.9
 """Largest ratio of the lengths of two full steps of a chain."""
@@ -299,7 +289,9 @@ class Step(Protocol):
 
 
 class Model(Protocol):
-    """The rules of one kind of problem for `minimize`."""
+    """The rules of one kind of problem for `minimize`. By default every decrease is accepted, and
+    no step is the last.
+    """
 
     def propose(self, point: Any, damping: FloatArray) -> Any:
         """Return the steps of points, damped by `damping` (a,)."""
@@ -307,13 +299,15 @@ class Model(Protocol):
 
     def is_negligible(self, point: Any, step: Any) -> BoolArray:
         """Return which steps (a,) are the last: they are taken without being evaluated."""
-        ...
+        del step
+        return np.zeros(len(point.cost), dtype=bool)
 
     def finish(self, point: Any, step: Any, trials: IntArray) -> Any:
         """Return all points, those of some trials (a,) after their negligible steps (a,), with
         their cost and model unchanged.
         """
-        ...
+        del step, trials
+        return point
 
     def evaluate(self, point: Any, step: Any, trials: IntArray) -> Any:
         """Return the points to which steps lead; `trials` (a,) are their numbers."""
@@ -321,11 +315,12 @@ class Model(Protocol):
 
     def judge(self, point: Any, step: Any, candidate: Any) -> tuple[BoolArray, FloatArray]:
         """Return which candidates are accepted (a,), and decrease over predicted decrease (a,)."""
-        ...
+        del step
+        return candidate.cost < point.cost, np.ones(len(point.cost))
 
     def objective(self, point: Any) -> FloatArray:
         """Return what is minimized (a,), the sum of squares with penalties."""
-        ...
+        return np.asarray(point.cost)
 
     def ending(self, point: Any, step: Any, candidate: Any, accepted: BoolArray) -> IntArray:
         """Return the status (a,) of every trial after this step, RUNNING where it goes on."""
@@ -572,8 +567,6 @@ def minimize_by_halving(
     return point, converged
 
 
-# --- Least squares from several starts at once, for problems whose good start is not known.
-
 STEPS = 60
 """Steps of damped Gauss-Newton [1]; starts in the right basin need fewer than ten."""
 
@@ -636,8 +629,9 @@ class _Step(TrialBatch):
     damping: FloatArray
 
 
-class _Descent(NamedTuple):
-    """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
+@dataclass(frozen=True)
+class _Descent(Model):
+    """The rules of `minimize_from_starts`."""
 
     linearize: Linearize
 
@@ -656,30 +650,11 @@ class _Descent(NamedTuple):
         step = np.where(norm > 0.0, -np.einsum("cku,ck->cu", V, gain * right) / scale, 0.0)
         return _Step(step, np.linalg.norm(step * scale, axis=1), damping)
 
-    def is_negligible(self, point: _Point, step: _Step) -> BoolArray:
-        """Return no step: all are evaluated."""
-        del point
-        return np.zeros(len(step.x), dtype=bool)
-
-    def finish(self, point: _Point, step: _Step, trials: IntArray) -> _Point:
-        """Return the points as they are."""
-        del step, trials
-        return point
-
     def evaluate(self, point: _Point, step: _Step, trials: IntArray) -> _Point:
         """Return the points to which steps lead."""
         x = point.x + step.x
         residual, jacobian = self.linearize(x, trials)
         return _Point(x, residual, jacobian, sum_squares(residual))
-
-    def judge(self, point: _Point, step: _Step, candidate: _Point) -> tuple[BoolArray, FloatArray]:
-        """Accept every decrease."""
-        del step
-        return candidate.cost < point.cost, np.ones(len(point.cost))
-
-    def objective(self, point: _Point) -> FloatArray:
-        """Return the sum of squares."""
-        return point.cost
 
     def ending(
         self, point: _Point, step: _Step, candidate: _Point, accepted: BoolArray
