@@ -12,8 +12,7 @@ from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.validation import report_reused_rows
 from loopcal.errors import DataError
-from loopcal.estimate.fit_input import exclude_poses
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import exclude_poses, identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import posterior_from_arrays

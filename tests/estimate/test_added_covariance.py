@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from loopcal.apply.accuracy import pose_uncertainty
-from loopcal.estimate.added_covariance import add_covariance
 from loopcal.estimate.fit_linearization import collect_uncertainty
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares, TruncatedSVD
 from loopcal.estimate.posterior import CovariancePart, posterior_from_arrays
 from loopcal.estimate.prior import prior_from
+from loopcal.estimate.result import add_covariance
 from loopcal.findings import report_finding
 from loopcal.measure.instrument import Sensor
 from loopcal.measure.kinds.poses import Pose

@@ -18,8 +18,7 @@ from loopcal.diagnose.fit_examination import examine_fit
 from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.fit_input import exclude_poses
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import exclude_poses, identify
 from loopcal.estimate.losses import Huber, Tukey
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares

@@ -27,8 +27,7 @@ from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.start_values import check_start_values
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
-from loopcal.estimate.fit_input import check_types, exclude_poses
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.information import count_equations
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.result import Identification

@@ -28,13 +28,17 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.errors import MechanismError
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit, linearize_rows_of
+from loopcal.estimate.fit_linearization import (
+    FitLinearization,
+    fold_sources,
+    linearize_fit,
+    linearize_rows_of,
+)
+from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
-from loopcal.estimate.source_rows import fold_sources
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits

@@ -37,12 +37,11 @@ from loopcal.diagnose.residual_patterns import (
     estimate_correlated_errors,
     find_patterns,
 )
-from loopcal.estimate.added_covariance import add_covariance
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import choose_severity
-from loopcal.estimate.result import Identification
+from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma

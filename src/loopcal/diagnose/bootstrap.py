@@ -33,8 +33,8 @@ from loopcal.diagnose.intervals import NAMED, OFF, Intervals, compare_ends, repo
 from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.observation_rows import ObservationRows, linked_blocks
 from loopcal.estimate.penalties import MAP, LeastSquares

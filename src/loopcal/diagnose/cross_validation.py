@@ -28,9 +28,8 @@ from loopcal.diagnose.row_errors import (
     join_errors,
 )
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import free_only, select_free_parameters
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options

@@ -24,11 +24,10 @@ import numpy as np
 from loopcal.diagnose.repeated_poses import LEVEL as REPEATS_LEVEL
 from loopcal.diagnose.repeated_poses import check_lack_of_fit
 from loopcal.diagnose.residual_patterns import LEVEL
-from loopcal.estimate.added_covariance import add_covariance
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy
 from loopcal.estimate.residual_test import FEWEST_DEGREES, choose_severity, count_sigma_degrees
-from loopcal.estimate.result import Identification
+from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.smooth_errors import SmoothErrors, describe_smooth_errors
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements

@@ -27,8 +27,7 @@ import numpy as np
 
 from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.errors import LoopcalError
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import check_fitted_data, exclude_poses, identify
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels

@@ -26,8 +26,8 @@ from loopcal.diagnose.intervals import (
     report_intervals,
 )
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.prior import WithPrior
 from loopcal.estimate.resampling import repeat_trial, resample_rows

@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from loopcal.diagnose.cross_validation import cross_validate, score_leave_one_out
-from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import GCV, MarginalLikelihood, Ridge, TruncatedSVD, TruncationGCV
 from loopcal.estimate.problem import problem_of

@@ -18,7 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.identification import exclude_poses
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.residual_test import SIGNIFICANCE

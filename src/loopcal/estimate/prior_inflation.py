@@ -17,13 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.estimate.added_covariance import add_covariance
 from loopcal.estimate.descent import Descent
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.penalties import MAP, Method
 from loopcal.estimate.posterior import TOLERANCES, CovariancePart, find_variance_sources
 from loopcal.estimate.prior_conflict import LEVEL, PriorConflict, assess_prior_conflict
-from loopcal.estimate.result import Identification
+from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.tolerance_components import (
     LARGEST_FACTOR,
     WIDEST,

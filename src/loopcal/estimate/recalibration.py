@@ -19,9 +19,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import check_types, identify
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import Posterior

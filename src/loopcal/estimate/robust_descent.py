@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.estimate.added_covariance import add_covariance
 from loopcal.estimate.descent import Descent
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.losses import Huber, Loss, Tukey, weigh_blocks
@@ -31,7 +30,7 @@ from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.residual_test import SIGNIFICANCE
-from loopcal.estimate.result import Identification
+from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import report_finding
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.numerics.statistics import (

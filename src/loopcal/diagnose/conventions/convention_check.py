@@ -45,8 +45,8 @@ from loopcal.diagnose.conventions.selection import (
     shares_poses,
 )
 from loopcal.errors import DataError
-from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.identification import check_types
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.data_checks import (
