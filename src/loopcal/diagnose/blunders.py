@@ -151,7 +151,7 @@ class Predictor(NamedTuple):
         values = np.array([[self.values[name] for name in table.names]]).reshape(1, -1)
         member = np.unique(linked_blocks(data), return_inverse=True)[1]
         poses = list_block_labels(data.labels, member)
-        total = problem.count_leverage_rows(member, len(poses))
+        total = problem.poses.count_rows(member, len(poses))
         by_y = self._predict(table.names, table.dimensions)
         noise = 1.0 if self.uncertainty is None else self.uncertainty.noise_scale
         groups = []

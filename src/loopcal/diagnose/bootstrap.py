@@ -40,7 +40,7 @@ from loopcal.estimate.observation_rows import ObservationRows, linked_blocks
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.pose_linearization import linearize_rows
 from loopcal.estimate.problem import Problem
-from loopcal.estimate.resampling import Resamples, draw_centers, fit_resamples, join_fits
+from loopcal.estimate.resampling import ResampleFits, Resamples, draw_centers, fit_resamples
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -585,7 +585,7 @@ def bootstrap(
         progress(first, count, "fitting resamples")
         batches.append(fit_resamples(fit, linear, draw(min(BATCH, count - first))))
     progress(count, count, "fitting resamples")
-    fits = join_fits(batches)
+    fits = ResampleFits.join(batches)
     kept = fits.take(np.flatnonzero(fits.converged))
     if len(kept.deviation) < 2:
         raise EstimationError(report_finding("sampling.resamples-failed", count=count))

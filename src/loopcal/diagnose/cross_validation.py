@@ -240,7 +240,7 @@ def score_leave_one_out(
     blocks, member = np.unique(linked_blocks(data), return_inverse=True)
     square, equations = np.zeros((len(blocks), len(penalty))), np.zeros(len(blocks))
     total, rows = (
-        problem.count_leverage_rows(member, len(blocks)),
+        problem.poses.count_rows(member, len(blocks)),
         problem.leverage_rows(linearization),
     )
     for numbers, A, r in iterate_blocks(rows, member, total):

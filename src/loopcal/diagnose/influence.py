@@ -75,7 +75,7 @@ def compute_influence(
         roots.append(d.scale[:, None] * d.directions[0] * sd)
         changes.append((solved - linearization.deviation)[0])
     results = [make_empty_influence(u) for _ in fits]
-    total = problem.count_leverage_rows(member, u)
+    total = problem.poses.count_rows(member, u)
     rows = problem.leverage_rows(linearization, solution)
     for blocks, columns, r in iterate_blocks(rows, member, total):
         # nuisance parameters come first, in units of their standard deviation
@@ -127,7 +127,7 @@ def iterate_blocks(
     """Yield blocks of equal size together: numbers (b,), matrices (b, m, p), residuals (b, m).
 
     A block whose rows come with several chunks of poses waits until the last of them. `total` (u,)
-    is the number of rows of each block, see `Problem.count_leverage_rows`.
+    is the number of rows of each block, see `PoseRows.count_rows`.
     """
     waiting: list[tuple[IntArray, FloatArray]] = []
     for rows_of_block in rows_of_problem:

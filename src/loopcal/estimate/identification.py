@@ -15,11 +15,7 @@ from loopcal.estimate.fit_descent import fit_with_tolerances, get_method, report
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.losses import Loss
-from loopcal.estimate.nuisance_estimate import (
-    add_followers,
-    empty_nuisance_estimate,
-    estimate_nuisance,
-)
+from loopcal.estimate.nuisance_estimate import NuisanceEstimate, add_followers, estimate_nuisance
 from loopcal.estimate.null_space import describe_null_space
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
@@ -38,7 +34,7 @@ from loopcal.estimate.posterior import (
     find_shown_noise,
     find_variance_sources,
 )
-from loopcal.estimate.prior import collect_used_rows, refuse_reused_rows, report_unknown_rows
+from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest, run_residual_test
@@ -57,6 +53,7 @@ from loopcal.estimate.unfixed_motions import FrameRows, describe_frames
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators
+from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
@@ -141,12 +138,6 @@ def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
         raise EstimationError(report_finding("fit.no-measured-value"))
 
 
-def count_spare_equations(problem: Problem) -> int:
-    """Return the number of equations less that of parameters and nuisance parameters."""
-    nuisance = 0 if problem.nuisance is None else problem.nuisance.unpenalized_count
-    return int(problem.equations[0]) - problem.parameters - nuisance
-
-
 def check_count(problem: Problem, data: Measurements, method: Method, allow_fewer: bool) -> None:
     """Refuse fewer equations than parameters where the method has no prior to fill the gap.
 
@@ -189,7 +180,7 @@ def check_start(
     if np.isfinite(cost[0]):
         return
     start = problem.start(deviation)
-    lost = problem.find_unreached(deviation, start)
+    lost = problem.poses.find_unreached(deviation, start)
     if len(lost) > 0:
         raise EstimationError(
             report_finding(
@@ -333,7 +324,8 @@ def identify(
     problem = problem_of(free, data, options.nuisance)
     check_rows(problem, data, robot)
     refuse_reused_rows(options.prior, data)
-    options = choose_noise(options, data, count_spare_equations(problem))
+    unknowns = len(free) + (0 if problem.nuisance is None else problem.nuisance.unpenalized_count)
+    options = choose_noise(options, data, int(problem.equations[0]) - unknowns)
     method = adapt_method(options.method or default, free.assumed, options.noise, free.correlation)
     options = replace(options, method=method)
     check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
@@ -349,10 +341,16 @@ def identify(
     result = add_factor_uncertainty(result, fit)
     if options.loss is not None:
         result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
-    findings = [*result.findings, *report_unknown_rows(options.prior)]
+    findings = list(result.findings)
+    rows: FittedRows | None = collect_fitted_rows(
+        data, are_readings_fitted=robot.program.sigma is not None
+    )
+    if (earlier := options.prior) is not None:
+        if earlier.fitted_rows is None:
+            findings.append(report_finding("prior.rows-unknown"))
+        rows = None if earlier.fitted_rows is None else earlier.fitted_rows.joined(rows)
     if unclosed.poses:
         findings.append(unclosed.report("fit.poses-open-at-start"))
-    rows = collect_used_rows(robot, data, options.prior)
     d, test = fit.decomposition, result.residual_test
     posterior = replace(
         result.posterior,
@@ -406,7 +404,7 @@ def _assemble(
     conflict, on_prior = run_prior_tests(free, fit, method)
     plain, values = d.plain(), free.values(fit.deviation)[0]
     corrected, setup = robot.with_values(values), weighted.nuisance
-    nuisance = empty_nuisance_estimate(problem.parameters)
+    nuisance = NuisanceEstimate.empty(problem.parameters)
     if setup is not None and linearization is not None:
         # a fit begins with the setup that fits its first robot best, with all poses and no weights
         began_there = options.start is None and not is_weighted

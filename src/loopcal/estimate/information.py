@@ -114,7 +114,7 @@ def collect_information(free: FreeParameters, data: Measurements) -> tuple[Float
     linearization = problem.linearize(z, start)
     is_reached = np.ones(data.n_poses, dtype=bool)
     if not np.isfinite(linearization.cost[0]):
-        is_reached[problem.find_unreached(z, start)] = False
+        is_reached[problem.poses.find_unreached(z, start)] = False
     return linearization.factor, is_reached
 
 
@@ -136,12 +136,8 @@ def instrument_factor(poses: ObservedPoses, measured: Measurements) -> FloatArra
     nuisance = measured.nuisance_parameters
     rows = observe_rows(poses, measured, nuisance, nuisance.values())
     factor = engine.fold(empty_factor(1, len(nuisance) + len(poses.free)), rows)
-    with_prior = engine.fold(factor, _prior_rows(nuisance, len(poses.free)))
-    return eliminate_from_factor(with_prior, len(nuisance))
-
-
-def _prior_rows(nuisance: NuisanceParameters, p: int) -> FloatArray:
-    """Return rows (1, U, U + p + 1) of nuisance parameters with a tolerance; zero for others."""
     has_prior = nuisance.table.free & ~np.isnan(nuisance.table.tolerance)
     weight = np.where(has_prior, 1.0 / np.where(has_prior, nuisance.table.tolerance, 1.0), 0.0)
-    return np.concatenate([np.diag(weight), np.zeros((len(nuisance), p + 1))], axis=1)[None]
+    nothing = np.zeros((len(nuisance), len(poses.free) + 1))
+    prior_rows = np.concatenate([np.diag(weight), nothing], axis=1)[None]
+    return eliminate_from_factor(engine.fold(factor, prior_rows), len(nuisance))

@@ -23,11 +23,11 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.setup_parameters import ROTATION_AXES
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.parameters import Parameter, ParameterTable
+from loopcal.parameters import ParameterTable
 from loopcal.results.description import Field, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import Dimension, find_unit
+from loopcal.units import Dimension
 
 SMALLEST_EFFECT = 1e-7
 """Share of all that the machine does to a nuisance parameter below which a direction does not move
@@ -96,6 +96,13 @@ class NuisanceEstimate(TableResult):
             number = f"{value / factor:>14.{decimals}f}"
             lines.append(f"{entry.name:<{width}} {number} {half:>12} {symbol}")
         return "\n".join(lines) if self.names else "no setup parameters"
+
+    @classmethod
+    def empty(cls, parameters: int) -> NuisanceEstimate:
+        """Return the estimate of no nuisance parameters at all, for p parameters."""
+        nothing, slope = np.zeros(0), np.zeros((0, parameters))
+        root, is_unobservable = np.zeros((0, 0)), np.zeros(0, dtype=bool)
+        return cls(ParameterTable(()), nothing, nothing, nothing, slope, root, is_unobservable, ())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -168,15 +175,6 @@ class NuisanceEstimate(TableResult):
         return (report_finding(code, names=owners),) if owners else ()
 
 
-def empty_nuisance_estimate(parameters: int) -> NuisanceEstimate:
-    """Return the estimate of no nuisance parameters at all, for p parameters."""
-    nothing, slope = np.zeros(0), np.zeros((0, parameters))
-    root, is_unobservable = np.zeros((0, 0)), np.zeros(0, dtype=bool)
-    return NuisanceEstimate(
-        ParameterTable(()), nothing, nothing, nothing, slope, root, is_unobservable, ()
-    )
-
-
 def estimate_nuisance(
     nuisance: NuisanceElimination,
     linearization: Linearization,
@@ -198,7 +196,8 @@ def estimate_nuisance(
     """
     table = nuisance.local.table
     begin = linearization.next_start.first_nuisance[0] if start is None else start
-    shown = tuple(_display_unit(robot, p) for p in table.entries)
+    units = [robot.get_unit(entry.dimension) for entry in table.entries]
+    shown = tuple((unit.factor_to_si, unit.symbol) for unit in units)
     U, p = len(table), len(decomposition.scale)
     if linearization.nuisance is None or not np.isfinite(linearization.cost[0]):
         estimate, nothing = linearization.next_start.nuisance[0].copy(), np.zeros(U)
@@ -269,12 +268,6 @@ def _only_displaces(
 def _owners(names: Iterable[str]) -> list[str]:
     """Return the frames, targets and surfaces to which parameters such as `tracker.x` belong."""
     return list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
-
-
-def _display_unit(robot: Mechanism, entry: Parameter) -> tuple[float, str]:
-    """Return factor to SI and symbol of the unit in which a parameter is shown."""
-    symbol = robot.units[entry.dimension]
-    return find_unit(symbol).factor_to_si, symbol
 
 
 def format_half_width(half: float) -> tuple[int, str]:

@@ -20,10 +20,6 @@ TRIAL_BLOCK = 16384
 is in memory: larger parts leave less time to Python, which runs in one thread at a time."""
 
 
-def _no_nuisance() -> IntArray:
-    return np.zeros((0, 0), dtype=np.int64)
-
-
 @dataclass(frozen=True, eq=False)
 class ObservationRows:
     """Rows of one kind for t trials.
@@ -43,7 +39,7 @@ class ObservationRows:
     poses: IntArray
     measured: FloatArray
     whitener: FloatArray
-    nuisance: IntArray = field(default_factory=_no_nuisance)
+    nuisance: IntArray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
     factor: FloatArray | None = None
     offset: FloatArray | None = None
 

@@ -22,9 +22,9 @@ from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.posterior import NOISE, CovariancePart, Posterior
 from loopcal.estimate.problem import Problem
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
-from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
+from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import are_nonzero
@@ -263,22 +263,6 @@ def refuse_reused_rows(earlier: Prior | Posterior | None, data: Measurements) ->
     if reused.count:
         others = reused.total - reused.count
         raise DataError(report_finding("prior.rows-reused", **reused._asdict(), others=others))
-
-
-def collect_used_rows(
-    robot: Mechanism, data: Measurements, prior: Prior | None
-) -> FittedRows | None:
-    """Return the measured rows of a fit and those of its prior; None where these are not known."""
-    rows = collect_fitted_rows(data, are_readings_fitted=robot.program.sigma is not None)
-    if prior is None:
-        return rows
-    return None if prior.fitted_rows is None else prior.fitted_rows.joined(rows)
-
-
-def report_unknown_rows(prior: Prior | None) -> list[Finding]:
-    """Return the finding that nobody knows which rows a prior comes from, where this is so."""
-    is_unknown = prior is not None and prior.fitted_rows is None
-    return [report_finding("prior.rows-unknown")] if is_unknown else []
 
 
 def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:

@@ -442,13 +442,6 @@ class Problem:
             of_poses = [part for part in node_rows if part.kind not in of_base]
             yield list(spread_rows(self.poses, block, of_poses, self.parameters, at_nodes))
 
-    def count_leverage_rows(self, member: IntArray, count: int) -> IntArray:
-        """Return how many rows `leverage_rows` gives of each of `count` blocks of poses.
-
-        `member` (n,) is the block of each pose.
-        """
-        return self.poses.count_rows(member, count)
-
     def count_pose_directions(
         self, solution: PoseSolution, member: IntArray, count: int
     ) -> IntArray:
@@ -460,10 +453,6 @@ class Problem:
             return np.zeros(count, dtype=np.int64)
         blocks = member[self.poses.first_pose]
         return np.bincount(blocks, solution.estimates.rank[0], count).astype(np.int64)
-
-    def find_unreached(self, deviation: FloatArray, start: Start) -> IntArray:
-        """Return the poses that a row needs and that are not reached at deviation (1, p)."""
-        return self.poses.find_unreached(deviation, start)
 
     def _eliminate(self, solution: PoseSolution, z: FloatArray, start: Start) -> Linearization:
         """Fold all rows at a solution and eliminate the nuisance parameters."""

@@ -120,8 +120,12 @@ def recalibrate(
     _check_names(robot, prior)
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
     change = assess_change(robot, data, earlier, names, free_limb or MACHINE, options, progress)
-    used = _used_prior(robot, prior, free_limb, names)
-    chosen = replace(options, prior=used)
+    if free_limb is not None:  # a freed limb is at its tolerances again
+        free = select_free_parameters(robot)
+        places = [free.names.index(name) for name in names]
+        nominal, tolerance = free.nominal[places], free.tolerance[places]
+        prior = prior.without(names).toleranced(names, nominal, tolerance)
+    chosen = replace(options, prior=prior)
     fit = identify(robot, data, LeastSquares(), options=chosen, progress=progress)
     return replace(fit, findings=(*fit.findings, change.finding)), change
 
@@ -248,15 +252,6 @@ def _explain_by_one(
     factor, symbols = fit.free_parameters.display()
     change = (fit.estimate[i] - prior.mean[prior.names.index(name)]) / factor[i]
     return {"tried": True, "parameter": name, "change": f"{change:+.3g} {symbols[i]}"}
-
-
-def _used_prior(robot: Mechanism, prior: Prior, limb: str | None, names: tuple[str, ...]) -> Prior:
-    """Return the prior of the fit: all of it, or with a freed limb at its tolerances again."""
-    if limb is None:
-        return prior
-    free = select_free_parameters(robot)
-    places = [free.names.index(name) for name in names]
-    return prior.without(names).toleranced(names, free.nominal[places], free.tolerance[places])
 
 
 def _check_options(options: FitOptions) -> FitOptions:

@@ -10,7 +10,6 @@ a prior is an observation, too, and its error is drawn from its stated distribut
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,6 +78,7 @@ class ResampleFits(TrialBatch):
         return self.status == DescentStatus.CONVERGED
 
 
+@dataclass(frozen=True, eq=False)
 class CenteredProblem:
     """A problem of t trials whose deviations count from a center (t, p) of their own.
 
@@ -88,11 +88,6 @@ class CenteredProblem:
     problem: LeastSquaresProblem
     center: FloatArray
     equations: IntArray
-
-    def __init__(
-        self, problem: LeastSquaresProblem, center: FloatArray, equations: IntArray
-    ) -> None:
-        self.problem, self.center, self.equations = problem, center, equations
 
     @property
     def parameters(self) -> int:
@@ -105,10 +100,8 @@ class CenteredProblem:
 
     def take(self, trials: IntArray) -> CenteredProblem:
         """Return the problem of some trials."""
-        other = copy(self)
-        other.problem = self.problem.take(trials)
-        other.center, other.equations = self.center[trials], self.equations[trials]
-        return other
+        own = self.problem.take(trials)
+        return CenteredProblem(own, self.center[trials], self.equations[trials])
 
     def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
         """Linearize at deviations (t, p) from the centers."""
@@ -197,8 +190,3 @@ def draw_centers(linear: FitLinearization, count: int, rng: np.random.Generator)
 def repeat_trial(start: Start, count: int) -> Start:
     """Return a start of one trial as that of `count` trials."""
     return map_arrays(lambda array: np.repeat(array[:1], count, axis=0), start)
-
-
-def join_fits(batches: Sequence[ResampleFits]) -> ResampleFits:
-    """Return the fits of all batches."""
-    return TrialBatch.join(batches)

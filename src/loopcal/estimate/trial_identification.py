@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -36,8 +36,6 @@ from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.results.description import Field, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-# --- The result of identifying many machines at once.
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +110,6 @@ class IdentifiedTrials(TableResult):
         )
         return scaled * self.free_parameters.tolerance
 
-
-# --- A start for many trials: one step of each with a factor that all of them share.
 
 ACCEPTED_STEP = 1e-3
 """A trial that began with a chord has converged where all further steps together would change the
@@ -265,14 +261,10 @@ def identify_trials(
     if chord_start and options.begin == "kinematics" and len(values) == 1:
         shared = share_factor(problem, z[:1], method, options.rank_tolerance)
     fits = _fit_parts(problem, z, options, free, threads, shared)
+    *arrays, models = zip(*fits, strict=True)
+    deviation, status, iterations, cost = map(np.concatenate, arrays)
     return IdentifiedTrials(
-        free.values(np.concatenate([fit.deviation for fit in fits])),
-        np.concatenate([fit.status for fit in fits]),
-        np.concatenate([fit.iterations for fit in fits]),
-        np.concatenate([fit.cost for fit in fits]),
-        free,
-        tuple(fit.linear_model for fit in fits),
-        method,
+        free.values(deviation), status, iterations, cost, free, tuple(models), method
     )
 
 
@@ -283,16 +275,6 @@ def check_threads(threads: int) -> None:
         raise EstimationError(f"threads is {threads}; give 1 or more")
 
 
-class _Part(NamedTuple):
-    """What is kept of the fits of a part, see `Descent`."""
-
-    deviation: FloatArray
-    status: IntArray
-    iterations: IntArray
-    cost: FloatArray
-    linear_model: LinearModel
-
-
 def _fit_parts(
     problem: Problem,
     z: FloatArray,
@@ -300,21 +282,21 @@ def _fit_parts(
     free: FreeParameters,
     threads: int,
     shared: SharedFactor | None,
-) -> list[_Part]:
-    """Return the fits of all parts of the trials, which begin at deviations z (t, p), with chords
-    where a factor is shared.
+) -> list[tuple[FloatArray, IntArray, IntArray, FloatArray, LinearModel]]:
+    """Return deviation, status, iterations, cost and linear model (see `Descent`) of all parts of
+    the trials, which begin at deviations z (t, p), with chords where a factor is shared.
     """
     # all trials begin with the nuisance parameters of the first one that reaches its poses
     start = None if problem.nuisance is None else problem.start(z)
 
-    def fit(part: IntArray) -> _Part:
+    def fit(part: IntArray) -> tuple[FloatArray, IntArray, IntArray, FloatArray, LinearModel]:
         own, begin = _cut_problem(problem, part), None if start is None else start.take(part)
         if shared is None:
             first = fit_rows(own, z[part], begin, options)
         else:
             first = _descend_from_chords(own, z[part], options, shared)
         fit = repeat_trials(own, first, options, free)
-        return _Part(fit.deviation, fit.status, fit.iterations, fit.cost, fit.linear_model)
+        return (fit.deviation, fit.status, fit.iterations, fit.cost, fit.linear_model)
 
     batches = divide_trials(problem, threads)
     if threads == 1 or len(batches) == 1:
@@ -368,9 +350,6 @@ def _cut_problem(problem: Problem, trials: IntArray) -> Problem:
     rows = (r.cut_trials(numbers) for r in problem.rows)
     cut = problem.with_rows(rows)
     return replace(cut, trials=own, data=lambda i: data(int(numbers[i])))
-
-
-# --- The posterior of one of many simulated machines that were identified at once.
 
 
 def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) -> Posterior:
