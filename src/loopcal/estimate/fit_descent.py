@@ -57,11 +57,10 @@ def fit_part_first(
 ) -> Descent | None:
     """Descend from a deviation (1, p) with a part of the poses, and from there with all of them.
 
-    None where a part cannot be used, where the residuals of all poses are not finite at the
-    deviation, or where one of the two descents does not converge within the steps of `control`: all
-    poses together then begin at the deviation. The history has the steps of the part. Its first sum
-    of squares is that of all poses, the others of the part are estimates: sums of the part times
-    the ratio of the numbers of equations.
+    None where a part cannot be used, where the residuals at the deviation are not finite, or where
+    a descent does not converge within the steps of `control`. The history has the steps of the
+    part, whose sums of squares are estimates for all poses: times the ratio of the numbers of
+    equations.
     """
     part = select_part(problem) if type(method) in METHODS else None
     if part is None:
@@ -107,12 +106,9 @@ def sum_squares(problem: Problem, deviation: FloatArray) -> float:
 
 
 def select_part(problem: Problem) -> Problem | None:
-    """Return the problem of a spread part of the poses.
-
-    None where the poses are too few, several trials are fitted at once, or something other than the
-    free parameters and the readings determines the rows: uncertain or missing readings, nuisance
-    parameters, rows that compare poses, measured passive joints, smooth errors, chains of stages,
-    or fewer readings than lengths (`Problem.folds_plain_rows`).
+    """Return the problem of a spread part of the poses; None where the poses are too few, several
+    trials are fitted at once, or something other than the free parameters and the readings
+    determines the rows (`Problem.folds_plain_rows`).
     """
     n = problem.readings.shape[1]
     if not problem.folds_plain_rows or len(problem) != 1:

@@ -91,12 +91,9 @@ class FitLinearization(NamedTuple):
 
 
 def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
-    """Linearize the rows of a fit at its estimate.
+    """Linearize the rows of a fit that converged at its estimate.
 
-    Parameters
-    ----------
-    fit : a fit that converged. data : its measurements, with the sigma of their readings, without
-        excluded poses.
+    `data` are its measurements, with the sigma of their readings, without excluded poses.
     """
     problem, solution, linearization = _linearize(fit, data)
     method = fit.method
@@ -124,11 +121,7 @@ def linearize_smooth_errors(
     fit: Identification, data: Measurements, errors: SmoothErrors, linear: FitLinearization
 ) -> Linearization:
     """Linearize the rows of a fit also by the coefficients of errors of the poses, whose columns
-    follow those of the parameters.
-
-    Parameters
-    ----------
-    fit, data : as of `linearize_fit`. linear : of both; its poses and nuisance parameters stay.
+    follow those of the parameters. Poses and nuisance parameters stay those of `linear`.
     """
     solution, free = linear.solution, replace(fit.free_parameters, errors=errors)
     if solution.linearized is not None:
@@ -244,15 +237,8 @@ def collect_uncertainty(fit: Identification) -> FitUncertainty:
 def uncertainty_from_arrays(
     robot: Mechanism, names: tuple[str, ...], arrays: Mapping[str, np.ndarray], noise_scale: float
 ) -> FitUncertainty | None:
-    """Return the joint uncertainty in the arrays of a run folder; None in one that has none.
-
-    Parameters
-    ----------
-    robot : the corrected robot of the run. names : (U,) of its nuisance parameters.
-
-    Raises
-    ------
-    EstimationError : see `posterior_from_arrays`.
+    """Return the joint uncertainty of a corrected robot and its nuisance parameters `names` in the
+    arrays of a run folder; None in one that has none. Raises as `posterior_from_arrays`.
     """
     if SLOPE not in arrays or ROOT not in arrays:
         return None
@@ -263,15 +249,11 @@ def uncertainty_from_arrays(
 def fold_sources(
     problem: Problem, linearization: Linearization, sources: Sequence[IntArray], count: int
 ) -> FloatArray:
-    """Return triangular factors (count, U + p, U + p) of the rows of each source.
+    """Return triangular factors (count, U + p, U + p) of the rows of each source (one machine).
 
-    The first U columns are in units of the standard deviations of the nuisance parameters, those of
-    the machine follow them; see `LeverageRows`.
-
-    Parameters
-    ----------
-    problem : of one machine. linearization : of it. sources : of every kind, (r,) number of the
-        source of each row.
+    `sources` are, of every kind, the number (r,) of the source of each row. The first U columns are
+    in units of the standard deviations of the nuisance parameters, those of the machine follow
+    them.
     """
     z, p = linearization.deviation, problem.parameters
     estimate, poses = linearization.nuisance, problem.poses

@@ -85,17 +85,8 @@ def check_fitted_data(fit: Identification, data: Measurements) -> None:
 
 
 def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
-    """Return the measurements with weight 0 for every row that belongs to one of these poses.
-
-    The poses keep their places; their readings do not count either.
-
-    Parameters
-    ----------
-    data : measurements. excluded : labels of poses.
-
-    Raises
-    ------
-    DataError : the data have no such pose.
+    """Return the measurements with weight 0 for every row and reading of poses of these labels;
+    they keep their places. Raises DataError for an unknown label.
     """
     if not excluded:
         return data
@@ -121,11 +112,6 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
 def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
     """Refuse readings of another robot, held-out poses, a robot without free parameters, and data
     without any row.
-
-    Raises
-    ------
-    DataError : wrong number of actuators, or `data.held-out-fitted`.
-    EstimationError : `fit.no-free-parameter` or `fit.no-measured-value`.
     """
     check_actuators(data, robot)
     if count := int(data.is_held_out.sum()):
@@ -139,13 +125,7 @@ def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
 
 
 def check_count(problem: Problem, data: Measurements, method: Method, allow_fewer: bool) -> None:
-    """Refuse fewer equations than parameters where the method has no prior to fill the gap.
-
-    Raises
-    ------
-    EstimationError : `fit.too-few-equations`, with the number of poses that would be enough, or
-        `fit.no-equation-left`.
-    """
+    """Refuse fewer equations than parameters where the method has no prior to fill the gap."""
     nuisance = 0 if problem.nuisance is None else problem.nuisance.unpenalized_count
     required = method.required_equations(problem.parameters)
     m, p = int(problem.equations[0]), required + nuisance
@@ -171,12 +151,7 @@ def check_count(problem: Problem, data: Measurements, method: Method, allow_fewe
 def check_start(
     problem: Problem, data: Measurements, deviation: FloatArray, cost: FloatArray
 ) -> None:
-    """Refuse a start at which some residuals are not finite.
-
-    Raises
-    ------
-    EstimationError : `fit.poses-out-of-reach` or `fit.residuals-not-finite`, with the poses.
-    """
+    """Refuse a start at which some residuals are not finite, with the poses."""
     if np.isfinite(cost[0]):
         return
     start = problem.start(deviation)

@@ -99,14 +99,9 @@ def observe_rows(
 
 
 def collect_information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, BoolArray]:
-    """Fold all rows of measurements at the robot's present values.
-
-    Nuisance parameters and uncertain poses are where the measurements put them.
-
-    Returns
-    -------
-    factor : (1, p + 1, p + 1) of rows [A | r], nuisance parameters eliminated.
-    is_reached : (n,) poses that close or that no row needs; the rows of the others are missing.
+    """Return the factor (1, p + 1, p + 1) of all rows [A | r] of measurements at the robot's
+    present values, nuisance parameters eliminated, and the poses (n,) that close or that no row
+    needs. Nuisance parameters and uncertain poses are where the measurements put them.
     """
     problem = problem_of(free, data)
     z = free.deviation(free.robot.values[None])

@@ -140,12 +140,8 @@ def describe_loss(loss: Loss) -> str:
 
 
 def block_limit(single: float, degrees: FloatArray) -> FloatArray:
-    """Return the limit (u,) of a block's norm with the exceedance probability of `single`.
-
-    Parameters
-    ----------
-    single : limit of one normal residual, in standard deviations. degrees : (u,) residuals of each
-        block.
+    """Return the limit (u,) of the norm of a block of `degrees` (u,) residuals with the exceedance
+    probability of `single`, the limit of one normal residual, in standard deviations.
     """
     from scipy.special import ndtr
 

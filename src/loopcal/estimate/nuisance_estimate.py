@@ -121,12 +121,8 @@ class NuisanceEstimate(TableResult):
 
     def count_degrees(self, parts: Iterable[CovariancePart], tolerance: FloatArray) -> FloatArray:
         """Return the effective degrees of freedom (U,) of the standard deviations; infinite where
-        nothing in them was estimated.
-
-        Parameters
-        ----------
-        parts : of the posterior of the machine; the noise is also that of the setup parameters at a
-            known machine. tolerance : (p,) of the parameters [SI].
+        nothing in them was estimated. The noise among the parts of the machine's posterior is also
+        that of the setup parameters at a known machine; `tolerance` (p,) [SI].
         """
         own = np.nan_to_num((self.root**2).sum(axis=1))
         squares = []
@@ -136,12 +132,8 @@ class NuisanceEstimate(TableResult):
         return combine_degrees(self.sd**2, squares)
 
     def rows(self, coverage: FloatArray, degrees: FloatArray) -> list[dict[str, Any]]:
-        """Return one entry for each, in its unit, ready for JSON.
-
-        Parameters
-        ----------
-        coverage : (U,) number of standard deviations in `plus_minus`.
-        degrees : (U,) of the standard deviations.
+        """Return one entry for each, in its unit, ready for JSON; `coverage` (U,) is the number of
+        standard deviations in `plus_minus`, `degrees` (U,) is theirs.
         """
         shown = []
         for i, entry in enumerate(self.table.entries):
@@ -184,15 +176,11 @@ def estimate_nuisance(
     noise: float,
     start: FloatArray | None = None,
 ) -> NuisanceEstimate:
-    """Return the nuisance parameters of one trial after a fit.
+    """Return the nuisance parameters of one trial after a fit, linearized at the estimate.
 
-    Parameters
-    ----------
-    nuisance : of the problem. linearization : at the estimate (t = 1).
-    robot : for its units. decomposition : of the fit (t = 1).
-    variance : (p,) of each of its directions.
-    noise : variance of the whitened rows; NaN where no interval is given.
-    start : (U,) values that fit the initial geometry; default: those with which the fit began.
+    `variance` (p,) is that of each direction of the decomposition, `noise` that of the whitened
+    rows; NaN where no interval is given. `start` (U,) fits the initial geometry; by default the fit
+    began there.
     """
     table = nuisance.local.table
     begin = linearization.next_start.first_nuisance[0] if start is None else start

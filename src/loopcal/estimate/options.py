@@ -184,10 +184,6 @@ class FitOptions:
 def find_foreign_setting(plain: Mapping[str, Any]) -> tuple[str, str] | None:
     """Return the first setting that stands beside the name of a method it does not belong to, with
     the method that it belongs to; None where there is none.
-
-    Raises
-    ------
-    DataError : an unknown method.
     """
     method = METHODS.resolve(plain.get("method", "auto"))
     for key, (owner, _) in SETTINGS.items():
@@ -272,13 +268,7 @@ def _refuse_object(plain: Any) -> None:
 def merge_options(
     options: FitOptions | None, method: Method | None = None, loss: Loss | None = None
 ) -> FitOptions:
-    """Return options in which a method and a loss that are not None replace those of `options`.
-
-    Raises
-    ------
-    DataError : `options` is no `FitOptions`.
-    EstimationError : the merged options are not allowed.
-    """
+    """Return options in which a method and a loss that are not None replace those of `options`."""
     if options is None:
         return FitOptions(method=method, loss=loss)
     check_type(options, FitOptions, "options", "such as FitOptions(noise='estimated')")

@@ -459,12 +459,8 @@ def decompose_for(
     deviation: FloatArray,
     tolerance: float = RANK_TOLERANCE,
 ) -> Decomposition:
-    """Decompose the factor of linearized rows in the coordinates that a method penalizes.
-
-    Parameters
-    ----------
-    factor : (t, p + 1, p + 1), columns scaled by tolerance. equations : (t,) that were folded.
-    deviation : (t, p) where the rows were linearized. tolerance : relative rank tolerance.
+    """Decompose the factor (t, p + 1, p + 1) of rows that were linearized at deviations (t, p), in
+    the coordinates that a method penalizes.
     """
     p = deviation.shape[1]
     return decompose(
@@ -491,12 +487,8 @@ def adapt_method(
     noise: Literal["given", "estimated"],
     correlation: FloatArray | None = None,
 ) -> Method:
-    """Return the method of a fit: the default where it is None; MAP with what it must know.
-
-    Parameters
-    ----------
-    assumed : (p,) free parameters whose tolerance is not stated. noise : see `FitOptions`.
-    correlation : (p, p) of the deviations, where the robot states common errors.
+    """Return the method of a fit: the default where it is None; MAP with what it must know, which
+    tolerances (p,) are assumed and the correlation (p, p) of the deviations by common errors.
     """
     method = MAP(InflatedTolerances()) if method is None else method
     if not isinstance(method, MAP):

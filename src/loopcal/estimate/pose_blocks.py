@@ -150,12 +150,8 @@ def _take_rows(
 
 
 def find_components(n: int, rows: Sequence[ObservationRows], coordinates: int) -> IntArray:
-    """Return the component (n,) of each pose, numbered by first poses.
-
-    Raises
-    ------
-    EstimationError
-        A component has more than `LARGEST` coordinates.
+    """Return the component (n,) of each pose, numbered by first poses; raises EstimationError for
+    one with more than `LARGEST` coordinates.
     """
     pairs = [consecutive_pairs(r.poses) for r in rows if r.poses.ndim > 1]
     links = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
@@ -176,10 +172,8 @@ def _group_components(
 ) -> tuple[ComponentGroup, ...]:
     """Group a block's components by number of poses, structure and, roughly, number of rows.
 
-    Parameters
-    ----------
-    rows : of the block. member : (b,) component of each of its poses.
-    nodes, structures : of all components, -1 without nuisance parameters.
+    `member` (b,) is the component of each of its poses; `nodes` and `structures` are those of all
+    components, -1 without nuisance parameters.
     """
     numbers, local, lengths = np.unique(member, return_inverse=True, return_counts=True)
     heights, starts = np.zeros(len(numbers), dtype=np.int64), []
@@ -229,17 +223,11 @@ def stack_rows(
     coordinates: int,
     tree: EliminationTree | None,
 ) -> FloatArray:
-    """Stack the rows of a group's components, [u | nuisance | machine | residual].
+    """Stack the rows of a group's components, [u | nuisance | machine | residual], into (a, C,
+    height, L k + w + p + 1).
 
-    Parameters
-    ----------
-    kinds : rows of every kind of the block, None without any. coordinates : k of a pose.
-    tree : of the nuisance parameters; None leaves out their columns, which are those of the path of
-        each component's node, w of them.
-
-    Returns
-    -------
-    rows : (a, C, height, L k + w + p + 1).
+    The w columns of nuisance parameters are those of the path of each component's node; there are
+    none without a tree.
     """
     present = next(kind for kind in kinds if kind is not None)
     a, p, k = len(present.residual), present.by_parameters.shape[-1], coordinates

@@ -85,13 +85,9 @@ class PoseCoordinates:
         follow: bool,
         driven: DrivenJoints | None = None,
     ) -> PoseStates:
-        """Solve closure of poses (m,) at parameter values (a, p), keeping what u moves.
-
-        Parameters
-        ----------
-        begin : states (a, m); home by default.
-        follow : whether a pose that Newton does not solve is followed along a path.
-        driven : joints that these readings drive, where they are known.
+        """Solve closure of poses (m,) at parameter values (a, p) from states (a, m), keeping what u
+        moves. `follow` tells whether a pose that Newton does not solve is followed along a path,
+        `driven` are joints that these readings drive, where they are known.
         """
         robot, state = self.free.robot, None if begin is None else begin.state
         q = self.readings_at(poses)

@@ -177,17 +177,8 @@ states."""
 
 
 def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solution, BoolArray]:
-    """Return the poses of all readings.
-
-    Returns
-    -------
-    solution : of n poses.
-    is_determined : (n,) poses that the readings determine which were taken and are believed.
-
-    Raises
-    ------
-    DataError
-        A redundant reading is stated to be exact.
+    """Return the poses of all readings, and which of them (n,) the readings determine that were
+    taken and are believed. Raises DataError where a redundant reading is stated to be exact.
     """
     if robot.program.sigma is not None:
         data = fill_in_reading_sigma(robot, data)
@@ -232,15 +223,8 @@ def fit_poses(
 ) -> PoseFit:
     """Return the poses where uncertain readings and all rows fit best at this geometry.
 
-    Parameters
-    ----------
-    data : with at least one uncertain reading. nuisance : with fixed values; those without are
-        fitted as well. None leaves the rows out: readings alone locate the poses.
-
-    Raises
-    ------
-    DataError
-        A redundant reading is stated to be exact.
+    Of `nuisance` those without fixed values are fitted as well. None leaves the rows out: readings
+    alone locate the poses. Raises DataError where a redundant reading is stated to be exact.
     """
     data, nothing = fill_in_reading_sigma(robot, data), np.zeros(0)
     if nuisance is None:

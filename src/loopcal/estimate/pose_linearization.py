@@ -100,14 +100,9 @@ def linearize_poses(
     names: Sequence[str] = (),
     reading_scale: FloatArray | None = None,
 ) -> LinearizedPoses:
-    """Linearize solved poses by the implicit function theorem.
-
-    Parameters
-    ----------
-    values : (a | 1, p of the robot) [SI]. q : (a | 1, n, actuators) readings [SI].
-    state : (a, n) solved there. names : joints whose values and derivatives are needed.
-    reading_scale : (n, actuators) [SI], optional. With it the coordinates of a pose are its
-        readings in these units.
+    """Linearize solved poses (a, n) at readings q by the implicit function theorem, with the named
+    joints. With `reading_scale` (n, actuators) [SI] the coordinates of a pose are its readings in
+    these units.
     """
     robot = free.robot
     solved = differentiate_pose(robot, values, q, state, free.columns)

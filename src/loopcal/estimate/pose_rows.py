@@ -171,14 +171,11 @@ class PoseRows:
         known: PoseSolution | None = None,
         derivatives: bool = True,
     ) -> PoseSolution:
-        """Solve for poses and nuisance parameters where all rows fit best.
+        """Solve for poses and nuisance parameters where all rows fit best, at deviations z (a, p).
 
-        Parameters
-        ----------
-        z : (a, p) deviations. trials : (a,) numbers of the rows' trials. start : of the a trials.
-        fixed : (a, U), optional; nuisance parameters that are not solved for.
-        known : poses without coordinates, the same for all trials, where they are solved already.
-        derivatives : whether poses without coordinates are linearized, too.
+        Nuisance parameters that are `fixed` (a, U) are not solved for. `known` are poses without
+        coordinates that are solved already, the same for all trials; `derivatives` tells whether
+        such poses are linearized.
         """
         solves_nuisance = self.nuisance is not None and fixed is None
         nuisance = start.predict_nuisance(z) if solves_nuisance else fixed

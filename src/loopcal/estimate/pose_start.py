@@ -46,18 +46,10 @@ with which they determine all freedoms."""
 def measure_poses(
     robot: Mechanism, rows: Sequence[ObservationRows], trial: IntArray, pose: IntArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Return where the rows of k poses put the platform.
+    """Return where the rows of k poses, of these trials and numbers (k,), put the platform (k, 4,
+    4), and which poses (k,) they determine in full; T has no meaning for the others.
 
     Rows that use nuisance parameters, compare poses, or look at joints are passed over.
-
-    Parameters
-    ----------
-    robot : at its present values. rows : what was measured. trial, pose : (k,) which poses.
-
-    Returns
-    -------
-    T : (k, 4, 4). is_full : (k,) poses that the rows determine in full; T has no meaning for the
-        others.
     """
     usable = _usable_rows(rows, pose)
     T = np.tile(robot.home, (len(pose), 1, 1))
@@ -276,11 +268,8 @@ def first_poses(
 ) -> PoseStates:
     """Return where the poses of all trials begin, at the robot's present values.
 
-    Parameters
-    ----------
-    recorded : (t | 1, n, actuators) [SI], NaN where a reading was not taken.
-    sigma : (n, actuators) [SI], infinite where a reading is not believed.
-    rows : what was measured. trials : t.
+    `recorded` (t | 1, n, actuators) is NaN where a reading was not taken, `sigma` (n, actuators) is
+    infinite where one is not believed.
     """
     missing = np.isnan(recorded) | np.isinf(sigma)
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]

@@ -64,20 +64,13 @@ class CovariancePart(NamedTuple):
 
 
 def combine_degrees(total: FloatArray, squares: Iterable[tuple[FloatArray, float]]) -> FloatArray:
-    """Return the effective degrees of freedom (..,) of variances.
-
-    With parts u_i^2 of nu_i degrees of freedom (Welch-Satterthwaite, JCGM 100, G.4):
+    """Return the effective degrees of freedom (..,) of variances u^2 = `total`, from the variance
+    and the degrees of freedom nu_i of each part u_i^2 that was estimated (Welch-Satterthwaite, JCGM
+    100, G.4):
 
         degrees = u^4 / sum(u_i^4 / nu_i)
 
-    Parameters
-    ----------
-    total : (..,) variance u^2 of all parts, also those that are known. squares : variance (..,) and
-        degrees of freedom of each part that was estimated.
-
-    Returns
-    -------
-    At least the smallest nu_i; infinite where nothing was estimated, or the variance is infinite.
+    They are at least the smallest nu_i; infinite where nothing was estimated, or u is infinite.
     """
     spread = sum((square**2 / nu for square, nu in squares), np.zeros_like(total))
     is_estimated = np.isfinite(total) & (spread > 0.0)
@@ -367,11 +360,7 @@ class Posterior:
 
     def count_degrees(self, effect: FloatArray) -> FloatArray:
         """Return the effective degrees of freedom (..,) of the size of errors, whose square is the
-        sum of the squares of c components; see `combine_degrees`.
-
-        Parameters
-        ----------
-        effect : (.., c, p) [per SI] of the components.
+        sum of the squares of the components of `effect` (.., c, p) [per SI]; see `combine_degrees`.
         """
         squares = ((_sum_squares(effect @ part.root), part.degrees) for part in self.parts)
         return combine_degrees(_sum_squares(effect @ self.root), squares)

@@ -249,13 +249,7 @@ def _find_noise_share(earlier: Posterior) -> tuple[FloatArray, float]:
 def refuse_reused_rows(earlier: Prior | Posterior | None, data: Measurements) -> None:
     """Refuse measurements of which an earlier calibration has used rows: they would count twice.
 
-    Parameters
-    ----------
-    earlier : the calibration, or the prior made of it, if any. data : the new measurements.
-
-    Raises
-    ------
-    DataError : `prior.rows-reused`, with the labels of the poses to exclude.
+    Raises DataError `prior.rows-reused`, with the labels of the poses to exclude.
     """
     if earlier is None or earlier.fitted_rows is None:
         return

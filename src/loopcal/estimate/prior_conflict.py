@@ -155,15 +155,9 @@ def assess_prior_conflict(
     deviation: FloatArray,
     components: tuple[ToleranceComponent, ...] = (),
 ) -> PriorConflict:
-    """Test the prior of a fit (t = 1).
-
-    Parameters
-    ----------
-    free : the parameters. decomposition : of the fit, for the stated tolerances, its rows divided
-        by the noise that they show.
-    inflation : factor by which the method inflated all of them.
-    deviation : (p,) of the estimate, in tolerances.
-    components : parts of the tolerances that the method inflated further.
+    """Test the prior of a fit (t = 1), from its decomposition for the stated tolerances, rows
+    divided by the noise that they show, and its deviation (p,) in tolerances. `inflation` and
+    `components` are what the method inflated.
     """
     statistic, degrees = (float(value[0]) for value in compute_prior_statistic(decomposition))
     p_value = float(compute_chi_square_tail(degrees, statistic))

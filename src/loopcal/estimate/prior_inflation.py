@@ -147,12 +147,8 @@ def optimize_variance(size: FloatArray, square: FloatArray) -> tuple[float, floa
 def estimate_variance_spread(
     data: PredictedData, component: ToleranceComponent, variance: float
 ) -> float:
-    """Return the root mean square deviation of a component's log factor from that of `variance`.
-
-    Parameters
-    ----------
-    data : predicted without the component (t = 1). variance : of the component with the factor on
-        all tolerances.
+    """Return the root mean square deviation of a component's log factor from that of `variance`,
+    for data predicted without the component (t = 1).
     """
     size, square = data.project(np.array([component.places]), component.kind == "shift")
     center = 0.5 * np.log1p(variance)
@@ -265,11 +261,8 @@ NAMED = 4
 
 
 def report_undetectable(free: FreeParameters, rows: Decomposition) -> list[Finding]:
-    """Return a finding where deviations of WIDE tolerances would stay undetected.
-
-    Parameters
-    ----------
-    free : the parameters. rows : for the stated tolerances, divided by their noise (t = 1).
+    """Return a finding where deviations of WIDE tolerances would stay undetected by rows for the
+    stated tolerances, divided by their noise (t = 1).
     """
     Q, count = predict(rows, np.ones(1)).information[0], int((~free.assumed).sum())
     if count == 0:
@@ -301,11 +294,8 @@ def report_undetectable(free: FreeParameters, rows: Decomposition) -> list[Findi
 
 
 def find_information(size: float, count: int) -> float:
-    """Return the E'Q E with which a deviation is detected in four of five data sets.
-
-    Parameters
-    ----------
-    size : of the deviation, in tolerances. count : number of statistics of the test.
+    """Return the E'Q E with which a deviation of `size` tolerances is detected in four of five data
+    sets by a test of `count` statistics.
     """
     level = compute_single_level(LEVEL, 3 * count)
     threshold = float(np.sqrt(compute_chi_square_quantile(1.0, level)))
@@ -322,13 +312,8 @@ SAME_FACTOR = 0.05
 def choose_methods(
     free: FreeParameters, fit: Descent, method: Method, trials: Sequence[int] | None = None
 ) -> dict[int, MAP]:
-    """Return the method with which a trial must be fitted again, by trial.
-
-    These are trials whose data ask for other components of the tolerances than those of `method`.
-
-    Parameters
-    ----------
-    free : the parameters. fit : of t trials by `method`. trials : that are asked, default all.
+    """Return the method with which a trial must be fitted again, by trial: those whose data ask for
+    other components of the tolerances than those of `method`.
     """
     if not (isinstance(method, MAP) and isinstance(method.inflation, InflatedTolerances)):
         return {}

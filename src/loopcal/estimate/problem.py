@@ -89,11 +89,7 @@ def spread_rows(
     """Give rows with columns for all nuisance parameters, poses eliminated (one trial).
 
     The columns of the p free parameters are those by which the nuisance parameters follow.
-
-    Parameters
-    ----------
-    poses : of the problem. block, node_rows : see `PoseRows.iterate_rows`.
-    at_nodes : None without nuisance parameters.
+    `at_nodes` is None without nuisance parameters.
     """
     wide = 0 if poses.nuisance is None else len(poses.nuisance)
     for part in node_rows:
@@ -144,12 +140,8 @@ class ConsistentPoses(NamedTuple):
     def move(
         self, solution: PoseSolution, z: FloatArray, trials: IntArray, start: Start
     ) -> PoseStates:
-        """Return poses (a, n) and readings at which the rows have the recorded gaps.
-
-        Parameters
-        ----------
-        solution : of the problem, whose nuisance parameters stay. z : (a, p) deviations.
-        trials : (a,) their numbers.
+        """Return poses (a, n) and readings at which the rows have the recorded gaps, at the
+        nuisance parameters of a solution.
         """
         begin = solution.states
         if solution.estimates is None or begin is None:
@@ -167,14 +159,11 @@ class ConsistentPoses(NamedTuple):
 def remove_null_space(
     factor: FloatArray, reference: FloatArray, tolerance: float = RANK_TOLERANCE
 ) -> FloatArray:
-    """Return a factor without the directions that the rows of a reference do not determine.
+    """Return a factor (t, p + 1, p + 1) without the directions that the rows of a reference with
+    the same columns do not determine.
 
     With the null space N of the reference, A becomes A (I - N N'). Where the reference has full
     rank, or numbers that are not finite, the factor stays as it is.
-
-    Parameters
-    ----------
-    factor, reference : (t, p + 1, p + 1) upper triangular, of rows [A | b] with the same columns.
     """
     p = factor.shape[-1] - 1
     finite = np.isfinite(reference).all(axis=(1, 2))
@@ -299,16 +288,11 @@ class Problem:
         return replace(self, poses=replace(self.poses, coordinates=coordinates))
 
     def start(self, deviation: FloatArray | None = None, seek: bool = True) -> Start:
-        """Return the first start.
-
-        Parameters
-        ----------
-        deviation : (t, p), optional; default: the robot's present values.
-        seek : whether nuisance parameters without a prior are found from the data; otherwise they
-            begin at their nominal values.
+        """Return the first start at deviations (t, p), by default the robot's present values.
 
         All trials begin with the nuisance parameters that fit the first one whose poses are
-        reached: trials are measured with the same instruments.
+        reached: trials are measured with the same instruments. Unless these are sought, all begin
+        at nominal values.
         """
         t, p = len(self), self.parameters
         if deviation is None:

@@ -139,13 +139,9 @@ def assess_change(
     options: FitOptions | None = None,
     progress: Progress = report_no_progress,
 ) -> Change:
-    """Test whether these parameters are still those of an earlier calibration.
-
-    Parameters
-    ----------
-    robot, data : as for `identify`. earlier : the earlier calibration.
-    names : the parameters in question. subject : their common name for the finding.
-    options : of the fits. Both calibrations count with the noise that their residuals show.
+    """Test whether the parameters `names` are still those of an earlier calibration; `subject` is
+    their common name for the finding. Both calibrations count with the noise that their residuals
+    show.
     """
     options = replace(options or FitOptions(), method=LeastSquares(), noise="given")
     prior = prior_from(with_shown_noise(earlier))
@@ -205,12 +201,11 @@ def _divide_by_source(
     prior: Prior, names: tuple[str, ...], kept: Identification, freed: Identification
 ) -> tuple[float, float]:
     """Return how many degrees of freedom of the chi-square of a change the noise of the earlier
-    rows causes, and how many the known uncertainty of the earlier calibration, such as tolerances;
-    the new rows cause the rest.
+    rows causes, and how many the known uncertainty of the earlier calibration, such as tolerances.
 
-    The chi-square is the squared length of the projection of all rows, those of the prior and the
-    new ones, on as many dimensions as it has degrees of freedom. The part of a row is its leverage
-    in the fit that allows a change, less that in the fit without one.
+    The chi-square is the squared length of the projection of all rows on as many dimensions as it
+    has degrees of freedom. The part of a row is its leverage in the fit that allows a change, less
+    that in the fit without one.
     """
     depending, others = prior.split(names)
     part = (depending**2).sum(axis=1)

@@ -117,12 +117,9 @@ def resample_rows(
     offset: Sequence[FloatArray] | None,
     prior_mean: FloatArray,
 ) -> Problem:
-    """Return the problem of t resamples of the rows of a problem (one trial).
-
-    Parameters
-    ----------
-    weight : (t, n) factors on each pose's squares. offset : of every kind (t, r, m), added to the
-        whitened residuals. prior_mean : (t, U) [SI] of the nuisance parameters.
+    """Return the problem of t resamples of the rows of a problem (one trial), with factors `weight`
+    (t, n) on each pose's squares, `offset` (t, r, m) of every kind added to the whitened residuals,
+    and means (t, U) [SI] of the priors of nuisance parameters.
     """
     rows = problem.rows if weight is None else tuple(r.weighted(weight) for r in problem.rows)
     if offset is not None:
@@ -137,12 +134,7 @@ def resample_rows(
 def fit_resamples(
     fit: Identification, linear: FitLinearization, resamples: Resamples
 ) -> ResampleFits:
-    """Fit resamples of the rows of a fit, each from its estimate.
-
-    Parameters
-    ----------
-    fit : a fit that converged. linear : its rows, see `linearize_fit`.
-    """
+    """Fit resamples of the rows of a fit that converged, each from its estimate."""
     t, method = len(resamples), fit.method
     changed = (resamples.weight, resamples.offset, resamples.nuisance)
     problem = resample_rows(linear.problem, *changed)

@@ -158,15 +158,9 @@ def run_residual_test(
 ) -> ResidualTest:
     """Test the residuals of a fit (t = 1).
 
-    Parameters
-    ----------
-    decomposition, penalty : of the fit. noise : "given", "estimated" or "assumed"; with assumed
-        noise the test is a note.
-    sigma_uncertainty : relative standard uncertainty of the stated sigmas.
-    weighted : whether a loss chose the weights by the residuals, so that the sum of squares has no
-        known distribution.
-    converged : whether the iteration did; elsewhere than at the minimum there are neither tests nor
-        intervals.
+    With assumed noise the test is a note. Where a loss chose the weights by the residuals, the sum
+    of squares has no known distribution; elsewhere than at the minimum there are neither tests nor
+    intervals.
     """
     if not converged:
         nan = np.nan
@@ -204,13 +198,8 @@ def _estimate_scale(
 
 
 def count_sigma_degrees(noise: str, uncertainty: float) -> float:
-    """Return nu0, the degrees of freedom that the stated sigmas count for: infinite where they are
-    exact, 0 where the noise is estimated.
-
-    Parameters
-    ----------
-    noise : "given", "estimated" or "assumed". uncertainty : relative standard uncertainty u of the
-        stated sigmas.
+    """Return nu0, the degrees of freedom that the stated sigmas count for with this relative
+    standard uncertainty: infinite where they are exact, 0 where the noise is estimated.
     """
     if noise == "estimated":
         return 0.0

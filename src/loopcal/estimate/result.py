@@ -190,14 +190,9 @@ def report_status(status: DescentStatus, iterations: int) -> Finding:
 def report_divergence(
     free: FreeParameters, deviation: FloatArray, method: Method, converged: bool
 ) -> list[Finding]:
-    """Return findings on estimates far beyond their stated tolerances.
+    """Return findings on estimates (p,) far beyond their stated tolerances, in these.
 
     Nothing is reported where the tolerances are a prior: then `PriorConflict` tests them.
-
-    Parameters
-    ----------
-    free : the parameters. deviation : (p,) estimate - nominal, in tolerances.
-    method : of the fit. converged : whether the iteration did.
     """
     if isinstance(method, MAP):
         return []
@@ -251,11 +246,8 @@ def report_equations(equations: int, parameters: int, method: Method) -> list[Fi
 def report_unknown_bias(
     free: FreeParameters, method: Method, prior: FloatArray | None
 ) -> list[Finding]:
-    """Return why a ridge has no intervals, where its bias is not known.
-
-    Parameters
-    ----------
-    prior : (1, p) variance of the true coordinates, see `Method.prior_variance`.
+    """Return why a ridge has no intervals, where its bias is not known: where `prior`, see
+    `Method.prior_variance`, is NaN.
     """
     if not isinstance(method, Ridge) or prior is None or not np.isnan(prior).any():
         return []
@@ -658,22 +650,13 @@ class FitFigures:
 def add_covariance(
     fit: Identification, root: FloatArray, degrees: float, finding: Finding
 ) -> Identification:
-    """Return a fit whose parameters have the additional covariance root root'.
+    """Return a fit whose parameters have the additional covariance root root', root (p, k) [SI].
 
-    Estimates do not change. `covariance` and `posterior` stay consistent; directions of infinite
-    variance stay infinite, and a fit without intervals (NaN) stays without. The setup parameters
-    follow the machine by their slope, and get the covariance S root root' S'. Several additions can
-    follow each other; each counts with its own degrees of freedom in the effective ones of every
-    interval (`Posterior.count_degrees`).
-
-    Parameters
-    ----------
-    fit : an identification.
-    root : (p, k) [SI] square root of the covariance to add, parameters in the order of `fit.names`.
-    degrees : degrees of freedom of its size, where it was estimated from data; infinite where it is
-        known.
-    finding : why it is added. It joins the findings of the fit, and its code is the source of the
-        new part of `posterior.parts`.
+    Estimates do not change. Directions of infinite variance stay infinite, and a fit without
+    intervals (NaN) stays without. The setup parameters follow the machine by their slope. `degrees`
+    of freedom of the size of the covariance, infinite where it is known, count in the effective
+    ones of every interval. The finding says why it is added; its code is the source of the new part
+    of `posterior.parts`.
     """
     root = np.asarray(root, dtype=np.float64)
     return replace(

@@ -77,14 +77,10 @@ def descend_robustly(
     run: Run,
     prior: Prior | None = None,
 ) -> RobustFit:
-    """Fit with a loss (one trial).
+    """Fit with a loss (one trial), blocks of poses numbered by `block` (n,).
 
-    Parameters
-    ----------
-    problem : unweighted. block : (n,) block of each pose. deviation : (1, p) where to begin.
-    estimate_scale : whether sigmas are only known up to a factor; it is then the median of the
-        blocks' distances.
-    run : descends a problem, with the rows of the prior. prior : the one that `run` adds.
+    Where sigmas are only known up to a factor (`estimate_scale`), it is the median of the blocks'
+    distances. `run` descends a problem, with the rows of the prior.
     """
     member = np.unique(block, return_inverse=True)[1]
     fit = RobustFit(run(problem, deviation, None), problem, np.ones(len(block)))
@@ -112,12 +108,8 @@ def descend_robustly(
 def measure_block_distances(
     problem: Problem, z: FloatArray, start: Start, member: IntArray, weighted: Problem
 ) -> tuple[FloatArray, FloatArray]:
-    """Return d = |W r| (u,) and the number of residuals (u,) of every block.
-
-    Parameters
-    ----------
-    z, start : deviation (1, p), and a start there. member : (n,) block of each pose.
-    weighted : the problem that the nuisance parameters fit best.
+    """Return d = |W r| (u,) and the number of residuals (u,) of every block at a deviation (1, p),
+    with the nuisance parameters that fit `weighted` best; `member` (n,) is the block of each pose.
     """
     count = int(member.max()) + 1
     nuisance = None
@@ -182,10 +174,6 @@ def add_loss_uncertainty(
     """Return a fit with a loss whose covariance allows for residuals that exceed the noise in it.
 
     Without a loss, or where the residuals agree with the noise (p > 0.001), it stays as it is.
-
-    Parameters
-    ----------
-    result, fit : of the weighted problem. problem : unweighted. blocks : (n,) of each pose.
     """
     loss, test = result.options.loss, result.residual_test
     if loss is None or not (result.converged and test.intervals):
@@ -207,12 +195,8 @@ def compute_loss_variance(
     loss: Loss, distance: FloatArray, counts: FloatArray, rank: int, unit: float = 1.0
 ) -> tuple[float, float]:
     """Return the variance of the noise that the covariance of the weighted rows must contain, and
-    its degrees of freedom.
-
-    Parameters
-    ----------
-    distance, counts : (u,) norm and number of whitened residuals of each block. rank : of the rows.
-    unit : noise by which the loss divides distances.
+    its degrees of freedom, from norm and number (u,) of the whitened residuals of each block. The
+    loss divides distances by `unit`.
     """
     weight = loss.weight(distance / unit, counts)
     longer = loss.weight(distance * (1.0 + STEP) / unit, counts)

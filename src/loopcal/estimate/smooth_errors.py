@@ -113,14 +113,11 @@ def describe_smooth_errors(
     *,
     by_rotation: bool = True,
 ) -> SmoothErrors:
-    """Return errors of unit amplitude (1 rad, 1 m) about reference poses T (n, 4, 4).
+    """Return errors of unit amplitude (1 rad, 1 m) about reference poses T (n, 4, 4), at a tool
+    point (3,) [m] of a robot of this size [m].
 
-    Parameters
-    ----------
-    tool : (3,) [m] tool point in the platform frame. size : of the robot [m].
-    length : over which errors vary, in halves of the range of each coordinate; a small one leaves
-        errors that different poses do not share. most : largest number of centers.
-    by_rotation : whether errors vary with the rotation of the platform, too.
+    They vary over `length` halves of the range of each coordinate; a small one leaves errors that
+    different poses do not share. There are at most `most` centers.
     """
     u, _, vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

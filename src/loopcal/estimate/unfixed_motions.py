@@ -129,12 +129,7 @@ class FrameRows:
 def find_unfixed_motions(
     problem: Problem, deviation: FloatArray, start: Start
 ) -> FloatArray | None:
-    """Return the result of `FrameRows` at deviation (1, p).
-
-    Parameters
-    ----------
-    problem : of one machine. start : near the poses and setup parameters.
-    """
+    """Return the result of `FrameRows` at deviation (1, p) of one machine."""
     located = problem.poses.locate(deviation, start)
     if located is None:
         return None
@@ -162,12 +157,8 @@ def find_frame_knowledge(
     linearization: Linearization | None = None,
     noise: float = 1.0,
 ) -> FrameKnowledge:
-    """Return how the measurements of one machine determine frames, at deviation (1, p).
-
-    Parameters
-    ----------
-    problem, data : measurements. start : near the poses and setup parameters. The others as of
-        `describe_frames`.
+    """Return how the measurements of one machine determine frames, at deviation (1, p); see
+    `describe_frames`.
     """
     unfixed = find_unfixed_motions(problem, deviation, start)
     return describe_frames(problem, data, unfixed, prior, linearization, noise)
@@ -181,14 +172,11 @@ def describe_frames(
     linearization: Linearization | None = None,
     noise: float = 1.0,
 ) -> FrameKnowledge:
-    """Return how the measurements of one machine determine frames.
+    """Return how the measurements of one machine determine frames, with motions from
+    `FrameRows.find_unfixed`.
 
-    Parameters
-    ----------
-    problem, data : measurements. unfixed : from `FrameRows.find_unfixed`.
-    prior : an earlier calibration, which may determine frames that these measurements do not.
-    linearization : there; without it the unknown frames of instruments are not described.
-    noise : variance of the whitened rows; where it is not finite, they are not described either.
+    An earlier calibration may determine frames that these measurements do not. Without a
+    linearization, or a finite noise variance, the unknown frames of instruments are not described.
     """
     readings = data.readings
     if len(readings) > MOST_READINGS:

@@ -95,13 +95,10 @@ class EliminationTree:
 
 
 def build_tree(is_free: BoolArray, scopes: Sequence[str], sets: IntArray) -> EliminationTree:
-    """Build the elimination tree of U unknowns.
+    """Build the elimination tree of U unknowns, some of them fixed, with their scopes.
 
-    Parameters
-    ----------
-    is_free : (U,) unknowns that are not fixed. scopes : (U,) the scope of each, see `SCOPES`.
-    sets : (k, 2) pairs (set, unknown). The unknowns of one set must lie on one path, because a
-        row, or rows that are eliminated together, use them.
+    `sets` (k, 2) are pairs (set, unknown). The unknowns of one set must lie on one path, because a
+    row, or rows that are eliminated together, use them.
     """
     if not is_free.any():
         nowhere, nothing = np.full(len(is_free), -1), np.zeros(0, dtype=np.int64)
@@ -386,12 +383,8 @@ class TreeElimination(TrialBatch):
 
 
 def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
-    """Eliminate all unknowns.
-
-    Returns
-    -------
-    elimination : what becomes of the unknowns.
-    factor : (a, p + 1, p + 1) of the machine's rows that are left.
+    """Eliminate all unknowns; return also the factor (a, p + 1, p + 1) of the machine's rows that
+    are left.
     """
     tree, arrays = factors.tree, factors.arrays()
     length = _column_lengths(factors, arrays)
@@ -563,16 +556,11 @@ units of the last place.
 
 
 def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
-    """Return derivatives with zeros where they are rounding.
+    """Return derivatives with zeros where they are at most ROUNDING of the size of the terms whose
+    sum they are; with a size of zero, or not finite, they stay.
 
-    They are rounding where they are at most ROUNDING of the size of the terms whose sum they are.
     A column that is rounding must be set to zero BEFORE columns are scaled to length one: after
     that, a few units of the last place look like any other direction and produce an unbounded step.
-
-    Parameters
-    ----------
-    values : any shape. size : of the terms, broadcast to it; with a size of zero, or not finite,
-        values stay.
     """
     return np.where(
         (np.abs(values) <= ROUNDING * size) & (size > 0.0) & (size < np.inf), 0.0, values
@@ -622,17 +610,10 @@ class Elimination:
 def eliminate_from_triangle(
     triangle: FloatArray, right: FloatArray, below: FloatArray, length: FloatArray | None = None
 ) -> Elimination:
-    """Eliminate k unknowns from rows [[triangle, right], [0, below]].
+    """Eliminate k unknowns from rows [[triangle (.., k, k), right], [0, below (.., m, w)]].
 
-    Parameters
-    ----------
-    triangle : (.., k, k). right : (.., k, w). below : (.., m, w).
-    length : (.., k), optional. Lengths of the columns over all rows, where the triangle is what
-        earlier eliminations left of them; by default those of the triangle's columns.
-
-    Returns
-    -------
-    Elimination; its `rest` has k + m rows, those of observable directions being zero.
+    `length` (.., k) are those of the columns over all rows, where the triangle is what earlier
+    eliminations left of them. The `rest` has k + m rows, those of observable directions being zero.
     """
     if length is None:
         norm = np.linalg.norm(triangle, axis=-2)
@@ -693,11 +674,8 @@ def eliminate_columns(rows: FloatArray, count: int) -> Elimination:
 
 
 def eliminate_from_factor(factor: FloatArray, count: int) -> FloatArray:
-    """Eliminate the first `count` columns k of one triangular factor (1, k + c, k + c).
-
-    Returns
-    -------
-    factor : (1, c, c) of the rows left.
+    """Eliminate the first `count` columns k of one triangular factor (1, k + c, k + c); return the
+    factor (1, c, c) of the rows left.
     """
     if count == 0:
         return factor

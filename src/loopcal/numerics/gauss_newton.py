@@ -438,17 +438,9 @@ def minimize(
 ) -> Minimum:
     """Minimize sums of squares by damped Gauss-Newton, every trial on its own.
 
-    Parameters
-    ----------
-    model : rules of the problem. point : the start of all trials.
-    damping : of the steps. With `Damping`, chains of full steps are tried, see
-        `loopcal.numerics.gauss_newton`, and trials that make no progress end, see `Progress`.
-    iterations : evaluations after the first, at most.
-    observe : called with the points after every evaluation by which one of them moved.
-
-    Returns
-    -------
-    Minimum; a trial that fails is marked in `status` and never stops the others.
+    A trial that fails is marked in `status` and never stops the others. With `Damping`, chains of
+    full steps are tried, and trials that make no progress end, see `Progress`. `iterations` counts
+    the evaluations after the first; `observe` is called with the points after each that moved one.
     """
     run = _Run(model, point, damping)
     for i in range(iterations + 1):
@@ -519,21 +511,16 @@ def minimize_by_halving(
     control: Halving,
     is_part_worse: Callable[[Any, Any], BoolArray] | None = None,
 ) -> tuple[Any, BoolArray]:
-    """Minimize sums of squares by full Gauss-Newton steps, halved where they are too long.
+    """Minimize sums of squares by full Gauss-Newton steps, halved where they are too long; return
+    the last point and which trials (t,) converged.
 
     All trials are evaluated together in each attempt. What has ended is moved by a share of zero.
 
     Parameters
     ----------
-    point : the start, with `cost` (t,).
-    propose : from a point to its full step.
     move : from a point, its step and shares (t, m) of it to the next point.
-    is_part_worse : from two points to the parts (t, m) that became worse, where parts are
+    is_part_worse : from two points to the parts (t, m) that became worse, where these are
         independent; default: all parts of a trial whose sum of squares grew.
-
-    Returns
-    -------
-    point : the last one. is_converged : (t,).
     """
     stuck = ~np.isfinite(point.cost)
     converged = np.zeros(len(point.cost), dtype=bool)
@@ -587,15 +574,8 @@ standard deviation or of order one, and their Jacobians (c, M, u)."""
 def minimize_from_starts(
     linearize: Linearize, x: FloatArray, steps: int = STEPS
 ) -> tuple[FloatArray, FloatArray]:
-    """Minimize sums of squares from several starts at once, by damped Gauss-Newton.
-
-    Parameters
-    ----------
-    linearize : see `Linearize`. x : (c, u) starts. steps : at most.
-
-    Returns
-    -------
-    x : (c, u). cost : (c,) sums of squares; infinite where a start cannot be evaluated.
+    """Minimize sums of squares from starts x (c, u) at once, by damped Gauss-Newton; return the
+    ends and the sums of squares (c,), infinite where a start cannot be evaluated.
     """
     residual, jacobian = linearize(x, np.arange(len(x)))
     start = _Point(x, residual, jacobian, sum_squares(residual))

@@ -36,12 +36,8 @@ def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatAr
 def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) -> FloatArray:
     """Return the probability that F exceeds a statistic; NaN without degrees of freedom left.
 
-    F is a chi-square per degree of freedom, where the noise is estimated from residuals.
-
-    Parameters
-    ----------
-    degrees : degrees of freedom of the statistic; without one the probability is 1.
-    left : of the residuals; infinite for known noise. All broadcast.
+    F is a chi-square per degree of freedom, where the noise is estimated from residuals of `left`
+    degrees of freedom; infinite for known noise. Without `degrees` the probability is 1.
     """
     from scipy.special import fdtrc
 
@@ -57,25 +53,15 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
 
 
 def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> FloatArray:
-    """Return the statistic that chi-square exceeds with a probability.
-
-    Parameters
-    ----------
-    degrees : degrees of freedom, above 0. probability : of a larger value [1]. Both broadcast.
-    """
+    """Return the statistic that chi-square exceeds with a probability."""
     from scipy.special import chdtri
 
     return np.asarray(chdtri(degrees, probability), dtype=float)
 
 
 def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLike) -> FloatArray:
-    """Return the statistic that F exceeds with a probability.
-
-    Parameters
-    ----------
-    degrees : degrees of freedom of the statistic, above 0.
-    left : of the estimated noise, above 0; infinite for a known one: chi-square over `degrees`.
-    probability : of a larger value [1]. All broadcast.
+    """Return the statistic that F exceeds with a probability; `left` are the degrees of freedom of
+    the estimated noise, infinite for a known one: chi-square over `degrees`.
     """
     from scipy.special import fdtri
 
