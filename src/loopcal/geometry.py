@@ -236,26 +236,20 @@ def pose_difference(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
 def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> FloatArray:
     """Return the map (..., 6, 6) of platform twists to another point, written in other axes.
 
-    `omega' = Q omega`, `v' = Q (v + omega x arm)`: the matrix `[[Q, 0], [-Q hat(arm), Q]]`.
-
-    Parameters
-    ----------
-    arm : (..., 3) from the platform origin to the point, in base axes [m].
-    rotation : (..., 3, 3) Q, from base axes to the new axes (default: base axes).
+    `omega' = Q omega`, `v' = Q (v + omega x arm)`: the matrix `[[Q, 0], [-Q hat(arm), Q]]`, for the
+    arm (..., 3) [m] from the platform origin to the point, in base axes, and Q from base axes to
+    the new ones (default: base axes).
     """
     turned = np.eye(3) if rotation is None else rotation
     return stack_blocks(((turned, None), (-(turned @ hat(arm)), turned)))
 
 
 def differentiate_by_frames(T: FloatArray) -> FloatArray:
-    """Return the twists (..., 6, 12) of platforms by motions of their base and platform frames.
+    """Return the twists (..., 6, 12) of platforms at T_base_platform (..., 4, 4) [m] by motions of
+    their base and platform frames.
 
     A motion (w, c) of the base frame moves a pose by `(w, c + w x t)`, one of the platform frame by
     `(R w, R c)`.
-
-    Parameters
-    ----------
-    T : (..., 4, 4) T_base_platform [m].
     """
     R, t = T[..., :3, :3], T[..., :3, 3]
     eye = np.eye(3)
@@ -648,15 +642,11 @@ def align_point_sets(points: FloatArray, reference: FloatArray) -> FloatArray:
 
 
 def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> FloatArray:
-    """Return the rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`.
+    """Return the rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`, at most
+    `count` different ones, for positive semidefinite H (9, 9).
 
     The vector v holds the nine entries of R row by row. Damped Gauss-Newton on the rotation group
     begins at the rotation nearest to the unconstrained minimum and at the 24 rotations of a cube.
-
-    Parameters
-    ----------
-    H : (9, 9), positive semidefinite. g : (9,)
-    count : largest number of different rotations to return.
     """
     from loopcal.numerics.gauss_newton import minimize_from_starts
 
@@ -690,17 +680,12 @@ def _select_distinct(R: FloatArray) -> FloatArray:
 def solve_hand_eye(
     T: FloatArray, measured: FloatArray, frame: FloatArray | None, tool: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return frame F and tool X (4, 4) with `F measured = T X`; at most one of them is given.
+    """Return frame F and tool X (4, 4) with `F measured = T X`, for poses T_base_platform and
+    T_frame_tool (r, 4, 4). At most one of F and X is given; None where unknown.
 
     Rotations: the trace of `sum R_F' R_T R_X R_measured'` is largest at the leading singular
     vectors of `sum R_T kron R_measured` (Shah, Journal of Mechanisms and Robotics 5(3) 031007,
     2013, doi 10.1115/1.4024473). Translations follow from a linear system.
-
-    Parameters
-    ----------
-    T : (r, 4, 4) T_base_platform.
-    measured : (r, 4, 4) T_frame_tool.
-    frame, tool : (4, 4), or None where unknown.
     """
     A, B = T[:, :3, :3], measured[:, :3, :3]
     if tool is not None:
@@ -742,18 +727,12 @@ def solve_hand_eye(
 def solve_frame_and_points(
     measured: FloatArray, moving: FloatArray, constant: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a frame and points on a moving body from `R measured + t = moving p + constant`.
+    """Return candidates of a frame (k, 4, 4) and of the coordinates p (k, w) of points on a moving
+    body with `R measured + t = moving p + constant`, for measured (q, 3), moving (q, 3, w) and
+    constant (q, 3).
 
     For a given rotation R the other unknowns enter linearly. Eliminating them leaves a quadratic
     form of R.
-
-    Parameters
-    ----------
-    measured : (q, 3) points in the frame. moving : (q, 3, w). constant : (q, 3).
-
-    Returns
-    -------
-    frames : (k, 4, 4) candidates (R, t). points : (k, w), p of each candidate.
     """
     q, w = len(measured), moving.shape[-1]
     C = np.concatenate([moving, -np.broadcast_to(np.eye(3), (q, 3, 3))], axis=-1).reshape(
@@ -769,15 +748,11 @@ def solve_frame_and_points(
 
 
 def solve_resection(rays: FloatArray, points: FloatArray) -> FloatArray:
-    """Return candidate frames (k, 4, 4) of a station from rays to known points, the best first.
+    """Return candidate frames (k, 4, 4) of a station from rays to known points (r, 3) in the base
+    [m], the best first; rays are unit vectors b (r, 3) in the frame of the station.
 
     `(1 - b b') (A p - s) = 0` with A = R' and s = R' t is linear in A and s. Eliminating s leaves a
     quadratic form of A.
-
-    Parameters
-    ----------
-    rays : (r, 3) unit vectors b in the frame of the station.
-    points : (r, 3) points p in the base [m].
     """
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     middle = points.mean(axis=0)
@@ -796,18 +771,12 @@ def solve_resection(rays: FloatArray, points: FloatArray) -> FloatArray:
 def solve_trilateration(
     points: FloatArray, distances: FloatArray, *, with_offset: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return centers c and offsets o with `|p - c| + o = d`.
+    """Return centers c (k, 3) and offsets o (k,) with `|p - c| + o = d` for points p (r, 3) [m] and
+    distances d (r,) [m]; o is 0 unless it is unknown (`with_offset`).
 
     `|p|^2 - d^2 = 2 p'c - 2 d o - (|c|^2 - o^2)` is linear in c, o and the bracket. Distances from
-    points near a plane do not determine on which side of it c is, so both sides are candidates.
-
-    Parameters
-    ----------
-    points : (r, 3) p [m]. distances : (r,) d [m]. with_offset : whether o is unknown; else 0.
-
-    Returns
-    -------
-    centers : (k, 3), offsets : (k,); k = 3, or 2 (one on each side) where the points are coplanar.
+    points near a plane do not determine on which side of it c is, so both sides are candidates: k
+    is 3, or 2 where the points are coplanar.
     """
     middle = points.mean(axis=0)
     p = points - middle
@@ -832,21 +801,12 @@ def solve_trilateration(
 def solve_line_anchor(
     positions: FloatArray, extensions: FloatArray
 ) -> tuple[FloatArray, int, FloatArray]:
-    """Return the anchor a of a line from positions x and the extensions d of the line at them.
+    """Return the anchor a (3,) of a line from positions x (k, 3) and the extensions d (k,) of the
+    line at them, the rank of the equations, and their singular values.
 
     A line from a to x is d longer than at the origin: `|x - a| = |a| + d`, and therefore `x'a + d
-    |a| = (x'x - d^2) / 2`, which is linear in a and |a|.
-
-    Parameters
-    ----------
-    positions : (k, 3) x. extensions : (k,) d, in the same unit.
-
-    Returns
-    -------
-    anchor : (3,) a.
-    rank : of the equations. Below `ANCHOR_RANK` the positions are too few, or in a plane through
-        the origin, and the anchor is not determined.
-    singular_values : of the equations.
+    |a| = (x'x - d^2) / 2`, which is linear in a and |a|. Below `ANCHOR_RANK` the positions are too
+    few, or in a plane through the origin, and the anchor is not determined.
     """
     rows = np.column_stack([positions, extensions])
     target = 0.5 * ((positions * positions).sum(axis=1) - extensions * extensions)
@@ -857,20 +817,11 @@ def solve_line_anchor(
 def solve_directions(
     measured: FloatArray, rotations: FloatArray, axis: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return orientations R and directions a with `R measured = rotations a`, the best first.
+    """Return orientations R (k, 3, 3) and directions a (k, 3) with `R measured = rotations a`, the
+    best first, for unit vectors (r, 3) in the frame of the instrument and rotations (r, 3, 3).
 
     Each of R and a follows in closed form from the other one. The alternation begins at 24
-    orientations. A given `axis` leaves R alone, in one step.
-
-    Parameters
-    ----------
-    measured : (r, 3) unit vectors in the frame of the instrument.
-    rotations : (r, 3, 3).
-    axis : (3,) the direction a, or None where unknown.
-
-    Returns
-    -------
-    R : (k, 3, 3). a : (k, 3).
+    orientations. A given `axis` (3,) is a, and leaves R alone, in one step.
     """
     if axis is not None:
         R = project_to_rotations(np.einsum("rij,j,rk->ik", rotations, axis, measured))

@@ -168,7 +168,7 @@ def _add_prior(
     return linearization if prior is None else prior.added(problem).append(linearization)
 
 
-# --- What a fit knows of machine and nuisance parameters together, to predict other measurements.
+# What a fit knows of machine and nuisance parameters together, to predict other measurements.
 
 UNKNOWN = 1e6
 """Standard deviation in `unit` that stands for a direction of which nothing is known."""

@@ -361,7 +361,7 @@ def _is_every_pose(rows: ObservationRows, count: int) -> bool:
     return np.array_equal(rows.poses, np.arange(count))
 
 
-# --- Poses of a batch of trials: their states, and what solving for them gives.
+# Poses of a batch of trials: their states, and what solving for them gives.
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, Model, mi
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- Poses that rows measure in full, without readings.
+# Poses that rows measure in full, without readings.
 
 STEPS = 30
 """Gauss-Newton steps, at most. A position takes one, an orientation four."""

@@ -480,7 +480,7 @@ class Problem:
         return states if len(self.trials) == total else states.take(self.trials)
 
 
-# --- Construction of a problem: from the measurements of one machine, or of many simulated ones.
+# Construction of a problem: from the measurements of one machine, or of many simulated ones.
 
 POSE_CONTROL = Halving(attempts=10, stuck=1e-3)
 """Control of the iteration to uncertain poses, which may lie at the end of their reach."""

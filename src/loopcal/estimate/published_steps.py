@@ -238,7 +238,7 @@ def _count_steps(
     return low
 
 
-# --- The six least-squares problems of the paper's section 3: changes of leg length by parameters.
+# The six least-squares problems of the paper's section 3: changes of leg length by parameters.
 
 SHARED = 1e-9
 """Share of a column of G, relative to its largest entry, that counts as no effect on a leg."""

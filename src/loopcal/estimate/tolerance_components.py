@@ -27,7 +27,7 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray
 
-# --- The most probable factor on all tolerances, and how well the data determine it.
+# The most probable factor on all tolerances, and how well the data determine it.
 
 LARGEST_FACTOR = 1e6
 """Factor on tolerances up to which the most probable one is searched."""

@@ -401,7 +401,7 @@ def _split(
     return Decomposition(s, directions, c, outside, rows, scale, tolerance, dual, marked)
 
 
-# --- Systems with one triangular matrix and many right sides, by numpy.
+# Systems with one triangular matrix and many right sides, by numpy.
 
 
 def substitute_backward(R: FloatArray, b: FloatArray) -> FloatArray:
@@ -422,7 +422,7 @@ def substitute_transposed(R: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(R.T[::-1, ::-1], b[::-1])[::-1], dtype=np.float64)
 
 
-# --- Upper triangular systems R x = b of many trials, and how far each R is from a singular
+# Upper triangular systems R x = b of many trials, and how far each R is from a singular
 # matrix.
 
 PART = 12

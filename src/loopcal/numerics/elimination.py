@@ -26,7 +26,7 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-# --- The elimination tree: in which order unknowns of different scopes are eliminated.
+# The elimination tree: in which order unknowns of different scopes are eliminated.
 
 SCOPES = ("machine", "session", "group", "pose")
 """Scopes of unknowns, from the outermost to the innermost."""
@@ -547,7 +547,7 @@ def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArra
         out[:, chosen, : triangle.shape[2]] = triangle
 
 
-# --- Derivatives that are nothing but rounding.
+# Derivatives that are nothing but rounding.
 
 ROUNDING = 1e-12
 """Share of the size of its terms below which a sum of a few products is rounding: some thousand
@@ -567,7 +567,7 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
     )
 
 
-# --- Elimination of leading columns of stacked rows by orthogonal projection.
+# Elimination of leading columns of stacked rows by orthogonal projection.
 
 SMALLEST_ROW = 1e-14
 """Rows that the projection leaves shorter than this share of the largest are rounding."""

@@ -96,7 +96,7 @@ def compute_averaged_tail(
     return float(compute_chi_square_tail(degrees, chi_square / true).mean())
 
 
-# --- Levels and probabilities where several tests are made at once.
+# Levels and probabilities where several tests are made at once.
 
 NEAR_ONE = 1.0 - 1e-16
 """Largest probability of a test whose complement a double still has."""
@@ -114,7 +114,7 @@ def compute_single_level(level: float, tests: int) -> float:
     return float(-np.expm1(np.log1p(-min(level, NEAR_ONE)) / max(tests, 1)))
 
 
-# --- A variance component of a vector whose elements else have equal, unknown variance.
+# A variance component of a vector whose elements else have equal, unknown variance.
 
 STEPS, NEWTON = 400, 100
 """Values of tau that are compared, and most steps to the saddlepoint."""
@@ -208,7 +208,7 @@ def _tail(values: FloatArray) -> float:
     return float(ndtr(-(w + np.log(v / w) / w)))
 
 
-# --- Distinct values and medians without masked arrays.
+# Distinct values and medians without masked arrays.
 
 
 def find_distinct(values: NDArray[Any]) -> NDArray[Any]:
