@@ -299,7 +299,7 @@ def test_sensitivities_at_perturbed_parameters_equal_complex_steps(case: str, si
 def test_hand_derivation_and_complex_steps_agree_at_nominal_parameters(case: str) -> None:
     record, rows = MODELS[case]
     machine = build_cached_robot(record)
-    solution = solve_random_poses(machine, 20)
+    solution = solve_random_poses(machine, 6)
     names = machine.parameters.names
     for T, q in zip(solution.T, solution.q, strict=True):
         _, slopes = sensitivities_by_complex_steps(
