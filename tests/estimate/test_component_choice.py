@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, norm, multivariate_normal
+from scipy.stats import chi2, multivariate_normal, norm
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
