@@ -291,7 +291,7 @@ host:/x on /Volumes/other (otherfs, nodev)
         (MOUNTS, "/srv/me/study", ("nfs4", True)),
         (MOUNTS, "/srv/me/local disk/study", ("xfs", False)),
         (MOUNTS, "/mnt/share/a", ("cifs", True)),
-        (MACOS, "/Users/me/study", ("apfs", False)),
+        (MACOS, "/opt/study", ("apfs", False)),
         (MACOS, "/Volumes/my share/study", ("smbfs", True)),
         (MACOS, "/Volumes/nfs", ("nfs", True)),
         (MACOS, "/Volumes/sshfs/a", ("macfuse", True)),
