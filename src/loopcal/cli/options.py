@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import cached_property
 from importlib import import_module
 from inspect import signature
 from operator import attrgetter
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
     from loopcal.diagnose.conventions.convention_check import ConventionCheck
     from loopcal.estimate.options import FitOptions
-    from loopcal.findings import Finding
     from loopcal.measure.instrument import Instrument
     from loopcal.measure.measurements import Measurements
     from loopcal.mechanism.model import Mechanism
@@ -221,15 +221,27 @@ POSITIVE_LENGTH = Quantity(Dimension.LENGTH, is_positive=True)
 POSITIVE_ANGLE = Quantity(Dimension.ANGLE, is_positive=True)
 
 
-def add_options(*options: Decorator) -> Decorator:
-    """Return a decorator that adds options to a command, in the order of its help."""
+class OptionGroup:
+    """Options in the order of their help; decorates a command with all of them."""
 
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(options):
+    def __init__(self, *options: Decorator) -> None:
+        self.options = options
+
+    def __call__(self, command: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the command with the options."""
+        for option in reversed(self.options):
             command = option(command)
         return command
 
-    return decorate
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of their values in the function of the command."""
+        decorated = click.command("group")(self(lambda: None))
+        return tuple(option.name or "" for option in decorated.params)
+
+    def take(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return those of the values of a command that belong to these options."""
+        return {name: values[name] for name in self.names}
 
 
 def file_option(*names: str, **kind: Any) -> Decorator:
@@ -305,32 +317,26 @@ def _limit_option(name: str, kind: Quantity, quantity: str, example: str) -> Dec
     return click.option(name, type=kind, help=f"{text}; above it the exit code is 2.")
 
 
-limit_options = add_options(
+limit_options = OptionGroup(
     _limit_option("--limit-position", POSITIVE_LENGTH, "position", "0.02mm"),
     _limit_option("--limit-angle", POSITIVE_ANGLE, "orientation", "0.01deg"),
 )
 """Decorator for limits on the errors."""
 
-DATA_FLAGS = {
-    "allow_still": "Accept a target that does not move from pose to pose.",
-    "allow_outside_stroke": "Accept readings outside the stroke of their actuator.",
-    "allow_implausible": "Accept values that fit far better in another unit, order, sign or "
-    "column.",
-    "allow_duplicates": "Accept rows that repeat another row to the last digit.",
-}
-
-data_options = add_options(
-    *(
-        click.option("--" + name.replace("_", "-"), is_flag=True, help=text)
-        for name, text in DATA_FLAGS.items()
-    )
+data_options = OptionGroup(
+    flag_option("--allow-still", help="Accept a target that does not move from pose to pose."),
+    flag_option(
+        "--allow-outside-stroke", help="Accept readings outside the stroke of their actuator."
+    ),
+    flag_option(
+        "--allow-implausible",
+        help="Accept values that fit far better in another unit, order, sign or column.",
+    ),
+    flag_option(
+        "--allow-duplicates", help="Accept rows that repeat another row to the last digit."
+    ),
 )
-"""Decorator for the flags that accept suspicious measurements; `take_flags` takes their values."""
-
-
-def take_flags(options: Mapping[str, Any]) -> dict[str, bool]:
-    """Return the values of `data_options`, for `read_checked_measurements`."""
-    return {name: options[name] for name in DATA_FLAGS}
+"""Decorator for the flags that accept suspicious measurements."""
 
 
 def name_option(name: str) -> str:
@@ -345,16 +351,31 @@ def is_given(name: str) -> bool:
     return source is click.core.ParameterSource.COMMANDLINE
 
 
-def refuse_given(names: Iterable[str], reason: str) -> None:
+def refuse_given(
+    names: Iterable[str],
+    reason: str,
+    sentence: str = "{option} has no effect {reason}; leave it out",
+) -> None:
     """Raise DataError for the first of these options that the user stated.
 
     Parameters
     ----------
-    reason : a clause such as "because ..." or "with --profile".
+    reason : a clause such as "because ..." or "with --profile", for the sentence.
     """
     for name in names:
         if is_given(name):
-            raise DataError(f"{name_option(name)} has no effect {reason}; leave it out")
+            raise DataError(sentence.format(option=name_option(name), reason=reason))
+
+
+def open_robot(
+    robot: str, outputs: Iterable[Path | None], inputs: Iterable[Path | None], force: bool
+) -> Mechanism:
+    """Return a robot; refuse outputs that exist, or that are its file or another input."""
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot
+
+    refuse_outputs(tuple(outputs), (find_robot_file(robot), *inputs), force)
+    return load_robot(robot)
 
 
 def read_checked_measurements(
@@ -376,22 +397,6 @@ def read_checked_measurements(
     return data
 
 
-def _refuse_explained_strokes(
-    stated: Finding, paths: Sequence[Path], robot: Mechanism, allowed: Mapping[str, bool]
-) -> None:
-    """Refuse readings outside their strokes, described by `data.outside-stroke`, if another unit,
-    order, sign or zero explains them.
-    """
-    from loopcal.diagnose.conventions.convention_check import explain_outside_strokes
-    from loopcal.io.data.measurement_file import load_measurements
-
-    data = load_measurements(paths, robot, **{**allowed, "allow_outside_stroke": True})
-    explained = explain_outside_strokes(robot, data, stated.data)
-    if explained is not None:
-        text = f"{' and '.join(map(str, paths))}: {explained}"
-        raise DataError(text) from DataError(explained)
-
-
 def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None:
     """Print a note where a check of these files leaves a doubt."""
     from loopcal.cli import terminal
@@ -400,11 +405,16 @@ def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None
         terminal.print_note(f"{' and '.join(map(str, paths))}: {check.finding}")
 
 
-def leave_out_held_out(data: Measurements) -> Measurements:
-    """Return the poses that a fit would use; print a note where others are held out."""
+def read_fitted_measurements(
+    paths: Sequence[Path], robot: Mechanism, options: Mapping[str, Any]
+) -> Measurements:
+    """Read the poses that a fit would use, by `data_options`; print a note where others are held
+    out.
+    """
     from loopcal.cli import terminal
     from loopcal.findings import report_finding
 
+    data = read_checked_measurements(paths, robot, **data_options.take(options))
     if count := int(data.is_held_out.sum()):
         terminal.print_note(str(report_finding("data.held-out-not-counted", count=count)))
     return data.fitted
@@ -417,6 +427,7 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
     no measured value.
     """
     from loopcal.cli import terminal
+    from loopcal.diagnose.conventions.convention_check import explain_outside_strokes
     from loopcal.findings import report_finding
     from loopcal.io.core.csv_table import read_settings
     from loopcal.io.core.yaml_file import list_absolute_references
@@ -438,7 +449,11 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
             unfilled = list_unfilled_files(paths, data)
     except DataError as error:
         if error.finding is not None and error.finding.code == "data.outside-stroke":
-            _refuse_explained_strokes(error.finding, paths, robot, allowed)
+            accepted = load_measurements(paths, robot, **{**allowed, "allow_outside_stroke": True})
+            explained = explain_outside_strokes(robot, accepted, error.finding.data)
+            if explained is not None:
+                text = f"{' and '.join(map(str, paths))}: {explained}"
+                raise DataError(text) from DataError(explained)
         raise
     for file in unfilled:
         terminal.print_note(str(report_finding("files.no-measured-value", file=str(file))))
@@ -456,7 +471,7 @@ rank_tolerance_option = library_option(
 )
 """Decorator of a command that decides a rank."""
 
-fit_options = add_options(
+fit_options = OptionGroup(
     click.option(
         "--method",
         type=Words("loopcal.estimate.methods:METHODS"),
@@ -516,18 +531,12 @@ fit_options = add_options(
 )
 """Decorator of a command that fits; `make_fit_options` takes their values."""
 
-FIT_OPTIONS = (
-    *("method", "inflation", "lam", "keep", "noise", "sigma_uncertainty", "loss"),
-    *("rank_tolerance", "excluded_poses"),
-)
-"""Names of `fit_options`, which are those of `FitOptions.from_dict`."""
-
 
 def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     """Return the options of the library from those of `fit_options`."""
     from loopcal.estimate.options import FitOptions, find_foreign_setting
 
-    stated = {name: options[name] for name in FIT_OPTIONS}
+    stated = fit_options.take(options)
     if (foreign := find_foreign_setting(stated)) is not None:
         raise DataError(
             f"--{foreign[0]} belongs to --method {foreign[1]}, not to {stated['method']}; leave it "
@@ -536,25 +545,9 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     return FitOptions.from_dict(stated)
 
 
-TILT = {"phi", "theta", "psi"}
-"""Components that are angles of tilt and torsion."""
-
-DESCRIPTION = (
-    "measure",
-    "frames",
-    "targets",
-    "kind",
-    "components",
-    "orientation",
-    "sigma_position",
-    "sigma_angle",
-)
-"""Names of the options that describe an instrument."""
-
-
 INSTRUMENT = "loopcal.apply.simulated_measurements:InstrumentDescription"
 
-instrument_options = add_options(
+instrument_options = OptionGroup(
     click.option(
         "--kind",
         default="pose",
@@ -586,7 +579,7 @@ instrument_options = add_options(
 )
 """Decorator for the kind of measurement and its noise; `make_instrument` takes their values."""
 
-unknown_options = add_options(
+unknown_options = OptionGroup(
     click.option(
         "--measure",
         metavar="NAMES",
@@ -650,7 +643,7 @@ def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) 
                 "--measure is short for --kind component --components; give one or the other"
             )
         kind, components = "component", measure
-        if orientation is None and TILT & set(measure.split(",")):
+        if orientation is None and {"phi", "theta", "psi"} & set(measure.split(",")):
             orientation = "tilt-torsion"
     frames, targets = options.get("frames"), options.get("targets")
     instrument = build_instrument(
@@ -715,7 +708,7 @@ class Goal(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # ge
             self.fail(f"{error}; or give an angle, such as 10urad", param, ctx)
 
 
-constraint_options = add_options(
+constraint_options = OptionGroup(
     library_option(
         "--min-margin",
         of="loopcal.planning.constraints:Constraints",
@@ -766,12 +759,11 @@ def make_constraints(options: Mapping[str, Any]) -> Constraints:
     margin, measured = options["stroke_margin"] or (0.0, "position")
     margins = {"stroke_margin" if measured == "position" else "stroke_margin_angle": margin}
     if options["seen_from"] is None:
-        for name in ("facing", "cone", "nearest", "farthest"):
-            if is_given(name):
-                raise DataError(
-                    f"--{name} belongs to a line of sight; state the position of the instrument "
-                    "with --seen-from"
-                )
+        refuse_given(
+            ("facing", "cone", "nearest", "farthest"),
+            "state the position of the instrument with --seen-from",
+            "{option} belongs to a line of sight; {reason}",
+        )
         return Constraints(options["min_margin"], options["max_tilt"], None, **margins)
     sight = LineOfSight(
         _parse_three(options["seen_from"], "--seen-from", Dimension.LENGTH),

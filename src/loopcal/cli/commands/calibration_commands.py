@@ -25,16 +25,15 @@ from loopcal.cli.options import (
     flag_option,
     force_option,
     frame_option,
-    leave_out_held_out,
     library_option,
     limit_options,
     make_fit_options,
     print_convention_note,
     read_checked_measurements,
+    read_fitted_measurements,
     read_measurements,
     robot_argument,
     seed_option,
-    take_flags,
     verbose_option,
 )
 from loopcal.cli.terminal import Output, shows_output
@@ -594,7 +593,7 @@ def regularize(
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
     if output is not None:
         refuse_curves(output, force, list(inputs.values()))
-    measurements = leave_out_held_out(read_checked_measurements(data, machine, **take_flags(flags)))
+    measurements = read_fitted_measurements(data, machine, flags)
     with terminal.ProgressBar() as progress:
         curves = compute_regularization_curves(
             machine,

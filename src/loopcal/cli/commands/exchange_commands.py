@@ -17,13 +17,14 @@ from loopcal.cli.options import (
     FILE,
     LENGTH,
     POSITIVE_LENGTH,
-    add_options,
+    OptionGroup,
     decimal_option,
     file_option,
     flag_option,
     force_option,
     format_option,
     name_option,
+    open_robot,
     print_convention_note,
     profile_option,
     read_measurements,
@@ -89,7 +90,6 @@ def gcode(
       loopcal gcode hexapod.yaml plan -o poses.ngc
       loopcal gcode hexapod.yaml plan -o poses.ngc --feed 600 --pause 5
     """  # noqa: D301
-    from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.gcode_program import (
         DEFAULT_FEED,
@@ -98,11 +98,9 @@ def gcode(
         read_stops,
         refuse_coordinates,
     )
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot
     from loopcal.planning.path import check_route
 
-    refuse_outputs((output,), (find_robot_file(robot), plan), force)
-    machine = load_robot(robot)
+    machine = open_robot(robot, (output,), (plan,), force)
     is_in_inches = machine.units[Dimension.LENGTH] == "in"
     program_unit: Literal["mm", "in"] = unit or ("in" if is_in_inches else "mm")
     feed_unit = find_unit(program_unit).factor_to_si / 60.0  # [m/s]
@@ -174,15 +172,12 @@ def fill(
     """  # noqa: D301
     from loopcal.diagnose.conventions.convention_check import check_conventions
     from loopcal.diagnose.point_names import examine_points
-    from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
     from loopcal.io.exports.sheet_filling import fill_sheet, save_filled_sheet
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot
     from loopcal.report.calibration_view import with_hint
 
     path = find_profile_file(profile)
-    refuse_outputs((output,), (find_robot_file(robot), sheet, *exports, path), force)
-    machine = load_robot(robot)
+    machine = open_robot(robot, (output,), (sheet, *exports, path), force)
     filled = fill_sheet(
         machine,
         sheet,
@@ -289,7 +284,7 @@ TAPED = (
 @file_option(
     "--corrected", help="Also calibrate with them, and write FILE with the corrected numbers."
 )
-@add_options(
+@OptionGroup(
     *(
         click.option(
             f"--sigma-{of}", type=POSITIVE_LENGTH, help=f"Noise of {what}.  [default: {default}]"

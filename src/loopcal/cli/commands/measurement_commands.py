@@ -13,7 +13,6 @@ import click
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for
 from loopcal.cli.options import (
-    DESCRIPTION,
     POSITIVE_ANGLE,
     POSITIVE_LENGTH,
     data_argument,
@@ -24,18 +23,15 @@ from loopcal.cli.options import (
     flag_option,
     force_option,
     instrument_options,
-    is_given,
-    leave_out_held_out,
     make_instrument,
-    name_option,
+    open_robot,
     parse_reading_sigma,
     rank_tolerance_option,
-    read_checked_measurements,
+    read_fitted_measurements,
     refuse_given,
     robot_argument,
     seed_option,
     sigma_reading_option,
-    take_flags,
     unknown_options,
     verbose_option,
 )
@@ -120,8 +116,7 @@ def identifiability(
     """  # noqa: D301
     from loopcal.apply.inspection import analyze_identifiability
     from loopcal.apply.simulated_measurements import predict_noise_free
-    from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_reduced_robot
+    from loopcal.io.robot.robot_file import save_reduced_robot
     from loopcal.report.calibration_view import view_identifiability
     from loopcal.results.serialization import json_fields
 
@@ -131,12 +126,9 @@ def identifiability(
         raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
     if useful is None and useful_angle is not None:
         raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
-    refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
-    machine, drawn = load_robot(robot), []
+    machine, drawn = open_robot(robot, (output,), (*data, poses), force), []
     if data:
-        measurements = leave_out_held_out(
-            read_checked_measurements(data, machine, **take_flags(options))
-        )
+        measurements = read_fitted_measurements(data, machine, options)
     else:
         if poses is None:
             drawn = [_name_drawn_poses(machine, draw, seed)]
@@ -172,17 +164,9 @@ def _refuse_beside_data(poses: Path | None) -> None:
     """Refuse options that describe measurements where data do."""
     if poses is not None:
         raise DataError("DATA and --poses exclude each other; give one of the two")
-    for name in ("measure", "frames", "targets"):
-        if is_given(name):
-            raise DataError(
-                "DATA states what is measured and what is unknown; leave out "
-                f"{name_option(name)}, or DATA"
-            )
-    if is_given("sigma_reading"):
-        raise DataError(
-            "DATA states the noise of its readings (reading_noise); leave out --sigma-reading, or "
-            "DATA"
-        )
+    sentence = "DATA states {reason}; leave out {option}, or DATA"
+    refuse_given(unknown_options.names, "what is measured and what is unknown", sentence)
+    refuse_given(("sigma_reading",), "the noise of its readings (reading_noise)", sentence)
 
 
 def _read_poses(poses: Path | None, draw: int, robot: Mechanism) -> dict[str, Any]:
@@ -260,12 +244,11 @@ def simulate(
     """  # noqa: D301
     from loopcal.apply.simulated_measurements import simulate_measurements
     from loopcal.findings import report_finding
-    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+    from loopcal.io.core.outputs import restore_on_failure
     from loopcal.io.data.measurement_writer import save_measurements
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
+    from loopcal.io.robot.robot_file import save_robot
 
-    refuse_outputs((output, truth), (find_robot_file(robot), poses, fill), force)
-    machine = load_robot(robot)
+    machine = open_robot(robot, (output, truth), (poses, fill), force)
     if fill is not None:
         result, remark = _fill_in(machine, fill, draw_errors, seed)
     else:
@@ -317,9 +300,9 @@ def _fill_in(
     from loopcal.io.runs.plan_folder import find_plan_sheet
     from loopcal.measure.kinds.joints import Closure
 
+    others = ("poses", "draw", "distribution", "sigma_reading", "skip_unreachable")
     refuse_given(
-        ("poses", "draw", *DESCRIPTION[3:], "distribution", "sigma_reading", "skip_unreachable"),
-        f"because --fill {sheet} states poses and instrument",
+        (*others, *instrument_options.names), f"because --fill {sheet} states poses and instrument"
     )
     instrument = load_instrument(sheet, robot)
     how = {"draw_errors": draw_errors, "seed": seed}

@@ -18,12 +18,11 @@ from loopcal.cli.options import (
     file_option,
     flag_option,
     force_option,
-    leave_out_held_out,
     library_option,
-    read_checked_measurements,
+    open_robot,
+    read_fitted_measurements,
     refuse_given,
     robot_argument,
-    take_flags,
 )
 from loopcal.cli.terminal import Output, shows_output
 
@@ -122,14 +121,10 @@ def per_leg(
       loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
     """  # noqa: D301
     from loopcal.estimate.published_steps import identify_per_leg
-    from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
+    from loopcal.io.robot.robot_file import save_robot
 
-    refuse_outputs((output,), (find_robot_file(robot), *data), force)
-    machine = load_robot(robot)
-    measurements = leave_out_held_out(
-        read_checked_measurements(data, machine, **take_flags(options))
-    )
+    machine = open_robot(robot, (output,), data, force)
+    measurements = read_fitted_measurements(data, machine, options)
     estimate = identify_per_leg(machine, measurements, steps)
     if output is not None:
         save_robot(estimate.robot, output)

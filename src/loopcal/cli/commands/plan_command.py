@@ -14,7 +14,6 @@ import click
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for
 from loopcal.cli.options import (
-    DESCRIPTION,
     Count,
     Goal,
     constraint_options,
@@ -28,8 +27,8 @@ from loopcal.cli.options import (
     library_option,
     make_constraints,
     make_instrument,
-    name_option,
     read_checked_measurements,
+    refuse_given,
     robot_argument,
     seed_option,
     unknown_options,
@@ -171,11 +170,10 @@ def plan(
         from loopcal.planning.plane_line_planning import SurfaceOptions, plan_surfaces
 
         for name, reason in EXCLUDED_BY_PLANE_LINE.items():
-            if is_given(name):
-                raise DataError(
-                    f"{name_option(name)} cannot be combined with --measure plane-line, {reason}; "
-                    "leave it out"
-                )
+            sentence = (
+                "{option} cannot be combined with --measure plane-line, {reason}; leave it out"
+            )
+            refuse_given((name,), reason, sentence)
         sigma, constraints = options["sigma_position"], make_constraints(options)
         surface_options = SurfaceOptions(groups, points, sigma, constraints, seed)
         with terminal.ProgressBar() as progress:
@@ -209,11 +207,9 @@ def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, 
 
     if like is None:
         return make_instrument(options, robot)
-    for name in DESCRIPTION:
-        if is_given(name):
-            raise DataError(
-                f"--like {like} describes the instrument; leave out {name_option(name)}, or --like"
-            )
+    described = (*unknown_options.names, *instrument_options.names)
+    sentence = "{reason} describes the instrument; leave out {option}, or --like"
+    refuse_given(described, f"--like {like}", sentence)
     return load_instrument_to_plan(like, robot)
 
 

@@ -17,6 +17,7 @@ from loopcal.cli.options import (
     force_option,
     instrument_options,
     make_instrument,
+    open_robot,
     robot_argument,
     unknown_options,
 )
@@ -105,13 +106,10 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool) -> Output:
       loopcal check 3-prs --plot 3-prs.png
     """  # noqa: D301
     from loopcal.apply.inspection import inspect_robot
-    from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_bytes
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot
     from loopcal.results.serialization import json_fields
 
-    refuse_outputs((plot,), (find_robot_file(robot),), force)
-    inspection = inspect_robot(load_robot(robot))
+    inspection = inspect_robot(open_robot(robot, (plot,), (), force))
     if plot is not None:
         from loopcal.report.figures.robot_figure import draw_robot
         from loopcal.report.pictures import save_figure

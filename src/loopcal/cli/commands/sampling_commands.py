@@ -12,21 +12,19 @@ import click
 from loopcal.cli import terminal
 from loopcal.cli.options import (
     Count,
+    OptionGroup,
     Words,
-    add_options,
     data_argument,
     data_options,
     file_option,
     fit_options,
     flag_option,
     force_option,
-    leave_out_held_out,
     library_option,
     make_fit_options,
-    read_checked_measurements,
+    read_fitted_measurements,
     refuse_given,
     seed_option,
-    take_flags,
 )
 from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import LoopcalError
@@ -44,12 +42,12 @@ MOST_DIGITS = 10
 
 BOOTSTRAP = "loopcal.diagnose.bootstrap"
 
-source_options = add_options(
+source_options = OptionGroup(
     click.argument("source", metavar="RUN|ROBOT"), data_argument("[DATA...]", required=False)
 )
 """Decorator of a command that takes a run folder, or a robot and its measurements."""
 
-draw_options = add_options(
+draw_options = OptionGroup(
     library_option(
         "--level",
         of=f"{BOOTSTRAP}:Bootstrap.intervals",
@@ -76,8 +74,8 @@ def load_fit(
     from loopcal.io.runs.run_folder import load_run, repeat_fit
 
     if data:
-        robot, flags = load_robot(source), take_flags(options)
-        measurements = leave_out_held_out(read_checked_measurements(data, robot, **flags))
+        robot = load_robot(source)
+        measurements = read_fitted_measurements(data, robot, options)
         chosen = make_fit_options(options)
         with terminal.ProgressBar() as progress:
             fit = identify(robot, measurements, options=chosen, progress=progress)

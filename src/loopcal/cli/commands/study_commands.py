@@ -16,7 +16,7 @@ from loopcal.cli.entry_point import CommandGroup
 from loopcal.cli.options import (
     FILE,
     Count,
-    add_options,
+    OptionGroup,
     file_option,
     flag_option,
     force_option,
@@ -52,7 +52,7 @@ class ShareType(click.ParamType):  # pyright: ignore[reportMissingTypeArgument] 
         return Share(int(match[1]), int(match[2]))
 
 
-worker_options = add_options(
+worker_options = OptionGroup(
     click.option(
         "--workers",
         type=Count("WORKERS", 1),
