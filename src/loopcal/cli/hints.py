@@ -127,9 +127,14 @@ OPTION = re.compile(r"--[a-z][a-z-]*")
 
 
 def find_hint(code: str | None, command: click.Command | None) -> str | None:
-    """Return the hint for a code; None where there is none for this command."""
+    """Return the hint for a code; None where there is none, or where this command, if it is known,
+    lacks an option in it. What follows the word `type` is another command.
+    """
     hint = None if code is None else HINTS.get(code)
-    return hint if hint is not None and _has_options(command, hint) else None
+    if hint is None or command is None or hint.startswith("type loopcal "):
+        return hint
+    options = {name for parameter in command.params for name in parameter.opts}
+    return hint if options.issuperset(OPTION.findall(hint)) else None
 
 
 def hint_for(finding: Finding) -> str | None:
@@ -141,16 +146,24 @@ def hint_for(finding: Finding) -> str | None:
 
 def word_hint(finding: Finding, hint: str | None) -> str | None:
     """Return a hint with the names that its finding contains; None where it does not help."""
-    if hint is None or is_hint_useless(finding):
+    from loopcal.findings.catalog.phrases import MACHINE
+
+    code, data = finding.code, finding.data
+    is_useless = (
+        (code in ("files.limb-branches", "files.no-limbs") and not data["platforms"])
+        or (code == "prior.rows-reused" and not data["others"])  # no row would be left
+        or (code == "prior.machine-changed" and data["subject"] != MACHINE)  # free already
+    )
+    if hint is None or is_useless:
         return None
-    links = finding.data.get("links") or finding.data.get("platforms")
+    links = data.get("links") or data.get("platforms")
     if "--platform LINK" in hint and links:
         return hint.replace("--platform LINK", name_options("--platform", links[:1]))
-    if finding.code == "workflow.next-check-outliers":
-        poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
+    if code == "workflow.next-check-outliers":
+        poses = [str(label).removeprefix("pose ") for label in data["poses"]]
         return f"use {name_options('--drop', poses)}, or --loss huber"
-    if finding.code == "validation.setup-moved":
-        return f"use {name_options('--refit', finding.data['names'])}"
+    if code == "validation.setup-moved":
+        return f"use {name_options('--refit', data['names'])}"
     return hint
 
 
@@ -159,24 +172,12 @@ def name_options(option: str, values: Iterable[str]) -> str:
     return " ".join(f"{option} {shlex.quote(value)}" for value in values)
 
 
-def is_hint_useless(finding: Finding) -> bool:
-    """Return whether the hint does not help: a limb that changed is free already, or no row would
-    be left.
-    """
-    from loopcal.findings.catalog.phrases import MACHINE
-
-    if finding.code in ("files.limb-branches", "files.no-limbs"):
-        return not finding.data["platforms"]
-    if finding.code == "prior.rows-reused":
-        return not finding.data["others"]
-    return finding.code == "prior.machine-changed" and finding.data["subject"] != MACHINE
+def with_hint(finding: Finding) -> str:
+    """Return the text of a finding, with the hint for the command that runs in parentheses."""
+    hint = hint_for(finding)
+    return str(finding) if hint is None else f"{finding} (Hint: {hint})"
 
 
-def _has_options(command: click.Command | None, hint: str) -> bool:
-    """Return whether a command has every option in a hint; True where no command is known. What
-    follows the word `type` is another command.
-    """
-    if command is None or hint.startswith("type loopcal "):
-        return True
-    options = {name for parameter in command.params for name in parameter.opts}
-    return options.issuperset(OPTION.findall(hint))
+def list_hints(findings: Iterable[Finding]) -> list[str]:
+    """Return the lines of the hints for findings."""
+    return [f"Hint: {hint}" for finding in findings if (hint := hint_for(finding))]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.hints import hint_for
+from loopcal.cli.hints import hint_for, list_hints, with_hint
 from loopcal.cli.options import (
     FILE,
     Count,
@@ -283,7 +283,7 @@ def validate(
         uncertainty=calibrated.load_uncertainty(),
     )
     is_changed = bool((calibrated.robot.values != calibrated.initial_robot.values).any())
-    hints = [f"Hint: {hint}" for f in validation.findings if (hint := hint_for(f))]
+    hints = list_hints(validation.findings)
     return Output(
         replace(validation, findings=(*validation.findings, *noted)).to_dict(),
         lambda: [*view_validation(validation, is_changed, verbose), *hints],
@@ -345,13 +345,13 @@ def compensate(
     from loopcal.io.runs.result_files import format_compensation, load_targets, save_compensation
     from loopcal.io.runs.run_folder import find_failure, load_posterior_or_robot
     from loopcal.mechanism.model import Mechanism
-    from loopcal.report.calibration_view import view_compensation, with_hint
+    from loopcal.report.calibration_view import view_compensation
 
     inputs = (run, targets, None if controller is None else Path(controller))
     refuse_outputs((output,), inputs, force)
     failure = find_failure(run)
     if failure is not None and not force:
-        return Output(None, list, [with_hint(failure, hint_for)])
+        return Output(None, list, [with_hint(failure)])
     known = load_posterior_or_robot(run)
     robot = known if isinstance(known, Mechanism) else known.robot
     coordinates, labels = load_targets(targets, robot)
@@ -363,7 +363,7 @@ def compensate(
     if output is not None:
         save_compensation(result, output)
     missed = [
-        f"target {label!r}: {with_hint(result.findings[i], hint_for)}"
+        f"target {label!r}: {with_hint(result.findings[i])}"
         for i, (label, is_usable) in enumerate(zip(labels, result.usable, strict=True))
         if not is_usable
     ]

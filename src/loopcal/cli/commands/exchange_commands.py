@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.hints import hint_for
+from loopcal.cli.hints import with_hint
 from loopcal.cli.options import (
     FILE,
     LENGTH,
@@ -38,7 +38,7 @@ from loopcal.units import Dimension, find_unit, list_symbols
 if TYPE_CHECKING:
     from loopcal.apply.calibration_report import CalibrationReport
     from loopcal.findings import Finding
-    from loopcal.io.formats.program_format import Format, Imported, ImportOptions
+    from loopcal.io.formats.program_format import Format
     from loopcal.mechanism.model import Mechanism
     from loopcal.results.tables import Block
 
@@ -174,7 +174,6 @@ def fill(
     from loopcal.diagnose.point_names import examine_points
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
     from loopcal.io.exports.sheet_filling import fill_sheet, save_filled_sheet
-    from loopcal.report.calibration_view import with_hint
 
     path = find_profile_file(profile)
     machine = open_robot(robot, (output,), (sheet, *exports, path), force)
@@ -195,7 +194,7 @@ def fill(
     findings = (*filled.findings, *examined)
     misfits = [{"file": f, "line": n, "reason": reason} for f, n, reason in filled.misfits]
     document = {"measurements": output, "misfits": misfits, "findings": findings}
-    first, *others = (with_hint(finding, hint_for) for finding in findings)
+    first, *others = (with_hint(finding) for finding in findings)
     page = [f"{output}: {first}", *(f"note: {text}" for text in others)]
     page += [
         f"note: {file}:{line} does not match: {reason}"
@@ -217,7 +216,6 @@ def convert_instrument_export(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.exports.conversion import convert_export, save_conversion
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
-    from loopcal.report.calibration_view import with_hint
 
     used = {"file", "profile", "output", "force", "as_json", "length_unit", "decimal"}
     names = (option.name or "" for option in click.get_current_context().command.params)
@@ -239,7 +237,7 @@ def convert_instrument_export(
     }
     page = [
         f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
-        *(f"note: {with_hint(finding, hint_for)}" for finding in converted.findings),
+        *(f"note: {with_hint(finding)}" for finding in converted.findings),
         *(
             f"note: {file}:{line} does not match: {reason}"
             for line, reason in converted.misfits[:SHOWN]
@@ -351,22 +349,33 @@ def import_(
     from loopcal.diagnose.start_values import compare_stored_geometry
     from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.formats.import_export import choose_format, save_imported
-    from loopcal.report.calibration_view import with_hint
+    from loopcal.io.formats.import_export import choose_format, list_formats, save_imported
+    from loopcal.io.formats.program_format import ImportOptions
 
     if profile is not None:
         local = (settings["length_unit"], decimal == "comma")
         return convert_instrument_export(file, profile, local, output, force)
     refuse_given(("decimal",), "without --profile")
     source = choose_format(file, format_name)
-    read = _find_reader(source)
+    if source.read is None:
+        raise DataError(
+            f"loopcal writes the format {source.name}, but cannot read it; it reads "
+            f"{', '.join(list_formats('read'))}, and an instrument's export with a profile "
+            "(--profile, docs/exports.md)"
+        )
     if corrected is not None and data is None:
         raise DataError(CORRECTED_ALONE)
     beside = file.with_suffix(".yaml") if source.name == "urdf" else None
     inputs = (file, settings["closures"] or beside, *settings["probes"])
     refuse_outputs((output, data), inputs, force)
     refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected
-    imported = read(file, _make_import_options(source, make_name(output.stem), settings))
+    stated = {key: value for key, value in settings.items() if value not in (None, ())}
+    for key in stated:
+        if key not in source.read_options:
+            raise DataError(
+                f"{name_option(key)} does not belong to the format {source.name}; leave it out"
+            )
+    imported = source.read(file, ImportOptions(make_name(output.stem), **stated))
     with restore_on_failure((output, data)):
         robot = save_imported(file, imported, output, data)
         noted = list(imported.findings)
@@ -391,34 +400,8 @@ def import_(
     return Output(
         document,
         lambda: _view_import(robot, document, noted, correction),
-        [] if failure is None else [with_hint(failure, hint_for)],
+        [] if failure is None else [with_hint(failure)],
     )
-
-
-def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
-    """Return the function that reads a format; DataError where loopcal only writes it."""
-    from loopcal.io.formats.import_export import list_formats
-
-    if source.read is None:
-        raise DataError(
-            f"loopcal writes the format {source.name}, but cannot read it; it reads "
-            f"{', '.join(list_formats('read'))}, and an instrument's export with a profile "
-            "(--profile, docs/exports.md)"
-        )
-    return source.read
-
-
-def _make_import_options(source: Format, name: str, settings: dict[str, Any]) -> ImportOptions:
-    """Return the options of a format; DataError for one that it does not have."""
-    from loopcal.io.formats.program_format import ImportOptions
-
-    stated = {key: value for key, value in settings.items() if value not in (None, ())}
-    for key in stated:
-        if key not in source.read_options:
-            raise DataError(
-                f"{name_option(key)} does not belong to the format {source.name}; leave it out"
-            )
-    return ImportOptions(name, **stated)
 
 
 @dataclass(frozen=True)
@@ -470,7 +453,7 @@ def _view_import(
 ) -> list[Block]:
     """Return what was read, what was identified, and which lines were changed."""
     from loopcal.findings.wording import name_count
-    from loopcal.report.calibration_view import view_fit, with_hint
+    from loopcal.report.calibration_view import view_fit
 
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
     actuators, parameters = name_count(len(robot.actuators), "actuator"), name_count(n, "parameter")
@@ -478,7 +461,7 @@ def _view_import(
     page: list[Block] = [f"{document['robot']}: {counts}"]
     if document["data"] is not None:
         page.append(f"{document['data']}: the measurements of the file")
-    page += [f"note: {with_hint(finding, hint_for)}" for finding in noted]
+    page += [f"note: {with_hint(finding)}" for finding in noted]
     files = shlex.join((str(document["robot"]), str(document["data"] or "DATA")))
     following = f"Next: loopcal calibrate {files} -o run"
     if correction is None:
@@ -525,7 +508,6 @@ def export(
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import choose_format, export_robot, load_source
     from loopcal.io.runs.run_folder import find_failure
-    from loopcal.report.calibration_view import with_hint
 
     if output is None and (format_name is None or into is not None):
         raise DataError(
@@ -538,7 +520,7 @@ def export(
     failures = [] if failure is None else [failure]
     if failures and not force:
         document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
-        return Output(document, list, [with_hint(failure, hint_for) for failure in failures])
+        return Output(document, list, [with_hint(failure) for failure in failures])
     loaded = replace(load_source(source), is_for_people=output is None)
     exported = export_robot(loaded, target, into)
     if output is not None:
@@ -548,7 +530,7 @@ def export(
     document |= {"text": exported.text} if output is None else {}
 
     def view() -> list[str] | str:
-        noted = [with_hint(finding, hint_for) for finding in exported.findings]
+        noted = [with_hint(finding) for finding in exported.findings]
         if output is not None:
             return [*noted, f"Written to {output}"]
         for note in noted:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.hints import hint_for
+from loopcal.cli.hints import list_hints
 from loopcal.cli.options import (
     POSITIVE_ANGLE,
     POSITIVE_LENGTH,
@@ -39,13 +39,8 @@ from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.apply.inspection import IdentifiabilityReport
     from loopcal.apply.simulated_measurements import SimulatedMeasurements
     from loopcal.mechanism.model import Mechanism
-
-
-DETAILS = "the first combinations, the singular values and a table of all parameters"
-"""What the summary of identifiability leaves out."""
 
 
 @click.command()
@@ -121,7 +116,11 @@ def identifiability(
     from loopcal.results.serialization import json_fields
 
     if data:
-        _refuse_beside_data(poses)
+        if poses is not None:
+            raise DataError("DATA and --poses exclude each other; give one of the two")
+        sentence = "DATA states {reason}; leave out {option}, or DATA"
+        refuse_given(unknown_options.names, "what is measured and what is unknown", sentence)
+        refuse_given(("sigma_reading",), "the noise of its readings (reading_noise)", sentence)
     if output is not None and not reduced:
         raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
     if useful is None and useful_angle is not None:
@@ -148,25 +147,15 @@ def identifiability(
     written = []
     if output is not None:
         written = ["", f"Written to {output}: the robot with the other parameters fixed"]
-    view, hints = view_identifiability(report, verbose), _list_hints(report, verbose)
-    return Output(json_fields(report), lambda: [*drawn, *view, *hints, *written])
-
-
-def _list_hints(report: IdentifiabilityReport, verbose: bool) -> list[str]:
-    """Return hints on options that show more."""
-    asked = report.useful is not None
-    hints = [hint for finding in report.summary if not asked and (hint := hint_for(finding))]
-    hints.append("use --json for all combinations" if verbose else f"use --verbose for {DETAILS}")
-    return [f"Hint: {hint}" for hint in hints]
-
-
-def _refuse_beside_data(poses: Path | None) -> None:
-    """Refuse options that describe measurements where data do."""
-    if poses is not None:
-        raise DataError("DATA and --poses exclude each other; give one of the two")
-    sentence = "DATA states {reason}; leave out {option}, or DATA"
-    refuse_given(unknown_options.names, "what is measured and what is unknown", sentence)
-    refuse_given(("sigma_reading",), "the noise of its readings (reading_noise)", sentence)
+    details = "the first combinations, the singular values and a table of all parameters"
+    page = [
+        *drawn,
+        *view_identifiability(report, verbose),
+        *(list_hints(report.summary) if report.useful is None else ()),
+        f"Hint: use {'--json for all combinations' if verbose else f'--verbose for {details}'}",
+        *written,
+    ]
+    return Output(json_fields(report), lambda: page)
 
 
 def _read_poses(poses: Path | None, draw: int, robot: Mechanism) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.hints import hint_for
+from loopcal.cli.hints import list_hints
 from loopcal.cli.options import (
     Count,
     Goal,
@@ -193,7 +193,7 @@ def plan(
     data = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
     page = [
         str(result),
-        *(f"Hint: {hint}" for finding in result.findings if (hint := hint_for(finding))),
+        *list_hints(result.findings),
         "",
         f"Written to {output}: {written}",
         f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
