@@ -37,80 +37,53 @@ from loopcal.output_record import record_outputs
 
 SECTIONS = {
     "Describe the robot": {
-        "new": ("robot_commands", "Write a robot file, and a measurement file, to fill in."),
-        "check": ("robot_commands", "Read a robot file and show what it contains."),
-        "view": ("robot_commands", "Show a robot, or a calibration, as a 3-D view in the browser."),
-        "import": ("exchange_commands", "Read the file of a controller as a robot file."),
-        "export": ("exchange_commands", "Write identified numbers into the file of a controller."),
+        "new": ("robot", "Write a robot file, and a measurement file, to fill in."),
+        "check": ("robot", "Read a robot file and show what it contains."),
+        "view": ("robot", "Show a robot, or a calibration, as a 3-D view in the browser."),
+        "import": ("exchange", "Read the file of a controller as a robot file."),
+        "export": ("exchange", "Write identified numbers into the file of a controller."),
     },
     "Prepare measurements": {
-        "identifiability": (
-            "measurement_commands",
-            "Show which parameters measurements determine.",
-        ),
-        "plan": ("plan_command", "Plan which poses to measure, and write a sheet for them."),
-        "gcode": (
-            "exchange_commands",
-            "Write a program that moves a machine to the poses of a plan.",
-        ),
-        "fill": (
-            "exchange_commands",
-            "Fill in the sheet of a plan from the export of an instrument.",
-        ),
-        "simulate": ("measurement_commands", "Write a measurement file of a simulated machine."),
+        "identifiability": ("measurement", "Show which parameters measurements determine."),
+        "plan": ("plan", "Plan which poses to measure, and write a sheet for them."),
+        "gcode": ("exchange", "Write a program that moves a machine to the poses of a plan."),
+        "fill": ("exchange", "Fill in the sheet of a plan from the export of an instrument."),
+        "simulate": ("measurement", "Write a measurement file of a simulated machine."),
     },
     "Calibrate": {
-        "calibrate": (
-            "calibration_commands",
-            "Identify the parameters of a robot and validate them.",
-        ),
-        "report": (
-            "calibration_commands",
-            "Write the report of a calibration as HTML, JSON and PDF.",
-        ),
-        "validate": (
-            "calibration_commands",
-            "Validate a calibration, or a robot file, with measurements.",
-        ),
-        "repeatability": (
-            "calibration_commands",
-            "Compute pose accuracy and repeatability by ISO 9283.",
-        ),
-        "budget": ("calibration_commands", "Show the uncertainty of a calibration by source."),
+        "calibrate": ("calibration", "Identify the parameters of a robot and validate them."),
+        "report": ("calibration", "Write the report of a calibration as HTML, JSON and PDF."),
+        "validate": ("calibration", "Validate a calibration, or a robot file, with measurements."),
+        "repeatability": ("calibration", "Compute pose accuracy and repeatability by ISO 9283."),
+        "budget": ("calibration", "Show the uncertainty of a calibration by source."),
         "compare": (
-            "calibration_commands",
+            "calibration",
             "Compare calibrations side by side: has the machine changed, and where?",
         ),
-        "certificate": (
-            "calibration_commands",
-            "Print a digital calibration certificate of a calibration.",
-        ),
-        "compensate": ("calibration_commands", "Compute readings or commands that reach targets."),
+        "certificate": ("calibration", "Print a digital calibration certificate of a calibration."),
+        "compensate": ("calibration", "Compute readings or commands that reach targets."),
         "regularize": (
-            "calibration_commands",
+            "calibration",
             "Show the error at held-out poses by the strength of regularization.",
         ),
     },
     "Examine the uncertainty": {
         "bootstrap": (
-            "sampling_commands",
+            "sampling",
             "Resample a calibration and compare the scatter with its intervals.",
         ),
-        "sample": ("sampling_commands", "Draw from the exact posterior of a calibration."),
+        "sample": ("sampling", "Draw from the exact posterior of a calibration."),
     },
     "Simulate many calibrations": {
-        "study": (
-            "study_commands",
-            "Compare instruments, numbers of poses and methods by simulation.",
-        )
+        "study": ("study", "Compare instruments, numbers of poses and methods by simulation.")
     },
     "Published studies": {
-        "reproduce": ("paper_commands", "Repeat a published study and compare its numbers."),
-        "per-leg": ("paper_commands", "Identify a hexapod leg by leg, to compare with calibrate."),
+        "reproduce": ("paper", "Repeat a published study and compare its numbers."),
+        "per-leg": ("paper", "Identify a hexapod leg by leg, to compare with calibrate."),
     },
     "Begin": {
-        "example": ("robot_commands", "Write the files of an example, to try the commands with."),
-        "completion": ("robot_commands", "Print the script with which a shell completes commands."),
+        "example": ("robot", "Write the files of an example, to try the commands with."),
+        "completion": ("robot", "Print the script with which a shell completes commands."),
     },
 }
 """Heading of the help -> command -> its module, imported when it runs, and what it does."""
@@ -156,7 +129,7 @@ def find_command(name: str) -> click.Command | None:
     """Import a command; None where there is none of this name."""
     for members in SECTIONS.values():
         if name in members:
-            module = import_module(f"loopcal.cli.commands.{members[name][0]}")
+            module = import_module(f"loopcal.cli.commands.{members[name][0]}_commands")
             return getattr(module, name.replace("-", "_") + "_" * keyword.iskeyword(name))
     return None
 
@@ -311,9 +284,17 @@ def repeat_lost_interrupts() -> Iterator[None]:
     """Raise an interrupt that a callback lost again, a moment after the callback."""
     report = sys.unraisablehook
 
+    def interrupt_main_thread() -> None:
+        time.sleep(DELAY)
+        main = threading.main_thread().ident
+        if main is not None and hasattr(signal, "pthread_kill"):  # reaches it while it waits
+            signal.pthread_kill(main, signal.SIGINT)
+        else:
+            _thread.interrupt_main()
+
     def repeat_or_report(lost: sys.UnraisableHookArgs) -> None:
         if issubclass(lost.exc_type, KeyboardInterrupt):
-            _thread.start_new_thread(_interrupt, ())  # raised here, it is lost again
+            _thread.start_new_thread(interrupt_main_thread, ())  # raised here, it is lost again
         else:
             report(lost)
 
@@ -322,16 +303,6 @@ def repeat_lost_interrupts() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = report
-
-
-def _interrupt() -> None:
-    """Interrupt the main thread, also while it waits where the operating system has signals."""
-    time.sleep(DELAY)
-    main = threading.main_thread().ident
-    if main is not None and hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(main, signal.SIGINT)
-    else:
-        _thread.interrupt_main()
 
 
 PACKAGES = ("loopcal", "numpy", "scipy", "ruamel.yaml", "msgspec", "click")

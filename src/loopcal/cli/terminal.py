@@ -71,29 +71,22 @@ def shows_output(function: Callable[..., Output]) -> Callable[..., int]:
         output = function(**options)
         page = None if as_json else output.page()
         if as_json and output.document is not None:
-            print_json(output.document)
+            from loopcal.io.core.text_file import to_json
+
+            print_text(to_json(output.document))
         elif isinstance(page, str):
             print_text(page)
         elif page:
-            print_page(page)
-        code = print_failures(output.failures, output.shown and not as_json)
-        return code if output.exit_code is None else output.exit_code
+            from loopcal.results.tables import render_text
+
+            print_text(render_text(page, width()) + "\n")
+        failures = list(output.failures)
+        if as_json or not (output.shown and sys.stdout.isatty()):
+            for failure in failures:
+                print_message(f"loopcal: quality gate not met: {failure}")
+        return (2 if failures else 0) if output.exit_code is None else output.exit_code
 
     return run
-
-
-def print_page(blocks: Iterable[Block]) -> None:
-    """Print paragraphs and tables, wrapped to the terminal."""
-    from loopcal.results.tables import render_text
-
-    print_text(render_text(blocks, width()) + "\n")
-
-
-def print_json(document: Any) -> None:
-    """Print one JSON document."""
-    from loopcal.io.core.text_file import to_json
-
-    print_text(to_json(document))
 
 
 def print_text(text: str) -> None:
@@ -164,20 +157,6 @@ def print_message(text: str) -> None:
 def print_note(text: str) -> None:
     """Print a note on standard error."""
     print_message(f"loopcal: note: {text}")
-
-
-def print_failures(failures: Iterable[Finding | str], shown: bool = False) -> int:
-    """Print quality gates that are not met on standard error, and return exit code 0 or 2.
-
-    Parameters
-    ----------
-    shown : whether standard output already contains them; then a terminal does not repeat them.
-    """
-    sentences = [str(failure) for failure in failures]
-    if not (shown and sys.stdout.isatty()):
-        for sentence in sentences:
-            print_message(f"loopcal: quality gate not met: {sentence}")
-    return 2 if sentences else 0
 
 
 class ProgressBar:
