@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -42,9 +41,6 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.findings import Finding
     from loopcal.results.tables import Block
-
-ALLOWED = ("allow_outside_stroke", "allow_duplicates")
-"""Options that accept doubtful measurements."""
 
 TAKEN_OPTIONS = (
     "limit_position",
@@ -137,7 +133,8 @@ def calibrate(
     """  # noqa: D301
     from loopcal.apply.calibration import calibrate
     from loopcal.apply.calibration_options import CalibrationOptions
-    from loopcal.io.robot.robot_file import load_robot, load_stored_values
+    from loopcal.io.data.measurement_file import list_measurement_files
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot, load_stored_values
     from loopcal.io.runs.run_folder import (
         build_document,
         load_run,
@@ -145,9 +142,14 @@ def calibrate(
         refuse_run_folder,
         save_run,
     )
+    from loopcal.io.runs.run_result import RESULT
     from loopcal.report.calibration_view import view_calibration
 
-    inputs = _list_inputs(robot, data, prior, compare)
+    inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
+    if prior is not None:
+        inputs["prior"] = prior / RESULT
+    if compare is not None:
+        inputs["compare"] = find_robot_file(compare)
     machine = load_robot(robot)
     settings = CalibrationOptions(
         make_fit_options(options),
@@ -159,7 +161,8 @@ def calibrate(
         **{name: options[name] for name in TAKEN_OPTIONS},
     )
     refuse_run_folder(output, force, list(inputs.values()))
-    measurements = read_measurements(data, machine, **{name: options[name] for name in ALLOWED})
+    allowed = {name: options[name] for name in ("allow_outside_stroke", "allow_duplicates")}
+    measurements = read_measurements(data, machine, **allowed)
     with terminal.ProgressBar() as progress:
         report = calibrate(machine, measurements, settings, progress)
     print_convention_note(report.conventions, data)
@@ -174,22 +177,6 @@ def calibrate(
         shown=True,
         exit_code=report.exit_code,
     )
-
-
-def _list_inputs(
-    robot: str, data: Sequence[Path], prior: Path | None, compare: Path | None
-) -> dict[str, Path]:
-    """Return role -> file of everything that is read."""
-    from loopcal.io.data.measurement_file import list_measurement_files
-    from loopcal.io.robot.robot_file import find_robot_file
-    from loopcal.io.runs.run_result import RESULT
-
-    inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
-    if prior is not None:
-        inputs["prior"] = prior / RESULT
-    if compare is not None:
-        inputs["compare"] = find_robot_file(compare)
-    return inputs
 
 
 @click.command()

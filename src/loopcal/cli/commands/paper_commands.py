@@ -67,20 +67,29 @@ def reproduce(
       loopcal reproduce hexapod-42
       loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
     """  # noqa: D301
-    from loopcal.papers.paper import TRIALS, find_paper
+    from loopcal.papers.paper import PAPERS, TRIALS, find_paper
 
     if paper is None:
         refuse_given(
             ("output", "seed", "trials", "force"), "without the name of a study, which is repeated"
         )
-        return _list_papers()
+        rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
+        lines = [
+            text for r in rows for text in (r["name"], f"    {r['title']}", f"    {r['source']}")
+        ]
+        return Output({"papers": rows}, lambda: lines)
     chosen = find_paper(paper)
     if output is not None:
         from loopcal.io.core.outputs import refuse_folder
         from loopcal.papers.reproduction import FOLDER
 
         refuse_folder(output, FOLDER, force)
-    result = chosen.run(seed, TRIALS if trials is None else trials, _print_step)
+
+    def print_step(text: str) -> None:
+        if sys.stderr.isatty():
+            terminal.print_message(text)
+
+    result = chosen.run(seed, TRIALS if trials is None else trials, print_step)
     if output is not None:
         from loopcal.io.runs.run_folder import collect_provenance
         from loopcal.papers.reproduction import write_folder
@@ -153,21 +162,6 @@ def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> lis
         f"{note} For calibrations use loopcal calibrate.",
     ]
     return page if output is None else [*page, f"Written to {output}"]
-
-
-def _print_step(text: str) -> None:
-    """Print a step on standard error where it is a terminal."""
-    if sys.stderr.isatty():
-        terminal.print_message(text)
-
-
-def _list_papers() -> Output:
-    """Return name, title and source of the studies."""
-    from loopcal.papers.paper import PAPERS
-
-    rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
-    lines = [text for r in rows for text in (r["name"], f"    {r['title']}", f"    {r['source']}")]
-    return Output({"papers": rows}, lambda: lines)
 
 
 def _view_reproduction(result: Reproduction) -> list[Block]:

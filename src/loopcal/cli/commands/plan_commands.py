@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,8 +37,6 @@ from loopcal.cli.terminal import Output, shows_output
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.measure.instrument import Instrument
-    from loopcal.measure.measurements import Measurements
     from loopcal.mechanism.model import Mechanism
     from loopcal.planning.constraints import PlanOptions
     from loopcal.planning.plane_line_planning import SurfacePlan
@@ -158,6 +156,7 @@ def plan(
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
     """  # noqa: D301
+    from loopcal.io.data.measurement_file import load_instrument_to_plan
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
     from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
 
@@ -182,7 +181,13 @@ def plan(
     else:
         if is_given("groups") or is_given("points"):
             raise DataError("--groups and --points belong to --measure plane-line; leave them out")
-        instrument = _find_instrument(machine, like, options)
+        if like is None:
+            instrument = make_instrument(options, machine)
+        else:
+            described = (*unknown_options.names, *instrument_options.names)
+            sentence = "{reason} describes the instrument; leave out {option}, or --like"
+            refuse_given(described, f"--like {like}", sentence)
+            instrument = load_instrument_to_plan(like, machine)
         plan_options = _make_plan_options(machine, allowed, measured, seed, options)
         from loopcal.planning.pose_planning import plan as plan_poses
 
@@ -199,18 +204,6 @@ def plan(
         f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
     ]
     return Output(document, lambda: page)
-
-
-def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
-    """Return the instrument that the options, or the settings of a file, describe."""
-    from loopcal.io.data.measurement_file import load_instrument_to_plan
-
-    if like is None:
-        return make_instrument(options, robot)
-    described = (*unknown_options.names, *instrument_options.names)
-    sentence = "{reason} describes the instrument; leave out {option}, or --like"
-    refuse_given(described, f"--like {like}", sentence)
-    return load_instrument_to_plan(like, robot)
 
 
 def _make_plan_options(
@@ -233,7 +226,15 @@ def _make_plan_options(
     if accuracy is not None and options["curve"]:
         raise DataError("--accuracy shows its own curve; leave out --curve")
     goal, target = (None, "pose") if accuracy is None else accuracy
-    earlier, names = _read_earlier(measured, robot) if measured else (None, ())
+    earlier = read_checked_measurements(measured, robot) if measured else None
+    if earlier is not None:
+        files = " ".join(map(str, measured))
+        if not earlier.n_rows:
+            raise DataError(
+                f"--measured {files} contains no measured value; fill it in, or leave it out"
+            )
+        if earlier.is_held_out.all():
+            raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
     return PlanOptions(
         n_poses=options["poses"],
         criterion=options["criterion"],
@@ -244,26 +245,11 @@ def _make_plan_options(
         constraints=make_constraints(options),
         allowed_poses=None if allowed is None else load_poses(allowed, robot),
         n_candidates=options["n_candidates"],
-        measured=earlier,
-        used_names=names,
+        measured=None if earlier is None else earlier.fitted,
+        used_names=() if earlier is None else earlier.labels,
         curve=options["curve"],
         seed=seed,
     )
-
-
-def _read_earlier(
-    measured: Sequence[Path], robot: Mechanism
-) -> tuple[Measurements, tuple[str, ...]]:
-    """Return the fitted poses of earlier files, and the names of all their poses."""
-    data = read_checked_measurements(measured, robot)
-    files = " ".join(map(str, measured))
-    if not data.n_rows:
-        raise DataError(
-            f"--measured {files} contains no measured value; fill it in, or leave it out"
-        )
-    if data.is_held_out.all():
-        raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
-    return data.fitted, data.labels
 
 
 def _write_plan(

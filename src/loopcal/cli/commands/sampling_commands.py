@@ -224,12 +224,24 @@ def sample(
       loopcal sample linear-delta measurements.csv --method map
       loopcal sample run --region -p radius -p 'tower*.angle'
     """  # noqa: D301
+    from loopcal.diagnose.joint_regions import compute_joint_region, compute_simultaneous_intervals
     from loopcal.diagnose.posterior_sample import sample_posterior
-    from loopcal.report.validation_view import view_posterior
+    from loopcal.io.runs.run_folder import load_run
+    from loopcal.report.validation_view import view_posterior, view_region
 
     if region:
         refuse_given(("count", "seed", "output", "force"), "with --region")
-        return _show_region(source, data, options, names, rule, level)
+        if data:
+            posterior = load_fit(source, data, options)[0].posterior
+        else:
+            refuse_given(options, "with a run folder")
+            posterior = load_run(source).load_posterior()
+        together = compute_simultaneous_intervals(posterior, names or None, level, rule)
+        joint = compute_joint_region(posterior, names, level) if names else None
+        return Output(
+            {"intervals": together.to_dict(), "region": None if joint is None else joint.to_dict()},
+            lambda: view_region(joint, together, posterior.robot),
+        )
     refuse_given(("names", "rule"), "without --region")
     _refuse_output(output, source, data, force)
     fit, measurements = load_fit(source, data, options)
@@ -237,33 +249,6 @@ def sample(
         result = sample_posterior(fit, measurements, count, seed=seed, progress=progress)
     intervals = result.intervals(level)
     return _finish(result, intervals, view_posterior(result, intervals), output)
-
-
-def _show_region(
-    source: str,
-    data: tuple[Path, ...],
-    options: dict[str, Any],
-    names: tuple[str, ...],
-    rule: Any,
-    level: float,
-) -> Output:
-    """Return simultaneous intervals, and the joint region of parameters that were named."""
-    from loopcal.diagnose.joint_regions import compute_joint_region, compute_simultaneous_intervals
-    from loopcal.io.runs.run_folder import load_run
-    from loopcal.report.validation_view import view_region
-
-    if data:
-        posterior = load_fit(source, data, options)[0].posterior
-    else:
-        refuse_given(options, "with a run folder")
-        posterior = load_run(source).load_posterior()
-    chosen = names or None
-    intervals = compute_simultaneous_intervals(posterior, chosen, level, rule)
-    joint = compute_joint_region(posterior, chosen, level) if names else None
-    return Output(
-        {"intervals": intervals.to_dict(), "region": None if joint is None else joint.to_dict()},
-        lambda: view_region(joint, intervals, posterior.robot),
-    )
 
 
 def _refuse_output(output: Path | None, source: str, data: tuple[Path, ...], force: bool) -> None:

@@ -180,30 +180,26 @@ def new(study_file: Path, robot: str | None, paper: str | None, force: bool) -> 
     from loopcal.studies.files.study_file import write_template
 
     if paper is not None:
-        return _write_paper_study(study_file, paper, robot, force)
+        from loopcal.papers.paper import find_paper, make_paper_study
+
+        made = make_paper_study(find_paper(paper), study_file, robot)
+        refuse_outputs(made.outputs, (), force)
+        made.write()
+        page = [f"Written: {', '.join(map(str, made.outputs))}"]
+        if made.replaced:
+            keys = " and ".join(made.replaced)
+            page.append(f"The {keys} of the paper belong to its robot and were replaced, too.")
+        page.append(f"Next: loopcal study check {study_file}")
+        written = [str(path) for path in made.outputs]
+        return Output(
+            {"written": written, "paper": paper, "robot": made.robot, "replaced": made.replaced},
+            lambda: page,
+        )
     robot = "linear-delta" if robot is None else robot
     refuse_outputs((study_file,), (), force)
     write_template(study_file, robot)
     page = [f"Written: {study_file}", f"Next: loopcal study check {study_file}"]
     return Output({"written": str(study_file), "robot": robot}, lambda: page)
-
-
-def _write_paper_study(study_file: Path, paper: str, robot: str | None, force: bool) -> Output:
-    """Write the study of a paper and return its files."""
-    from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.papers.paper import find_paper, make_paper_study
-
-    made = make_paper_study(find_paper(paper), study_file, robot)
-    refuse_outputs(made.outputs, (), force)
-    made.write()
-    written = [str(path) for path in made.outputs]
-    page = [f"Written: {', '.join(map(str, made.outputs))}"]
-    if made.replaced:
-        keys = " and ".join(made.replaced)
-        page.append(f"The {keys} of the paper belong to its robot and were replaced, too.")
-    page.append(f"Next: loopcal study check {study_file}")
-    document = {"written": written, "paper": paper, "robot": made.robot, "replaced": made.replaced}
-    return Output(document, lambda: page)
 
 
 @study.command()
