@@ -20,6 +20,7 @@ import loopcal as lc
 from loopcal.apply.height_errors import PREFIX, HeightErrors
 from loopcal.cli.entry_point import main
 from loopcal.errors import FileError, LoopcalError
+from loopcal.estimate.posterior import DISCREPANCY_PREFIX
 from loopcal.estimate.smooth_errors import describe_smooth_errors
 from loopcal.io.runs.run_folder import Run
 from loopcal.io.runs.run_result import (
@@ -204,7 +205,8 @@ def list_wrong_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
     arrays = read_arrays(folder / "RUN")
-    own = describe_smooth_errors(np.tile(np.eye(4), (3, 1, 1)), np.zeros(3), 1.0).arrays()
+    errors = describe_smooth_errors(np.tile(np.eye(4), (3, 1, 1)), np.zeros(3), 1.0)
+    own = store_arrays(errors, DISCREPANCY_PREFIX)
     m, p = 6 * len(own["discrepancy_centers"]), len(arrays["estimate"])
     own |= {"discrepancy_root": np.zeros((p, m)), "discrepancy_degrees": np.ones(2)}
     own |= {"discrepancy_directions": np.eye(p), "discrepancy_variance": np.ones(p)}

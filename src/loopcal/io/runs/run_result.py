@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Literal, NamedTuple
+from typing import Any, BinaryIO, ClassVar, Literal, NamedTuple, dataclass_transform
 
 import numpy as np
 
@@ -42,14 +42,16 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 """Half a character: part of a file name that is not UTF-8."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass_transform(frozen_default=True)
 class _Part:
     """A mapping in result.json, of which only the fields are read."""
 
     OTHER_KEYS: ClassVar[bool] = True
 
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, eq=False, repr=False)(cls)
 
-@dataclass(frozen=True, eq=False, repr=False)
+
 class StoredParameter(_Part):
     """An entry of `fit.parameters` or, for setup parameters, of `fit.local`."""
 
@@ -59,7 +61,6 @@ class StoredParameter(_Part):
     unit: str = ""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredFit(_Part):
     """The identification under `fit`."""
 
@@ -70,14 +71,12 @@ class StoredFit(_Part):
     sigma_scale: float | None = None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredSplit(_Part):
     """The held-out poses under `split`."""
 
     held_out: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredInput(_Part):
     """An input file under `made_by.inputs`."""
 
@@ -85,7 +84,6 @@ class StoredInput(_Part):
     sha256: str
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredOrigin(_Part):
     """The provenance under `made_by`."""
 
@@ -93,14 +91,12 @@ class StoredOrigin(_Part):
     inputs: dict[str, StoredInput]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredErrors(_Part):
     """The errors of poses under `expected_error.position` and `.orientation`."""
 
     rms: float | None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredHalf(_Part):
     """What half the sigma of a source leaves, under `halved`."""
 
@@ -109,7 +105,6 @@ class StoredHalf(_Part):
     worst_parameter_sd: float | None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredSource(_Part):
     """A source of errors under `expected_error.sources`."""
 
@@ -123,14 +118,12 @@ class StoredSource(_Part):
     halved: StoredHalf | None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredSentence(_Part):
     """A finding, of which the sentence is read."""
 
     text: str
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredBudget(_Part):
     """The uncertainty budget under `expected_error`; earlier versions state no `sources`."""
 
@@ -144,7 +137,6 @@ class StoredBudget(_Part):
     sources: tuple[StoredSource, ...] | None = None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class StoredResult(_Part):
     """What loopcal reads back from result.json."""
 
@@ -172,11 +164,8 @@ LARGEST = 1e100
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """Return the content of result.json of a run, of which `StoredResult` is checked.
-
-    Raises
-    ------
-    FileError : not a run, made by a newer loopcal, or damaged; with the file and the key.
+    """Return the content of result.json of a run, of which `StoredResult` is checked; FileError
+    where it is no run, made by a newer loopcal, or damaged.
     """
     content = read_json(path, "run result", f"this file of a run is damaged; {REPEAT}", TABLE_SIZE)
     if not isinstance(content, dict):
@@ -202,17 +191,8 @@ def read_result(path: Path) -> dict[str, Any]:
 def refuse_other_parameters(
     result: Mapping[str, Any], count: int, robot: Mechanism, path: Path
 ) -> None:
-    """Refuse a robot file of a run that lacks identified parameters.
-
-    Parameters
-    ----------
-    result : of `read_result`, which states the identified parameters. count : number of all
-        parameters before the calibration. robot : read from the file `path`; others may be free,
-        too, because a choice of the model identifies some of them.
-
-    Raises
-    ------
-    FileError : `files.run-robot-changed`.
+    """Refuse a robot, read from `path`, that lacks parameters that a result identified, of `count`
+    in all. Others may be free, too, because a choice of the model identifies some of them.
     """
     stated = [row["name"] for row in result["fit"]["parameters"]]
     identified, table = set(stated), robot.parameters
@@ -228,16 +208,8 @@ def refuse_other_parameters(
 def refuse_other_estimates(
     path: Path, result: Mapping[str, Any], key: str, array: np.ndarray, name: str
 ) -> None:
-    """Refuse a result that states other estimates than the arrays of its run.
-
-    Parameters
-    ----------
-    path : of result.json, whose content is `result`. key : of its rows under `fit`.
-    array : the estimates [SI]; `name` is that of the array.
-
-    Raises
-    ------
-    FileError : `files.run-damaged`.
+    """Refuse a result, read from `path`, whose rows under `fit`, of this `key`, state other
+    estimates than the array [SI] of its run.
     """
     rows, holds = result["fit"].get(key, ()), f"but the array {name!r} of the run holds"
     if len(array) != len(rows):
@@ -265,7 +237,8 @@ def _find_contradiction(stated: StoredResult) -> str | None:
     numbers = [budget.position.rms, budget.orientation.rms]
     for i, source in enumerate(budget.sources or ()):
         tables[f"expected_error.sources entry {i + 1}.parameters"] = source.parameters
-        numbers += [source.position, source.orientation, *_list_halved(source.halved)]
+        numbers += [source.position, source.orientation]
+        numbers += () if source.halved is None else dataclasses.astuple(source.halved)
     for name, table in tables.items():
         if budget.worst_parameter and budget.worst_parameter not in table:
             return f"{name!r} lacks the worst parameter {budget.worst_parameter!r}"
@@ -276,13 +249,7 @@ def _find_contradiction(stated: StoredResult) -> str | None:
     return None
 
 
-def _list_halved(halved: StoredHalf | None) -> tuple[float | None, ...]:
-    """Return the numbers of a source with half its sigma."""
-    return () if halved is None else dataclasses.astuple(halved)
-
-
-# The arrays of a run folder: an archive of NumPy's, read without trust in what it says of
-# itself.
+# The arrays of a run folder: an archive of NumPy's, read without trust in what it says of itself.
 
 WHAT = "archive of arrays"
 KINDS = "biufU"
@@ -310,14 +277,7 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Return name -> array, read-only, of a file that `numpy.savez` wrote.
 
-    Parameters
-    ----------
-    path : the file. size : limit of its bytes, and of all arrays. count : limit of its arrays.
-
-    Raises
-    ------
-    FileError : not an ordinary file, not readable, or beyond a limit.
-    ValueError : damaged; the text says how.
+    FileError : not an ordinary file, not readable, or beyond a limit. ValueError : damaged.
     """
     with open_bytes(path, WHAT) as stream:
         size.check(os.fstat(stream.fileno()).st_size, WHAT, path)
@@ -471,15 +431,9 @@ FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
 
 
 def read_run_arrays(path: Path, digest: str | None) -> dict[str, np.ndarray]:
-    """Return the arrays of a run by name, of which `RULES` are checked.
+    """Return the arrays of a run by name, of which `RULES` are checked; FileError names the array.
 
-    Parameters
-    ----------
-    path : of arrays.npz. digest : its SHA-256 that result.json states; None in format 1.
-
-    Raises
-    ------
-    FileError : damaged; with the file and the array.
+    `digest` is the SHA-256 of arrays.npz that result.json states; None in format 1.
     """
     if digest is not None and sha256(path) != digest:
         raise report_damage(path, "it is not the file that result.json names")
