@@ -25,21 +25,21 @@ def inputs(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_two_files_are_written_together_or_restored(tmp_path) -> None:
-    outcomes = examine(CASES["new"], tmp_path, 12, 4)
+    outcomes = examine(CASES["new"], tmp_path, 8, 3)
     assert list_wrong_outcomes(outcomes) == []
     assert set(outcomes[INTERRUPT]) == {"old", "new"}
 
 
 @pytest.mark.slow
 def test_run_folder_is_the_old_or_the_new_one(inputs) -> None:
-    outcomes = examine(CASES["calibrate"], inputs, 6, 3)
+    outcomes = examine(CASES["calibrate"], inputs, 4, 2)
     assert list_wrong_outcomes(outcomes) == []
     assert {"old", "new"} <= set(outcomes[KILL]) | set(outcomes[INTERRUPT])
 
 
 @pytest.mark.slow
 def test_first_run_folder_is_absent_or_complete(inputs) -> None:
-    assert list_wrong_outcomes(examine(CASES["calibrate, no old run"], inputs, 5, 0)) == []
+    assert list_wrong_outcomes(examine(CASES["calibrate, no old run"], inputs, 3, 0)) == []
     assert sorted(FIVE_BAR) == ["data.csv", "run", "targets.csv"]
 
 
