@@ -328,8 +328,9 @@ def compensate(
     """  # noqa: D301
     from loopcal.apply.compensation import compensate as compensate_targets
     from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
     from loopcal.io.robot.robot_file import load_robot
-    from loopcal.io.runs.result_files import format_compensation, load_targets, save_compensation
+    from loopcal.io.runs.result_files import format_compensation, load_targets
     from loopcal.io.runs.run_folder import find_failure, load_posterior_or_robot
     from loopcal.mechanism.model import Mechanism
     from loopcal.report.calibration_view import view_compensation
@@ -348,7 +349,7 @@ def compensate(
             known, coordinates, mode, old, steps, labels, progress, frame=frame
         )
     if output is not None:
-        save_compensation(result, output)
+        write_text(output, format_compensation(result))
     missed = [
         f"target {label!r}: {with_hint(result.findings[i])}"
         for i, (label, is_usable) in enumerate(zip(labels, result.usable, strict=True))
@@ -568,9 +569,10 @@ def regularize(
     """  # noqa: D301
     from loopcal.diagnose.regularization_curves import compute_regularization_curves
     from loopcal.estimate.options import FitOptions
+    from loopcal.io.core.outputs import refuse_folder
     from loopcal.io.data.measurement_file import list_measurement_files
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
-    from loopcal.io.runs.result_files import refuse_curves, write_curves
+    from loopcal.io.runs.result_files import CURVES, write_curves
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.report.figures.fit_figures import draw_regularization
     from loopcal.report.pictures import render_figure
@@ -579,7 +581,7 @@ def regularize(
     machine = load_robot(robot)
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
     if output is not None:
-        refuse_curves(output, force, list(inputs.values()))
+        refuse_folder(output, CURVES, force, list(inputs.values()))
     measurements = read_fitted_measurements(data, machine, flags)
     with terminal.ProgressBar() as progress:
         curves = compute_regularization_curves(

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 PLANE_LINE = "plane-line"
 """Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
 
-PLAN = "loopcal.planning.constraints:PlanOptions"
+OPTIONS = "loopcal.planning.constraints:PlanOptions"
 SURFACES = "loopcal.planning.plane_line_planning:SurfaceOptions"
 
 _COUNTED = "which is counted by --groups and --points"
@@ -79,7 +79,7 @@ EXCLUDED_BY_PLANE_LINE = {
 )
 @library_option(
     "--criterion",
-    of=PLAN,
+    of=OPTIONS,
     type=click.Choice(("I", "D")),
     help="What the plan minimizes: the mean predicted variance of poses (I), or the uncertainty of "
     "the parameters (D).",
@@ -118,7 +118,7 @@ EXCLUDED_BY_PLANE_LINE = {
 @library_option(
     "--candidates",
     "n_candidates",
-    of=PLAN,
+    of=OPTIONS,
     type=Count("CANDIDATES", 10),
     metavar="N",
     help="Number of candidate poses to draw.",
@@ -156,14 +156,15 @@ def plan(
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
     """  # noqa: D301
+    from loopcal.io.core.outputs import refuse_folder
     from loopcal.io.data.measurement_file import load_instrument_to_plan
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
-    from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
+    from loopcal.io.runs.plan_folder import FORMAT, PLAN
 
     files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
     files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
     inputs = {role: path for role, path in files.items() if path is not None}
-    refuse_plan_folder(output, force, list(inputs.values()))
+    refuse_folder(output, PLAN, force, list(inputs.values()))
     machine = load_robot(robot)
     if options["measure"] == PLANE_LINE:
         from loopcal.planning.plane_line_planning import SurfaceOptions, plan_surfaces

@@ -265,11 +265,13 @@ def _finish(
     output: Path | None,
 ) -> Output:
     """Write the draws, where a file is named, and return what to print."""
-    from loopcal.io.runs.result_files import save_draws
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.runs.result_files import format_draws
 
     if output is not None:
         factors, units = result.fit.free_parameters.display()
         weight = getattr(result, "weight", None)
-        save_draws(output, result.fit.names, units, factors, result.draws, weight)
+        names, draws = result.fit.names, result.draws
+        write_text(output, format_draws(names, units, factors, draws, weight))
         page = [*page, "", f"Written to {output}"]
     return Output({**result.to_dict(), "intervals": intervals.to_dict()}, lambda: page)

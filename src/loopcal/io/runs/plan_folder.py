@@ -24,7 +24,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import format_row, parse_exact
-from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
+from loopcal.io.core.outputs import FolderKind, write_result_folder
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN, get_dimension
 from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
 from loopcal.mechanism.model import Mechanism
@@ -107,19 +107,8 @@ def format_plan_data(plan: Plan) -> str:
     return _empty_readings(text, plan.robot) if is_closure else text
 
 
-def refuse_plan_folder(path: Path, force: bool, inputs: Sequence[Path] = ()) -> None:
-    """Raise FileError where a plan must not be written; see `refuse_folder`."""
-    refuse_folder(path, PLAN, force, inputs)
-
-
 def find_plan_sheet(data: Path) -> Path:
-    """Return the operator's sheet beside a data file without readings, which has the commands.
-
-    Raises
-    ------
-    FileError
-        There is none.
-    """
+    """Return the operator's sheet beside a data file without readings, which has the commands."""
     beside = data.parent / SHEET
     if not beside.is_file():
         sentence = f"this sheet has no readings, and there is no {SHEET} beside it"
@@ -134,18 +123,8 @@ def write_plan_folder(
     pictures: Mapping[str, bytes],
     force: bool = False,
 ) -> None:
-    """Write the folder of a plan whole or not at all.
-
-    Parameters
-    ----------
-    path : the folder to make. texts : name -> text of a file.
-    document : content of plan.json; `format` and `files` are added.
-    pictures : name -> content.
-    force : replace an older, unchanged plan.
-
-    Raises
-    ------
-    FileError : see `write_result_folder`.
+    """Write the folder of a plan whole or not at all, see `write_result_folder`: texts and
+    pictures by name, and plan.json, to whose content `format` and `files` are added.
     """
     files = {name: text.encode() for name, text in texts.items()} | dict(pictures)
     write_result_folder(path, PLAN, {"format": FORMAT, **document}, files, force)

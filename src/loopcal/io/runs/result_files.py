@@ -25,7 +25,7 @@ from loopcal.io.core.csv_table import (
     read_table,
     require_columns,
 )
-from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
+from loopcal.io.core.outputs import FolderKind, write_result_folder
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.columns import COMMANDED, NOTE, get_dimension
 from loopcal.mechanism.model import Mechanism
@@ -71,11 +71,6 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
             raise table.row_error(i, f"{problem}; give each target a name of its own")
         used.add(label)
     return np.column_stack(columns), labels
-
-
-def save_compensation(result: Compensation, path: str | Path) -> None:
-    """Write the result as CSV; raise FileError where it cannot be written."""
-    write_text(path, format_compensation(result))
 
 
 def _list_columns(result: Compensation) -> tuple[list[tuple[str, Unit]], FloatArray]:
@@ -133,20 +128,9 @@ def _format_error(value: float) -> str:
 
 
 def save_comparison(path: Path, titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Write the table of a comparison.
-
-    Parameters
-    ----------
-    titles : of the columns. rows : their cells as text.
-
-    Raises
-    ------
-    FileError : the file cannot be written.
-    """
+    """Write the table of a comparison: titles of columns, and their cells as text."""
     lines = [titles, *rows]
-    text = "".join(format_row(map(escape_formula, line)) + "\n" for line in lines)
-
-    write_text(path, text)
+    write_text(path, "".join(format_row(map(escape_formula, line)) + "\n" for line in lines))
 
 
 # The folder of regularization curves.
@@ -158,27 +142,13 @@ CURVES = FolderKind(
 )
 
 
-def refuse_curves(path: Path, force: bool, inputs: Sequence[Path] = ()) -> None:
-    """Raise FileError where the folder must not be written; see `refuse_folder`."""
-    refuse_folder(path, CURVES, force, inputs)
-
-
 def write_curves(
     path: Path, document: Mapping[str, Any], points: str, picture: bytes, force: bool = False
 ) -> None:
-    """Write the folder whole or not at all.
-
-    Parameters
-    ----------
-    document : content of curves.json; `format` and `files` are added. points : the text of
-        curves.csv. picture : the content of curves.png. force : replace an older, unchanged folder.
-
-    Raises
-    ------
-    FileError : see `write_result_folder`.
+    """Write the folder whole or not at all, see `write_result_folder`; `format` and `files` are
+    added to the document.
     """
     files = {POINTS: points.encode(), PICTURE: picture}
-
     write_result_folder(path, CURVES, {"format": FORMAT, **document}, files, force)
 
 
@@ -186,23 +156,6 @@ def write_curves(
 
 WEIGHT = "weight"
 """Column of the weights of draws, whose sum is 1; absent where all draws weigh the same."""
-
-
-def save_draws(
-    path: str | Path,
-    names: Sequence[str],
-    units: Sequence[str],
-    factors: FloatArray,
-    draws: FloatArray,
-    weight: FloatArray | None = None,
-) -> None:
-    """Write draws as CSV; arguments as of `format_draws`.
-
-    Raises
-    ------
-    FileError : the file cannot be written.
-    """
-    write_text(path, format_draws(names, units, factors, draws, weight))
 
 
 def format_draws(
