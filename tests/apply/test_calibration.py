@@ -384,8 +384,16 @@ def test_next_step_after_an_exceeded_limit_names_repeatability_that_no_calibrati
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [Position(), Position(unknown=("frame",))], ids=repr)
-@pytest.mark.parametrize("n", [BLOCK + 1, EXACT_BLOCK + 1])
+@pytest.mark.parametrize(
+    ("n", "kind"),
+    [
+        (BLOCK + 1, Position(unknown=("frame",))),
+        (EXACT_BLOCK + 1, Position()),
+        pytest.param(BLOCK + 1, Position(), marks=pytest.mark.evidence),
+        pytest.param(EXACT_BLOCK + 1, Position(unknown=("frame",)), marks=pytest.mark.evidence),
+    ],
+    ids=repr,
+)
 def test_poses_of_several_blocks_are_calibrated_with_all_findings(kind, n):
     """Poses that one problem solved serve others with further parameters, in the same blocks."""
     robot = lc.load_robot("linear-delta")
