@@ -59,6 +59,17 @@ def word_column(title: str, wraps: bool = False) -> Column:
     return Column(title, align="left", wraps=wraps)
 
 
+def read_column(title: str | Column) -> Column:
+    """Return the column of a title: of numbers after ">", of words that wrap after "~", else of
+    words.
+    """
+    if isinstance(title, Column):
+        return title
+    if title.startswith(">"):
+        return Column(title[1:])
+    return word_column(title.removeprefix("~"), wraps=title.startswith("~"))
+
+
 @dataclass(frozen=True)
 class Table:
     """Columns, rows of formatted cells, and a caption."""
@@ -179,10 +190,17 @@ class Table:
         ]
 
 
+def make_table(
+    caption: str, columns: Iterable[str | Column], rows: Iterable[Iterable[str]]
+) -> Table:
+    """Return a table of formatted cells; see `read_column` for titles."""
+    return Table(caption, tuple(map(read_column, columns)), tuple(map(tuple, rows)))
+
+
 def build_table(
     caption: str,
     rows: Iterable[Row],
-    *columns: Field | tuple[Column, Callable[[Row], str]],
+    *columns: Field | tuple[str | Column, Callable[[Row], str]],
     units: Mapping[Dimension, Unit] = MappingProxyType({}),
 ) -> Table:
     """Return a table from objects: fields of theirs, or columns with functions that give the cell
@@ -198,7 +216,7 @@ def build_table(
             shown.append(heading)
             cells.append([_format_field(column, row, units) for row in rows])
         else:
-            shown.append(column[0])
+            shown.append(read_column(column[0]))
             cells.append([column[1](row) for row in rows])
     return Table(caption, tuple(shown), tuple(zip(*cells, strict=True)))
 
@@ -220,7 +238,7 @@ def _total(widths: Sequence[int]) -> int:
     return sum(widths) + GAP * (len(widths) - 1)
 
 
-# --- Numbers for people: digits that the uncertainty leaves, and the units of a robot's file.
+# Numbers for people: digits that the uncertainty leaves, and the units of a robot's file.
 
 ROUNDING = 1e-12
 """A number smaller than this, in whatever unit is shown, is rounding and printed as 0."""
@@ -280,7 +298,7 @@ def format_uncertainty(uncertainty: float) -> str:
     return f"{uncertainty:.{count_decimals(uncertainty)}f}" if uncertainty > 0.0 else "0"
 
 
-# --- A page of paragraphs and tables, rendered as text of a given width.
+# A page of paragraphs and tables, rendered as text of a given width.
 
 COMMAND = "Next: loopcal "
 """Start of a line that contains a command."""
