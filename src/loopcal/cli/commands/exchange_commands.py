@@ -195,15 +195,20 @@ def fill(
     misfits = [{"file": f, "line": n, "reason": reason} for f, n, reason in filled.misfits]
     document = {"measurements": output, "misfits": misfits, "findings": findings}
     first, *others = (with_hint(finding) for finding in findings)
-    page = [f"{output}: {first}", *(f"note: {text}" for text in others)]
-    page += [
-        f"note: {file}:{line} does not match: {reason}"
-        for file, line, reason in filled.misfits[:SHOWN]
+    page = [
+        f"{output}: {first}",
+        *(f"note: {text}" for text in others),
+        *_note_misfits(filled.misfits),
+        f"Next: loopcal calibrate {shlex.join((robot, str(output)))} -o run",
     ]
-    if len(filled.misfits) > SHOWN:
-        page.append(f"note: {len(filled.misfits) - SHOWN} more lines do not match")
-    page.append(f"Next: loopcal calibrate {shlex.join((robot, str(output)))} -o run")
     return Output(document, lambda: page)
+
+
+def _note_misfits(misfits: Sequence[tuple[Any, int, str]], where: str = "") -> list[str]:
+    """Return notes on lines (file, number, reason) that do not match a profile."""
+    notes = [f"note: {file}:{line} does not match: {why}" for file, line, why in misfits[:SHOWN]]
+    more = len(misfits) - SHOWN
+    return notes if more <= 0 else [*notes, f"note: {more} more lines do not match{where}"]
 
 
 def convert_instrument_export(
@@ -238,14 +243,8 @@ def convert_instrument_export(
     page = [
         f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
         *(f"note: {with_hint(finding)}" for finding in converted.findings),
-        *(
-            f"note: {file}:{line} does not match: {reason}"
-            for line, reason in converted.misfits[:SHOWN]
-        ),
+        *_note_misfits([(file, *misfit) for misfit in converted.misfits], f"; {output} lists them"),
     ]
-    more = len(converted.misfits) - SHOWN
-    if more > 0:
-        page.append(f"note: {more} more lines do not match; {output} lists them")
     return Output(document, lambda: page)
 
 

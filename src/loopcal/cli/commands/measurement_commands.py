@@ -130,7 +130,7 @@ def identifiability(
         measurements = read_fitted_measurements(data, machine, options)
     else:
         if poses is None:
-            drawn = [_name_drawn_poses(machine, draw, seed)]
+            drawn = [f"{_name_drawn_poses(machine, draw)}, seed {seed}"]
         measurements = predict_noise_free(
             machine,
             make_instrument(options, machine),
@@ -170,9 +170,9 @@ def _read_poses(poses: Path | None, draw: int, robot: Mechanism) -> dict[str, An
     return {"poses": load_poses(poses, robot), "labels": labels, "places": places}
 
 
-def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
+def _name_drawn_poses(robot: Mechanism, count: int) -> str:
     """Return what the drawn poses are."""
-    return f"{count} poses drawn from the workspace of {robot.name}, seed {seed}"
+    return f"{count} poses drawn from the workspace of {robot.name}"
 
 
 @click.command()
@@ -239,7 +239,8 @@ def simulate(
 
     machine = open_robot(robot, (output, truth), (poses, fill), force)
     if fill is not None:
-        result, remark = _fill_in(machine, fill, draw_errors, seed)
+        result = _fill_in(machine, fill, draw_errors, seed)
+        source = fill.name
     else:
         result = simulate_measurements(
             machine,
@@ -250,10 +251,9 @@ def simulate(
             seed=seed,
             skip_unreachable=skip_unreachable,
         )
-        drawn = _name_drawn_poses(machine, draw, seed)
-        source = drawn if poses is None else f"{poses.name}, seed {seed}"
-        remark = f"simulated by loopcal: {source}"
+        source = _name_drawn_poses(machine, draw) if poses is None else poses.name
     with restore_on_failure((output, truth)):
+        remark = f"simulated by loopcal: {source}, seed {seed}"
         save_measurements(result.data, output, result.truth, remark)
         if truth is not None:
             save_robot(result.truth, truth)
@@ -275,10 +275,8 @@ def simulate(
     return Output(document, lambda: page)
 
 
-def _fill_in(
-    robot: Mechanism, sheet: Path, draw_errors: bool, seed: int
-) -> tuple[SimulatedMeasurements, str]:
-    """Return the filled-in data of a plan, and what they are."""
+def _fill_in(robot: Mechanism, sheet: Path, draw_errors: bool, seed: int) -> SimulatedMeasurements:
+    """Return the filled-in data of a plan."""
     from loopcal.apply.simulated_measurements import fill_in_measurements
     from loopcal.io.data.measurement_file import (
         has_empty_readings,
@@ -301,5 +299,4 @@ def _fill_in(
         how["are_contacts"] = not is_closure
     else:
         planned = load_measurements(sheet, robot)
-    result = fill_in_measurements(robot, planned, instrument, **how)
-    return result, f"simulated by loopcal: {sheet.name}, seed {seed}"
+    return fill_in_measurements(robot, planned, instrument, **how)

@@ -151,9 +151,10 @@ def bootstrap(
       loopcal bootstrap hexapod-42 measurements.csv --method least-squares
     """  # noqa: D301
     from loopcal.diagnose.bootstrap import bootstrap as resample
+    from loopcal.io.core.outputs import refuse_outputs
     from loopcal.report.validation_view import view_bootstrap
 
-    _refuse_output(output, source, data, force)
+    refuse_outputs((output,), (Path(source), *data), force)
     fit, measurements = load_fit(source, data, options)
     is_number = unit is not None and unit.isdecimal() and len(unit) < MOST_DIGITS
     chosen = int(unit) if unit is not None and is_number else unit
@@ -226,6 +227,7 @@ def sample(
     """  # noqa: D301
     from loopcal.diagnose.joint_regions import compute_joint_region, compute_simultaneous_intervals
     from loopcal.diagnose.posterior_sample import sample_posterior
+    from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.runs.run_folder import load_run
     from loopcal.report.validation_view import view_posterior, view_region
 
@@ -243,19 +245,12 @@ def sample(
             lambda: view_region(joint, together, posterior.robot),
         )
     refuse_given(("names", "rule"), "without --region")
-    _refuse_output(output, source, data, force)
+    refuse_outputs((output,), (Path(source), *data), force)
     fit, measurements = load_fit(source, data, options)
     with terminal.ProgressBar() as progress:
         result = sample_posterior(fit, measurements, count, seed=seed, progress=progress)
     intervals = result.intervals(level)
     return _finish(result, intervals, view_posterior(result, intervals), output)
-
-
-def _refuse_output(output: Path | None, source: str, data: tuple[Path, ...], force: bool) -> None:
-    """Refuse an output file that exists, or that is an input."""
-    from loopcal.io.core.outputs import refuse_outputs
-
-    refuse_outputs((output,), (Path(source), *data), force)
 
 
 def _finish(
