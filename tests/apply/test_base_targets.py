@@ -131,13 +131,14 @@ def test_machine_frames_and_targets_agree_with_a_dense_fit(is_known):
 
 
 @pytest.mark.slow
-def test_the_motion_of_the_tracker_is_recovered_within_its_uncertainty():
+@pytest.mark.parametrize("machines", [4, pytest.param(10, marks=pytest.mark.evidence)])
+def test_the_motion_of_the_tracker_is_recovered_within_its_uncertainty(machines):
     total, covariance = 0.0, np.eye(6)
-    for number in range(10):
+    for number in range(machines):
         motion, covariance = compare_frames(lc.identify(ROBOT, measure(number)[0]))
         error = motion - DRIFT
         total += error @ np.linalg.solve(covariance, error)
-    assert chi2.ppf(0.005, 60) < total < chi2.ppf(0.995, 60)
+    assert chi2.ppf(0.005, 6 * machines) < total < chi2.ppf(0.995, 6 * machines)
     # 0.1 mm and 20 arcsec are many standard deviations, so that a fit that ignores them fails
     sd = np.sqrt(np.diag(covariance))
     assert sd[2] < 0.3 * DRIFT[2]
@@ -145,10 +146,11 @@ def test_the_motion_of_the_tracker_is_recovered_within_its_uncertainty():
 
 
 @pytest.mark.slow
-def test_a_calibration_with_targets_on_the_base_does_not_suffer_from_the_motion():
+@pytest.mark.parametrize("machines", [2, pytest.param(4, marks=pytest.mark.evidence)])
+def test_a_calibration_with_targets_on_the_base_does_not_suffer_from_the_motion(machines):
     q = lc.inverse(ROBOT, resolve_poses(ROBOT, 30, 9)).q
     errors = {"still": [], "moved": [], "unnoticed": [], "without": []}
-    for number in range(4):
+    for number in range(machines):
         moved, still = measure(number)[0], measure(number, 0.0 * DRIFT)[0]
         data = {
             "still": join_sessions(still),
@@ -206,11 +208,12 @@ def make_repeats(seed, *, targets=5, moved=None, step=None, sessions=("", "", ""
 
 
 @pytest.mark.parametrize("sessions", [("",) * 4, ("am", "am", "pm", "pm")])
-def test_p_values_without_motion_are_uniform(sessions):
-    data = [make_repeats(seed, sessions=sessions) for seed in range(60)]
+@pytest.mark.parametrize("count", [30, pytest.param(60, marks=pytest.mark.evidence)])
+def test_p_values_without_motion_are_uniform(sessions, count):
+    data = [make_repeats(seed, sessions=sessions) for seed in range(count)]
     moved = [drift.p_value for each in data for drift in estimate_frame_drifts(each)]
     shapes = [shape.p_value for each in data for shape in compare_shapes(each)]
-    assert len(moved) == 60 * len(set(sessions))
+    assert len(moved) == count * len(set(sessions))
     assert kstest(moved, "uniform").pvalue > 1e-3
     assert kstest(shapes, "uniform").pvalue > 1e-3
 
