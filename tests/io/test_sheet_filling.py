@@ -26,13 +26,14 @@ from loopcal.diagnose.point_names import examine_points
 from loopcal.errors import DataError, FileError
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.data.measurement_writer import format_data_sheet
+from loopcal.io.exports.conversion import save_converted
 from loopcal.io.exports.profile import (
     find_profile_file,
     list_shipped_profiles,
     read_profile,
     with_local_settings,
 )
-from loopcal.io.exports.sheet_filling import fill_sheet, save_filled_sheet
+from loopcal.io.exports.sheet_filling import fill_sheet
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
@@ -168,7 +169,7 @@ def test_every_format_fills_the_sheet_with_the_same_points(
     assert examine_points(robot, filled.data, filled.unit) == ()
     assert not filled.misfits
     output = tmp_path / "measured.csv"
-    save_filled_sheet(filled, output)
+    save_converted(filled.text, output)
     data = load_measurements(output, robot)
     assert data.is_held_out.sum() == 3
     wanted = np.array([xyz for _, xyz in points]).reshape(N, 9) / 1e3
@@ -277,7 +278,7 @@ def test_moved_tracker_is_refused_and_two_files_are_two_sessions(
     ]
     with pytest.raises(DataError, match="two positions"):
         examine(robot, sheet, *days, has_one_session=True)
-    save_filled_sheet(fill(robot, sheet, *days), tmp_path / "measured.csv")
+    save_converted(fill(robot, sheet, *days).text, tmp_path / "measured.csv")
     rows = load_measurements(tmp_path / "measured.csv", robot).observations[0]
     assert rows.session.tolist() == ["monday"] * 7 + ["tuesday"] * 7
 
@@ -323,7 +324,7 @@ def test_one_target_needs_no_name_of_a_target(robot, simulated, points, tmp_path
 
 def test_filled_sheet_is_refused(robot, sheet, points, tmp_path) -> None:
     path = write_spatial_analyzer(tmp_path / "e.txt", points)
-    save_filled_sheet(fill(robot, sheet, path), tmp_path / "measured.csv")
+    save_converted(fill(robot, sheet, path).text, tmp_path / "measured.csv")
     with pytest.raises(FileError, match="this sheet has measured values already"):
         fill(robot, tmp_path / "measured.csv", path)
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
-from loopcal.io.exports.conversion import convert_export, save_conversion
+from loopcal.io.exports.conversion import convert_export, save_converted
 from loopcal.io.exports.profile import read_profile
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import export_robot, save_imported
@@ -153,7 +153,7 @@ def test_a_damaged_document_is_refused_or_read(files) -> None:
 
 def convert(profile: Path, export: Path) -> None:
     """Convert an export, and write the measurement file."""
-    save_conversion(convert_export(export, read_profile(profile)), "out.csv")
+    save_converted(convert_export(export, read_profile(profile)).text, "out.csv")
 
 
 @pytest.mark.slow

@@ -172,8 +172,9 @@ def fill(
     """  # noqa: D301
     from loopcal.diagnose.conventions.convention_check import check_conventions
     from loopcal.diagnose.point_names import examine_points
+    from loopcal.io.exports.conversion import save_converted
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
-    from loopcal.io.exports.sheet_filling import fill_sheet, save_filled_sheet
+    from loopcal.io.exports.sheet_filling import fill_sheet
 
     path = find_profile_file(profile)
     machine = open_robot(robot, (output,), (sheet, *exports, path), force)
@@ -190,7 +191,7 @@ def fill(
         machine, filled.data.fitted, allow_implausible=allow_implausible
     )
     print_convention_note(conventions, exports)
-    save_filled_sheet(filled, output)
+    save_converted(filled.text, output)
     findings = (*filled.findings, *examined)
     misfits = [{"file": f, "line": n, "reason": reason} for f, n, reason in filled.misfits]
     document = {"measurements": output, "misfits": misfits, "findings": findings}
@@ -219,7 +220,7 @@ def convert_instrument_export(
     `local` : the unit of lengths in place of that of the profile, and whether commas are decimal.
     """
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.exports.conversion import convert_export, save_conversion
+    from loopcal.io.exports.conversion import convert_export, save_converted
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
 
     used = {"file", "profile", "output", "force", "as_json", "length_unit", "decimal"}
@@ -231,7 +232,7 @@ def convert_instrument_export(
     path = find_profile_file(profile)
     refuse_outputs((output,), (file, path), force)
     converted = convert_export(file, with_local_settings(read_profile(path), *local))
-    save_conversion(converted, output)
+    save_converted(converted.text, output)
     document = {
         "measurements": output,
         "rows": converted.rows,

@@ -418,20 +418,19 @@ def convert_export(
         lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
     lines += [f"## {format_comment(str(finding))}" for finding in findings]
     lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
-    table = _tabulate(profile, rows)
+    columns = list_headers(profile)
+    # a target without a line has no covariance
+    absent = {name: "0" if name.startswith(COVARIANCE) else "" for name in columns}
+    numbered = [{**absent, "pose": str(i), **row} for i, row in enumerate(rows, 1)]
+    table = (format_header(columns), *(tuple(row[n] for n in columns) for row in numbered))
     text = "\n".join([*lines, *map(format_row, table)]) + "\n"
     return Conversion(text, table, skipped, tuple(misfits), findings)
 
 
-def save_conversion(conversion: Conversion, path: str | Path) -> None:
-    """Write the measurement file of an export.
-
-    Raises
-    ------
-    FileError : the file cannot be written.
-    """
+def save_converted(text: str, path: str | Path) -> None:
+    """Write the measurement file that became of an export."""
     refuse_settings_beside(Path(path))
-    write_text(path, conversion.text)
+    write_text(path, text)
 
 
 def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:
@@ -531,18 +530,6 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
     R = geometry.project_to_rotations(matrix)
     quaternion = (repr(float(q)) for q in geometry.matrix_to_quaternion(R))
     return dict(zip(QUATERNION, quaternion, strict=True))
-
-
-def _tabulate(profile: Profile, rows: Sequence[Row]) -> tuple[tuple[str, ...], ...]:
-    """Return the header and the rows of the measurement file."""
-    columns = list_headers(profile)
-    # a target without a line has no covariance
-    absent = {name: "0" if name.startswith(COVARIANCE) else "" for name in columns}
-    table = [format_header(columns)]
-    for i, row in enumerate(rows, 1):
-        cells = {**absent, "pose": str(i), **row}
-        table.append(tuple(cells[name] for name in columns))
-    return tuple(table)
 
 
 def _format_setting(value: Any) -> str:

@@ -17,14 +17,8 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import (
-    Table,
-    format_header,
-    format_row,
-    read_table,
-    refuse_settings_beside,
-)
-from loopcal.io.core.text_file import read_text, write_text
+from loopcal.io.core.csv_table import Table, format_header, format_row, read_table
+from loopcal.io.core.text_file import read_text
 from loopcal.io.data.kind_settings import KindRows, read_kinds
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export, list_headers
@@ -124,18 +118,13 @@ def fill_sheet(
     # columns of the sheet, measured ones with the unit of the export, then further ones
     header = {n: units.get(n, u) if n in columns else u for n, u in table.units.items()}
     header |= {name: unit for name, unit in units.items() if name not in header}
-    lines = _list_settings(table)
+    above = read_text(table.path, "sheet").lstrip("\ufeff").splitlines()[: table.header_line - 1]
+    lines = [line for line in above if line.strip()]
     cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
     written = (format_header(header), *cells)
     text = "\n".join([*lines, *map(format_row, written)]) + "\n"
     unit = next((units.get(name) for name in columns if units.get(name)), None) or "mm"
     return FilledSheet(text, written, tuple(misfits), data, unit, tuple(findings))
-
-
-def save_filled_sheet(filled: FilledSheet, path: str | Path) -> None:
-    """Write a filled sheet; FileError where it cannot be written."""
-    refuse_settings_beside(Path(path))
-    write_text(path, filled.text)
 
 
 def _read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
@@ -263,12 +252,6 @@ def _merge(
         kept = {name: cell for name, cell in row.items() if name not in columns}
         for points in filled.get(row["pose"], ()) or ({},):
             yield {**dict.fromkeys(units, ""), **kept, **{n: c for n, c in points.items() if c}}
-
-
-def _list_settings(table: Table) -> list[str]:
-    """Return the lines above the header of a sheet."""
-    lines = read_text(table.path, "sheet").lstrip("\ufeff").splitlines()
-    return [line for line in lines[: table.header_line - 1] if line.strip()]
 
 
 def _build_measurements(

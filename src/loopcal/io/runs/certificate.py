@@ -289,11 +289,10 @@ def _add_contact(parent: Element, contact: Contact) -> None:
     if contact.email:
         _add(parent, "eMail", contact.email)
     location = _add(parent, "location")
-    for name, text in (("street", contact.street), ("postCode", contact.post_code)):
+    place = {"street": contact.street, "postCode": contact.post_code, "city": contact.city}
+    for name, text in place.items():
         if text:
             _add(location, name, text)
-    if contact.city:
-        _add(location, "city", contact.city)
     _add(location, "countryCode", contact.country)
 
 
