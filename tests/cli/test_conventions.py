@@ -2,6 +2,8 @@
 """Convention checks on the command line, and setup frames that `validate` takes from a run."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,6 +51,19 @@ def write_simulated_data(path, kind, n=9, seed=0, change=None, unknowns=None):
 
 
 MOVED = "validation.setup-moved"
+PLACED = {"frame.x": 0.1, "frame.rz": 0.5}
+
+
+@pytest.fixture(scope="module")
+def placed_run(tmp_path_factory) -> Path:
+    """Return a folder with measurements in an unknown frame and their calibration."""
+    folder = tmp_path_factory.mktemp("placed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        data = Path("data.csv")
+        write_simulated_data(data, Pose(unknown=("frame",)), 20, 0, unknowns=PLACED)
+        assert main(["calibrate", "hexapod-42", "data.csv", "-o", "run"]) == 0
+    return folder
 
 
 def read_codes(result: tuple[int, str, str]) -> set[str]:
@@ -105,12 +120,10 @@ def test_target_that_never_moves_is_refused_without_allow_still(folder_and_run) 
     assert run("identifiability hexapod-42 data.csv --allow-still --allow-implausible")[0] == 0
 
 
-def test_validate_uses_the_frame_estimated_by_the_run(folder_and_run) -> None:
+def test_validate_uses_the_frame_estimated_by_the_run(folder_and_run, placed_run) -> None:
     folder, run = folder_and_run
-    placed = {"frame.x": 0.1, "frame.rz": 0.5}
-    write_simulated_data(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
-    write_simulated_data(folder / "more.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed)
-    assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
+    shutil.copytree(placed_run, folder, dirs_exist_ok=True)
+    write_simulated_data(folder / "more.csv", Pose(unknown=("frame",)), 6, 1, unknowns=PLACED)
     assert read_codes(run("validate run more.csv --json")) == {"validation.setup-kept"}
     assert read_codes(run("validate run more.csv --refit frame --json")) == {
         "validation.setup-fitted"
@@ -120,17 +133,17 @@ def test_validate_uses_the_frame_estimated_by_the_run(folder_and_run) -> None:
     assert "is called 'tracker'; the data have: frame" in err
 
 
-def test_frame_moved_since_the_fit_is_reported_and_kept_for_both_errors(folder_and_run) -> None:
+def test_frame_moved_since_the_fit_is_reported_and_kept_for_both_errors(
+    folder_and_run, placed_run
+) -> None:
     folder, run = folder_and_run
-    placed = {"frame.x": 0.1, "frame.rz": 0.5}
-    write_simulated_data(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    shutil.copytree(placed_run, folder, dirs_exist_ok=True)
     write_simulated_data(
-        folder / "moved.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed | {"frame.x": 0.105}
+        folder / "moved.csv", Pose(unknown=("frame",)), 6, 1, unknowns=PLACED | {"frame.x": 0.105}
     )
     write_simulated_data(
-        folder / "one.csv", Pose(unknown=("frame",)), 1, 1, unknowns=placed | {"frame.x": 0.105}
+        folder / "one.csv", Pose(unknown=("frame",)), 1, 1, unknowns=PLACED | {"frame.x": 0.105}
     )
-    assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
     code, out, _ = run("validate run moved.csv")
     assert code == 0
     assert "Position error (rms): the same" in out  # 5 mm of the frame in both
@@ -144,10 +157,11 @@ def test_frame_moved_since_the_fit_is_reported_and_kept_for_both_errors(folder_a
     assert MOVED not in read_codes(run("validate run one.csv --json"))
 
 
-def test_prior_or_fixed_value_that_contradicts_the_data_is_refused_by_name(folder_and_run) -> None:
+def test_prior_or_fixed_value_that_contradicts_the_data_is_refused_by_name(
+    folder_and_run, placed_run
+) -> None:
     folder, run = folder_and_run
-    placed = {"frame.x": 0.1, "frame.rz": 0.5}
-    write_simulated_data(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    shutil.copytree(placed_run, folder, dirs_exist_ok=True)
     text = (folder / "data.csv").read_text()
 
     def run_with_statement(statement: str) -> tuple[int, str, str]:
