@@ -134,14 +134,6 @@ def find_command(name: str) -> click.Command | None:
     return None
 
 
-def find_running_command(words: Sequence[str]) -> click.Command | None:
-    """Import the command of the words of a command line, also one of a group; None without one."""
-    command = find_command(words[0]) if words else None
-    if isinstance(command, click.Group) and len(words) > 1:
-        return command.commands.get(words[1], command)
-    return command
-
-
 @click.group(
     cls=SectionedGroup,
     context_settings={
@@ -188,19 +180,16 @@ def _print_version(context: click.Context, is_asked: bool) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code.
-
-    Parameters
-    ----------
-    arguments : words after `loopcal`; default: those of the process.
-    """
+    """Run the command line, or these words after `loopcal`, and return its exit code."""
     os.environ.update(dict.fromkeys(THREADS, "1"))
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_streams()
     command = None
     with repeat_lost_interrupts(), record_outputs() as list_outputs:
         try:
-            command = find_running_command(words)
+            command = find_command(words[0]) if words else None
+            if isinstance(command, click.Group) and len(words) > 1:
+                command = command.commands.get(words[1], command)
             if command is not None and not _has_working_folder():
                 return _refuse("the working folder was removed; change to a folder that exists.")
             code = command_line.main(words, prog_name="loopcal", standalone_mode=False)
@@ -226,11 +215,8 @@ def _report(
     words: Sequence[str],
     outputs: Sequence[Path],
 ) -> int:
-    """Print what an exception means for the user, and return the exit code.
-
-    Parameters
-    ----------
-    command : that ran, if known. words : of the command line. outputs : that were written before.
+    """Print what an exception means for the user; return the exit code. `outputs` were written
+    completely before it.
     """
     if outputs:
         names = " and ".join(str(path) for path in outputs)

@@ -77,12 +77,7 @@ def data_option(name: str, help_text: str, **kind: Any) -> Decorator:
 
 
 class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """A number with its unit on the command line, such as 0.02mm; its value is in SI.
-
-    Parameters
-    ----------
-    dimension : of the unit. is_positive : whether only numbers above 0 are allowed.
-    """
+    """A number with its unit on the command line, such as 0.02mm; its value is in SI."""
 
     name = "quantity"
 
@@ -112,12 +107,9 @@ class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  
 
 
 class Count(click.IntRange):
-    """A whole number on the command line, up to a limit of `loopcal.io.core.limits`.
-
-    Parameters
-    ----------
-    limit : name of the `CountLimit`, which is not imported before the option is used.
-    least : smallest number that is allowed; None where the command itself refuses small ones.
+    """A whole number on the command line, up to a limit of `loopcal.io.core.limits`, which is given
+    by its name, so that it is only imported when the option is used; without `least`, the command
+    itself refuses small ones.
     """
 
     def __init__(self, limit: str, least: int | None = None) -> None:
@@ -141,12 +133,9 @@ def _import(place: str) -> Any:
 
 
 class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """A word of the library on the command line, which is imported when it is needed.
-
-    Parameters
-    ----------
-    place : of a registry, whose names are allowed, or of a `Literal`. others : words beside these.
-    property : of the entries that are listed, such as `read` of formats; empty for all.
+    """A word of the library on the command line: of the registry, or `Literal`, at a place, which is
+    imported when it is needed, or one of `others`. A `property`, such as `read` of formats, leaves
+    only entries of a registry that have it.
     """
 
     def __init__(self, place: str, *others: str, property: str = "") -> None:  # noqa: A002
@@ -174,11 +163,8 @@ class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # gene
 
 
 class LibraryOption(click.Option):
-    """An option whose default is that of the library.
-
-    Parameters
-    ----------
-    of : place of the function, or record of options, that has the option under the same name.
+    """An option with the default of the library: of the function, or record of options, at the place
+    `of`, that has it under the same name.
     """
 
     def __init__(self, *arguments: Any, of: str, **settings: Any) -> None:
@@ -356,11 +342,8 @@ def refuse_given(
     reason: str,
     sentence: str = "{option} has no effect {reason}; leave it out",
 ) -> None:
-    """Raise DataError for the first of these options that the user stated.
-
-    Parameters
-    ----------
-    reason : a clause such as "because ..." or "with --profile", for the sentence.
+    """Raise DataError for the first of these options that the user stated; the reason is a clause of
+    the sentence, such as "because ..." or "with --profile".
     """
     for name in names:
         if is_given(name):

@@ -155,7 +155,7 @@ def study() -> None:
 
 
 @study.command()
-@click.argument("study_file", metavar="STUDY", type=FILE)
+@study_argument
 @click.option(
     "--robot",
     metavar="ROBOT",
