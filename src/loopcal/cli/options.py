@@ -133,9 +133,9 @@ def _import(place: str) -> Any:
 
 
 class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """A word of the library on the command line: of the registry, or `Literal`, at a place, which is
-    imported when it is needed, or one of `others`. A `property`, such as `read` of formats, leaves
-    only entries of a registry that have it.
+    """A word of the library on the command line: of the registry, or `Literal`, at a place, which
+    is imported when it is needed, or one of `others`. A `property`, such as `read` of formats,
+    leaves only entries of a registry that have it.
     """
 
     def __init__(self, place: str, *others: str, property: str = "") -> None:  # noqa: A002
@@ -163,8 +163,8 @@ class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # gene
 
 
 class LibraryOption(click.Option):
-    """An option with the default of the library: of the function, or record of options, at the place
-    `of`, that has it under the same name.
+    """An option with the default of the library: of the function, or record of options, at the
+    place `of`, that has it under the same name.
     """
 
     def __init__(self, *arguments: Any, of: str, **settings: Any) -> None:
@@ -342,8 +342,8 @@ def refuse_given(
     reason: str,
     sentence: str = "{option} has no effect {reason}; leave it out",
 ) -> None:
-    """Raise DataError for the first of these options that the user stated; the reason is a clause of
-    the sentence, such as "because ..." or "with --profile".
+    """Raise DataError for the first of these options that the user stated; the reason is a clause
+    of the sentence, such as "because ..." or "with --profile".
     """
     for name in names:
         if is_given(name):
