@@ -60,9 +60,10 @@ def test_stated_chi_square_is_the_cost_at_the_stated_estimate(text: str, tmp_pat
     assert fit.rank == len(fit.names)
 
 
-def test_chi_square_of_twenty_calibrations_is_that_of_the_noise(tmp_path: Path) -> None:
+@pytest.mark.parametrize("draws", [8, pytest.param(20, marks=pytest.mark.evidence)])
+def test_chi_square_of_calibrations_is_that_of_the_noise(tmp_path: Path, draws: int) -> None:
     robot = load_text(tmp_path, close_by_least_squares(EXECHON))
-    poses, draws = draw_poses(robot, 15, 1), 20
+    poses = draw_poses(robot, 15, 1)
     instrument = Instrument((Sensor(Pose(), Gaussian(SIGMA)),))
     trials = simulate_trials(robot, sample_truth(robot, draws, 2), poses, instrument, 3)
     fits = identify_trials(robot, trials, LeastSquares())

@@ -59,7 +59,9 @@ def test_list_contains_every_record_without_distances(data_folder) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stop_offset", [0.0, 40.0, -40.0])
+@pytest.mark.parametrize(
+    "stop_offset", [0.0, 40.0, pytest.param(-40.0, marks=pytest.mark.evidence)]
+)
 @pytest.mark.parametrize("name", CALIBRATED)
 def test_calibration_from_wrong_end_stops_gives_the_geometry_of_the_firmware(
     calibrate, data_folder, name, stop_offset
@@ -278,7 +280,15 @@ def test_assumed_sigma_is_estimated_where_the_data_can(import_record, capsys) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*CALIBRATED, FACTORY_DEFAULT, WITH_DISTANCES])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(pytest.param(name, marks=pytest.mark.evidence) for name in CALIBRATED[:2]),
+        CALIBRATED[2],
+        pytest.param(FACTORY_DEFAULT, marks=pytest.mark.evidence),
+        WITH_DISTANCES,
+    ],
+)
 def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
     import_record, capsys, tmp_path, data_folder, name
 ) -> None:

@@ -71,7 +71,13 @@ def test_import_reads_the_geometry_and_every_probe_of_printer_cfg(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FIRMWARE_CALIBRATED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        FIRMWARE_CALIBRATED[0],
+        *(pytest.param(name, marks=pytest.mark.evidence) for name in FIRMWARE_CALIBRATED[1:]),
+    ],
+)
 def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
     folder, capsys, data_folder, name
 ) -> None:
