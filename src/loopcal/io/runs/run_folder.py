@@ -91,14 +91,9 @@ def list_reasons(failures: Iterable[object]) -> tuple[str, ...]:
 
 
 def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
-    """Return why the numbers of a run are not for a machine; None where they are, or of no run.
+    """Return why the numbers of a run are not for a machine; None where they are, or where there is
+    no result, as of a robot file.
 
-    Parameters
-    ----------
-    path : of the run. result : content of result.json; empty for a robot file.
-
-    Returns
-    -------
     `gates.run-not-calibrated` where the run failed, or `gates.run-without-verdict` where it was
     made before runs had a verdict and does not state that its gates were met.
     """
@@ -114,13 +109,6 @@ def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
     if "verdict" not in result and (status != CONVERGED or "passed" not in result):
         return report_finding("gates.run-without-verdict", run=str(path))
     return None
-
-
-def find_file_failure(path: Path) -> Finding | None:
-    """Return `gates.run-not-calibrated` for a robot file that states it; None for other paths."""
-    if not path.is_file() or not read_yaml(path, "robot file").text.startswith(NOT_CALIBRATED):
-        return None
-    return report_finding("gates.run-not-calibrated", run=str(path), reasons=())
 
 
 # A calibration that was read from its run folder.
@@ -318,16 +306,7 @@ MADE_BY: Mapping[str, str] = {
 def collect_provenance(
     command: Sequence[str], inputs: Mapping[str, Path], seeds: Mapping[str, int]
 ) -> dict[str, Any]:
-    """Return the provenance of a result, with the keys of MADE_BY.
-
-    Parameters
-    ----------
-    command : the command line. inputs : role ("robot", "data") -> file. seeds : name -> seed.
-
-    Raises
-    ------
-    FileError : an input cannot be read.
-    """
+    """Return the provenance of a result, with the keys of MADE_BY; inputs are role -> file."""
     files = {role: {"path": str(path), "sha256": sha256(path)} for role, path in inputs.items()}
     made_by = {"command": list(command), "versions": collect_versions()}
     return made_by | {"seeds": dict(seeds), "inputs": files}
@@ -346,17 +325,10 @@ def write_run_folder(
     force: bool = False,
     robot_name: str = ROBOT,
 ) -> Path:
-    """Write a run folder whole or not at all, and return it.
+    """Write a run folder whole or not at all, see `write_result_folder`, and return it.
 
-    Parameters
-    ----------
-    path : the folder to make. result : content of result.json; `format` and `files` are added.
-    arrays : name -> array, SI. robot_text : of the corrected robot file.
-    force : replace an older run. robot_name : of that file, ROBOT or FAILED_ROBOT.
-
-    Raises
-    ------
-    FileError : see `write_result_folder`.
+    `format` and `files` are added to the result; arrays are in SI; `robot_name` is ROBOT or
+    FAILED_ROBOT.
     """
     path = as_path(path, "run folder")
     np.savez(stream := BytesIO(), allow_pickle=False, **arrays)
@@ -486,7 +458,11 @@ def find_failure(path: str | Path) -> Finding | None:
     path = as_path(path, "run folder or robot file")
     folder = path.parent if path.name in (ROBOT, FAILED_ROBOT) else path
     result = read_run_folder(folder)[0] if (folder / RESULT).is_file() else {}
-    return find_run_failure(folder, result) or find_file_failure(path)
+    if failure := find_run_failure(folder, result):
+        return failure
+    if not path.is_file() or not read_yaml(path, "robot file").text.startswith(NOT_CALIBRATED):
+        return None
+    return report_finding("gates.run-not-calibrated", run=str(path), reasons=())
 
 
 def load_posterior_or_robot(path: str | Path) -> Mechanism | Posterior:
