@@ -108,7 +108,7 @@ def test_validation_keeps_the_frame_of_the_fit_unless_a_refit_is_requested(fit):
 
 ROBOT = load_robot("linear-delta")
 SIGMA = 20e-6  # [m]
-SIZES = [(30, 0.290), pytest.param(100, 0.163, marks=pytest.mark.evidence)]
+SIZES = [(16, 0.392), pytest.param(100, 0.163, marks=pytest.mark.evidence)]
 """Simulated machines, and how far their p values may be from uniform ones (KS test, 1 %)."""
 
 

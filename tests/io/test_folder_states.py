@@ -159,9 +159,16 @@ class RunFolder(RuleBasedStateMachine):
 
 TestRunFolder = RunFolder.TestCase
 TestRunFolder.settings = settings(
-    max_examples=25,
+    max_examples=12,
     stateful_step_count=12,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )
+
+
+@pytest.mark.evidence
+class TestRunFolderLonger(RunFolder.TestCase):
+    """Twice as many orders."""
+
+    settings = settings(TestRunFolder.settings, max_examples=25)
