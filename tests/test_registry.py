@@ -136,6 +136,7 @@ def test_settings_may_stand_beside_the_name_of_their_method() -> None:
     for plain, method in (
         ({"method": "ridge", "lam": 0.5}, lc.Ridge(0.5)),
         ({"method": "tsvd", "keep": 7}, lc.TruncatedSVD(7)),
+        ({"method": {"name": "ridge"}, "lam": 0.5}, lc.Ridge(0.5)),
         ({"method": "auto", "inflation": "groups"}, lc.MAP(lc.InflatedTolerances("groups"))),
         ({"method": "auto", "inflation": "none"}, lc.MAP()),
         ({"method": "auto", "inflation": "auto"}, None),
@@ -152,6 +153,7 @@ def test_settings_may_stand_beside_the_name_of_their_method() -> None:
         ({"loss": {"name": "huber", "c": 2.0}}, "the loss huber has no setting 'c'; it has k"),
         ({"method": {"name": "ridge", "lam": {"name": "gcw"}}}, "not a rule"),
         ({"lost": "huber"}, "not an option of a fit .*'loss'"),
+        ({"control": {"steps": 3}}, "'steps' is no limit of the steps"),
         (lc.FitOptions(loss=Unnamed()).to_dict(), r"Unnamed\(\) has no name"),
         (lc.FitOptions(lc.Ridge(lambda d: np.ones(1))).to_dict(), "has no name"),
     ],

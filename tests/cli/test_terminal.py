@@ -10,11 +10,13 @@ import pytest
 
 from loopcal.cli import terminal
 from loopcal.cli.commands.calibration_commands import calibrate, validate
+from loopcal.cli.commands.study_commands import study
 from loopcal.cli.hints import HINTS, find_hint, hint_for
 from loopcal.findings import IMPORTANCE, report_finding, sort_by_importance
 from loopcal.findings.catalog import load_catalog
 from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.report.calibration_view import no_hint, with_hint
+from tools.fuzz.commands import list_commands
 
 WORK = """
 import sys, time
@@ -138,3 +140,9 @@ def test_copies_of_all_rows_have_no_hint_to_exclude_them():
     )
     assert hint_for(nothing_left) is None
     assert hint_for(some_left) == "exclude poses with --drop POSE"
+
+
+def test_every_hint_is_shown_by_some_command() -> None:
+    commands = [*list_commands().values(), *study.commands.values()]
+    never = [code for code in HINTS if not any(find_hint(code, c) for c in commands)]
+    assert never == []

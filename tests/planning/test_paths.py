@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Paths between poses are interpolated and checked, and poses are put into a short order."""
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -105,6 +106,14 @@ def test_tilt_path_takes_the_shorter_azimuth_or_passes_zero_tilt():
     assert_allclose(
         measure_distance(robot, start, end), np.hypot(0.1, 0.4 * robot.size), rtol=1e-12
     )
+
+
+def test_a_robot_of_one_meter_wraps_angles_like_others():
+    robot = load_robot("hexapod-42")
+    start, end = np.zeros((2, len(robot.controlled)))
+    start[-1], end[-1] = 3.1, -3.1
+    lengths = [measure_distance(replace(robot, size=size), start, end) for size in (1.0, 2.0)]
+    assert_allclose(lengths, (2.0 * np.pi - 6.2) * np.array([1.0, 2.0]))
 
 
 def test_order_of_few_poses_is_within_5_percent_of_the_shortest():

@@ -49,7 +49,7 @@ from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
-from loopcal.mechanism.assembly import TWIST_UNITS
+from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions
@@ -66,7 +66,6 @@ from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 # table G.2).
 COMPONENT_LEVEL = 0.954499736103642
 LEVEL = 0.95  # share of the errors below the expanded uncertainty of a length or an angle
-COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
 BLOCK = 1024  # poses whose sensitivities are in memory at once
 BATCH = 250  # trials that are identified at once; progress is reported between them
 
@@ -88,7 +87,7 @@ class PoseDegrees(NamedTuple):
 class PoseUncertainty(TableResult):
     """Uncertainty of n poses.
 
-    The components are those of `COMPONENTS`: a small rotation, then the displacement of the point.
+    The components are those of `AXES`: a small rotation, then the displacement of the point.
 
     Attributes
     ----------
@@ -106,14 +105,14 @@ class PoseUncertainty(TableResult):
     degrees: PoseDegrees
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
-        *fields("frame", "coverage_factor", "degrees", components=lambda _: COMPONENTS),
+        *fields("frame", "coverage_factor", "degrees", components=lambda _: AXES),
         Field("position", axes="pose", unit="m", key="position_rms"),
         Field("orientation", axes="pose", unit="rad", key="orientation_rms"),
         Field("sd", axes="pose component", unit=TWIST_UNITS),
         Field("expanded", axes="pose component", unit=TWIST_UNITS, key="expanded"),
         *fields(position_95="expanded_position", orientation_95="expanded_orientation"),
     )
-    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=COMPONENTS)
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=AXES)
 
     @property
     def frame(self) -> str:
@@ -356,7 +355,7 @@ class AccuracyMap(DrawnResult):
         *fields("position_ratio", "orientation_ratio"),
         *fields(extrapolated=lambda accuracy: int(accuracy.extrapolated.sum())),
     )
-    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=COMPONENTS, coordinate="names")
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=AXES, coordinate="names")
     CAPTION: ClassVar[str] = "Poses of the map"
 
     @property
@@ -460,7 +459,7 @@ class AccuracySimulation(TableResult):
         Field("observed", axes="pose component", unit=TWIST_UNITS),
         Field("ratio", axes="pose component", unit="1"),
     )
-    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=COMPONENTS)
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(component=AXES)
 
     def __str__(self) -> str:
         return f"{self.trials} trials, {self.failed} did not converge; {self.predicted.frame}"

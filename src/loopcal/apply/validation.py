@@ -87,6 +87,11 @@ class ErrorChange:
         return np.inf if self.before > 0.0 else 1.0
 
     @property
+    def growth(self) -> float:
+        """How many times larger the error became; infinite where there was none before."""
+        return self.after / self.before if self.before > 0.0 else np.inf
+
+    @property
     def largest_noise(self) -> float:
         """The rms that noise alone exceeds with the probability `NOISE_LEVEL`."""
         square = compute_chi_square_quantile(max(self.values, 1), NOISE_LEVEL) / max(self.values, 1)
@@ -283,6 +288,11 @@ class Validation(DrawnResult):
         return lines
 
     __repr__ = __str__
+
+    @property
+    def checked(self) -> Validation:
+        """What is said of the geometry: without blunders, which say nothing of it."""
+        return self.without_blunders or self
 
     def _list_without_blunders(self) -> dict[str, Any] | None:
         rest = self.without_blunders

@@ -102,7 +102,7 @@ def report_validation(errors: Validation | None, is_held_out: bool) -> list[Find
     if errors is None:
         return []
     own = [f for f in errors.findings if f.code not in ON_BASE]  # reported once for all rows
-    checked = errors.without_blunders or errors  # a wrong measurement says nothing of the geometry
+    checked = errors.checked
     if checked.judged < FEW_ROWS:
         few = report_finding("workflow.few-held-out-poses", count=checked.judged, needed=FEW_ROWS)
         return [*own, few]
@@ -110,7 +110,7 @@ def report_validation(errors: Validation | None, is_held_out: bool) -> list[Find
         values, setup = checked.kinds[-1].count, checked.setup_count
         return [*own, report_finding("workflow.held-out-setup", values=values, setup=setup)]
     return own + [
-        report_finding("gates.errors-grew", quantity=quantity, times=1.0 / change.times)
+        report_finding("gates.errors-grew", quantity=quantity, times=change.growth)
         for quantity, change in checked.changes().items()
         if change.has_grown
     ]
@@ -325,7 +325,7 @@ def recommend_values(
     if start.verdict in (StartVerdict.BEST, StartVerdict.WITHIN_NOISE):
         return report_finding("values.keep-within-noise")
     is_open = start.verdict is StartVerdict.OPEN
-    checked = None if errors is None else errors.without_blunders or errors
+    checked = None if errors is None else errors.checked
     if checked is None or min(checked.judged, checked.values_left) < FEW_ROWS:
         if is_open:
             return report_finding("values.keep-undecided")
@@ -344,6 +344,6 @@ def _judge_fitted(test: ResidualTest, findings: Iterable[Finding]) -> str:
     """Return the code of the recommendation by fitted poses alone, whose gain is beyond noise."""
     if test.is_doubtful:
         return "values.keep-doubtful-residuals"
-    if any(finding.code == "model.no-expected-gain" for finding in findings):
+    if any(finding.code == NO_GAIN for finding in findings):
         return "values.keep-no-gain"
     return "values.apply-fitted"

@@ -63,8 +63,8 @@ HINTS = {
     "fit.no-prior": "use --method map",
     "identifiability.arbitrary-cut": "use --useful, such as --useful 1um",
     "fit.too-few-equations": "use --method map",
-    "noise.assumed": "use --sigma-height or another --sigma option of loopcal import, or write the "
-    "noise in the file",
+    "noise.assumed": "type loopcal import FILE with --sigma-height LENGTH, or write the noise in "
+    "the file",
     "gates.correction-not-written": "use --force to write it nevertheless",
     "gates.run-not-calibrated": "use --force to write them nevertheless",
     "gates.run-without-verdict": "use --force to write its numbers nevertheless",
@@ -87,7 +87,7 @@ HINTS = {
     "plan.target-unobservable": "give --accuracy as a length or as an angle",
     "plan.too-few-candidates": "use fewer --poses or --hold-out, or more --candidates",
     "plan.too-few-equations": "use more --poses",
-    "plan.few-groups": "use more --groups or --points; calibrate without --method least-squares",
+    "plan.few-groups": "use more --groups or --points; calibrate by a method with a prior",
     "plan.too-few-held-out": "use a smaller --hold-out, or more --candidates",
     "plan.weak-certificate": "use another --seed, or more --poses",
     "plan.workspace-excluded": "relax --min-margin, --max-tilt or --seen-from",

@@ -40,7 +40,7 @@ from loopcal.measure.readings import list_sensed_joints, select_joint_values
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
-from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.numerics.statistics import NEAR_ONE, compute_chi_square_tail
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -71,7 +71,7 @@ def _median_of_largest(variances: FloatArray) -> float:
 
     def compute_log_probability(limit: float) -> float:
         tail = compute_chi_square_tail(degrees, limit / unit)
-        return float(np.log1p(-np.minimum(tail, 1.0 - 1e-300)).sum())
+        return float(np.log1p(-np.minimum(tail, NEAR_ONE)).sum())
 
     highest = 1e3 * float(mean.max())
     return float(np.sqrt(invert_increasing(compute_log_probability, np.log(0.5), highest, 60)))
@@ -382,7 +382,8 @@ def summarize_kinds(totals: Mapping[str, FloatArray]) -> tuple[KindErrors, ...]:
 def compute_noise_floor(observations: Sequence[Observations]) -> NoiseFloor:
     """Return the noise floor of rows with their stated covariances."""
     variances = [np.diagonal(o.covariance, axis1=1, axis2=2) for o in observations]
-    sigma = [np.sqrt(np.where(o.present, v, 0.0)) for o, v in zip(observations, variances)]  # noqa: B905
+    both = zip(observations, variances, strict=True)
+    sigma = [np.sqrt(np.where(o.present, v, 0.0)) for o, v in both]
     errors = compute_row_errors(observations, sigma).quantities
     floors = {name: METRICS[name].find_noise_floor for name in SUMMARY}
     return NoiseFloor(

@@ -172,11 +172,16 @@ class FitOptions:
         if beside:
             method = {"name": method} if isinstance(method, str) else dict(method)
             method |= {SETTINGS[key][1]: value for key, value in beside.items()}
-        given = {key: _from_plain(value) for key, value in given.items() if key != "control"}
+        control = given.pop("control", None) or {}
+        steps = [entry.name for entry in fields(StepControl)]
+        for key in control:
+            if key not in steps:
+                raise DataError(f"{key!r} is no limit of the steps{suggest_names(key, steps)}")
+        given = {key: _from_plain(value) for key, value in given.items()}
         return cls(
             method=_make_entry(METHODS, method),
             loss=None if loss == NO_LOSS else _make_entry(LOSSES, loss),
-            control=StepControl(**plain.get("control", {})),
+            control=StepControl(**control),
             **given,
         )
 
@@ -185,7 +190,8 @@ def find_foreign_setting(plain: Mapping[str, Any]) -> tuple[str, str] | None:
     """Return the first setting that stands beside the name of a method it does not belong to, with
     the method that it belongs to; None where there is none.
     """
-    method = METHODS.resolve(plain.get("method", "auto"))
+    method = plain.get("method", "auto")
+    method = METHODS.resolve(method if isinstance(method, str) else method.get("name", "auto"))
     for key, (owner, _) in SETTINGS.items():
         if plain.get(key) is not None and method != owner:
             return key, owner

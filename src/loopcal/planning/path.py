@@ -77,8 +77,8 @@ def measure_distance(robot: Mechanism, start: FloatArray, end: FloatArray) -> Fl
     the robot's size.
     """
     names = robot.controlled
-    scale = np.array([1.0 if name in POSITION else robot.size for name in names])
-    step = np.where(scale == 1.0, end - start, geometry.wrap_angle(end - start)) * scale
+    angular = np.array([name not in POSITION for name in names])
+    step = np.where(angular, robot.size * geometry.wrap_angle(end - start), end - start)
     if "phi" in names:
         places = [names.index(name) for name in TILT[:2]]
         tilted = robot.size * (_tilt_vector(end, places) - _tilt_vector(start, places))

@@ -214,7 +214,7 @@ def describe_improvements(validation: Validation) -> list[str]:
     if validation.judged < FEW_ROWS:
         return []
     lines = []
-    for quantity, change in (validation.without_blunders or validation).changes().items():
+    for quantity, change in validation.checked.changes().items():
         name = "error divided by sigma" if quantity == "weighted" else f"{quantity} error"
         lines.append(f"{name[0].upper()}{name[1:]} (rms): {_compare(change)}.")
     return lines
