@@ -99,7 +99,8 @@ class Source(NamedTuple):
     @property
     def words(self) -> str:
         """What people read."""
-        return SOURCE_WORDS.get(self.kind, self.kind).format(name=self.name)
+        words = SOURCE_WORDS.get(self.kind)
+        return self.kind if words is None else words.format(name=self.name)
 
 
 class CovarianceSplit(NamedTuple):
