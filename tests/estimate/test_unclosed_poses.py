@@ -97,7 +97,7 @@ def test_every_entry_point_answers_in_words(wrong, data, readings_alone, poses):
 @pytest.mark.parametrize("wrong", ["spools ten times as wide"], indirect=True)
 def test_a_fit_that_does_not_converge_from_unclosed_poses_is_refused(wrong, data):
     with pytest.raises(EstimationError) as error:
-        identify(wrong, data)
+        identify(wrong, data.take(np.arange(2)))
     assert error.value.code == "fit.poses-open"
 
 
