@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
-from loopcal.diagnose.cross_validation import build_regularization_path, score_leave_one_out
+from loopcal.diagnose.cross_validation import score_leave_one_out
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
@@ -90,7 +90,8 @@ def bench_filters() -> Metric:
     robot = load_robot("hexapod-42")
     data = _measured(robot, 50)
     fit = identify(robot, data, LeastSquares())
-    methods = build_regularization_path(1.0, 40, 42)
+    ridges = (Ridge(float(lam)) for lam in np.logspace(-8.0, 4.0, 40))
+    methods = (*ridges, *(TruncatedSVD(k) for k in range(43)))
     return measure_ratio(
         "identify.paths_of_one_fit",
         lambda: score_leave_one_out(fit.robot, data, methods),

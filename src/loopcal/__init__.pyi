@@ -37,10 +37,10 @@ from .diagnose.fit_examination import examine_fit as examine_fit
 from .diagnose.identifiable_parameters import Identifiability as Identifiability
 from .diagnose.identifiable_parameters import identifiability as identifiability
 from .diagnose.intervals import Intervals as Intervals
-from .diagnose.joint_regions import JointRegion as JointRegion
-from .diagnose.joint_regions import SimultaneousIntervals as SimultaneousIntervals
-from .diagnose.joint_regions import compute_joint_region as compute_joint_region
-from .diagnose.joint_regions import compute_simultaneous_intervals as compute_simultaneous_intervals
+from .diagnose.intervals import JointRegion as JointRegion
+from .diagnose.intervals import SimultaneousIntervals as SimultaneousIntervals
+from .diagnose.intervals import compute_joint_region as compute_joint_region
+from .diagnose.intervals import compute_simultaneous_intervals as compute_simultaneous_intervals
 from .diagnose.outliers import OutlierCheck as OutlierCheck
 from .diagnose.outliers import find_outliers as find_outliers
 from .diagnose.parameter_subset import choose_identifiable_subset as choose_identifiable_subset

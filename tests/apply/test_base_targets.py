@@ -17,7 +17,7 @@ import loopcal as lc
 from loopcal.apply.verdict import Verdict
 from loopcal.diagnose.frame_drift import compare_shapes, estimate_frame_drifts, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
-from loopcal.diagnose.repeated_poses import check_lack_of_fit
+from loopcal.diagnose.model_discrepancy import check_lack_of_fit
 from loopcal.errors import DataError
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP

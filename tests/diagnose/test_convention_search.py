@@ -143,7 +143,9 @@ def test_swapped_actuators_and_a_wrong_unit_of_the_values_are_named_together() -
     result = compare_conventions(load_cached_robot("linear-delta"), data)
     assert result.interpretation is not None
     slips = {
-        part.slip for one in (result.interpretation, *result.alternatives) for part in one.parts
+        part.slip
+        for one in (result.interpretation, *result.alternatives)
+        for part in one.parts or (one,)
     }
     assert {"unit", "swapped-readings"} <= slips
 

@@ -6,7 +6,7 @@ problem.
 import numpy as np
 import pytest
 
-from loopcal.diagnose.cross_validation import build_regularization_path, score_leave_one_out
+from loopcal.diagnose.cross_validation import score_leave_one_out
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
@@ -35,7 +35,8 @@ def test_leave_one_out_scores_equal_those_of_linear_refits(method):
 
 def test_regularization_path_runs_from_nominal_to_least_squares():
     fit = identify(hexapod(), DATA)
-    methods = build_regularization_path(1.0, 40, 42)
+    ridges = (Ridge(float(lam)) for lam in np.logspace(-8.0, 4.0, 40))
+    methods = (*ridges, *(TruncatedSVD(k) for k in range(43)))
     result = score_leave_one_out(fit.robot, DATA, methods)
     assert len(result.score) == 40 + 43
     assert result.dof[40] == 0.0

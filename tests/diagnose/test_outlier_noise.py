@@ -99,8 +99,8 @@ def test_the_noise_of_a_block_is_that_of_a_fit_without_it(method) -> None:
         others = np.delete(A, np.arange(3 * j, 3 * j + 3), axis=0)
         _, square, rank, _ = np.linalg.lstsq(others[:, :-1], others[:, -1], rcond=None)
         left = len(others) - rank
-        assert whole.noise.degrees[j] == left
-        assert whole.noise.variance[j] == pytest.approx(float(square[0]) / left, rel=1e-6)
+        assert whole.noise[1][j] == left
+        assert whole.noise[0][j] == pytest.approx(float(square[0]) / left, rel=1e-6)
 
 
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])

@@ -12,11 +12,12 @@ from scipy.stats import binom, chi2
 from loopcal.diagnose import outliers
 from loopcal.diagnose import outliers as outlier_search
 from loopcal.diagnose.fit_examination import examine_fit
-from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.diagnose.outliers import (
+    Influence,
     OutlierCheck,
     PartialFit,
     _summarize,
+    compute_influence,
     find_outliers,
     fit_without,
     list_suspected_in_turn,
@@ -442,8 +443,7 @@ def test_cyclic_outlier_search_is_not_converged_and_lists_its_suspects():
     (group,) = list_suspected_in_turn(visited)
     assert np.flatnonzero(group).tolist() == [0, 1]
     fit = identify(*probe_delta(12, {}))
-    counts = {"outliers": 0, "ambiguous": 2, "blocks": 6}
     shared = {"blocks": 6, "single_poses": True}
-    (finding,) = _summarize(fit, counts, 0.05, shared, is_converged=False)
+    (finding,) = _summarize(fit, 0, 2, 0.05, shared, is_converged=False)
     assert finding.code == "outliers.search-not-converged"
     assert (finding.data["count"], finding.data["blocks"]) == (2, 6)

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose.fit_examination import estimate_calibration_gain, find_correlated_groups
-from loopcal.diagnose.repeated_poses import check_lack_of_fit
+from loopcal.diagnose import fit_examination
+from loopcal.diagnose.fit_examination import (
+    check_lack_of_fit,
+    estimate_calibration_gain,
+    find_correlated_groups,
+)
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Tukey
 from loopcal.estimate.penalties import LeastSquares
@@ -82,7 +86,7 @@ def test_lack_of_fit_is_undecided_without_repeats_or_with_a_loss():
     assert check_lack_of_fit(identify(hexapod(), again, loss=Tukey()), again).is_explained is None
 
 
-def test_correlated_parameters_are_grouped_and_named():
+def test_correlated_parameters_are_grouped_and_named(monkeypatch):
     # small tilts: a leg's length and the heights of its ends act alike
     flat = zoo.make_poses(
         np.random.default_rng(0).uniform(-1, 1, (30, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05]
@@ -100,7 +104,8 @@ def test_correlated_parameters_are_grouped_and_named():
     assert groups[0].correlation == pytest.approx(rho[a, b])
     names = [name for group in groups for name in group.names]
     assert len(names) == len(set(names))
-    assert find_correlated_groups(fit, strong=1.0) == ()
+    monkeypatch.setattr(fit_examination, "STRONG", 1.0)
+    assert find_correlated_groups(fit) == ()
 
 
 def test_calibration_with_a_coarse_instrument_is_not_worthwhile():

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -101,7 +100,7 @@ def _add_patterns(
     is_small = any(finding.code == TOO_SMALL for finding in fit.findings)
     if not (effects or patterns.is_correlated or is_small):
         return fit
-    tool = state_tool_uncertainty(fit, locate_measured_poses(fit, data))
+    tool = ToolUncertainty(fit, locate_measured_poses(fit, data))
     for effect in effects:
         root = rows.root @ (rows.gain.T @ effect.effect.columns) @ take_root(effect.moments)
         finding = _report_effect(effect, tool.measure_growth(root))
@@ -140,47 +139,46 @@ def _add_correlation(
     return add_covariance(fit, root, errors.degrees, finding)
 
 
-class ToolUncertainty(NamedTuple):
-    """The uncertainty of the measured poses as a fit states it."""
+class ToolUncertainty:
+    """The uncertainty of some evenly chosen measured poses as a fit states it, frames fitted."""
 
-    # orientation and position (3 n, p) by deviations of the parameters [per SI]
-    effects: tuple[FloatArray, FloatArray]
-    stated: tuple[float, float]  # sum of the variances of each [SI]
+    # orientation and position (3 n, p) by deviations of the parameters [per SI], and the sum of the
+    # variances of each [SI]
+    parts: tuple[tuple[FloatArray, float], ...]
+
+    def __init__(self, fit: Identification, measured: Solution) -> None:
+        posterior = fit.posterior
+        solution = measured.take(choose_evenly(len(measured.q), MOST_POSES))
+        D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
+        effects = [D[:, rows].reshape(-1, D.shape[-1]) for rows in (slice(0, 3), slice(3, 6))]
+        self.parts = tuple((E, _sum_squares(E @ posterior.root)) for E in effects)
 
     def measure_growth(self, root: FloatArray) -> float:
         """Return the factor by which a covariance of root (p, k) [SI] increases the standard
         uncertainty, the larger one of position and orientation.
         """
-        pairs = zip(self.effects, self.stated, strict=True)
-        shares = [_sum_squares(E @ root) / stated for E, stated in pairs if stated > 0.0]
+        shares = [_sum_squares(E @ root) / stated for E, stated in self.parts if stated > 0.0]
         return float(np.sqrt(1.0 + max(shares, default=0.0)))
 
 
-def state_tool_uncertainty(fit: Identification, measured: Solution) -> ToolUncertainty:
-    """Return the uncertainty of some evenly chosen measured poses of a fit, frames fitted."""
-    posterior, solution = fit.posterior, measured.take(choose_evenly(len(measured.q), MOST_POSES))
-    D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
-    p = D.shape[-1]
-    angle, position = D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
-    stated = (_sum_squares(angle @ posterior.root), _sum_squares(position @ posterior.root))
-    return ToolUncertainty((angle, position), stated)
-
-
 def take_root(moments: FloatArray) -> FloatArray:
-    """Return a square root (c, c) of a positive semidefinite matrix (c, c)."""
-    scale = np.sqrt(np.diag(moments))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    s, v = np.linalg.eigh(moments / scale[:, None] / scale)
-    return np.asarray(scale[:, None] * v * np.sqrt(np.maximum(s, 0.0)))
+    """Return a square root (c, r) of a matrix (c, c), in the directions, relative to their size, in
+    which it is positive.
+    """
+    return _take_root(moments, np.diag(moments))
 
 
 def take_larger(covariance: FloatArray, stated: FloatArray) -> FloatArray:
     """Return a root (k, c) of what a covariance (k, k) has more than a stated one, in the
     directions, relative to the sum of both, in which it is larger.
     """
-    scale = np.sqrt(np.diag(covariance + stated))
+    return _take_root(covariance - stated, np.diag(covariance + stated))
+
+
+def _take_root(matrix: FloatArray, squares: FloatArray) -> FloatArray:
+    scale = np.sqrt(squares)
     scale = np.where(scale > 0.0, scale, 1.0)
-    s, v = np.linalg.eigh((covariance - stated) / scale[:, None] / scale)
+    s, v = np.linalg.eigh(matrix / scale[:, None] / scale)
     return np.asarray(scale[:, None] * v[:, s > 0.0] * np.sqrt(s[s > 0.0]))
 
 
@@ -224,8 +222,6 @@ def _without_doubt_of_sigma(fit: Identification) -> Identification:
     )
     return replace(fit, findings=findings)
 
-
-# Test whether large residuals are more frequent than normal noise makes them.
 
 LEVEL = 0.01  # probability that normal noise is reported; below `SIGNIFICANCE` it is a warning
 DRAWS, BATCH = 10_000, 500  # draws of normal errors at most, and at once
@@ -278,7 +274,7 @@ def check_heavy_tails(
     residuals depend on something: this makes some of them larger, and is reported already.
     `outliers` : labels of poses that are known to be wrong. `linear` : see `linearize_fit`.
     """
-    nothing = _untested(0)
+    nothing = HeavyTails(0, *[np.nan] * 4)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
         return nothing
     reported = (f for f in fit.findings if f.severity is Severity.WARNING)
@@ -308,7 +304,7 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
     testable = left > TESTABLE
     kept, basis, left = kept[testable], basis[testable], left[testable]
     if left.sum() < FEWEST:
-        return _untested(len(kept))
+        return HeavyTails(len(kept), *[np.nan] * 4)
     member = rows.series[kept][:, None] == find_distinct(rows.series[kept])
     u = _standardize(rows.residual[kept, None], left, member)
     square, vectors = np.linalg.eigh(np.eye(basis.shape[1]) - basis.T @ basis)
@@ -321,24 +317,15 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
         taken = basis.T @ errors + others @ rng.standard_normal((others.shape[1], BATCH))
         drawn = _standardize(errors - basis @ taken, left, member)
         smaller += int((_compute_statistic(drawn) <= observed).sum())
-        median += float(_compute_medians(np.abs(drawn)).sum())
+        # the median of each column, faster than `np.median` for some hundred rows
+        ordered, n = np.sort(np.abs(drawn), axis=0), len(drawn)
+        median += float((0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])).sum())
         done += BATCH
         if (1 + smaller) / (1 + done) > DOUBT:
             break
     size = np.abs(u)
     p_value = (1 + smaller) / (1 + done)
     return HeavyTails(len(kept), p_value, compute_median(size), median / done, float(size.max()))
-
-
-def _compute_medians(values: FloatArray) -> FloatArray:
-    """Return the median of each column of (n, c), faster than `np.median` for some hundred rows."""
-    ordered, n = np.sort(values, axis=0), len(values)
-    return np.asarray(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
-
-
-def _untested(rows: int) -> HeavyTails:
-    """Return that residuals are not tested."""
-    return HeavyTails(rows, np.nan, np.nan, np.nan, np.nan)
 
 
 def _standardize(residual: FloatArray, left: FloatArray, member: BoolArray) -> FloatArray:

@@ -17,13 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.influence import (
+from loopcal.diagnose.outliers import (
+    BlockSearch,
     Influence,
+    PartialFit,
     compute_block_influence,
     iterate_blocks,
     make_empty_influence,
+    search_blocks,
 )
-from loopcal.diagnose.outliers import BlockSearch, PartialFit, search_blocks
 from loopcal.errors import LoopcalError
 from loopcal.estimate.fit_linearization import FitUncertainty
 from loopcal.estimate.free_parameters import FreeParameters
@@ -32,15 +34,12 @@ from loopcal.estimate.problem import problem_of
 from loopcal.estimate.robust_descent import estimate_scale_of
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import Observations
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import substitute_transposed
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
-
-# Test held-out blocks against what a fit predicts: noise plus the uncertainty of the fit.
 
 # Probability of naming any block where none is wrong. It is small, because a named block changes
 # the verdict.
@@ -71,11 +70,9 @@ class HeldOutBlocks(NamedTuple):
         if inside.any():
             distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
             # the lower middle: of two blocks, one may be wrong
-            middle = np.argsort(distance / np.sqrt(degrees), kind="stable")[
-                [(inside.sum() - 1) // 2]
-            ]
-            of_middle = estimate_scale_of(distance[middle], degrees[middle].astype(np.float64))
-            scale = max(1.0, of_middle)
+            order = np.argsort(distance / np.sqrt(degrees), kind="stable")
+            middle = order[[(len(order) - 1) // 2]]
+            scale = max(1.0, estimate_scale_of(distance[middle], degrees[middle].astype(float)))
         return PartialFit(excluded, influence, scale, 0)
 
     def combine(self, excluded: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -127,9 +124,7 @@ class HeldOutCheck:
 
 
 class Predictor(NamedTuple):
-    """What predicts held-out rows: a robot, the values of its nuisance parameters, and what is
-    known of both.
-    """
+    """What predicts held-out rows."""
 
     robot: Mechanism  # the calibrated one
     values: Mapping[str, float]  # name -> nuisance parameter [SI]
@@ -141,9 +136,10 @@ class Predictor(NamedTuple):
     def make_blocks(self, data: Measurements) -> HeldOutBlocks:
         """Return the rows of measurements with what predicts them."""
         data = fill_in_reading_sigma(self.robot, data)
-        nothing = np.zeros(0)
-        free = FreeParameters(self.robot, nothing.astype(int), nothing, nothing, nothing > 0.0)
-        if self.uncertainty is not None:
+        if self.uncertainty is None:
+            nothing = np.zeros(0)
+            free = FreeParameters(self.robot, nothing.astype(int), nothing, nothing, nothing > 0.0)
+        else:
             free = self.uncertainty.free
         problem = problem_of(free, data)
         table = data.nuisance_parameters.table
@@ -196,11 +192,10 @@ def check_held_out_rows(
 ) -> HeldOutCheck | None:
     """Search the held-out blocks that neither the fit nor the other blocks explain.
 
-    robot : the calibrated one. data : held-out rows whose poses are reached.
-    values : name -> nuisance parameter [SI] with which they are compared. kept : names of those
-        that the fit determined; the others were fitted to these rows.
-    uncertainty : of the fit; None where it is not known.
-    Returns the result; None without any block that can be tested.
+    robot, values, uncertainty : see `Predictor`. data : held-out rows whose poses are reached.
+    kept : names of the nuisance parameters that the fit determined; the others were fitted to these
+        rows.
+    Returns None without any block that can be tested.
     """
     table = data.nuisance_parameters.table
     unknown = tuple(p.name for p in table.entries if p.free and p.name not in kept)
@@ -217,8 +212,7 @@ def check_held_out_rows(
         search = replace(search, fits=(alone if is_wrong else search.whole,))
     always = np.all([fit.excluded for fit in search.fits], axis=0)
     order = np.argsort(-search.end.ratio, kind="stable")
-    suspects = order[always[order]]
-    return HeldOutCheck(predictor, blocks, search, suspects)
+    return HeldOutCheck(predictor, blocks, search, order[always[order]])
 
 
 def compare_blocks(
@@ -244,14 +238,7 @@ MOST_EXPLAINED = 10  # poses for which explanations are tried, the farthest firs
 # Other poses that do not fit, the farthest first, with which the values of one are exchanged.
 MOST_EXCHANGED = 50
 # Data of the finding that only some explanations have.
-UNUSED: dict[str, Any] = {
-    "pairs": (),
-    "other": "",
-    "dimension": "",
-    "factor": 1.0,
-    "column": "",
-    "left_out": "",
-}
+UNUSED = {"pairs": (), "other": "", "dimension": "", "factor": 1.0, "column": "", "left_out": ""}
 # Factors by which values in another unit differ.
 FACTORS: dict[Dimension, tuple[float, ...]] = {
     Dimension.LENGTH: (1e3, 1e-3, 10.0, 0.1, 25.4, 1.0 / 25.4),
@@ -279,15 +266,14 @@ class Blunder:
 
     def report(self, **error: Any) -> Finding:
         """Return the finding, with `quantity`, `target` and `error` of its largest error."""
-        explanation = self.explanation
         return report_finding(
             "validation.blunder",
             poses=self.poses,
             times=self.times,
             p_value=self.p_value,
-            explanation=explanation.what,
-            tried=explanation.tried,
-            **{**UNUSED, **explanation.data},
+            explanation=self.explanation.what,
+            tried=self.explanation.tried,
+            **(UNUSED | self.explanation.data),
             **error,
         )
 
@@ -308,7 +294,7 @@ def _explain(check: HeldOutCheck, data: Measurements, block: int) -> Explanation
     poses = np.flatnonzero(check.blocks.member == block)
     alone = data.take(poses)
     others = [int(i) for i in check.suspects[:MOST_EXCHANGED] if i != block]
-    tried = []
+    tried: dict[str, None] = {}
     for what, readings in (
         ("targets", _permute_targets(alone)),
         ("poses", _exchange_poses(check, data, poses, others)),
@@ -318,13 +304,13 @@ def _explain(check: HeldOutCheck, data: Measurements, block: int) -> Explanation
     ):
         best, fitting = 0.0, None
         for words, read in readings:
-            tried.append(what)
+            tried[what] = None
             p_value = _worst_p_value(check, read)
             if p_value >= check.search.limit and p_value > best:
                 best, fitting = p_value, words
         if fitting is not None:
-            return Explanation(what, fitting, tuple(dict.fromkeys(tried)))
-    return Explanation("none", {}, tuple(dict.fromkeys(tried)))
+            return Explanation(what, fitting, tuple(tried))
+    return Explanation("none", {}, tuple(tried))
 
 
 # Names and numbers for the sentence, and the measurements read in another way.
@@ -433,10 +419,7 @@ def _leave_out(data: Measurements, what: str) -> Iterator[Reading]:
 
 def _with_measured(data: Measurements, i: int, measured: FloatArray) -> Measurements:
     """Return measurements with other values of one kind; rows that become invalid are absent."""
-    rows = data.observations[i]
-    invalid = [row for row, _ in rows.kind.find_invalid_rows(measured)]
-    measured = np.array(measured)
-    measured[invalid] = np.nan
-    changed: Observations = replace(rows, measured=measured)
-    observations = (*data.observations[:i], changed, *data.observations[i + 1 :])
-    return replace(data, observations=observations)
+    observations, measured = list(data.observations), np.array(measured)
+    measured[[row for row, _ in observations[i].kind.find_invalid_rows(measured)]] = np.nan
+    observations[i] = replace(observations[i], measured=measured)
+    return replace(data, observations=tuple(observations))

@@ -28,8 +28,8 @@ from loopcal.diagnose.cluster_covariance import (
     compute_robust_spread,
     divide_into_clusters,
 )
-from loopcal.diagnose.influence import TESTABLE
 from loopcal.diagnose.intervals import NAMED, OFF, Intervals, compare_ends, report_intervals
+from loopcal.diagnose.outliers import TESTABLE
 from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
@@ -52,9 +52,6 @@ from loopcal.numerics.statistics import compute_single_level
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
-
-# Whitened rows of a fit in the order of its kinds, with columns for everything that they
-# determine.
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +76,12 @@ def list_observed_columns(
     solution = problem.poses.solve(z, trials, linearization.next_start, problem.control, fixed)
     root = None if estimate is None else estimate.elimination.joint_root()[0]
     width = 0 if root is None else len(root)
-    kinds = [_make_empty(problem, rows, width) for rows in problem.rows]
+    kinds = []
+    for rows in problem.rows:
+        shape = rows.whitener.shape[1:3]
+        by_nuisance = np.zeros((*shape, width))
+        by_parameters = np.zeros((*shape, problem.parameters))
+        kinds.append(ObservedColumns(np.zeros(shape), by_nuisance, by_parameters, None))
     for block, poses in problem.poses.iterate_poses(solution, z):
         for i, (numbers, rows) in enumerate(zip(block.row_numbers, block.rows, strict=True)):
             if not len(numbers):
@@ -101,19 +103,9 @@ def list_observed_columns(
     return tuple(kinds)
 
 
-def _make_empty(problem: Problem, rows: ObservationRows, width: int) -> ObservedColumns:
-    """Return arrays of zeros for the rows of a kind and `width` nuisance parameters."""
-    r, m = rows.whitener.shape[1:3]
-    by_parameters = np.zeros((r, m, problem.parameters))
-    return ObservedColumns(np.zeros((r, m)), np.zeros((r, m, width)), by_parameters, None)
-
-
-# Errors of the blocks of a fit, estimated from its residuals and corrected for leverage.
-
-
 @dataclass(frozen=True, eq=False)
 class BlockErrors:
-    """Errors of the M present measured values, block by block."""
+    """Errors of the M present measured values, block by block, corrected for leverage."""
 
     residual: FloatArray  # (M,) whitened residuals at the truth of the resamples
     error: FloatArray  # (M,) those at the estimate, corrected for leverage
@@ -243,7 +235,11 @@ def _correct(
     half : (M, w) with half half' the leverage of the block by setup and machine. poses : (M, K)
         columns of the coordinates of its poses, whose range has leverage 1.
     """
-    Q = _find_range(poses)
+    Q = poses
+    if Q.shape[1]:
+        length = np.linalg.norm(poses, axis=0)
+        u, s, _ = np.linalg.svd(poses / np.where(length > 0.0, length, 1.0), full_matrices=False)
+        Q = u[:, are_nonzero(s, NUISANCE_TOLERANCE)]
     residual, half = residual - Q @ (Q.T @ residual), half - Q @ (Q.T @ half)
     L, s, _ = np.linalg.svd(half, full_matrices=False)
     remaining = 1.0 - s**2
@@ -252,17 +248,6 @@ def _correct(
     error = residual + L @ ((gain - 1.0) * (L.T @ residual))
     return error, np.concatenate([Q, L[:, ~is_tested]], axis=1)
 
-
-def _find_range(columns: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (M, d) of the range of columns (M, K)."""
-    if not columns.shape[1]:
-        return columns
-    length = np.linalg.norm(columns, axis=0)
-    u, s, _ = np.linalg.svd(columns / np.where(length > 0.0, length, 1.0), full_matrices=False)
-    return u[:, are_nonzero(s, NUISANCE_TOLERANCE)]
-
-
-# The scatter of the errors of blocks against the stated uncertainty of each parameter.
 
 # Probability that any parameter is reported where errors are independent and as stated.
 FALSE_ALARMS = 0.01
@@ -285,10 +270,14 @@ class BlockScatter:
     noise: float
 
     def report(self, names: tuple[str, ...], ratio: FloatArray, blocks: Clusters) -> Finding:
-        """Return whether the ratio (p,) of bootstrapped to stated standard deviations is beyond
-        chance for any parameter.
+        """Return whether the ratio (p,) of bootstrapped to stated standard deviations is off by
+        more than `OFF`, beyond chance, for any parameter.
         """
-        off = self.find_off(ratio)
+        tested = np.isfinite(self.tail) & (self.noise_degrees >= FEWEST_DEGREES)
+        level = 0.5 * compute_single_level(FALSE_ALARMS, int(tested.sum()))
+        larger = (ratio > 1.0 + OFF) & (self.tail < level)
+        smaller = (ratio < 1.0 / (1.0 + OFF)) & (self.tail > 1.0 - level)
+        off = tested & (larger | smaller)
         unit = {"unit": blocks.unit, "blocks": blocks.count, "limit": OFF}
         if not off.any():
             return report_finding("sampling.scatter-agrees", **unit)
@@ -301,14 +290,6 @@ class BlockScatter:
             names=tuple(names[i] for i in order[:NAMED]),
             ratio=float(ratio[order[0]]),
         )
-
-    def find_off(self, ratio: FloatArray) -> BoolArray:
-        """Return which ratios (p,) are off by more than `OFF`, beyond chance."""
-        tested = np.isfinite(self.tail) & (self.noise_degrees >= FEWEST_DEGREES)
-        level = 0.5 * compute_single_level(FALSE_ALARMS, int(tested.sum()))
-        larger = (ratio > 1.0 + OFF) & (self.tail < level)
-        smaller = (ratio < 1.0 / (1.0 + OFF)) & (self.tail > 1.0 - level)
-        return np.asarray(tested & (larger | smaller))
 
 
 def describe_scatter(
@@ -338,8 +319,6 @@ def describe_scatter(
     effective = np.where(np.isfinite(degrees), degrees / safe**2, np.inf)
     return BlockScatter(ratio, degrees, effective, tail, unit_sd, noise)
 
-
-# Choose which poses are resampled together.
 
 # Blocks of a unit with which it is resampled by default: with fewer, the scatter of the resamples
 # is itself known to 20 % at best.
@@ -519,25 +498,19 @@ class Bootstrap(TableResult):
             factor = coverage_factor(self.scatter.degrees, level) / coverage_factor(np.inf, level)
             return tuple(estimate + (quantile - estimate) * factor)
         if kind == "studentized":
-            ratio = (self.draws - estimate) / self.sd
-            q = np.quantile(ratio, tails, axis=0)
+            q = np.quantile((self.draws - estimate) / self.sd, tails, axis=0)
             own = self.scatter.noise * self.scatter.unit_sd
             return estimate - q[1] * own, estimate - q[0] * own
-        return self._bias_corrected(tails)
-
-    def _bias_corrected(self, tails: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return quantiles (p,) shifted by the share of resamples below the estimate."""
+        # bias-corrected: shifted by the share of resamples below the estimate
         from scipy.special import ndtr, ndtri
 
-        share = (self.draws < self.fit.estimate).mean(axis=0)
-        least = 0.5 / len(self.draws)
+        share, least = (self.draws < estimate).mean(axis=0), 0.5 / len(self.draws)
         z = 2.0 * ndtri(np.clip(share, least, 1.0 - least)) + ndtri(tails)[:, None]
-        columns = range(self.draws.shape[1])
-        probabilities = ndtr(z)
-        ends = [
-            [np.quantile(self.draws[:, j], probabilities[i, j]) for j in columns] for i in (0, 1)
-        ]
-        return np.array(ends[0]), np.array(ends[1])
+        lower, upper = (
+            np.array([np.quantile(of_one, p) for of_one, p in zip(self.draws.T, row, strict=True)])
+            for row in ndtr(z)
+        )
+        return lower, upper
 
 
 def bootstrap(
@@ -590,7 +563,6 @@ def bootstrap(
     if len(kept.deviation) < 2:
         raise EstimationError(report_finding("sampling.resamples-failed", count=count))
     nominal, unit_of = fit.nominal, fit.tolerance
-    noise = np.sqrt(kept.noise)[:, None]
     return Bootstrap(
         fit=fit,
         scheme=scheme,
@@ -598,7 +570,7 @@ def bootstrap(
         blocks=blocks,
         draws=nominal + unit_of * kept.deviation,
         linear=nominal + unit_of * kept.linear,
-        sd=unit_of * kept.sd * noise,
+        sd=unit_of * kept.sd * np.sqrt(kept.noise)[:, None],
         failed=count - len(kept.deviation),
         scatter=describe_scatter(fit, blocks, linear),
     )
@@ -625,8 +597,7 @@ class _Draw:
     def __call__(self, count: int) -> Resamples:
         """Draw `count` resamples."""
         G, sigma = self.blocks.count, self.fit.residual_test.sigma_scale
-        base = int(self.linear.linearization.equations[0])
-        equations = np.full(count, base)
+        equations = np.full(count, int(self.linear.linearization.equations[0]))
         weight, offset = None, None
         if self.errors is None:
             drawn = self.rng.multinomial(G, np.full(G, 1.0 / G), count)

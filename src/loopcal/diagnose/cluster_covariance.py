@@ -28,12 +28,11 @@ from loopcal.diagnose.error_frames import (
     linearize_tool_errors,
     locate_measured_poses,
 )
-from loopcal.diagnose.influence import TESTABLE
+from loopcal.diagnose.outliers import TESTABLE
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.posterior import Posterior
-from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
@@ -42,8 +41,6 @@ from loopcal.numerics.elimination import find_connected_groups, fold_at
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-# Divide poses into the units that may share an error: days, sessions, blocks or single poses.
 
 # Clusters that a cluster-robust variance needs. The variance of a mean has one degree of freedom
 # less, and with fewer than 4 its distribution is not known well enough (Tipton, 2015).
@@ -280,13 +277,14 @@ def compute_robust_spread(
         even choice stands for all. linear : of the fit and its data, see `linearize_fit`.
     """
     clusters, times = choose_clusters(clusters)
-    problem, d, p = linear.problem, linear.decomposition, len(fit.names)
+    d, p = linear.decomposition, len(fit.names)
     used = linear.is_estimated
     V = d.scale[:, None] * d.directions[0][:, used]
     total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
     sd = np.sqrt(linear.variance[used])
     sigma = fit.residual_test.sigma_scale
-    rows = _fold_clusters(linear, clusters) / np.r_[np.ones(_width(problem)), np.ones(p), sigma]
+    rows = _fold_clusters(linear, clusters)
+    rows = rows / np.r_[np.ones(rows.shape[-1] - 1), sigma]
     nuisance, A, r = rows[..., : -p - 1], rows[..., -p - 1 : -1], rows[..., -1]
     half = np.concatenate([nuisance, (A @ V) / np.sqrt(total)], axis=2)
     P = (A @ V) * (sigma / (total * sd))
@@ -314,15 +312,11 @@ def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:
     return replace(clusters, member=number[clusters.member], count=MOST_CLUSTERS), times
 
 
-def _width(problem: Problem) -> int:
-    """Return the number of columns of nuisance parameters in `Problem.leverage_rows`."""
-    return 0 if problem.nuisance is None else len(problem.nuisance)
-
-
 def _fold_clusters(linear: FitLinearization, clusters: Clusters) -> FloatArray:
     """Return the rows (G, h, U + p + 1) of each cluster, folded."""
     problem = linear.problem
-    width = _width(problem) + problem.parameters + 1
+    setup = 0 if problem.nuisance is None else len(problem.nuisance)
+    width = setup + problem.parameters + 1
     factor = np.zeros((1, clusters.count, 0, width))
     for rows_of_block in problem.leverage_rows(linear.linearization, linear.solution):
         for part in rows_of_block:
@@ -342,9 +336,16 @@ def _compare(
     linear: FitLinearization,
 ) -> ClusterCheck | None:
     """Return the comparison for clusters; None where residuals cannot judge the poses."""
-    spread = compute_robust_spread(fit, clusters, linear)
-    effects = _list_pose_effects(fit, data, frame)
-    angle, position = (spread.compare(*effect) for effect in effects)
+    spread, posterior = compute_robust_spread(fit, clusters, linear), fit.posterior
+    errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data, MOST_POSES), frame)
+    root = _find_added_root(posterior.without_discrepancy) / posterior.unit[:, None]
+    # variances of the poses beyond C, and their changes by deviations in tolerances
+    beside = np.concatenate([errors.by_parameters @ root, errors.by_discrepancy], axis=2) ** 2
+    D = errors.by_parameters * (fit.tolerance / posterior.unit)
+    angle, position = (
+        spread.compare(D[:, rows].reshape(-1, D.shape[-1]), float(beside[:, rows].sum()))
+        for rows in (slice(0, 3), slice(3, 6))
+    )
     sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
     sizes = [r for r in sizes if r.share >= JUDGED and r.degrees >= FEWEST_DEGREES]
     if not sizes:
@@ -363,24 +364,6 @@ def _compare(
         parameter_ratio=parameter[1],
     )
     return ClusterCheck(clusters.unit, clusters.count, position, angle, parameter, finding)
-
-
-def _list_pose_effects(
-    fit: Identification, data: Measurements, frame: str
-) -> list[tuple[FloatArray, float]]:
-    """Return for the orientation and the tool's position of the measured poses their changes
-    (3 n, p) by deviations in tolerances, and the sum of the variances that they have beyond C.
-    """
-    posterior = fit.posterior
-    errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data, MOST_POSES), frame)
-    p = len(posterior.unit)
-    by_part = errors.by_parameters @ (
-        _find_added_root(posterior.without_discrepancy) / posterior.unit[:, None]
-    )
-    added = np.concatenate([by_part, errors.by_discrepancy], axis=2) ** 2
-    D = errors.by_parameters * (fit.tolerance / posterior.unit)
-    parts = (slice(0, 3), slice(3, 6))
-    return [(D[:, rows].reshape(-1, p), float(added[:, rows].sum())) for rows in parts]
 
 
 def _find_added_root(posterior: Posterior) -> FloatArray:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.influence import iterate_blocks
+from loopcal.diagnose.outliers import iterate_blocks
 from loopcal.diagnose.row_errors import (
     PoseErrors,
     compare_predictions,
@@ -28,12 +28,13 @@ from loopcal.diagnose.row_errors import (
     join_errors,
 )
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import free_only, select_free_parameters
-from loopcal.estimate.identification import check_types, exclude_poses, identify
+from loopcal.estimate.identification import identify
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.penalties import Method, Ridge, TruncatedSVD, adapt_method
+from loopcal.estimate.penalties import Method, adapt_method
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
@@ -156,20 +157,16 @@ def cross_validate(
 ) -> CrossValidation:
     """Fit `count` times without one fold, and predict the held-out fold.
 
-    Parameters
-    ----------
     robot, data, method, options : as for `identify`. A robot without free parameters is only used
         to predict. Excluded poses are neither fitted nor predicted.
     count : number of folds. seed : of their choice. progress : receives the folds that are done.
-    must_converge : whether the first fit that does not converge ends the comparison. A fit that
-        will never converge takes all iterations, and so do those without the other folds.
+    must_converge : whether the first fit that does not converge ends the comparison.
 
     Raises
     ------
-    DataError, EstimationError
-        As `draw_folds` and `identify`; a fit does not converge (code `model.fold-not-converged`,
-        with `must_converge`); or the options have nuisance parameters, which belong to all
-        rows together.
+    DataError, EstimationError : as `draw_folds` and `identify`; a fit does not converge (code
+        `model.fold-not-converged`, with `must_converge`); or the options have nuisance parameters,
+        which belong to all rows together.
     """
     check_types(robot, data)
     options = merge_options(options, method)
@@ -239,11 +236,11 @@ def score_leave_one_out(
     y = weight * (s * d.projections[0])
     blocks, member = np.unique(linked_blocks(data), return_inverse=True)
     square, equations = np.zeros((len(blocks), len(penalty))), np.zeros(len(blocks))
-    total, rows = (
-        problem.poses.count_rows(member, len(blocks)),
+    count, rows = (
+        problem.count_leverage_rows(member, len(blocks)),
         problem.leverage_rows(linearization),
     )
-    for numbers, A, r in iterate_blocks(rows, member, total):
+    for numbers, A, r in iterate_blocks(rows, member, count):
         B = A @ d.directions[0]  # (blocks, m, p)
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
         H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))
@@ -256,33 +253,15 @@ def score_leave_one_out(
     score = square.sum(axis=0) / int(linearization.equations[0])
     dof = d.filter_factors(penalty).sum(axis=1)
     estimate = free.nominal + free.tolerance * (y @ d.directions[0].T)
-    error = _ratio_error(square, equations, score)
-    used = int((equations > 0).sum())
-    return LeaveOneOut(tuple(methods), score, dof, estimate, error, used)
-
-
-def build_regularization_path(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:
-    """Return `count` ridges, lam from 1e-8 to 1e4 of `data_scale`, and every truncation from 0 to
-    all parameters.
-    """
-    lam = data_scale * np.logspace(-8.0, 4.0, count)
-    return (
-        *(Ridge(float(value)) for value in lam),
-        *(TruncatedSVD(k) for k in range(parameters + 1)),
-    )
-
-
-def _ratio_error(square: FloatArray, equations: FloatArray, score: FloatArray) -> FloatArray:
-    """Return the standard errors (k,) of scores, which are sums of squares (b, k) of b blocks over
-    their equations (b,); NaN of a score that is infinite or of one block.
-    """
+    # standard error of a ratio of sums over b blocks; NaN of a score that is infinite
     b = int((equations > 0).sum())
-    if b < 2:
-        return np.full(len(score), np.nan)
-    with np.errstate(invalid="ignore"):
-        residual = square - equations[:, None] * score
-    residual = np.where(np.isfinite(score), residual, np.nan)
-    return np.sqrt(b / (b - 1) * (residual**2).sum(axis=0)) / equations.sum()
+    error = np.full(len(score), np.nan)
+    if b > 1:
+        with np.errstate(invalid="ignore"):
+            off = square - equations[:, None] * score
+        off = np.where(np.isfinite(score), off, np.nan)
+        error = np.sqrt(b / (b - 1) * (off**2).sum(axis=0)) / equations.sum()
+    return LeaveOneOut(tuple(methods), score, dof, estimate, error, b)
 
 
 def _mean_square(robot: Mechanism, data: Measurements) -> float:
@@ -298,8 +277,6 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
     equations = int(linearization.equations[0])
     return total / equations if np.isfinite(total) and equations else np.inf
 
-
-# Choose the simplest set of free parameters that predicts held-out poses as well as any.
 
 # Names of parameters that shift an actuator reading.
 OFFSETS = re.compile(r"(^|\.)(offset|stop|zero|home)$|^q\d+$")
@@ -475,8 +452,6 @@ def choose_model(
 ) -> ModelChoice:
     """Choose the simplest set of free parameters that predicts held-out poses as well as any.
 
-    Parameters
-    ----------
     robot, data, method, options, count, seed : as for `cross_validate`; all candidates are subsets
         of the free parameters and have the same folds.
     nested : name -> parameters, each set within the next; default `list_parameter_sets`. The set
@@ -485,25 +460,27 @@ def choose_model(
 
     Raises
     ------
-    EstimationError
-        The stated sets are not nested. Sets with too few equations, and those that do not converge,
-        are listed, but not compared.
+    EstimationError : the stated sets are not nested. Sets with too few equations, and those that do
+        not converge, are listed, but not compared.
     """
     check_types(robot, data)
-    if nested is not None:
-        _check_nested(nested)
     sets = list_parameter_sets(robot) if nested is None else nested
     named = [(NOTHING, ()), *((name, tuple(names)) for name, names in sets.items())]
+    for (small, inner), (large, outer) in pairwise(named):
+        if nested is not None and not set(inner) < set(outer):
+            raise EstimationError(
+                f"the set {small!r} is not within {large!r}, or equal to it; give each set within "
+                "the next"
+            )
     options = merge_options(options, method)
 
     def validate_set(place: int, names: Sequence[str]) -> CrossValidation | None:
         def count_fits(done: int, _total: int, _what: str) -> None:
             progress(place * count + done, len(named) * count, "comparing parameter sets")
 
-        only = free_only(robot, names)
         try:
             return cross_validate(
-                only,
+                free_only(robot, names),
                 data,
                 options=options,
                 count=count,
@@ -525,17 +502,6 @@ def choose_model(
     limit = best.score + best.standard_error if np.isfinite(best.score) else np.inf
     chosen = next(c for c in candidates if c.score <= limit)
     return ModelChoice(candidates, chosen, best, free_only(robot, chosen.parameters))
-
-
-def _check_nested(nested: Mapping[str, Sequence[str]]) -> None:
-    """Refuse sets of which one is not within the next."""
-    named = [(NOTHING, ()), *nested.items()]
-    for (small, inner), (large, outer) in pairwise(named):
-        if not set(inner) < set(outer):
-            raise EstimationError(
-                f"the set {small!r} is not within {large!r}, or equal to it; give each set within "
-                "the next"
-            )
 
 
 def _rate_conditioning(

@@ -28,7 +28,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms, probe_readings, twist_weights
 from loopcal.errors import EstimationError, suggest_names
-from loopcal.estimate.posterior import InstrumentFrame, Posterior
+from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import MOTIONS, frame_twists
 from loopcal.findings import Finding, report_finding
@@ -89,10 +89,10 @@ class ErrorFrame(NamedTuple):
 
 
 class ReferencePoses(NamedTuple):
-    """Poses over which frames are fitted: T (m, 4, 4), twists (m, 6, p), and which they are."""
+    """Poses over which frames are fitted."""
 
-    T: FloatArray
-    twists: FloatArray
+    T: FloatArray  # (m, 4, 4)
+    twists: FloatArray  # (m, 6, p)
     over: Over
 
 
@@ -170,7 +170,16 @@ def choose_error_frame(
     if frame in (FITTED, BASE):
         return refer_errors(robot, frame, reference, motions)
     if frame != RELATIVE:
-        followed = _follow_instrument(posterior, instruments[frame])
+        # the motions of the base that move it like the frame of the instrument
+        instrument = instruments[frame]
+        of_frame = frame_twists(instrument.T, robot.size)[:, :6]
+        by_parameters = _as_base_motion(of_frame, instrument.by_parameters * posterior.unit)
+        if posterior.discrepancy is not None:  # the frame does not follow errors of the poses
+            nothing = np.zeros((MOTIONS, posterior.discrepancy.errors.count))
+            by_parameters = np.concatenate([by_parameters, nothing], axis=1)
+        by_frames = np.diag(np.repeat([1.0, 0.0], 6))
+        own_errors = _as_base_motion(of_frame, instrument.own)
+        followed = FollowedMotion(by_frames, by_parameters, own_errors)
         return refer_errors(robot, frame, reference, motions, followed)
     if origin is None or not origin.converged.all():
         raise EstimationError(
@@ -240,17 +249,6 @@ def follow_pose(
     return FollowedMotion(by_frames, by_parameters, by_own, name)
 
 
-def _follow_instrument(posterior: Posterior, frame: InstrumentFrame) -> FollowedMotion:
-    """Return the motions of the base that move it like the frame of an instrument."""
-    of_frame = frame_twists(frame.T, posterior.robot.size)[:, :6]
-    by_parameters = _as_base_motion(of_frame, frame.by_parameters * posterior.unit)
-    if posterior.discrepancy is not None:  # the frame does not follow errors of the poses
-        nothing = np.zeros((MOTIONS, posterior.discrepancy.errors.count))
-        by_parameters = np.concatenate([by_parameters, nothing], axis=1)
-    by_frames = np.diag(np.repeat([1.0, 0.0], 6))
-    return FollowedMotion(by_frames, by_parameters, _as_base_motion(of_frame, frame.own))
-
-
 def solve_home(robot: Mechanism) -> Solution:
     """Return the home pose (1,) of a robot, to which errors may be relative."""
     return forward(robot, compute_readings(robot, robot.values[None], robot.home_state)[0])
@@ -279,9 +277,8 @@ def list_unfixed_motions(posterior: Posterior) -> FloatArray:
 
 
 def reference_poses(posterior: Posterior) -> ReferencePoses:
-    """Return the poses over which frames are fitted.
-
-    They are the measured poses; poses about home where a run folder does not name these.
+    """Return the poses over which frames are fitted: the measured poses, or poses about home where
+    a run folder does not name these.
     """
     robot, frames = posterior.robot, posterior.frames
     if frames is not None and _names_readings(posterior):
@@ -335,9 +332,6 @@ def _as_base_motion(by_base: FloatArray, twists: FloatArray) -> FloatArray:
     motion = np.asarray(np.linalg.solve(by_base, twists), dtype=np.float64)
     return np.concatenate([motion, np.zeros_like(motion)])
 
-
-# What the parameters, the frame and the readings of a calibrated robot do to its tool at
-# poses.
 
 # Measured poses, evenly chosen, by which two uncertainties are compared: ratios over more poses
 # hardly differ.

@@ -18,10 +18,10 @@ from loopcal.diagnose.error_frames import (
     linearize_tool_errors,
     locate_measured_poses,
 )
+from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
-from loopcal.diagnose.repeated_poses import LackOfFit, check_lack_of_fit
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.measurements import Measurements
@@ -37,8 +37,6 @@ from loopcal.units import Dimension
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
-
-# Find parameters whose estimates are strongly correlated.
 
 # Correlation above which the error of one parameter is mostly that of another (81 % of its
 # variance).
@@ -62,15 +60,13 @@ class CorrelatedGroup:
         return report_finding("residuals.correlated-parameters", **vars(self))
 
 
-def find_correlated_groups(
-    fit: Identification, strong: float = STRONG
-) -> tuple[CorrelatedGroup, ...]:
+def find_correlated_groups(fit: Identification) -> tuple[CorrelatedGroup, ...]:
     """Return the groups of strongly correlated parameters, the largest correlation first."""
     sd = fit.standard_deviations
     finite = np.isfinite(sd) & (sd > 0.0)
     scale = np.where(finite, 1.0 / np.where(finite, sd, 1.0), np.nan)
     rho = np.where(finite[:, None] & finite, fit.covariance, np.nan) * scale[:, None] * scale
-    linked = np.where(np.isnan(rho), 0.0, np.abs(rho)) > strong
+    linked = np.where(np.isnan(rho), 0.0, np.abs(rho)) > STRONG
     np.fill_diagonal(linked, val=False)
     group = np.arange(len(rho))
     for i, j in np.argwhere(linked):
@@ -85,9 +81,6 @@ def find_correlated_groups(
         groups.append(CorrelatedGroup(names, (fit.names[a], fit.names[b]), float(rho[a, b])))
     return tuple(sorted(groups, key=lambda g: -abs(g.correlation)))
 
-
-# Predict the gain of a calibration: pose errors expected from the tolerances, and after the
-# fit.
 
 GAIN = 1.1  # factor by which an expected error must become smaller to count as an improvement
 # Expected errors below this share of the robot's size, or this angle [rad], are rounding.
@@ -124,18 +117,23 @@ def estimate_calibration_gain(
     frame : in which the errors are stated, see `choose_error_frame`; "relative"
         means relative to the home pose.
     """
+
+    def predict_nothing(code: str, **data: Any) -> CalibrationGain:
+        nan = float("nan")
+        return CalibrationGain(nan, nan, nan, nan, None, report_finding(code, **data))
+
     free = fit.free_parameters
     if free.assumed.any():
-        return _unpredicted("model.gain-needs-tolerances", missing=int(free.assumed.sum()))
+        return predict_nothing("model.gain-needs-tolerances", missing=int(free.assumed.sum()))
     if fit.residual_test.failed:
-        return _unpredicted("model.gain-needs-consistent-noise")
+        return predict_nothing("model.gain-needs-consistent-noise")
     solution = locate_measured_poses(fit, data, MOST_POSES)
     # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
     posterior = fit.posterior.without_discrepancy
     variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
     factor = posterior.directions * np.sqrt(variance)
     if not len(solution.q) or np.isnan(factor).any():
-        return _unpredicted("model.gain-without-intervals")
+        return predict_nothing("model.gain-without-intervals")
     effects = linearize_tool_errors(fit.posterior, solution, frame)
     D, own = effects.by_parameters, (effects.by_frame, effects.by_discrepancy)
     size = fit.robot.size
@@ -154,12 +152,6 @@ def estimate_calibration_gain(
     return CalibrationGain(
         position_before, position_after, angle_before, angle_after, is_worthwhile, finding
     )
-
-
-def _unpredicted(code: str, **data: Any) -> CalibrationGain:
-    """Return the reason why there is no prediction."""
-    nan = float("nan")
-    return CalibrationGain(nan, nan, nan, nan, None, report_finding(code, **data))
 
 
 def _rms_errors(factor: FloatArray, size: float) -> tuple[float, float]:
@@ -259,17 +251,11 @@ def examine_fit(
     )
 
 
-# Compute the errors of recorded actuator readings, per actuator and in terms of the driven
-# joint.
-
-
 @dataclass(frozen=True)
 class ReadingError:
     """Recorded minus estimated readings of one actuator.
 
-    name : of the actuator. count : number of readings.
-    reading, joint : root mean square of the reading and of the driven joint [SI], of these
-        dimensions.
+    reading, joint : root mean square of the reading and of the driven joint [SI].
     largest : of the joint, by size, with its sign [SI]. pose : label of its pose.
     """
 
@@ -293,9 +279,12 @@ def compute_reading_errors(
     recorded = exclude_poses(data, fit.options.excluded_poses).readings
     compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
     reading = np.where(compared, recorded - estimated, np.nan)
-    joint = np.where(
-        compared, _joint_values(robot, recorded) - _joint_values(robot, estimated), np.nan
-    )
+    _, tau = robot.slots(robot.values[None])
+    # values (n, a) of the driven joints, or of their sums
+    joint_values = [
+        transmit_readings(q[None], tau, robot.slots.frequency)[0] for q in (recorded, estimated)
+    ]
+    joint = np.where(compared, joint_values[0] - joint_values[1], np.nan)
     limbs = robot.assembly.limbs
     turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}
     dimensions = [
@@ -320,9 +309,3 @@ def compute_reading_errors(
             )
         )
     return tuple(errors) or None
-
-
-def _joint_values(robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Return the values (n, a) of the driven joints, or their sums, at these readings."""
-    _, tau = robot.slots(robot.values[None])
-    return transmit_readings(readings[None], tau, robot.slots.frequency)[0]

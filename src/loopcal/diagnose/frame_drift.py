@@ -28,7 +28,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.numerics.decomposition import decompose, empty_factor
 from loopcal.numerics.statistics import compute_any_probability, compute_chi_square_tail
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import find_unit
 
 # Probability, for each of the two tests, of a report although no frame and no target moved.
@@ -126,7 +126,10 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
         for drift in drifts
         if compute_any_probability(drift.p_value, len(drifts)) < LEVEL
     ]
-    if unused := _list_unused_sessions(data):
+    used = {name for rows in data.observations for name in rows.session.tolist()}
+    open_frames = [rows for rows in data.base_observations if "frame" in rows.kind.unknown]
+    on_base = dict.fromkeys(name for rows in open_frames for name in rows.session.tolist())
+    if used and (unused := [name for name in on_base if name not in used]):
         names = tuple(f"session {name!r}" if name else "rows without a session" for name in unused)
         findings.append(report_finding("data.base-session-unused", sessions=names))
     return tuple(findings)
@@ -144,32 +147,14 @@ def report_moved_targets(shape: ShapeTest) -> Finding:
     )
 
 
-def _list_unused_sessions(data: Measurements) -> tuple[str, ...]:
-    """Return the sessions with targets on the base in an unknown frame, but without a pose."""
-    used = {name for rows in data.observations for name in rows.session.tolist()}
-    if not used:
-        return ()
-    return tuple(
-        dict.fromkeys(
-            name
-            for rows in data.base_observations
-            if "frame" in rows.kind.unknown
-            for name in rows.session.tolist()
-            if name not in used
-        )
-    )
-
-
 def _leave_out(data: Measurements, changed: Sequence[ShapeTest]) -> Measurements:
     """Return the measurements without targets that moved; without all where it is open which."""
     kept = []
     for rows in data.base_observations:
         kind, measured = rows.kind, np.array(rows.measured)
         for shape in changed:
-            if isinstance(kind, Position) and (kind.frame, kind.targets) == (
-                shape.frame,
-                shape.targets,
-            ):
+            own = (shape.frame, shape.targets)
+            if isinstance(kind, Position) and (kind.frame, kind.targets) == own:
                 known = len(shape.suspects) == 1
                 for name in shape.suspects if known else kind.targets:
                     measured[:, list(kind.target_columns[name])] = np.nan
@@ -235,8 +220,11 @@ def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[
     for alike in groups.values():
         kind = alike[0].kind
         assert isinstance(kind, Position)
-        order = [_order_rows(rows) for rows in alike]
-        pairs = list(zip(alike, order, strict=True))
+        pairs = []
+        for rows in alike:  # those that count, in the order of their time
+            counted, time = np.flatnonzero(rows.weight > 0.0), rows.context.get("time")
+            time = None if time is None else time[counted]
+            pairs.append((rows, counted[order_by_time(time, len(counted))]))
         measured = np.concatenate([rows.measured[i] for rows, i in pairs])
         points = measured.reshape(len(measured), -1, 3)
         whitener = np.concatenate([rows.whitener[i] for rows, i in pairs])
@@ -248,12 +236,6 @@ def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[
         used = [i for i, each in enumerate(points) if _spans_plane(each)]
         if len(used) > 1:
             yield _Repeats(kind, points[used], whitener[used], session[used].tolist())
-
-
-def _order_rows(rows: Observations) -> IntArray:
-    """Return the rows that count in the order of their time if all state it, else as they are."""
-    counted, time = np.flatnonzero(rows.weight > 0.0), rows.context.get("time")
-    return counted[order_by_time(None if time is None else time[counted], len(counted))]
 
 
 def _spans_plane(points: FloatArray) -> bool:

@@ -62,11 +62,8 @@ def find_gauge_freedoms(posterior: Posterior) -> GaugeFreedoms:
     null = posterior.directions[:, ~posterior.determined]
     if null.shape[1] == 0:
         return GaugeFreedoms(null, (), 0, np.zeros((12, 0)))
-    robot, readings, values = (
-        posterior.robot,
-        probe_readings(posterior.robot),
-        posterior.robot.values,
-    )
+    robot, values = posterior.robot, posterior.robot.values
+    readings = probe_readings(robot)
     state = forward_trials(robot, values[None], readings[None], follow=False)
     D = differentiate_pose(robot, values[None], readings[None], state).parameters[0]
     usable = (state.status[0] == Status.CONVERGED) & np.isfinite(D).all(axis=(1, 2))
@@ -140,9 +137,7 @@ def interpret_combinations(
 
 
 def interpret_fit(fit: Identification) -> Identification:
-    """Return a fit whose unidentifiable combinations, and the findings on them, name the motion of
-    the robot that each of them stands for.
-    """
+    """Return a fit whose unidentifiable combinations, and their findings, name their motions."""
     free = replace(fit.free_parameters, robot=fit.robot)
     combinations = interpret_combinations(free, fit.unidentifiable)
     named = iter(combination.finding for combination in combinations)
@@ -260,20 +255,16 @@ def _describe_frame_motion(frame: str, motion: FloatArray, size: float) -> Findi
         along = abs(float(w @ c)) / turn**2
         kind, axis = "rotation" if along <= SAME_MOTION * size else "screw", w
         through_origin = float(np.linalg.norm(np.cross(w, c))) / turn**2 <= SAME_MOTION * size
+    unit = axis / np.linalg.norm(axis)
+    largest = int(np.argmax(np.abs(unit)))
+    name = "xyz"[largest]
+    if np.linalg.norm(np.delete(unit, largest)) > SAME_MOTION:
+        shown = np.where(np.abs(unit) <= SAME_MOTION, 0.0, unit * np.sign(unit[largest]))
+        name = "(" + ", ".join(f"{x:.3g}" for x in shown) + ")"
     return report_finding(
         "identifiability.frame-moves",
         frame=frame,
         motion=kind,
-        axis=_axis_name(axis),
+        axis=name,
         through_origin=through_origin,
     )
-
-
-def _axis_name(vector: FloatArray) -> str:
-    """Return a direction as x, y or z, or by its components."""
-    unit = vector / np.linalg.norm(vector)
-    largest = int(np.argmax(np.abs(unit)))
-    if np.linalg.norm(np.delete(unit, largest)) <= SAME_MOTION:
-        return "xyz"[largest]
-    shown = np.where(np.abs(unit) <= SAME_MOTION, 0.0, unit * np.sign(unit[largest]))
-    return "(" + ", ".join(f"{x:.3g}" for x in shown) + ")"

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
 
-# The observability indices O1 to O5. Formulas and sources: docs/theory/observability.md.
-
 # Units of the singular values; every index depends on them.
 SCALING = "rows divided by sigma, columns multiplied by tolerance"
 
@@ -86,9 +84,8 @@ class Observability:
 def compute_observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
     """Return the indices of the singular values of whitened rows in units of tolerance.
 
-    singular_values : (p,), descending. rank : how many of them count. equations : m, number of
-        rows.
-    Returns Observability; all indices are zero where the rank is zero.
+    singular_values : (p,), descending. rank : how many of them count. equations : number of rows.
+    All indices are zero where the rank is zero.
     """
     s = singular_values[:rank]
     left_out = len(singular_values) - rank
@@ -263,26 +260,16 @@ class Identifiability(DrawnResult):
             findings.append(
                 report_finding("identifiability.gap", counted=counted, cut=cut, gap=self.gap)
             )
-        findings += self._report_arbitrary_cut()
+        # singular values that continue through the cut make the rank depend on the tolerance
+        tolerances = tuple(self.tolerance * factor for factor in NEARBY_TOLERANCES)
+        ranks = tuple(int(are_nonzero(s, tolerance).sum()) for tolerance in tolerances)
+        if ranks[0] != ranks[1] and self.gap < CLEAR_GAP:
+            data = {"gap": self.gap, "ranks": ranks, "tolerances": tolerances}
+            findings.append(report_finding("identifiability.arbitrary-cut", **data))
         findings += [combination.finding for combination in (*self.unidentifiable, *self.weak)]
         if (more := rank - self.improved - len(self.weak)) > 0:
             findings.append(report_finding("identifiability.more-weak-directions", count=more))
         return (*findings, *self.free_parameters.findings())
-
-    def _report_arbitrary_cut(self) -> list[Finding]:
-        """Return that the rank depends on the rank tolerance, where singular values continue
-        through the cut.
-        """
-        s = self.singular_values
-        tolerances = tuple(self.tolerance * factor for factor in NEARBY_TOLERANCES)
-        ranks = tuple(int(are_nonzero(s, tolerance).sum()) for tolerance in tolerances)
-        if ranks[0] == ranks[1] or self.gap >= CLEAR_GAP:
-            return []
-        return [
-            report_finding(
-                "identifiability.arbitrary-cut", gap=self.gap, ranks=ranks, tolerances=tolerances
-            )
-        ]
 
     @property
     def posterior(self) -> Posterior:

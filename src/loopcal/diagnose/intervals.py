@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intervals of parameters from draws, compared with linear ones.
+"""Intervals of parameters from draws, compared with linear ones, and regions of several parameters.
 
 A linear interval is off where one of its ends differs from that of the draws by more than 10 % of
 its half-width, beyond what the finite number of draws explains. The ends are compared draw by draw:
@@ -10,24 +10,41 @@ better than either. Its standard error follows from the influence of each draw,
 
 with the quantiles q and r at level a of draws x_i with weights w_i and of linear draws l_i with
 weights v_i, and the linear density f there.
+
+For q quantities with the covariance C, the region (x - estimate)' C^-1 (x - estimate) <= c contains
+the truth with the stated probability for c of the chi-square distribution with q degrees of
+freedom, or c = q F(q, nu) where the noise has nu of them. Intervals of single quantities each hold
+with their level; all q of them at once hold less often. Simultaneous ones have the half-width
+k sd with
+
+    maximum      the quantile of max |t_j| for these correlations (simulated; the narrowest)
+    sidak        single level 1 - (1 - level)^(1/q): exact for independent quantities
+    bonferroni   single level (1 - level) / q
+    scheffe      sqrt(c): holds for all linear combinations, too
+
+See docs/theory/resampling.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from fnmatch import fnmatchcase
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from loopcal.estimate.residual_test import coverage_factor
+from loopcal.errors import EstimationError, suggest_names
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.residual_test import LEVEL, coverage_factor
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.numerics.statistics import compute_single_level
-from loopcal.results.description import Field, fields, label_axes
+from loopcal.findings.wording import round_to_digits
+from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal.numerics.statistics import compute_f_quantile, compute_single_level
+from loopcal.results.description import OTHER, Field, fields, label_axes
 from loopcal.results.result import TableResult
-from loopcal.typing import BoolArray, FloatArray
-
-# Statistics of weighted draws, and how well the draws determine them.
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 LARGEST_TAIL = 0.2  # share of the draws whose weights are the tail, at most; see `fit_tail_shape`
 
@@ -160,15 +177,12 @@ class Intervals(TableResult):
         return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
-@dataclass(frozen=True, eq=False)
-class EndDifference:
-    """Quantiles (2, p) of draws and of linear draws at the ends of intervals, and the standard
-    error (2, p) of their difference.
-    """
+class EndDifference(NamedTuple):
+    """The ends of intervals of draws; arrays (2, p)."""
 
-    quantile: FloatArray
-    linear: FloatArray
-    error: FloatArray
+    quantile: FloatArray  # of draws
+    linear: FloatArray  # of linear draws
+    error: FloatArray  # standard error of their difference
 
 
 def compare_ends(
@@ -178,10 +192,7 @@ def compare_ends(
     linear_weight: FloatArray,
     level: float,
 ) -> EndDifference:
-    """Compare the ends of intervals of draws (T, p) with those of linear draws (T, p), one by one.
-
-    Both have weights (T,) of sum 1.
-    """
+    """Compare ends of intervals of draws and linear draws (T, p), with weights (T,) of sum 1."""
     tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
     quantile = weighted_quantiles(draws, weight, tails)
     reference = weighted_quantiles(linear, linear_weight, tails)
@@ -214,3 +225,303 @@ def report_intervals(intervals: Intervals, agrees: str, differs: str) -> list[Fi
             largest=float(size[order[0]]),
         )
     ]
+
+
+Rule = Literal["maximum", "sidak", "bonferroni", "scheffe"]  # how simultaneous intervals are made
+DRAWS = 100_000  # simulated maxima: the quantile has a standard error of about 0.3 %
+
+BATCH = 10_000
+SMALLEST = 1e-10  # eigenvalue of a correlation matrix below which quantities depend on each other
+
+
+@dataclass(frozen=True, eq=False)
+class JointRegion(TableResult):
+    """An ellipsoid of q quantities.
+
+    Attributes
+    ----------
+    names : of the quantities. center : (q,) estimates [SI]. covariance : (q, q) [SI].
+    level : probability. degrees : of freedom of the noise; infinite where it is known.
+    square : c, the largest squared distance within the region.
+    """
+
+    names: tuple[str, ...]
+    center: FloatArray
+    covariance: FloatArray
+    level: float
+    degrees: float
+    square: float
+
+    FIELDS: ClassVar[tuple[Field, ...]] = (
+        *fields("*", "half_widths", "axes", "correlation"),
+        *(
+            Field(name, axes="quantity", unit="SI")
+            for name in ("center", "standard_deviations", "half_widths")
+        ),
+        Field("covariance", axes=f"quantity {OTHER}", unit="SI times SI"),
+    )
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(quantity="names", other="names")
+
+    def __repr__(self) -> str:
+        return f"<JointRegion of {', '.join(self.names)}: {round_to_digits(100 * self.level, 4)} %>"
+
+    @property
+    def standard_deviations(self) -> FloatArray:
+        """(q,) [SI]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """(q, q)."""
+        sd = self.standard_deviations
+        return self.covariance / (sd[:, None] * sd)
+
+    @property
+    def half_widths(self) -> FloatArray:
+        """(q,) half-widths [SI] of the box around the region; those of Scheffe's intervals."""
+        return np.sqrt(self.square) * self.standard_deviations
+
+    @property
+    def axes(self) -> FloatArray:
+        """(q, q) vectors [SI] from the center to the ends of the principal axes, one per row, the
+        longest in standard deviations first.
+
+        They are principal for quantities in units of their standard deviations, so that they do
+        not depend on units.
+        """
+        value, vectors = np.linalg.eigh(self.correlation)
+        sd = self.standard_deviations
+        return (sd[:, None] * vectors * np.sqrt(self.square * np.maximum(value, 0.0))).T[::-1]
+
+    def measure_distance(self, values: FloatArray) -> FloatArray:
+        """Return squared distances (..,) of values (.., q) [SI], comparable with `square`."""
+        sd = self.standard_deviations
+        off = (np.asarray(values, dtype=np.float64) - self.center) / sd
+        value, vectors = np.linalg.eigh(self.correlation)
+        return np.asarray(((off @ vectors) ** 2 / value).sum(axis=-1))
+
+    def contains(self, values: FloatArray) -> np.ndarray:
+        """Return whether values (.., q) [SI] lie in the region."""
+        return np.asarray(self.measure_distance(values) <= self.square)
+
+    def compute_p_value(self, values: FloatArray) -> FloatArray:
+        """Return the probability (..,) of estimates as far from values (.., q) [SI], if these were
+        true.
+        """
+        from scipy.special import chdtrc, fdtrc
+
+        square, q = self.measure_distance(values), len(self.names)
+        if np.isinf(self.degrees):
+            return np.asarray(chdtrc(q, square))
+        return np.asarray(fdtrc(q, self.degrees, square / q))
+
+
+@dataclass(frozen=True, eq=False)
+class SimultaneousIntervals(TableResult):
+    """Intervals that hold for all q quantities at once with a probability.
+
+    Attributes
+    ----------
+    names : of the quantities. center : (q,) [SI]. half_widths : (q,) [SI]. level : of all together.
+    rule : how they were made. factor : (q,) half-widths in standard deviations.
+    single : (q,) half-widths [SI] of the intervals that hold one at a time.
+    """
+
+    names: tuple[str, ...]
+    center: FloatArray
+    half_widths: FloatArray
+    level: float
+    rule: Rule
+    factor: FloatArray
+    single: FloatArray
+
+    FIELDS: ClassVar[tuple[Field, ...]] = (
+        *fields("*"),
+        *(Field(name, axes="quantity", unit="SI") for name in ("center", "half_widths", "single")),
+    )
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(quantity="names")
+
+    def __repr__(self) -> str:
+        names = f"{len(self.names)} quantities at {round_to_digits(100 * self.level, 4)} %"
+        return f"<SimultaneousIntervals of {names} by {self.rule}>"
+
+    def contains(self, values: FloatArray) -> np.ndarray:
+        """Return whether all of values (.., q) [SI] lie in their intervals."""
+        off = np.abs(np.asarray(values) - self.center)
+        return np.asarray((off <= self.half_widths).all(axis=-1))
+
+
+def compute_joint_region(
+    fit: Identification | Posterior,
+    names: str | Sequence[str] | None = None,
+    level: float = LEVEL,
+    combinations: FloatArray | None = None,
+) -> JointRegion:
+    """Return the joint region of parameters, or of combinations of them.
+
+    Parameters
+    ----------
+    fit : an identification, or the posterior of a run. names : parameters; `*` stands for any
+        characters, as in `leg1.*`. None takes all that the data determine.
+    level : probability. combinations : (q, len(names)), optional; rows of factors, so that the
+        quantities are combinations @ parameters.
+
+    Raises
+    ------
+    EstimationError : an unknown name, a parameter that the data do not determine, quantities that
+        depend on each other, or a fit without intervals.
+    """
+    chosen = _select(fit, names, level, combinations)
+    q = len(chosen.names)
+    whitened = np.linalg.eigh(chosen.correlation)
+    if whitened[0][0] < SMALLEST:
+        raise EstimationError(report_finding("sampling.region-dependent", names=chosen.names))
+    white = (whitened[1] / np.sqrt(whitened[0])).T / chosen.sd
+    degrees = float(chosen.posterior.count_degrees(white @ chosen.effect))
+    square = _find_square(q, degrees, level)
+    return JointRegion(chosen.names, chosen.center, chosen.covariance, level, degrees, square)
+
+
+def compute_simultaneous_intervals(
+    fit: Identification | Posterior,
+    names: str | Sequence[str] | None = None,
+    level: float = LEVEL,
+    rule: Rule = "maximum",
+    combinations: FloatArray | None = None,
+    seed: int = 1,
+) -> SimultaneousIntervals:
+    """Return intervals that hold for all selected quantities at once.
+
+    Parameters
+    ----------
+    fit, names, level, combinations : as for `compute_joint_region`; quantities may depend on each
+        other. rule : see the module. seed : of the simulated maxima.
+
+    Raises
+    ------
+    EstimationError : as `compute_joint_region`, or an unknown rule.
+    """
+    if rule not in get_args(Rule):
+        raise EstimationError(f"rule is {rule!r}; it must be one of {', '.join(get_args(Rule))}")
+    chosen = _select(fit, names, level, combinations)
+    q = len(chosen.names)
+    degrees = chosen.posterior.count_degrees(chosen.effect[:, None, :])
+    least = float(degrees.min())
+    if rule == "maximum":
+        factor = np.full(q, _simulate_maximum(chosen.correlation, level, least, seed))
+    elif rule == "scheffe":
+        rank = int((np.linalg.eigvalsh(chosen.correlation) > SMALLEST).sum())
+        factor = np.full(q, np.sqrt(_find_square(rank, least, level)))
+    else:
+        tail = 1.0 - level
+        single = 1.0 - (compute_single_level(tail, q) if rule == "sidak" else tail / q)
+        factor = coverage_factor(degrees, single)
+    return SimultaneousIntervals(
+        chosen.names,
+        chosen.center,
+        factor * chosen.sd,
+        level,
+        rule,
+        factor,
+        coverage_factor(degrees, level) * chosen.sd,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Selection:
+    """Quantities of a posterior: effect (q, p) by its parameters, root (q, k) of the covariance."""
+
+    posterior: Posterior
+    names: tuple[str, ...]
+    center: FloatArray
+    effect: FloatArray
+    root: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        return self.root @ self.root.T
+
+    @property
+    def sd(self) -> FloatArray:
+        return np.sqrt((self.root**2).sum(axis=1))
+
+    @property
+    def correlation(self) -> FloatArray:
+        unit = self.root / self.sd[:, None]
+        return unit @ unit.T
+
+
+def _select(
+    fit: Identification | Posterior,
+    names: str | Sequence[str] | None,
+    level: float,
+    combinations: FloatArray | None,
+) -> _Selection:
+    """Return the selected quantities; raise EstimationError where they are not determined."""
+    posterior = fit if isinstance(fit, Posterior) else fit.posterior
+    if not 0.0 < level < 1.0:
+        raise EstimationError(f"level is {level}; give a probability between 0 and 1")
+    if np.isnan(posterior.variance).any():
+        raise EstimationError(report_finding("sampling.without-intervals"))
+    size = np.abs(posterior.directions[:, np.isinf(posterior.variance)]).max(axis=1, initial=0.0)
+    is_known = size <= NULL_COMPONENT
+    places = np.flatnonzero(is_known) if names is None else _find_places(posterior.names, names)
+    unknown = tuple(posterior.names[i] for i in places[~is_known[places]])
+    if combinations is None and unknown:
+        raise EstimationError(report_finding("sampling.region-undetermined", names=unknown))
+    if not len(places):
+        raise EstimationError(report_finding("sampling.region-undetermined", names=posterior.names))
+    effect = np.eye(len(posterior.names))[places]
+    labels = tuple(posterior.names[i] for i in places)
+    if combinations is not None:
+        rows = np.atleast_2d(np.asarray(combinations, dtype=np.float64))
+        if rows.ndim != 2 or rows.shape[1] != len(places):
+            raise EstimationError(
+                f"combinations have shape {rows.shape} for {len(places)} parameters; give rows "
+                "with one factor for each"
+            )
+        if not np.isfinite(rows).all() or not rows.any(axis=1).all():
+            raise EstimationError(
+                "combinations have a row of zeros, or a number that is not finite; give finite "
+                "factors, not all of them 0"
+            )
+        effect, labels = rows @ effect, tuple(f"combination {i + 1}" for i in range(len(rows)))
+        open_part = effect * posterior.unit @ posterior.directions[:, np.isinf(posterior.variance)]
+        length = np.linalg.norm(effect * posterior.unit, axis=1)
+        if (np.abs(open_part).max(axis=1, initial=0.0) > NULL_COMPONENT * length).any():
+            raise EstimationError(report_finding("sampling.region-undetermined", names=labels))
+    center = effect @ posterior.estimate
+    return _Selection(posterior, labels, center, effect, effect @ posterior.root)
+
+
+def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntArray:
+    """Return the places of names or patterns among the available names, in the order of these."""
+    if isinstance(names, str):
+        names = [names]
+    chosen = []
+    for name in names:
+        matching = [i for i, known in enumerate(available) if fnmatchcase(known, name)]
+        if not matching:
+            similar = suggest_names(name, available)
+            raise EstimationError(f"no free parameter is called {name!r}{similar}")
+        chosen += [i for i in matching if i not in chosen]
+    return np.array(chosen, dtype=np.int64)
+
+
+def _find_square(count: int, degrees: float, level: float) -> float:
+    """Return the largest squared distance of `count` quantities within a region."""
+    return count * float(compute_f_quantile(count, degrees, 1.0 - level))
+
+
+def _simulate_maximum(correlation: FloatArray, level: float, degrees: float, seed: int) -> float:
+    """Return the quantile of max |t_j| for these correlations, from `DRAWS` simulated values."""
+    value, vectors = np.linalg.eigh(correlation)
+    root = vectors * np.sqrt(np.maximum(value, 0.0))
+    rng = np.random.default_rng(np.random.SeedSequence(seed))
+    largest = []
+    for _ in range(DRAWS // BATCH):
+        drawn = np.abs(rng.standard_normal((BATCH, len(root))) @ root.T).max(axis=1)
+        if np.isfinite(degrees):
+            drawn = drawn / np.sqrt(rng.chisquare(degrees, BATCH) / degrees)
+        largest.append(drawn)
+    return float(np.quantile(np.concatenate(largest), level))

@@ -16,7 +16,7 @@ covariance of u.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
@@ -140,7 +140,9 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     assert before is not None
     assert after is not None
     unit = first.unit
-    rows, values = zip(*(_divide_by_noise(i) for i in (before, after)), strict=True)
+    sigmas = [np.sqrt(information.variance) for information in (before, after)]
+    rows = (before.rows / sigmas[0], after.rows / sigmas[1])
+    values = (before.deviations / sigmas[0], after.deviations / sigmas[1])
     # both deviations from the nominal values of the first
     offset = second.robot.nominal.values[second.places] - first.robot.nominal.values[first.places]
     values = (values[0], values[1] + rows[1] @ offset)
@@ -155,17 +157,15 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     return _whiten(first, second, slope, value, combinations, (before, after))
 
 
-def _divide_by_noise(information: DataInformation) -> tuple[FloatArray, FloatArray]:
-    """Return rows and values of unit noise."""
-    sigma = np.sqrt(information.variance)
-    return information.rows / sigma, information.deviations / sigma
-
-
 def _remove_common_null(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return both sets of rows without the directions that neither determines: each has them at its
     own linearization, and the small angle between the two would count as information.
     """
-    null, other = (_find_null(rows) for rows in (first, second))
+    bases = []
+    for rows in (first, second):
+        _, s, vt = np.linalg.svd(rows, full_matrices=True)
+        bases.append(vt[int(are_nonzero(s).sum()) if len(s) else 0 :].T)
+    null, other = bases
     if not null.shape[1] or not other.shape[1]:
         return first, second
     outside = null - other @ (other.T @ null)
@@ -173,12 +173,6 @@ def _remove_common_null(first: FloatArray, second: FloatArray) -> tuple[FloatArr
     sine = np.r_[sine, np.zeros(len(combine) - len(sine))]
     common = null @ combine[sine < PARALLEL].T
     return first - (first @ common) @ common.T, second - (second @ common) @ common.T
-
-
-def _find_null(rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (p, k) of the directions that rows (r, p) do not determine."""
-    _, s, vt = np.linalg.svd(rows, full_matrices=True)
-    return vt[int(are_nonzero(s).sum()) if len(s) else 0 :].T
 
 
 def _whiten(
@@ -215,8 +209,6 @@ def _whiten(
     )
 
 
-# Which parameter, limb or pair of limbs explains the change of a machine.
-
 DISTINGUISHED = 0.05  # probability of distinguishing the true cause from a better one by chance
 
 
@@ -236,9 +228,12 @@ class ChangeCause:
 def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
     """Return the simplest cause of a change.
 
-    changes : of all parameters. level : probability with which the true cause is rejected.
+    level : probability with which the true cause is rejected.
     """
-    limbs = group_by_limb(changes.names)
+    limbs: dict[str, list[int]] = {}  # places of its parameters, named before the first point
+    for i, name in enumerate(changes.names):
+        if "." in name:
+            limbs.setdefault(name.split(".")[0], []).append(i)
     kinds: dict[str, list[tuple[tuple[str, ...], list[int]]]] = {
         "parameter": [((name,), [i]) for i, name in enumerate(changes.names)],
         "limb": [((limb,), places) for limb, places in limbs.items()],
@@ -252,15 +247,6 @@ def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
         if cause is not None:
             return cause
     return ChangeCause("none")
-
-
-def group_by_limb(names: Sequence[str]) -> Mapping[str, list[int]]:
-    """Return limb -> places of its parameters: names before the first point."""
-    limbs: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        if "." in name:
-            limbs.setdefault(name.split(".")[0], []).append(i)
-    return limbs
 
 
 def _choose(

@@ -11,34 +11,53 @@ depend on the order of the poses. Displacements and rotations of the tool are te
 other, the more significant first. Where repeats of a pose agree much better with each other than
 with the fit, and no slow errors are found, every pose may have an error of its own. See
 docs/theory/uncertainty.md.
+
+The lack of fit is tested against the pure error of repeated poses. Poses of equal readings have
+equal predictions, so with the whitened residuals r of a group of repeats
+
+    SS_pure = sum over groups min over mu of |W (r - mu)|^2,   SS_lack = RSS - SS_pure
+
+and SS_lack / dof_lack over SS_pure / dof_pure has an F distribution if the model is right, whatever
+the true sigma is (the stated one must be right up to a factor). Source: Draper and Smith, Applied
+Regression Analysis.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.repeated_poses import LEVEL as REPEATS_LEVEL
-from loopcal.diagnose.repeated_poses import check_lack_of_fit
 from loopcal.diagnose.residual_patterns import LEVEL
+from loopcal.estimate.added_covariance import add_covariance
+from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy
-from loopcal.estimate.residual_test import FEWEST_DEGREES, choose_severity, count_sigma_degrees
-from loopcal.estimate.result import Identification, add_covariance
+from loopcal.estimate.problem import problem_of
+from loopcal.estimate.residual_test import (
+    FEWEST_DEGREES,
+    SIGNIFICANCE,
+    choose_severity,
+    count_sigma_degrees,
+)
+from loopcal.estimate.result import Identification
 from loopcal.estimate.smooth_errors import SmoothErrors, describe_smooth_errors
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.statistics import (
     VarianceComponent,
+    compute_chi_square_tail,
     compute_component_tail,
     compute_f_tail,
     compute_single_level,
     estimate_variance_component,
+    find_distinct,
 )
-from loopcal.typing import FloatArray
+from loopcal.results.description import Field, fields
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 FEWEST_POSES = 5  # different poses below which nothing can be said of how errors vary with the pose
@@ -252,3 +271,102 @@ def _is_seen(rows: SlowErrorRows, part: int) -> bool:
     """Return whether the residuals can show errors of rotation or of place."""
     own = rows.rows[:, _columns(rows.errors, part)]
     return bool(len(own)) and bool(np.linalg.norm(own) > UNSEEN * np.linalg.norm(rows.rows))
+
+
+# Singular values of the whiteners of repeats below this share of the largest belong to components
+# that no repeat measured, which have no mean. Stated sigmas differ by less than that.
+UNMEASURED = 1e-12
+REPEATS_LEVEL = 0.01  # probability below which the lack of fit exceeds the pure error
+
+
+@dataclass(frozen=True)
+class LackOfFit:
+    """Lack of fit against the pure error of repeated poses."""
+
+    groups: int  # number of poses that were repeated
+    # pure, pure_degrees: sum of squares between repeats in units of the stated sigma, and its
+    # degrees of freedom
+    pure: float
+    pure_degrees: int
+    # lack, lack_degrees: the remaining sum of squares of the fit, and its degrees of freedom
+    lack: float
+    lack_degrees: float
+    sigma_scale: float  # repeatability over the stated sigma
+    p_value: float  # probability of a larger F if the model is right; NaN where there is no test
+    is_explained: bool | None  # whether the model explains the data; None where there is no test
+    # the result of the test, and the repeatability where it contradicts the stated sigma
+    findings: tuple[Finding, ...]
+
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
+        *("groups", "pure", "pure_degrees", "lack", "lack_degrees", "sigma_scale", "p_value"),
+        *("findings",),
+        explained="is_explained",
+    )
+
+
+def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
+    """Test a fit against the pure error of repeated poses."""
+    if fill_in_reading_sigma(fit.robot, data).reading_sigma is not None:
+        return _untested("residuals.repeats-with-uncertain-readings")
+    data = exclude_poses(data, fit.options.excluded_poses)
+    member = data.repeats
+    times = np.bincount(member)
+    pure, degrees = _pure_error(fit, data, member)
+    lack = float(fit.history.cost[-1]) - pure
+    lack_degrees = fit.residual_test.dof - degrees
+    if degrees == 0:
+        return _untested("residuals.no-repeats")
+    scale = float(np.sqrt(pure / degrees))
+    groups = int((times > 1).sum())
+    if fit.pose_weights.min(initial=1.0) < 1.0:
+        return _untested("residuals.repeats-with-weights", groups, pure, degrees, scale)
+    if lack_degrees < 1.0 or pure <= 0.0:
+        return _untested("residuals.repeats-only", groups, pure, degrees, scale)
+    from scipy.special import fdtrc
+
+    ratio = max(lack, 0.0) / lack_degrees / (pure / degrees)
+    p_value = float(fdtrc(lack_degrees, degrees, ratio))
+    findings = [report_finding("residuals.explained")]
+    if p_value < REPEATS_LEVEL:
+        findings = [report_finding("residuals.lack-of-fit", ratio=float(np.sqrt(ratio)))]
+    tail = float(compute_chi_square_tail(degrees, scale**2 * degrees))
+    if tail < SIGNIFICANCE:
+        findings.append(report_finding("residuals.repeatability-larger", scale=scale))
+    if tail > 1.0 - SIGNIFICANCE:
+        findings.append(report_finding("residuals.repeatability-smaller", scale=scale))
+    numbers = (groups, pure, degrees, lack, lack_degrees, scale, p_value)
+    return LackOfFit(*numbers, p_value >= REPEATS_LEVEL, tuple(findings))
+
+
+def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tuple[float, int]:
+    """Sum of squares between repeats, and its degrees of freedom; each kind has its own means."""
+    problem, groups = problem_of(fit.free_parameters, data), []
+    for rows in problem.rows:
+        same = np.column_stack([member[rows.poses_by_link], rows.nuisance])
+        if rows.kind.is_of_base:  # rows of targets on the base repeat no pose
+            same = np.arange(len(rows.poses))[:, None]
+        groups.append(np.unique(same, axis=0, return_inverse=True)[1].ravel())
+    total, degrees = 0.0, 0
+    if all(len(find_distinct(of_rows)) == len(of_rows) for of_rows in groups):
+        return total, degrees
+    z = fit.free_parameters.deviation(fit.robot.values[None])
+    residuals = problem.residuals(z, problem.solve(z, problem.start(z)))
+    for rows, group_of_row, residual in zip(problem.rows, groups, residuals, strict=True):
+        for group in np.flatnonzero(np.bincount(group_of_row) > 1):
+            chosen = group_of_row == group
+            W = rows.whitener[0, chosen]
+            present = np.einsum("rii->ri", W) != 0.0
+            A = W.reshape(-1, W.shape[-1])
+            b = np.where(present, residual.whitened[0, chosen], 0.0).ravel()
+            mean, _, rank, _ = np.linalg.lstsq(A, b, rcond=UNMEASURED)
+            total += float(((b - A @ mean) ** 2).sum())
+            degrees += int(present.sum()) - int(rank)
+    return total, degrees
+
+
+def _untested(
+    code: str, groups: int = 0, pure: float = 0.0, degrees: int = 0, scale: float = np.nan
+) -> LackOfFit:
+    """Return the reason why there is no test."""
+    finding = report_finding(code)
+    return LackOfFit(groups, pure, degrees, np.nan, np.nan, scale, np.nan, None, (finding,))

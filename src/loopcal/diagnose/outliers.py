@@ -1,12 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detect poses that do not fit the others, at a false-alarm rate for the whole data set.
 
-Rows that belong together form an observation block: a pose, or several poses that share rows. Each
-block is compared with the prediction of all others. It is an outlier where the probability of its
-distance is below 1 - (1 - level)^(1/u), u blocks tested (Sidak), so that data without a wrong block
-raise no alarm in 95 % of cases. Several wrong blocks hide each other: see `outlier_search`. With
-one degree of freedom every block explains the misfit of all, and none is named. Nothing is removed
-from the data: the result names the blocks for whoever decides.
+Rows that belong together form an observation block: a pose, or several poses that share rows. With
+the information M = sum_j w_j A_j'A_j + P (P the penalty), G = A_j M^-1 A_j' and the residual r_j of
+block j, the residual that it has with respect to a fit without it, and the squared Mahalanobis norm
+of that residual, are
+
+    r_(j) = (I - w_j G)^-1 r_j,    d^2 = r_(j)' (I + G_(j))^-1 r_(j),    G_(j) = (I - w_j G)^-1 G
+
+In the eigenvectors of G, eigenvalues g, d^2 = sum r^2 / ((1 - w g)(1 + (1 - w) g)): for a block
+inside the fit r^2 / (1 - g), for one outside r^2 / (1 + g). If block and model are right it has a
+chi-square distribution with as many degrees of freedom as there are directions with 1 - w g > 0.
+The leverage is the trace of w G. See docs/theory/uncertainty.md.
+
+A block is an outlier where the probability of its distance is below 1 - (1 - level)^(1/u), u blocks
+tested (Sidak), so that data without a wrong block raise no alarm in 95 % of cases. Several wrong
+blocks hide each other: suspects are excluded until the same ones are suspected twice. With one
+degree of freedom every block explains the misfit of all, and none is named. Nothing is removed from
+the data: the result names the blocks for whoever decides.
 
 The distance is judged by the noise that the other blocks show (an F ratio), not by the stated one.
 A wrong sigma therefore makes no outliers, and a misfit that is spread over all blocks names none.
@@ -18,20 +29,21 @@ geometry so far that right poses seem wrong. Blocks are then compared at a robus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.errors import LoopcalError
-from loopcal.estimate.identification import check_fitted_data, exclude_poses, identify
-from loopcal.estimate.linearization import Start
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import identify
+from loopcal.estimate.linearization import LeverageRows, Linearization, Start
 from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.penalties import decompose_for
+from loopcal.estimate.pose_linearization import PoseSolution
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
@@ -39,17 +51,140 @@ from loopcal.estimate.robust_descent import estimate_scale_of, measure_block_dis
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import (
     compute_chi_square_quantile,
     compute_chi_square_tail,
     compute_f_tail,
     compute_single_level,
+    find_distinct,
 )
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
-# Search the observation blocks that a fit to all others does not explain.
+# Remaining part 1 - w g of a direction below which only this block determines it, so that its
+# residual tests nothing.
+TESTABLE = 1e-6
+# Variance of a predicted residual outside the fit, in units of the noise, above which the fit
+# does not predict it.
+UNPREDICTABLE = 1e10
+# Standard deviation in tolerances that stands in G for a direction that the fit does not use.
+UNDETERMINED = 1e6
+
+
+class Influence(NamedTuple):
+    """One entry for each of u blocks."""
+
+    leverage: FloatArray  # (u,) trace of w G: number of parameters that the block determines
+    residuals: IntArray  # (u,) number of residuals
+    distance: FloatArray  # (u,) d^2
+    degrees: IntArray  # (u,) its degrees of freedom
+    # (u,) squared norm of the whitened leave-one-out residual r_(j), over the directions that can
+    # be tested
+    deleted: FloatArray
+
+
+def compute_influence(
+    problem: Problem,
+    linearization: Linearization,
+    member: IntArray,
+    decomposition: Decomposition,
+    fits: Sequence[tuple[FloatArray, FloatArray]],
+    weight: FloatArray,
+    solution: PoseSolution | None = None,
+) -> list[Influence]:
+    """Return the influence of every block (one trial) on fits of the same rows, in one pass.
+
+    problem : unweighted. linearization : of the weighted problem.
+    member : (n,) block 0..u-1 of each pose. decomposition : of the weighted fits.
+    fits : the penalty of each fit, and the deviation (1, p) at which its residuals are evaluated,
+        to first order.
+    weight : (u,) weight of each block in the fits.
+    solution : poses and nuisance parameters of the rows, see `Problem.leverage_rows`.
+    """
+    d, u, p = decomposition, len(weight), len(decomposition.scale)
+    roots, changes = [], []
+    for penalty, solved in fits:
+        variance = d.variances(penalty)[0]
+        sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
+        roots.append(d.scale[:, None] * d.directions[0] * sd)
+        changes.append((solved - linearization.deviation)[0])
+    results = [make_empty_influence(u) for _ in fits]
+    total = problem.count_leverage_rows(member, u)
+    rows = problem.leverage_rows(linearization, solution)
+    for blocks, columns, r in iterate_blocks(rows, member, total):
+        # nuisance parameters come first, in units of their standard deviation
+        A, nuisance = columns[..., -p:], columns[..., :-p]
+        present = np.any(A != 0.0, axis=2) | np.any(nuisance != 0.0, axis=2) | (r != 0.0)
+        for result, root, change in zip(results, roots, changes, strict=True):
+            half = np.concatenate([nuisance, A @ root], axis=2)
+            tested = compute_block_influence(half, r + A @ change, present, weight[blocks])
+            for array, values in zip(result, tested, strict=True):
+                array[blocks] = values
+    return results
+
+
+def make_empty_influence(blocks: int) -> Influence:
+    """Return an influence of zeros, to be filled."""
+    leverage, distance, deleted = np.zeros((3, blocks))
+    residuals, degrees = np.zeros((2, blocks), np.int64)
+    return Influence(leverage, residuals, distance, degrees, deleted)
+
+
+def compute_block_influence(
+    half: FloatArray, residual: FloatArray, present: BoolArray, weight: FloatArray
+) -> Influence:
+    """Return the influence of b blocks of equal size.
+
+    half : (b, m, k) square root of G. residual : (b, m). present : (b, m) rows that exist; the
+        others are zero. weight : (b,) of the blocks in the fit.
+    """
+    g, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
+    w = weight[:, None]
+    remaining = 1.0 - w * g
+    # absent rows are zero: eigenvectors of value zero and residual zero, subtracted below
+    tested = (remaining > TESTABLE) & ((1.0 - w) * g < UNPREDICTABLE)
+    square = np.matmul(residual[:, None, :], vectors)[:, 0] ** 2
+    safe = np.where(tested, remaining, 1.0)
+    normed = square / (safe * (1.0 + (1.0 - w) * g))
+    return Influence(
+        (w * g).sum(axis=1),
+        present.sum(axis=1),
+        np.where(tested, normed, 0.0).sum(axis=1),
+        tested.sum(axis=1) - (~present).sum(axis=1),
+        np.where(tested, square / safe**2, 0.0).sum(axis=1),
+    )
+
+
+def iterate_blocks(
+    rows_of_problem: Iterable[list[LeverageRows]], member: IntArray, total: IntArray
+) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+    """Yield blocks of equal size together: numbers (b,), matrices (b, m, p), residuals (b, m).
+
+    A block whose rows come with several chunks of poses waits until the last of them. `total` (u,)
+    is the number of rows of each block, see `Problem.count_leverage_rows`.
+    """
+    waiting: list[tuple[IntArray, FloatArray]] = []
+    for rows_of_block in rows_of_problem:
+        for rows in rows_of_block:
+            blocks = np.repeat(member[rows.poses], rows.rows.shape[1])
+            waiting.append((blocks, rows.rows.reshape(-1, rows.rows.shape[2])))
+        if not waiting:
+            continue
+        block_of_row = np.concatenate([w[0] for w in waiting])
+        stacked = np.concatenate([w[1] for w in waiting])
+        order = np.argsort(block_of_row, kind="stable")
+        block_of_row, stacked = block_of_row[order], stacked[order]
+        numbers, first, sizes = np.unique(block_of_row, return_index=True, return_counts=True)
+        complete = sizes == total[numbers]
+        for size in find_distinct(sizes[complete]):
+            chosen = complete & (sizes == size)
+            places = first[chosen][:, None] + np.arange(size)
+            yield numbers[chosen], stacked[places, :-1], stacked[places, -1]
+        left = np.repeat(~complete, sizes)
+        waiting = [(block_of_row[left], stacked[left])] if left.any() else []
+
 
 MOST_ROUNDS = 20  # largest number of searches with other suspects
 MOST_EXCLUDED = 0.5  # largest share of excluded blocks; beyond it nothing can be said of the others
@@ -60,15 +195,6 @@ SMALLEST_NOISE = 1e-12
 MOST_COMPARED = 10
 
 
-class JudgingNoise(NamedTuple):
-    """The noise by which each of u blocks is judged: that of the other fitted blocks."""
-
-    variance: FloatArray  # (u,) of the whitened rows, in units of the stated one
-    # (u,) its degrees of freedom; infinite where the stated noise counts, 0 where nothing is
-    # known of it
-    degrees: FloatArray
-
-
 class PartialFit(NamedTuple):
     """A linear fit without some of u blocks, and its influence on every block."""
 
@@ -77,8 +203,10 @@ class PartialFit(NamedTuple):
     # factor on sigma; NaN where it is to be estimated and the fitted blocks do not show it
     scale: float
     directions: int  # number of directions that the fit determines
-    # by which noise each block is judged; by default that of `scale`, as if it were known
-    noise: JudgingNoise | None = None
+    # the noise by which each block is judged, that of the other fitted blocks: (u,) variance of the
+    # whitened rows in units of the stated one, and (u,) its degrees of freedom, infinite where the
+    # stated noise counts, 0 where nothing is known; by default that of `scale`, as if it were known
+    noise: tuple[FloatArray, FloatArray] | None = None
     left: float = 0.0  # degrees of freedom of `scale`; 0 where the stated noise counts
 
     @property
@@ -91,12 +219,12 @@ class PartialFit(NamedTuple):
         """(u,) distance per degree of freedom in units of the noise; zero without a test."""
         degrees = self.influence.degrees
         ratio = self.influence.distance / np.maximum(degrees, 1)
-        variance = self.scale**2 if self.noise is None else self.noise.variance
+        variance = self.scale**2 if self.noise is None else self.noise[0]
         return np.where(degrees > 0, ratio, 0.0) / variance
 
     def p_value(self) -> FloatArray:
         """Return (u,) the probability of a larger distance; 1 where there is no test."""
-        left = np.inf if self.noise is None else self.noise.degrees
+        left = np.inf if self.noise is None else self.noise[1]
         p_value = compute_f_tail(self.influence.degrees, left, self.ratio)
         return np.where(np.isnan(p_value), 1.0, p_value)
 
@@ -108,7 +236,7 @@ class PartialFit(NamedTuple):
 
     def determines_as_much(self, whole: PartialFit) -> bool:
         """Return whether the fitted blocks determine as many directions as all blocks do, and the
-        noise where it is estimated.
+        noise.
         """
         return self.directions >= whole.directions and bool(np.isfinite(self.scale))
 
@@ -148,8 +276,7 @@ def search_blocks(
     if low_weight.any() and (without := refit(low_weight)).determines_as_much(whole):
         first = without
     limit = compute_single_level(level, whole.tested)
-    most = int(MOST_EXCLUDED * whole.tested)
-    fits = search_suspects(refit, whole, first, limit, most, progress)
+    fits = search_suspects(refit, whole, first, limit, int(MOST_EXCLUDED * whole.tested), progress)
     return BlockSearch(refit, whole, limit, fits)
 
 
@@ -189,24 +316,23 @@ def fit_without(
 
 def judge_noise(
     unexplained: float, degrees: float, plain: Influence, excluded: BoolArray, is_given: bool
-) -> JudgingNoise:
-    """Return the noise that the fitted blocks show to each block: without its own residuals, so
-    that a wrong block cannot hide in it. No prior contributes.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the noise that the fitted blocks show to each block, see `PartialFit`: without its own
+    residuals, so that a wrong block cannot hide in it. No prior contributes.
 
     The sum of squares that no parameter explains is lower by d_j^2 without block j, and its
     degrees of freedom by those of d_j^2 (least squares). Where fewer than five are left, stated
     noise counts as it is.
 
     unexplained, degrees : sum of squares of all fitted blocks that no parameter explains.
-    plain : influence (u,) on the fit by least squares. excluded : (u,) blocks that are not fitted.
-    is_given : whether the noise is stated.
+    plain : influence (u,) on the fit by least squares.
     """
     left = degrees - np.where(excluded, 0, plain.degrees)
     square = unexplained - np.where(excluded, 0.0, plain.distance)
     is_shown = left >= (FEWEST_DEGREES if is_given else 1)
     variance = np.maximum(square / np.where(is_shown, left, 1.0), SMALLEST_NOISE)
     otherwise = np.inf if is_given else 0.0
-    return JudgingNoise(np.where(is_shown, variance, 1.0), np.where(is_shown, left, otherwise))
+    return np.where(is_shown, variance, 1.0), np.where(is_shown, left, otherwise)
 
 
 def search_suspects(
@@ -219,7 +345,7 @@ def search_suspects(
 ) -> tuple[PartialFit, ...]:
     """Exclude suspects until the same ones are suspected twice.
 
-    refit : see `Refit`. whole : the fit to all blocks. first : where the search begins.
+    whole : the fit to all blocks. first : where the search begins.
     limit : p-value below which a block is a suspect. most : largest number of excluded blocks.
     Returns the fit without the suspects, or all fits of a cycle.
     """
@@ -268,16 +394,20 @@ def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) ->
         if group.any():
             group[i] = True
             groups.append(group)
-    return _join_groups(groups)
+    joined: list[BoolArray] = []  # groups that share a block are one
+    for group in groups:
+        shared = [other for other in joined if (other & group).any()]
+        apart = [other for other in joined if not (other & group).any()]
+        joined = [*apart, np.any([group, *shared], axis=0)]
+    return joined
 
 
 def _may_have_rivals(end: PartialFit, i: int, far: float) -> bool:
-    """Return whether any d_j^2 may come within `far` of d_i^2 with block i back in the fit.
+    """Return whether any d_j^2 may come within `far` of d_i^2 with block i back in the fit; this
+    saves a fit where one of very many blocks is far off.
 
-    Block i then moves the fit by at most d_i in the norm of the information, and d_j by at most
-    sqrt(g / (1 - g)) d_i, where the largest eigenvalue g of G_j is at most the leverage of j. Both
-    d_i^2 and the information of the others are as before. Where one of very many blocks is far off,
-    this takes the place of a fit.
+    Block i moves the fit by at most d_i in the norm of the information, and d_j by at most
+    sqrt(g / (1 - g)) d_i, where the largest eigenvalue g of G_j is at most the leverage of j.
     """
     leverage, distance = end.influence.leverage, np.sqrt(end.influence.distance) / end.scale
     inside = np.where(leverage < 1.0, leverage, 0.0)
@@ -307,16 +437,6 @@ def _exclude_farthest(refit: Refit, order: IntArray, whole: PartialFit) -> Parti
             impossible = count
         count = (possible + impossible) // 2
     return best
-
-
-def _join_groups(groups: list[BoolArray]) -> list[BoolArray]:
-    """Join groups that share a block."""
-    joined: list[BoolArray] = []
-    for group in groups:
-        shared = [other for other in joined if (other & group).any()]
-        apart = [other for other in joined if not (other & group).any()]
-        joined = [*apart, np.any([group, *shared], axis=0)]
-    return joined
 
 
 # Blocks that a robust fit is made from: it is where the others are compared, not a result.
@@ -460,8 +580,9 @@ def find_outliers(
     if len(reference.pose_weights) == len(member):
         low_weight[member] = reference.pose_weights < 0.5
     else:
-        low_weight = _weigh_blocks(problem, z, start, member) < 0.5
-
+        distance, degrees = measure_block_distances(problem, z, start, member, problem)
+        scale = estimate_scale_of(distance, degrees)
+        low_weight = Tukey().weight(distance / scale, degrees) < 0.5
     noise = fit.residual_test.noise
     refit = partial(fit_without, fit, problem, member, deviation=z, start=start, noise=noise)
     search = search_blocks(refit, low_weight, level, progress)
@@ -483,23 +604,14 @@ def find_outliers(
         Conflict(tuple(labels[i] for i in np.flatnonzero(group)), float(ratio[group].max()))
         for group in groups
     )
-    counts = {"outliers": len(outliers), "ambiguous": int(ambiguous.sum()), "blocks": tested}
-    single = all(len(poses) == 1 for poses in labels)
-    shared = {"blocks": tested, "single_poses": single}
-    summary = _summarize(fit, counts, level, shared, is_converged=search.is_converged)
+    shared = {"blocks": tested, "single_poses": all(len(poses) == 1 for poses in labels)}
+    is_converged, suspected = search.is_converged, int(ambiguous.sum())
+    summary = _summarize(fit, len(outliers), suspected, level, shared, is_converged=is_converged)
     if noise == "given" and outliers and end.contradicts_noise:
-        times = report_finding("outliers.larger-noise", times=end.scale, **shared)
-        summary = (times, *summary)
+        summary = (report_finding("outliers.larger-noise", times=end.scale, **shared), *summary)
+    influence, factor = end.influence, end.scale
     return OutlierCheck(
-        outliers,
-        conflicts,
-        search.is_converged,
-        level,
-        tested,
-        labels,
-        end.influence,
-        end.scale,
-        summary,
+        outliers, conflicts, is_converged, level, tested, labels, influence, factor, summary
     )
 
 
@@ -522,37 +634,30 @@ def _refit_robustly(
     return robust if robust.converged else fit
 
 
-def _weigh_blocks(problem: Problem, z: FloatArray, start: Start, member: IntArray) -> FloatArray:
-    """Return the weights (u,) of blocks in a robust fit at z (1, p), which others determined."""
-    distance, degrees = measure_block_distances(problem, z, start, member, problem)
-    return Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)
-
-
 def _summarize(
     fit: Identification,
-    counts: dict[str, int],
+    outliers: int,
+    ambiguous: int,
     level: float,
     shared: dict[str, Any],
     *,
     is_converged: bool,
 ) -> tuple[Finding, ...]:
     """Return the findings on all blocks together."""
-    blocks, ambiguous = counts["blocks"], counts["ambiguous"]
-    if blocks == 0:
-        return (report_finding("outliers.not-testable"),)
-    if blocks == 1:
-        return (report_finding("outliers.single-block"),)
-    if round(fit.residual_test.dof) <= 1:
-        is_given = fit.residual_test.noise == "given"
+    test, blocks = fit.residual_test, shared["blocks"]
+    if blocks < 2:
+        return (report_finding("outliers.single-block" if blocks else "outliers.not-testable"),)
+    if round(test.dof) <= 1:
+        is_given = test.noise == "given"
         return (report_finding("outliers.one-degree" if is_given else "outliers.unknown-noise"),)
     findings = []
-    if count := counts["outliers"]:
-        findings.append(report_finding("outliers.some", count=count, level=level, **shared))
+    if outliers:
+        findings.append(report_finding("outliers.some", count=outliers, level=level, **shared))
     if ambiguous or not is_converged:
         code = "outliers.ambiguous" if is_converged else "outliers.search-not-converged"
         findings.append(report_finding(code, count=ambiguous, **shared))
-    if findings:
-        return tuple(findings)
-    if fit.residual_test.failed:
-        return (report_finding("outliers.none-but-misfit", **shared),)
-    return (report_finding("outliers.none", level=level, **shared),)
+    if not findings and test.failed:
+        findings.append(report_finding("outliers.none-but-misfit", **shared))
+    elif not findings:
+        findings.append(report_finding("outliers.none", level=level, **shared))
+    return tuple(findings)

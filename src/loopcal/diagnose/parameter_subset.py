@@ -100,13 +100,8 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
 
     The result has as many free parameters as the rank, and does not depend on the machine.
 
-    Parameters
-    ----------
     identifiability : as from `identifiability(robot, data)`.
-
-    Returns
-    -------
-    IdentifiableSubset; its `robot` has the chosen parameters free and the others fixed at their
+    Returns a subset whose `robot` has the chosen parameters free and the others fixed at their
     nominal values. Least squares can identify it.
 
     Raises
@@ -153,9 +148,7 @@ def _weights(free: FreeParameters) -> FloatArray:
 def _merge(
     free: FreeParameters, place: int, direction: FloatArray, kept: IntArray
 ) -> MergedParameter:
-    """Return the replacement of a parameter whose null direction (p,) is one at its own place and
-    zero at the other fixed ones.
-    """
+    """Return the replacement of a parameter, whose null direction (p,) is one at its place."""
     factor, symbols = free.display()
     unit = free.tolerance / factor  # tolerances in the units of the robot's file
     chosen = kept[np.abs(direction[kept]) > NEGLIGIBLE]
@@ -164,9 +157,6 @@ def _merge(
     units = tuple(symbols[i] for i in chosen)
     return MergedParameter(free.names[place], symbols[place], names, changes, units)
 
-
-# Separate the combinations of parameters that data determine to a useful accuracy from the
-# others.
 
 # Multiples of the accuracy for which the number of combinations is stated, too.
 NEIGHBORS = (0.1, 10.0)

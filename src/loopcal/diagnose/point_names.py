@@ -20,8 +20,6 @@ from loopcal.mechanism.solutions import forward
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, find_unit, list_symbols
 
-# Whether measured points have the names of the poses and targets at which they were measured.
-
 # Distance from its prediction, in medians, above which a point is not where its name says.
 FAR = 8.0
 FITS = 6  # repetitions of the fit without the points that are far
@@ -195,9 +193,8 @@ def _find_shift(
 def _find_late_shift(
     kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, typical: float
 ) -> tuple[int, int, float] | None:
-    """Return like `_find_shift` a shift that begins at a later row, and this row.
-
-    A pose was left out, or counted twice, and the numbers went on.
+    """Return like `_find_shift` a shift that begins at a later row: a pose was left out, or counted
+    twice, and the numbers went on.
     """
     n, best = len(T), None
     for shift in (1, -1):

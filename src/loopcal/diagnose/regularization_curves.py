@@ -13,9 +13,9 @@ Stone, Classification and Regression Trees (1984).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -32,9 +32,6 @@ from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
-
-if TYPE_CHECKING:
-    pass
 
 PER_DECADE = 4  # values of lam per factor of ten where no fit is repeated
 # Values of lam, and of k, that are fitted again for each fold, beside those of rules.
@@ -155,9 +152,12 @@ def compute_regularization_curves(
     z = free.deviation(fit.robot.values[None])
     linearization = problem.linearize(z, problem.start(z))
     d = decompose(linearization.factor, linearization.equations, z)
-    rules_lam = _apply_rules(d, {"GCV": GCV(), "marginal likelihood": MarginalLikelihood()})
+    rules_lam = [
+        ChosenValue("GCV", float(GCV()(d)[0])),
+        ChosenValue("marginal likelihood", float(MarginalLikelihood()(d)[0])),
+    ]
+    rules_k = [ChosenValue("GCV", float(TruncationGCV()(d)[0]))]
     lam, k = list_lam(d, [rule.value for rule in rules_lam]), np.arange(len(free) + 1)
-    rules_k = _apply_rules(d, {"GCV": TruncationGCV()})
     if problem.nuisance is not None:
         lam, k = lam[_spread(len(lam), MOST_FITTED)], k[_spread(len(k), MOST_FITTED)]
     # what the rules choose has its own score
@@ -204,13 +204,6 @@ def list_lam(d: Decomposition, chosen: Sequence[float]) -> FloatArray:
     high = np.log10(max(HIGHEST * square[0], 10.0, *chosen))
     steps = np.arange(np.floor(low * PER_DECADE), np.ceil(high * PER_DECADE) + 1)
     return np.asarray(10.0 ** (steps / PER_DECADE))
-
-
-def _apply_rules(
-    d: Decomposition, rules: dict[str, Callable[[Decomposition], Any]]
-) -> list[ChosenValue]:
-    """Return what rules choose from a decomposition."""
-    return [ChosenValue(name, float(rule(d)[0])) for name, rule in rules.items()]
 
 
 def _mark(

@@ -33,8 +33,6 @@ from loopcal.numerics.statistics import compute_any_probability, compute_f_tail,
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-# The residuals of a fit that no parameter explains, in the order of measurement.
-
 EXPLAINED = 1e-6  # share of its length below which a column counts as explained by other columns
 
 
@@ -126,10 +124,16 @@ def collect_residual_rows(
     if linear.problem.is_uncertain:
         return None
     observations = [rows for rows in data.observations if len(rows)]
-    row_groups = list(_iterate_rows(linear, observations))
-    if not row_groups:
+    groups: list[tuple[FloatArray, IntArray, IntArray, IntArray]] = []  # present rows
+    for node_rows in linear.problem.leverage_rows(linear.linearization, linear.solution):
+        for part in node_rows:
+            present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
+            i, column = np.nonzero(present[part.numbers])
+            kind = np.full(len(i), part.kind)
+            groups.append((part.rows[i, column], kind, part.numbers[i], column))
+    if not groups:
         return None
-    rows, kind, row, column = (np.concatenate(arrays) for arrays in zip(*row_groups, strict=True))
+    rows, kind, row, column = (np.concatenate(arrays) for arrays in zip(*groups, strict=True))
     first = np.cumsum([0, *(o.present.shape[1] for o in observations)])
     series = first[kind] + column
     place = np.concatenate([order_rows(o) for o in observations])
@@ -173,21 +177,6 @@ def order_by_time(time: FloatArray | None, count: int) -> IntArray:
     return np.argsort(time, kind="stable")
 
 
-def _iterate_rows(
-    linear: FitLinearization, observations: list[Observations]
-) -> Iterator[tuple[FloatArray, IntArray, IntArray, IntArray]]:
-    """Give rows (k, U + p + 1) that are present, with their kind, row and column (k,)."""
-    for node_rows in linear.problem.leverage_rows(linear.linearization, linear.solution):
-        for part in node_rows:
-            present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
-            i, column = np.nonzero(present[part.numbers])
-            kind = np.full(len(i), part.kind)
-            yield part.rows[i, column], kind, part.numbers[i], column
-
-
-# Effects that the residuals of a fit may depend on: time, temperature, session, actuator
-# reading.
-
 # What residuals may depend on.
 ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
 
@@ -209,12 +198,10 @@ class Effect(NamedTuple):
 
 
 def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
-    """Return the effects that measurements can have.
+    """Return the effects that measurements without excluded poses can have.
 
     Linear in time, or in the order of measurement where the rows state no time, linear in each
     temperature, a difference between sessions, and quadratic in each actuator reading.
-
-    rows : of a fit. data : its measurements, without excluded poses. robot : names the actuators.
     """
     observations = [o for o in data.observations if len(o)]
     kinds = []  # of each kind: places among all rows, its rows, and what a unit of a component adds
@@ -261,9 +248,7 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
 
 
 def scale_to_range(values: FloatArray) -> FloatArray:
-    """Return values (r,) moved and scaled to the range -0.5 to 0.5; 0 where they are missing, or
-    all equal.
-    """
+    """Return values (r,) in the range -0.5 to 0.5; 0 where they are missing, or all equal."""
     known = np.isfinite(values)
     if not known.any() or not np.ptp(values[known]) > 0.0:
         return np.zeros(len(values))
@@ -327,7 +312,7 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     tests = len(effects) + int(np.isfinite(p_value))
     significant: list[EffectSizes] = []
     while effects:
-        p_values = [_compute_tail(rows, basis) for _, basis in effects]
+        p_values = [test_effect(rows, basis) for _, basis in effects]
         best = int(np.argmin(p_values))
         p_any = compute_any_probability(p_values[best], tests)
         if not p_any < LEVEL:
@@ -345,13 +330,11 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     )
 
 
-def test_effect(rows: ResidualRows, effect: Effect) -> float:
-    """Return the probability of a larger F for independent errors."""
-    return _compute_tail(rows, span_columns(rows.project(effect.columns)))
+def test_effect(rows: ResidualRows, basis: FloatArray) -> float:
+    """Return the probability of a larger F for independent errors.
 
-
-def _compute_tail(rows: ResidualRows, basis: FloatArray) -> float:
-    """Return the same for an effect with the basis (R, q) of what nothing estimated explains."""
+    basis : (R, q) orthonormal, of the part of an effect that nothing estimated explains.
+    """
     q, explained = basis.shape[1], float(((basis.T @ rows.residual) ** 2).sum())
     left = rows.degrees - q
     statistic = explained / q / ((rows.square - explained) / left)
@@ -412,27 +395,21 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
     variance = 2.0 * (second - first**2 / nu) / (nu * (nu + 2.0))
     if not variance > 0.0:
         return np.nan, np.nan
-    return observed - mean, _compute_beta_tail(observed, mean, variance)
-
-
-def _compute_beta_tail(observed: float, mean: float, variance: float) -> float:
-    """Return the probability of a larger value of a beta variable on (-1, 1)."""
+    # the beta distribution on (-1, 1) of this mean and variance
+    center = 0.5 * (1.0 + mean)
+    total = center * (1.0 - center) / (0.25 * variance) - 1.0
+    if not total > 0.0:
+        return observed - mean, np.nan
     from scipy.special import betainc
 
-    center, spread = 0.5 * (1.0 + mean), 0.25 * variance
-    total = center * (1.0 - center) / spread - 1.0
-    if not total > 0.0:
-        return float("nan")
     place = float(np.clip(0.5 * (1.0 - observed), 0.0, 1.0))
-    return float(betainc((1.0 - center) * total, center * total, place))
+    return observed - mean, float(betainc((1.0 - center) * total, center * total, place))
 
 
 def _list_testable(
     rows: ResidualRows, effects: Iterable[Effect]
 ) -> list[tuple[Effect, FloatArray]]:
-    """Return the effects that residuals can show, with enough degrees of freedom left, each with
-    the basis (R, q) of what nothing estimated explains of it.
-    """
+    """Return the effects that residuals can show, each with its basis, see `test_effect`."""
     testable = []
     for effect in effects:
         if effect.columns.shape[1]:
@@ -465,8 +442,7 @@ class CorrelatedErrors:
 def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> CorrelatedErrors:
     """Return the covariance by errors that are correlated within each series.
 
-    rows : of a fit. sigma_degrees : degrees of freedom nu0 that the stated sigmas count for,
-        infinite where they are exact.
+    sigma_degrees : degrees of freedom of the stated sigmas, infinite where they are exact.
     """
     starts = np.flatnonzero(np.r_[True, np.diff(rows.series) != 0])
     by_length: dict[int, list[IntArray]] = {}
@@ -479,10 +455,8 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
     for rho in RHO:
         for share in SHARE if rho > 0.0 else (1.0,):
             log_det, square, explained = _evaluate(rows, segments, rho, share)
-            by_size, scale = square, 1.0
-            if np.isfinite(nu):
-                scale = (sigma_degrees + square) / nu
-                by_size = nu * np.log(scale)
+            scale = (sigma_degrees + square) / nu if np.isfinite(nu) else 1.0
+            by_size = nu * np.log(scale) if np.isfinite(nu) else square
             logs.append(-0.5 * (log_det + by_size))
             scales.append(scale)
             covariances.append(scale * explained)

@@ -88,18 +88,13 @@ def invert_increasing(
     return high
 
 
-def _root_mean_square(sizes: FloatArray) -> float:
-    return float(np.sqrt(np.mean(sizes**2)))
-
-
 # All numbers that results, JSON and tables state of errors, by their names there.
 METRICS: Mapping[str, Metric] = {
     "max": Metric("largest", lambda sizes: float(sizes.max()), _median_of_largest),
     "rms": Metric(
         "rms",
-        _root_mean_square,
-        # errors whose components are the sigmas have the sums of the variances as squares
-        lambda variances: _root_mean_square(np.sqrt(np.nansum(variances, axis=1))),
+        lambda sizes: float(np.sqrt(np.mean(sizes**2))),
+        lambda variances: float(np.sqrt(np.mean(np.sqrt(np.nansum(variances, axis=1)) ** 2))),
     ),
     "mean": Metric("mean", lambda sizes: float(sizes.mean())),
     "sd": Metric("sd", lambda sizes: float(sizes.std(ddof=1)) if len(sizes) > 1 else np.nan),
@@ -152,9 +147,9 @@ class QuantityErrors:
     def take(self, rows: IntArray) -> QuantityErrors:
         """Return the errors of some rows only."""
         kept = np.isin(self.rows, rows)
-        targets = tuple(t for t, is_kept in zip(self.targets, kept, strict=True) if is_kept)
-        return QuantityErrors(
-            self.dimension, self.components[kept], self.rows[kept], targets, self.measured
+        targets = tuple(np.array(self.targets, dtype=object)[kept])
+        return replace(
+            self, components=self.components[kept], rows=self.rows[kept], targets=targets
         )
 
 
@@ -351,10 +346,7 @@ def join_errors(errors: Sequence[PoseErrors]) -> PoseErrors:
 def compute_kind_errors(
     observations: Sequence[Observations], before: list[FloatArray], after: list[FloatArray]
 ) -> tuple[KindErrors, ...]:
-    """Return the whitened errors of each kind and, last, of all kinds.
-
-    observations : of every kind. before, after : residuals (r, m) [SI] of each.
-    """
+    """Return the whitened errors of each kind and, last, of all kinds, from residuals (r, m)."""
     totals: dict[str, FloatArray] = {}
     for o, *residuals in zip(observations, before, after, strict=True):
         squares = [
@@ -407,9 +399,6 @@ def _join(errors_by_kind: Sequence[QuantityErrors]) -> QuantityErrors:
     )
 
 
-# Predict the same measurements with two geometries of a robot.
-
-
 @dataclass(frozen=True, eq=False)
 class PosePredictions:
     """Poses that a geometry predicts, and the setup parameters with which it is compared."""
@@ -428,11 +417,8 @@ class PosePredictions:
 
     def regrouped(self, data: Measurements) -> PosePredictions:
         """Return the same prediction for fewer rows of the same poses."""
-        setup, place = (
-            data.nuisance_parameters,
-            {n: i for i, n in enumerate(self.setup.table.names)},
-        )
-        values = self.values[:, [place[name] for name in setup.table.names]]
+        setup, names = data.nuisance_parameters, self.setup.table.names
+        values = self.values[:, [names.index(name) for name in setup.table.names]]
         return replace(self, setup=setup, values=values)
 
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
@@ -491,22 +477,27 @@ class PredictionComparison:
     def without(self, poses: BoolArray) -> PredictionComparison:
         """Return the comparison without some poses (n,), with the same setup parameters."""
         data, usable = _take_rows(self.data, ~poses), self.usable & ~poses
-        predictions = {
-            name: getattr(self, name).regrouped(data) for name in ("before", "after", "reached")
-        }
         return replace(
             self,
             data=data,
             rows=label_rows(data),
             usable=usable,
             absorbed=np.where(usable, self.absorbed, 0),
-            **predictions,
+            before=self.before.regrouped(data),
+            after=self.after.regrouped(data),
+            reached=self.reached.regrouped(data),
         )
 
     @property
     def readings(self) -> KindErrors | None:
         """Errors of the readings of redundant actuators; None where there are none."""
-        return _compare_readings(*self.reading_fits, self.usable)
+        first, last = self.reading_fits
+        if first is None or last is None:
+            return None
+        residuals = [fit.reading_residuals[self.usable] for fit in (first, last)]
+        squares = [(r**2).sum() for r in (*residuals, residuals[0] - residuals[1])]
+        count = int(last.left[self.usable].sum())
+        return summarize_kinds({READINGS: np.array([count, *squares])})[0]
 
     def kind_errors(self) -> tuple[KindErrors, ...]:
         """Return the errors of each kind, readings among them, and last of all kinds."""
@@ -533,7 +524,6 @@ def compare_predictions(
 ) -> PredictionComparison:
     """Predict measurements with two geometries of a robot.
 
-    before, after : the geometries. data : the measurements.
     setup_before, setup_after : values [SI] by name of setup parameters that are kept; the others
         are fitted to these rows.
     """
@@ -652,18 +642,6 @@ def _fix_nuisance(nuisance: NuisanceParameters, kept: Mapping[str, float]) -> Nu
         for p in nuisance.table.entries
     )
     return replace(nuisance, table=ParameterTable(entries))
-
-
-def _compare_readings(
-    first: PoseFit | None, last: PoseFit | None, usable: BoolArray
-) -> KindErrors | None:
-    """Return the whitened errors of redundant readings of two geometries, at usable poses."""
-    if first is None or last is None:
-        return None
-    residuals = [fit.reading_residuals[usable] for fit in (first, last)]
-    squares = [(r**2).sum() for r in (*residuals, residuals[0] - residuals[1])]
-    count = int(last.left[usable].sum())
-    return summarize_kinds({READINGS: np.array([count, *squares])})[0]
 
 
 def _explain_unreached(

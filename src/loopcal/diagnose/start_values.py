@@ -110,27 +110,41 @@ def check_start_values(fit: Identification) -> StartCheck:
     gain = max(first - last, 0.0)
     if gain <= NO_GAIN * first:
         return judged(StartVerdict.BEST, 1.0, "is-best")
-    p_value = _gain_p_value(fit, gain, last)
+    test = fit.residual_test
+    # the stated noise explains the residuals of the fit, or none are left
+    is_consistent = test.noise == "given" and not test.failed
+    p_value = float("nan")  # of a larger gain by this noise, else by that of the residuals
+    if is_consistent:
+        p_value = float(compute_chi_square_tail(fit.rank, gain))
+    elif test.dof >= 1.0 and last > 0.0:
+        from scipy.special import fdtrc
+
+        p_value = float(fdtrc(fit.rank, test.dof, gain / fit.rank / (last / test.dof)))
     ratio = float(before / after) if after > 0.0 else None
     if p_value < SIGNIFICANCE:
         return judged(StartVerdict.NOT_CALIBRATED, p_value, "not-calibrated", ratio=ratio)
-    if fit.residual_test.dof < FEWEST_DEGREES and not _is_noise_consistent(fit):
+    if test.dof < FEWEST_DEGREES and not is_consistent:
         return judged(StartVerdict.OPEN, p_value, "needs-sigma", ratio=ratio)
-    if fit.residual_test.failed:
+    if test.failed:
         return judged(StartVerdict.OPEN, p_value, "undecided", ratio=ratio)
     return judged(StartVerdict.WITHIN_NOISE, p_value, "within-noise", ratio=ratio)
 
 
 def compare_stored_geometry(robot: Mechanism, measured: Measurements) -> StoredAnswer | None:
-    """Compare the stored geometry with the optimum of the firmware's cost.
+    """Compare the stored geometry of a printer with the optimum of the firmware's cost; None where
+    the probes do not determine one.
 
-    Return None where the probes do not determine an optimum.
-
-    robot : the printer with its stored geometry. measured : its heights and distances; their sigmas
-        do not matter.
+    measured : heights and distances; their sigmas do not matter.
     """
+    count = {o.kind.poses_per_row: len(o) for o in measured.observations}
+    w = 2.0 * count[2] / count[1] if count.get(1) and count.get(2) else 1.0
+    sigma = {1: MM / np.sqrt(w), 2: MM}
+    weighted = tuple(
+        Observations.from_sigma(o.kind, o.rows, o.measured, sigma[o.kind.poses_per_row])
+        for o in measured.observations
+    )
     try:
-        fit = identify(robot, _with_firmware_weights(measured), LeastSquares())
+        fit = identify(robot, replace(measured, observations=weighted), LeastSquares())
     except EstimationError:
         return None  # fewer probes than parameters, or a geometry that cannot reach them
     if not fit.converged or fit.rank < len(fit.names):
@@ -149,35 +163,3 @@ def compare_stored_geometry(robot: Mechanism, measured: Measurements) -> StoredA
             if abs(last - first) > SMALL
         ),
     )
-
-
-def _is_noise_consistent(fit: Identification) -> bool:
-    """Whether the noise is stated and explains the residuals of the fit (or none are left)."""
-    return fit.residual_test.noise == "given" and not fit.residual_test.failed
-
-
-def _gain_p_value(fit: Identification, gain: float, last: float) -> float:
-    """Probability of a larger gain by noise alone: by the stated noise where it is consistent, else
-    by that of the residuals.
-    """
-    from scipy.special import fdtrc
-
-    if _is_noise_consistent(fit):
-        return float(compute_chi_square_tail(fit.rank, gain))
-    if fit.residual_test.dof < 1.0 or last <= 0.0:
-        return float("nan")
-    return float(
-        fdtrc(fit.rank, fit.residual_test.dof, gain / fit.rank / (last / fit.residual_test.dof))
-    )
-
-
-def _with_firmware_weights(measured: Measurements) -> Measurements:
-    """The same rows with the firmware's weights as sigmas."""
-    count = {o.kind.poses_per_row: len(o) for o in measured.observations}
-    w = 2.0 * count[2] / count[1] if count.get(1) and count.get(2) else 1.0
-    sigma = {1: MM / np.sqrt(w), 2: MM}
-    weighted = [
-        Observations.from_sigma(o.kind, o.rows, o.measured, sigma[o.kind.poses_per_row])
-        for o in measured.observations
-    ]
-    return replace(measured, observations=tuple(weighted))

@@ -21,7 +21,6 @@ from loopcal.diagnose.identifiable_parameters import (
     identifiability,
 )
 from loopcal.errors import DataError, MechanismError
-from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.information import ObservedPoses, instrument_factor, observe_poses
 from loopcal.estimate.null_space import Combination, sparsify_basis
 from loopcal.findings import Finding, report_finding
@@ -98,14 +97,8 @@ def suggest_measurements(
 ) -> tuple[MeasurementSuggestion, ...]:
     """Test every kind of measurement, one after the other, on the unidentifiable combinations.
 
-    Parameters
-    ----------
-    identifiability : of the data. sigma : standard deviations of the further instrument by
-        dimension [SI].
-
-    Returns
-    -------
-    One suggestion for each of `identifiability.unidentifiable`, in order.
+    sigma : standard deviations of the further instrument by dimension [SI].
+    Returns one suggestion for each of `identifiability.unidentifiable`, in order.
     """
     check_type(
         identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
@@ -127,12 +120,16 @@ def suggest_measurements(
         (f"{limb.name}.{joint.name}", "length" if joint.kind == "P" else "angle")
         for limb, joint in free.robot.assembly.passive_joints
     ]
-    scene = _draw_scene(free, [name for name, _ in joints])
+    names = [name for name, _ in joints]
+    try:
+        q = sample_workspace(free.robot, POSES, seed=0).solution.q
+        scene = observe_poses(free, q, names)
+    except MechanismError:  # no stated workspace
+        scene = probe_workspace(free, names)
     for words, kind in _list_candidates(free.robot, joints):
         try:
-            X = instrument_factor(scene, _measure_at(scene, kind, SIGMA | (sigma or {})))[
-                0, :-1, :-1
-            ]
+            seen = _measure_at(scene, kind, SIGMA | (sigma or {}))
+            X = instrument_factor(scene, seen)[0, :-1, :-1]
         except DataError:
             continue  # this kind has nothing to measure on this robot
         # combinations that the rows X separate from all others
@@ -151,11 +148,8 @@ def suggest_measurements(
 
 
 def describe_missing_equations(robot: Mechanism, data: Measurements) -> Finding | None:
-    """Return what too few equations leave open and what determines it, for a refusal.
-
-    Return None where more than a few combinations are open.
-
-    robot, data : as for `identifiability`.
+    """Return what too few equations leave open and what determines it, for a refusal; None where
+    more than a few combinations are open.
     """
     if int(robot.parameters.free.sum()) - data.n_rows > MOST_MISSING:
         return None
@@ -172,15 +166,6 @@ def describe_missing_equations(robot: Mechanism, data: Measurements) -> Finding 
         combinations=tuple(dict(s.combination.finding.data) for s in suggestions),
         measurement=common[0] if common else None,
     )
-
-
-def _draw_scene(free: FreeParameters, joints: list[str]) -> ObservedPoses:
-    """Return poses drawn from the workspace, or about home where none is stated."""
-    try:
-        q = sample_workspace(free.robot, POSES, seed=0).solution.q
-    except MechanismError:
-        return probe_workspace(free, joints)
-    return observe_poses(free, q, joints)
 
 
 def _list_candidates(robot: Mechanism, joints: list[tuple[str, str]]) -> Iterator[tuple[str, Kind]]:
@@ -203,19 +188,15 @@ def _list_examples(kinds: Iterable[type[Kind]]) -> Iterator[tuple[str, Kind]]:
     """Yield examples of kinds whose descriptions differ."""
     listed: set[str] = set()
     for kind in (example for cls in kinds for example in cls.examples()):
-        words = _describe_kind(kind)
+        targets, unknown = getattr(kind, "targets", ()), list(kind.setup_items)
+        words = kind.description
+        if unknown or not words:
+            words = f"the {kind.name}" + (f" of {len(targets)} targets" if len(targets) > 1 else "")
+        if unknown:
+            words = f"{words} ({list_names(unknown)} unknown)"
         if words not in listed:
             listed.add(words)
             yield words, kind
-
-
-def _describe_kind(kind: Kind) -> str:
-    """Return a noun phrase for a kind, with its nuisance parameters."""
-    targets, unknown = getattr(kind, "targets", ()), list(kind.setup_items)
-    if kind.description and not unknown:
-        return kind.description
-    words = f"the {kind.name}" + (f" of {len(targets)} targets" if len(targets) > 1 else "")
-    return f"{words} ({list_names(unknown)} unknown)" if unknown else words
 
 
 def _measure_at(scene: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:

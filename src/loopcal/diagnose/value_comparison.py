@@ -52,8 +52,6 @@ if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
 
-# Measure by how much second-order effects of a change of parameters exceed the noise.
-
 # Poses at which machines are compared; without a stated workspace their distance from home: a
 # share of the robot's size, or radians.
 POSES, NEAR = 20, 0.05
@@ -220,16 +218,11 @@ class ValueComparison(TableResult):
 def compare_with_truth(fit: Identification, truth: ArrayLike) -> ValueComparison:
     """Compare the parameters of a fit with true ones in the directions that its data determine.
 
-    Parameters
-    ----------
-    fit : Identification
-    truth : (parameters of the robot,) or (free parameters,) [SI]
-        True values of the robot's table, or of its free parameters only, in that order.
+    truth : (parameters of the robot,) or (free parameters,) [SI], in the order of the table.
 
     Raises
     ------
-    EstimationError
-        The number of true values is different, or one of them is not finite.
+    EstimationError : the number of true values is different, or one of them is not finite.
     """
     true = np.asarray(truth, dtype=np.float64)
     p, total = len(fit.names), len(fit.robot.parameters)
@@ -248,19 +241,15 @@ def compare_with_values(
 ) -> ValueComparison:
     """Compare a fit with a stored answer: published values, or those of a firmware.
 
-    Parameters
-    ----------
-    fit : Identification
     values : of parameters by name [SI], all of them or some (the others are free to differ); or a
         robot of the same structure, whose values are compared. Parameters that the fit keeps fixed
         must have the same value in both.
 
     Raises
     ------
-    EstimationError
-        An unknown name, a value that is not finite, no parameter that was estimated, another value
-        of a fixed parameter, or a robot with other dimensions: the values belong to another
-        geometry, or to another frame, and equal values do not mean the same machine.
+    EstimationError : an unknown name, a value that is not finite, no parameter that was estimated,
+        another value of a fixed parameter, or a robot with other dimensions: the values belong to
+        another geometry, or to another frame.
 
     Examples
     --------
@@ -283,7 +272,16 @@ def compare_with_values(
             raise EstimationError(f"{name!r} is not a parameter of {fit.robot.name!r}{hint}")
         if not np.isfinite(value):
             raise EstimationError(f"the value of {name!r} is {value}; give a finite number")
-    _refuse_other_fixed_values(fit, values)
+        if name not in fit.names:
+            place = table.index(name)
+            kept, dimension = float(fit.robot.values[place]), table.dimensions[place]
+            size = fit.robot.size if dimension is Dimension.LENGTH else 1.0
+            if abs(value - kept) > EQUAL * size:
+                given = fit.robot.to_quantity(float(value), dimension)
+                data = {"name": name, "kept": fit.robot.to_quantity(kept, dimension)}
+                raise EstimationError(
+                    report_finding("comparison.fixed-differs", **data, given=given)
+                )
     indices = [i for i, name in enumerate(fit.names) if name in values]
     if not indices:
         raise EstimationError(
@@ -291,19 +289,6 @@ def compare_with_values(
             f"{', '.join(fit.names)}"
         )
     return _compare(fit, np.array(indices), np.array([values[fit.names[i]] for i in indices]))
-
-
-def _refuse_other_fixed_values(fit: Identification, values: Mapping[str, float]) -> None:
-    """Refuse other values of parameters that the fit keeps fixed."""
-    robot = fit.robot
-    for name in (name for name in values if name not in fit.names):
-        place = robot.parameters.index(name)
-        kept, dimension = float(robot.values[place]), robot.parameters.dimensions[place]
-        size = robot.size if dimension is Dimension.LENGTH else 1.0
-        if abs(values[name] - kept) > EQUAL * size:
-            given = robot.to_quantity(float(values[name]), dimension)
-            data = {"name": name, "kept": robot.to_quantity(kept, dimension), "given": given}
-            raise EstimationError(report_finding("comparison.fixed-differs", **data))
 
 
 def refuse_other_dimensions(

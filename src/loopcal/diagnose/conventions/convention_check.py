@@ -37,9 +37,8 @@ from loopcal.diagnose.conventions.misfit import (
 )
 from loopcal.diagnose.conventions.selection import (
     GROSS,
-    Search,
+    UNDECLARED,
     Selection,
-    SetupInterpretation,
     report_equals,
     search_interpretations,
     shares_poses,
@@ -60,15 +59,12 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.over_constraint import fix_breaking_parameters
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import find_distinct
-from loopcal.parameters import Parameter
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 
 if TYPE_CHECKING:
     from loopcal.diagnose.conventions.interpretations import Interpretation
 
-
-# The result of a convention check.
 
 # Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
 # three times too small, give about 3 each.
@@ -140,16 +136,12 @@ def check_conventions(
     allow_still : accept targets that no pose moves. allow_implausible : accept any convention
         without comparing others.
 
-    Returns
-    -------
-    ConventionCheck
-        Its finding, where there is one, is a warning: the data fit badly, but no tested
-        interpretation fits far better.
+    Returns the check; its finding, where there is one, is a warning: the data fit badly, but no
+    tested interpretation fits far better.
 
     Raises
     ------
-    DataError
-        With the files of the data and the evidence; its code is that of the finding.
+    DataError : with the files of the data and the evidence; its code is that of the finding.
     """
     check_types(robot, data)
     try:
@@ -184,46 +176,34 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
 
     Raises
     ------
-    DataError
-        The readings have another number of actuators.
+    DataError : the readings have another number of actuators.
     """
     check_types(robot, data)
     check_actuators(data, robot)
     data = replace(data, base_observations=())
     robot = fix_breaking_parameters(robot)  # no data contain other values of them
     free = select_free_parameters(robot)
-    known = _select_known_readings(data, is_redundant(free))
-    if known is None:
-        return ConventionCheck(float("nan"))
+    known, sigma = data, data.reading_sigma
+    if sigma is not None:
+        believed = np.isfinite(sigma).all(axis=1) & np.isfinite(data.readings).all(axis=1)
+        if not believed.any():
+            return ConventionCheck(float("nan"))
+        known = data.take(believed)
+        if not is_redundant(free):  # their errors contradict nothing
+            known = replace(known, reading_sigma=None)
     misfit = compute_quick_misfit(free, known)
     if not misfit > ALLOWED:
         return ConventionCheck(misfit, finding=report_equals(free, known, misfit))
 
-    thinned = thin_out(known)
+    thinned = _thin_out(known)
     fitted = compute_fitted_misfit(robot, thinned) if np.isinf(misfit) else np.inf
     if not fitted > ALLOWED:
         return ConventionCheck(fitted)
-    sigma = data.reading_sigma
     has_errors = sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
-    return compare_interpretations(free, thinned, has_errors and not is_redundant(free))
+    return _compare_interpretations(free, thinned, has_errors and not is_redundant(free))
 
 
-def _select_known_readings(data: Measurements, redundant: bool) -> Measurements | None:
-    """Return the poses all of whose readings exist and are believed; None where there is none.
-
-    Only redundant readings keep their sigma: those of other robots contradict nothing.
-    """
-    if data.reading_sigma is None:
-        return data
-    known = np.isfinite(data.reading_sigma).all(axis=1) & np.isfinite(data.readings).all(axis=1)
-    if not known.any():
-        return None
-    poses = data.take(known)
-    return poses if redundant else replace(poses, reading_sigma=None)
-
-
-# Check setup parameters (frames, targets, surfaces): stated values, and values kept from a
-# fit.
+# Setup parameters (frames, targets, surfaces): stated values, and values kept from a fit.
 
 # Number of stated parameters up to which each is estimated alone, to find the wrong one.
 MOST_SINGLE = 12
@@ -244,12 +224,9 @@ class Contradiction(NamedTuple):
 
 
 def find_contradiction(stated: Comparison, misfit: float, better: float) -> Contradiction | None:
-    """Find stated setup parameters without which measurements fit far better.
+    """Find stated setup parameters without which measurements fit better by this factor.
 
-    stated : the measurements as written. misfit : of these. better : factor by which it must
-        decrease.
-    Returns Contradiction or None Of the parameter that alone explains the misfit, or else of all
-        stated ones.
+    Returns the parameter that alone explains the misfit, or else all stated ones; None without any.
     """
     present = set(stated.data.nuisance_parameters.table.names)
     names = tuple(value.name for value in stated.data.stated_values if value.name in present)
@@ -273,8 +250,8 @@ def find_moved_setups(
 
     names : of those whose values are kept.
     sizes : from the names that are fitted again to the root mean square [1] of whitened errors,
-        with the lost degrees of freedom taken into account, and the number of equations left; NaN
-        and 0 where the rows do not determine them.
+        per degree of freedom, and the number of equations left; NaN and 0 where the rows do not
+        determine them.
     """
     names = tuple(names)
     if not names:
@@ -295,38 +272,28 @@ def find_moved_setups(
 
 def _estimate_stated(stated: Comparison, names: tuple[str, ...]) -> Contradiction:
     """Compare the measurements with some stated parameters estimated."""
-    from loopcal.diagnose.conventions.misfit import refine_misfit
-
     free, data = stated.problem.free, stated.data
     remaining = tuple(value for value in data.stated_values if value.name not in names)
     freed = replace(data, stated_values=remaining)
     comparison = exclude_far_rows(compare_with_robot(free, freed))
     misfit, estimates = refine_misfit(comparison)
     before, after = data.nuisance_parameters.table, freed.nuisance_parameters.table
-    values = tuple(
-        _describe_value(
-            free.robot, before.entries[before.index(name)], float(estimates[after.index(name)])
-        )
-        for name in names
-    )
-    return Contradiction(comparison, misfit, names, values)
-
-
-def _describe_value(robot: Mechanism, entry: Parameter, estimate: float) -> dict[str, Any]:
-    """Return estimate, stated value and certainty of a parameter, in the unit of the robot's
-    file.
-    """
-    unit = robot.get_unit(entry.dimension)
-    symbol, factor = unit.symbol, unit.factor_to_si
-    certainty = "fixed"
-    if entry.free and entry.tolerance is not None:
-        certainty = f"sd {entry.tolerance / factor:.3g} {symbol}"
-    return {
-        "name": entry.name,
-        "estimated": f"{estimate / factor:.4g} {symbol}",
-        "stated": f"{entry.nominal / factor:.4g} {symbol}",
-        "certainty": certainty,
-    }
+    values = []
+    for name in names:
+        entry, estimate = before.entries[before.index(name)], float(estimates[after.index(name)])
+        unit = free.robot.get_unit(entry.dimension)
+        symbol, factor = unit.symbol, unit.factor_to_si
+        certainty = "fixed"
+        if entry.free and entry.tolerance is not None:
+            certainty = f"sd {entry.tolerance / factor:.3g} {symbol}"
+        value = {
+            "name": name,
+            "estimated": f"{estimate / factor:.4g} {symbol}",
+            "stated": f"{entry.nominal / factor:.4g} {symbol}",
+            "certainty": certainty,
+        }
+        values.append(value)
+    return Contradiction(comparison, misfit, names, tuple(values))
 
 
 # Judge measurements that the robot does not explain in one step of a fit: a few rows far off,
@@ -340,7 +307,7 @@ FEWEST_TO_REFUSE = 8
 MOST_POSES, RUNS = 120, 4
 
 
-def compare_interpretations(
+def _compare_interpretations(
     free: FreeParameters, thinned: Measurements, has_errors: bool
 ) -> ConventionCheck:
     """Return the check of data that the robot does not explain in one step.
@@ -351,25 +318,32 @@ def compare_interpretations(
     stated, against, misfit = None, None, np.inf
     if reach.is_enough:
         whole = compare_with_robot(free, reach.data)
-        if not whole.misfit > ALLOWED:
-            return ConventionCheck(
-                whole.misfit, finding=report_equals(free, reach.data, whole.misfit)
-            )
-        stated = exclude_far_rows(whole)
-        misfit = min(whole.misfit, refine_misfit(stated)[0])
+        misfit = whole.misfit
+        if misfit > ALLOWED:
+            stated = exclude_far_rows(whole)
+            misfit = min(misfit, refine_misfit(stated)[0])
         if not misfit > ALLOWED:
-            has_far_rows = whole.misfit > IMPLAUSIBLE and bool(stated.excluded)
-            if has_far_rows:
-                finding = report_finding(
-                    "conventions.rows-far-off",
-                    count=len(stated.excluded),
-                    rows=sum(len(o) for o in stated.data.observations),
-                    poses=tuple(dict.fromkeys(stated.excluded)),
-                )
-                return ConventionCheck(misfit, finding=finding)
-            return ConventionCheck(misfit, finding=report_equals(free, reach.data, misfit))
-        if misfit > IMPLAUSIBLE:
+            if stated is None or not stated.excluded or not whole.misfit > IMPLAUSIBLE:
+                return ConventionCheck(misfit, finding=report_equals(free, reach.data, misfit))
+            finding = report_finding(
+                "conventions.rows-far-off",
+                count=len(stated.excluded),
+                rows=sum(len(o) for o in stated.data.observations),
+                poses=tuple(dict.fromkeys(stated.excluded)),
+            )
+            return ConventionCheck(misfit, finding=finding)
+        if stated is not None and misfit > IMPLAUSIBLE:
             against = find_contradiction(stated, misfit, BETTER)
+    if against is not None and against.misfit <= ALLOWED:
+        return _contradict(misfit, against)
+    search = search_interpretations(free, thinned, stated, misfit, misfit > IMPLAUSIBLE)
+    chosen = search.selection
+    # those beyond unknown frames: of the data as written or as read, whichever has fewer
+    compared = (stated, None if chosen is None else chosen.comparison)
+    linear = [c.linearization for c in compared if c is not None]
+    counts = (int(each.equations[0]) for each in linear if each is not None)
+    equations = min(counts, default=FEWEST_TO_REFUSE)
+    has_enough = equations >= FEWEST_TO_REFUSE
     description = {
         "robot": free.robot.name,
         "misfit": misfit,
@@ -377,45 +351,29 @@ def compare_interpretations(
         "reached": reach.n_reached if stated is None else None,
         "poses": reach.n_tested,
     }
-    if against is not None and against.misfit <= ALLOWED:
-        return _contradict(misfit, against)
-    search = search_interpretations(free, thinned, stated, misfit, misfit > IMPLAUSIBLE)
-    # those beyond unknown frames: of the data as written or as read, whichever has fewer
-    chosen = None if search.selection is None else search.selection.comparison
-    linear = [c.linearization for c in (stated, chosen) if c is not None]
-    counts = (int(each.equations[0]) for each in linear if each is not None)
-    equations = min(counts, default=FEWEST_TO_REFUSE)
-    if search.selection is not None and equations >= FEWEST_TO_REFUSE:
-        return _refuse(description, misfit, search.selection)
+    if chosen is not None and has_enough:
+        return _refuse(description, misfit, chosen)
     if against is not None:
         return _contradict(misfit, against)
     if not misfit > IMPLAUSIBLE or has_errors:
         return ConventionCheck(misfit)
-    return _report_unexplained(description, misfit, search, equations)
-
-
-def _report_unexplained(
-    description: dict[str, Any], misfit: float, search: Search, equations: int
-) -> ConventionCheck:
-    """Report data that no tested interpretation explains, or too few rows to decide which."""
-    if equations < FEWEST_TO_REFUSE:
-        chosen = search.selection
-        listed = () if chosen is None else (chosen.interpretation, *chosen.alternatives)
+    if has_enough:
         finding = report_finding(
-            "conventions.undecided",
-            **description,
-            equations=equations,
-            needed=FEWEST_TO_REFUSE,
-            alternatives=tuple(other.describe() for other in listed),
+            "conventions.unexplained", **description, tried=search.tried, pairs=search.pairs
         )
         return ConventionCheck(misfit, finding=finding)
+    listed = () if chosen is None else (chosen.interpretation, *chosen.alternatives)
     finding = report_finding(
-        "conventions.unexplained", **description, tried=search.tried, pairs=search.pairs
+        "conventions.undecided",
+        **description,
+        equations=equations,
+        needed=FEWEST_TO_REFUSE,
+        alternatives=tuple(other.describe() for other in listed),
     )
     return ConventionCheck(misfit, finding=finding)
 
 
-def thin_out(data: Measurements) -> Measurements:
+def _thin_out(data: Measurements) -> Measurements:
     """Return at most `MOST_POSES` poses, in runs of neighbors spread over the data; all where rows
     share more than their pose.
     """
@@ -431,7 +389,7 @@ def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> Co
     tolerances looks the same as a setup item that is not declared unknown.
     """
     interpretation, alternatives = chosen.interpretation, chosen.alternatives
-    is_setup = isinstance(interpretation, SetupInterpretation)
+    is_setup = interpretation.slip == UNDECLARED
     finding = report_finding(
         "conventions.other-interpretation",
         Severity.WARNING if is_setup and not misfit > GROSS else Severity.REFUSAL,
@@ -446,9 +404,7 @@ def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> Co
 
 
 def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
-    """Report stated setup parameters without which the data fit: refused where they contradict the
-    data grossly, else a warning.
-    """
+    """Report stated setup parameters without which the data fit; refuse gross contradictions."""
     finding = report_finding(
         "conventions.stated-values-contradicted",
         Severity.REFUSAL if misfit > GROSS else Severity.WARNING,
@@ -462,18 +418,14 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
     return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
 
 
-# Explain readings outside their strokes by another unit, order, sign or zero.
-
-
 def explain_outside_strokes(
     robot: Mechanism, data: Measurements, described: Mapping[str, Any] | None = None
 ) -> Finding | None:
     """Find the interpretation that puts all readings inside their strokes and fits the data.
 
-    robot : as given. data : with readings outside their strokes. described : these readings, as of
-        `loopcal.measure.data_checks.describe_outside_strokes`; default: described without places.
-    Returns Finding or None `conventions.strokes-explained`, or `conventions.strokes-contradicted`
-        if the data fit as they are written; None if nothing explains them.
+    described : these readings, as of `describe_outside_strokes`; default: without places.
+    Returns `conventions.strokes-explained`, or `conventions.strokes-contradicted` if the data fit
+    as they are written; None if nothing explains them.
     """
     described = describe_outside_strokes(data, robot) if described is None else described
     if described is None:

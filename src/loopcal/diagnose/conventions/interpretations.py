@@ -2,8 +2,8 @@
 """Interpretations: other ways to read measurements, as pure functions from data to data.
 
 An interpretation writes the values as the stated convention would write them, so that one
-evaluation judges all interpretations. `value_interpretations` lists those of measured values,
-`reading_interpretations` those of actuator readings; a combination applies two of them.
+evaluation judges all interpretations, whether of measured values, of actuator readings, of both, or
+of the setup items that are known.
 """
 
 from __future__ import annotations
@@ -27,42 +27,9 @@ from loopcal.mechanism.assembly import Actuator
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-# Changes of tables of numbers: pure functions that scale or permute columns.
-
 # From written values (r, c), or readings (n, a), to those that the stated convention would write
 # [SI].
 Change = Callable[[FloatArray], FloatArray]
-
-
-def scale_columns(columns: Sequence[int], factor: float, zero: FloatArray | float = 0.0) -> Change:
-    """Return the change that multiplies columns by a factor, counted from `zero` (k,) or ()."""
-    chosen = list(columns)
-
-    def change(values: FloatArray) -> FloatArray:
-        changed = np.array(values)
-        changed[:, chosen] = zero + factor * (values[:, chosen] - zero)
-        return changed
-
-    return change
-
-
-def scale_chosen(chosen: BoolArray, factor: float) -> Change:
-    """Return the change that multiplies chosen values (n, a) by a factor."""
-    return lambda values: np.where(chosen, factor * values, values)
-
-
-def permute_columns(columns: Sequence[int], sources: Sequence[int]) -> Change:
-    """Return the change that takes the values of columns from other columns."""
-    chosen, taken = list(columns), list(sources)
-
-    def change(values: FloatArray) -> FloatArray:
-        changed = np.array(values)
-        changed[:, chosen] = values[:, taken]
-        return changed
-
-    return change
-
-
 Slip = tuple[str, dict[str, Any], Change]  # kind of a slip, what is read differently, and how
 
 
@@ -72,89 +39,79 @@ class Interpretation:
 
     slip: str  # kind of the slip, such as `unit`; its code in the catalog is `conventions.<slip>`
     details: Mapping[str, Any]  # what is read differently, such as quantity and factor
-    source: str  # file or kind that it concerns; empty where it concerns all data
-    # index of the observations; None where the actuator readings are read differently
-    observation: int | None
-    change: Change  # of the measured values, row by row, or of the readings of all poses
-
-    @property
-    def parts(self) -> tuple[Interpretation, ...]:
-        """The single interpretations that it consists of: itself."""
-        return (self,)
+    apply: Callable[[Measurements], Measurements]  # covariances stay as stated
+    source: str = ""  # file or kind that it concerns; empty where it concerns all data
+    of_values: bool = False  # whether it leaves the actuator readings as they are
+    parts: tuple[Interpretation, ...] = ()  # the two of a combination
 
     @property
     def shrinks(self) -> bool:
         """Whether values become smaller, so that they might no longer carry information."""
-        return bool(self.details.get("factor", 1.0) < 1.0)
-
-    @property
-    def code(self) -> str:
-        """Code of the slip in the catalog."""
-        return f"conventions.{self.slip}"
+        return any(part.details.get("factor", 1.0) < 1.0 for part in self.parts or (self,))
 
     @property
     def finding(self) -> Finding:
         """The interpretation as a finding."""
-        return report_finding(self.code, source=self.source, **self.details)
+        return report_finding(**self.describe())
 
     def describe(self) -> dict[str, Any]:
         """Return code, source and details, for the data of another finding."""
-        return {"code": self.code, "source": self.source, **self.details}
+        return {"code": f"conventions.{self.slip}", "source": self.source, **self.details}
 
     def __repr__(self) -> str:
         return f"<Interpretation: {self.finding}>"
 
-    def apply(self, data: Measurements) -> Measurements:
-        """Return the measurements under this interpretation; covariances stay as stated."""
-        if self.observation is None:
-            return replace(data, readings=self.change(data.readings))
-        observations = list(data.observations)
-        rows = observations[self.observation]
-        observations[self.observation] = replace(rows, measured=self.change(rows.measured))
-        return replace(data, observations=tuple(observations))
+
+def combine(first: Interpretation, second: Interpretation) -> Interpretation:
+    """Return the combination of two interpretations, the first applied first."""
+    parts = (first, second)
+    return Interpretation(
+        "combination",
+        {"parts": tuple(part.describe() for part in parts)},
+        lambda data: second.apply(first.apply(data)),
+        of_values=first.of_values and second.of_values,
+        parts=parts,
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class Combination(Interpretation):
-    """Two interpretations, the first applied first; its `change` and `observation` are unused.
-
-    Attributes
-    ----------
-    pair : the two.
-    """
-
-    pair: tuple[Interpretation, ...] = ()
-
-    @property
-    def parts(self) -> tuple[Interpretation, ...]:
-        """The two interpretations."""
-        return self.pair
-
-    def apply(self, data: Measurements) -> Measurements:
-        """Return the measurements under both interpretations."""
-        for part in self.pair:
-            data = part.apply(data)
-        return data
+def interpret_readings(
+    slip: str, details: Mapping[str, Any], change: Change, source: str = ""
+) -> Interpretation:
+    """Return the interpretation that changes the actuator readings of all poses."""
+    return Interpretation(
+        slip, details, lambda data: replace(data, readings=change(data.readings)), source
+    )
 
 
-def combine(first: Interpretation, second: Interpretation) -> Combination:
-    """Return the combination of two interpretations."""
-    details = {"parts": (first.describe(), second.describe())}
-    return Combination("combination", details, "", None, second.change, (first, second))
+def change_columns(
+    columns: Sequence[int], compute: Callable[[FloatArray], FloatArray | float]
+) -> Change:
+    """Return the change that computes columns from all values of a row."""
+    chosen = list(columns)
+
+    def change(values: FloatArray) -> FloatArray:
+        changed = np.array(values)
+        changed[:, chosen] = compute(values)
+        return changed
+
+    return change
 
 
-def name_source(i: int, data: Measurements) -> str:
-    """Return the source of an observation, such as a file, different from those of the others."""
-    sources = [rows.source for rows in data.observations]
-    if sources[i] and sources.count(sources[i]) == 1:
-        return sources[i]
-    return f"part {i + 1} of the data"
+def scale_columns(columns: Sequence[int], factor: float, zero: FloatArray | float = 0.0) -> Change:
+    """Return the change that multiplies columns by a factor, counted from `zero` (k,) or ()."""
+    chosen = list(columns)
+    return change_columns(chosen, lambda values: zero + factor * (values[:, chosen] - zero))
+
+
+def permute_columns(columns: Sequence[int], sources: Sequence[int]) -> Change:
+    """Return the change that takes the values of columns from other columns."""
+    taken = list(sources)
+    return change_columns(columns, lambda values: values[:, taken])
 
 
 # Interpretations of measured values: other units, orders, signs and columns.
 
 DEGREES = 180.0 / np.pi
-
 # Factors by which the true values are larger than the written ones where a unit is wrong: m, mm,
 # um, cm, inch; rad, deg, mrad, arcmin, gon.
 FACTORS: Mapping[Dimension, tuple[float, ...]] = {
@@ -174,24 +131,39 @@ def list_interpretations(data: Measurements) -> Iterator[Interpretation]:
     An interpretation that the kind itself rules out (a negative distance, an impossible tilt), or
     that changes no number, is omitted.
     """
-    several = len(data.observations) > 1
+
+    def apply(data: Measurements, i: int, change: Change) -> Measurements:
+        observations = list(data.observations)
+        observations[i] = replace(observations[i], measured=change(observations[i].measured))
+        return replace(data, observations=tuple(observations))
+
+    names = [rows.kind.name for rows in data.observations]
     for i, rows in enumerate(data.observations):
         if not len(rows):
             continue
         kind, measured, source = rows.kind, rows.measured, ""
-        if several:
-            unique = sum(other.kind.name == kind.name for other in data.observations) == 1
-            source = f"kind {kind.name!r}" if unique else name_source(i, data)
+        if len(names) > 1:
+            is_unique = names.count(kind.name) == 1
+            source = f"kind {kind.name!r}" if is_unique else name_source(i, data)
         for slip, details, change in chain.from_iterable(rule(kind) for rule in RULES):
             values = change(measured)
             meant = np.isfinite(values) | np.isnan(measured)
             same = np.allclose(values, measured, rtol=1e-12, atol=0.0, equal_nan=True)
             if meant.all() and not same and not kind.find_invalid_rows(values):
-                yield Interpretation(slip, details, source, i, change)
+                yield Interpretation(
+                    slip, details, partial(apply, i=i, change=change), source, of_values=True
+                )
 
 
-def describe_unit(quantity: str, dimension: Dimension, factor: float) -> dict[str, Any]:
-    """Return the details of a wrong unit."""
+def name_source(i: int, data: Measurements) -> str:
+    """Return the source of an observation, such as a file, different from those of the others."""
+    sources = [rows.source for rows in data.observations]
+    if sources[i] and sources.count(sources[i]) == 1:
+        return sources[i]
+    return f"part {i + 1} of the data"
+
+
+def _describe_unit(quantity: str, dimension: Dimension, factor: float) -> dict[str, Any]:
     return {"quantity": quantity, "dimension": dimension.value, "factor": factor}
 
 
@@ -210,7 +182,7 @@ def _list_units(kind: Kind) -> Iterator[Slip]:
             groups.append((name, d, columns, factors))
     for name, d, columns, factors in groups:
         for factor in factors if columns else ():
-            yield "unit", describe_unit(name, d, factor), scale_columns(columns, factor)
+            yield "unit", _describe_unit(name, d, factor), scale_columns(columns, factor)
 
 
 def _list_rotations(kind: Kind) -> Iterator[Slip]:
@@ -234,9 +206,6 @@ def _list_rotations(kind: Kind) -> Iterator[Slip]:
     def back(values: FloatArray) -> FloatArray:
         return np.swapaxes(form.to_matrix(values[:, angles]), -1, -2)
 
-    def read_as(name: str) -> Change:
-        return lambda values: parse_orientation(name).to_matrix(values[:, angles])
-
     def mirror(sign: FloatArray) -> Change:
         return rewrite(
             lambda values: sign[:, None] * form.to_matrix(values[:, angles]) * sign,
@@ -249,7 +218,9 @@ def _list_rotations(kind: Kind) -> Iterator[Slip]:
         eulers = [f"euler-{order}" for order in geometry.EULER_ORDERS]
         for name in ("rotation-vector", "tilt-torsion", *eulers):
             if name != form.name:
-                yield "orientation-form", {"form": name}, rewrite(read_as(name))
+                other = parse_orientation(name)
+                read = rewrite(lambda v, other=other: other.to_matrix(v[:, angles]))
+                yield "orientation-form", {"form": name}, read
     yield "inverted-rotations", {}, rewrite(back)
     if position:
         inverse = rewrite(back, lambda v: -(back(v) @ v[:, position, None])[..., 0])
@@ -340,30 +311,58 @@ def list_reading_interpretations(
 ) -> Iterator[Interpretation]:
     """Yield all other interpretations of the readings of actuators, the likelier slips first.
 
-    data : the measurements. actuators : of the robot.
-    home : (a,), optional [SI]. Readings of the home pose; wrong gear factors are also counted from
-        there, as for a machine that is homed to a reading other than 0.
+    home : (a,) readings of the home pose [SI]; wrong gear factors are also counted from there, as
+        for a machine that is homed to a reading other than 0.
     """
     for source, poses in _list_sources(data):
         for dimension in dict.fromkeys(actuator.dimension for actuator in actuators):
             chosen = poses[:, None] & np.array([a.dimension is dimension for a in actuators])
             for factor in FACTORS.get(dimension, ()):
-                details = describe_unit("readings", dimension, factor)
-                yield Interpretation("unit", details, source, None, scale_chosen(chosen, factor))
-    for j, actuator in enumerate(actuators if len(actuators) > 1 else ()):
-        for factor in FACTORS.get(actuator.dimension, ()):
-            details = describe_unit(f"readings of {actuator.name}", actuator.dimension, factor)
-            yield Interpretation("unit", details, "", None, scale_columns([j], factor))
-    for rule in (
-        _list_reading_signs(actuators),
-        _list_reading_orders(actuators),
-        _list_gears(actuators, home),
+                details = _describe_unit("readings", dimension, factor)
+                scale = partial(_scale_chosen, chosen=chosen, factor=factor)
+                yield interpret_readings("unit", details, scale, source)
+    for slip, details, change in chain(
+        _list_reading_slips(actuators), _list_gears(actuators, home)
     ):
-        for slip, details, change in rule:
-            yield Interpretation(slip, details, "", None, change)
+        yield interpret_readings(slip, details, change)
     for shift, neighbor in ((1, "above"), (-1, "below")):
         change = partial(np.roll, shift=shift, axis=0)
-        yield Interpretation("shifted-readings", {"neighbor": neighbor}, "", None, change)
+        yield interpret_readings("shifted-readings", {"neighbor": neighbor}, change)
+
+
+def _scale_chosen(values: FloatArray, chosen: BoolArray, factor: float) -> FloatArray:
+    return np.where(chosen, factor * values, values)
+
+
+def _group_actuators(count: int) -> list[tuple[int, ...]]:
+    """Return all actuators together, and each by itself."""
+    return [tuple(range(count)), *((j,) for j in range(count) if count > 1)]
+
+
+def _list_reading_slips(actuators: Sequence[Actuator]) -> Iterator[Slip]:
+    """Yield other units, signs and orders of actuators."""
+    names, dimensions = tuple(a.name for a in actuators), [a.dimension for a in actuators]
+    columns = tuple(range(len(names)))
+    groups = _group_actuators(len(names))
+    for (j,) in groups[1:]:
+        for factor in FACTORS.get(dimensions[j], ()):
+            details = _describe_unit(f"readings of {names[j]}", dimensions[j], factor)
+            yield "unit", details, scale_columns([j], factor)
+    for group in groups:
+        details = {"actuators": tuple(names[j] for j in group)}
+        yield "reading-sign", details, scale_columns(group, -1.0)
+    for order in list_orders(len(names)):
+        moved = [i for i in columns if order[i] != i]
+        if any(dimensions[i] is not dimensions[order[i]] for i in moved):
+            continue
+        change, those = permute_columns(columns, order), tuple(names[i] for i in moved)
+        if len(moved) == 2:
+            yield "swapped-readings", {"actuators": those}, change
+        elif order == columns[::-1]:
+            yield "reversed-readings", {}, change
+        else:
+            details = {"actuators": those, "order": tuple(names[order[i]] for i in moved)}
+            yield "permuted-readings", details, change
 
 
 def list_orders(count: int) -> list[tuple[int, ...]]:
@@ -389,53 +388,18 @@ def list_orders(count: int) -> list[tuple[int, ...]]:
     return [order for order in dict.fromkeys(orders) if order != numbers]
 
 
-def _list_reading_signs(actuators: Sequence[Actuator]) -> Iterator[Slip]:
-    names, columns = tuple(a.name for a in actuators), range(len(actuators))
-    if len(names) > 1:
-        yield "reading-sign", {"actuators": names}, scale_columns(columns, -1.0)
-    for j in columns:
-        yield "reading-sign", {"actuators": (names[j],)}, scale_columns([j], -1.0)
-
-
-def _list_reading_orders(actuators: Sequence[Actuator]) -> Iterator[Slip]:
-    """Yield permutations of actuators of one dimension."""
-    names, dimensions = [a.name for a in actuators], [a.dimension for a in actuators]
-    columns = tuple(range(len(actuators)))
-    for order in list_orders(len(actuators)):
-        moved = [i for i in columns if order[i] != i]
-        if any(dimensions[i] is not dimensions[order[i]] for i in moved):
-            continue
-        change = permute_columns(columns, order)
-        if len(moved) == 2:
-            yield "swapped-readings", {"actuators": tuple(names[i] for i in moved)}, change
-        elif order == columns[::-1]:
-            yield "reversed-readings", {}, change
-        else:
-            details = {
-                "actuators": tuple(names[i] for i in moved),
-                "order": tuple(names[order[i]] for i in moved),
-            }
-            yield "permuted-readings", details, change
-
-
 def _list_gears(actuators: Sequence[Actuator], home: FloatArray | None) -> Iterator[Slip]:
     """Yield wrong factors of all actuators and of single ones, counted from 0 and from home."""
-    names = tuple(a.name for a in actuators)
-    groups = [tuple(range(len(names))), *((j,) for j in range(len(names)) if len(names) > 1)]
-    zeros = [("zero", np.zeros(len(names)))]
-    if home is not None:
-        zeros.append(("home", np.asarray(home)))
-    for origin, zero in zeros:
-        for columns in groups:
-            if origin == "home" and not np.any(np.abs(zero[list(columns)]) > NEGLIGIBLE):
+    zeros = {"zero": np.zeros(len(actuators))} | ({} if home is None else {"home": home})
+    for origin, zero in zeros.items():
+        for group in _group_actuators(len(actuators)):
+            start = zero[list(group)]
+            if origin == "home" and not np.any(np.abs(start) > NEGLIGIBLE):
                 continue  # the same as from 0
+            names = tuple(actuators[j].name for j in group)
             for factor in GEAR_FACTORS:
-                details = {
-                    "actuators": tuple(names[j] for j in columns),
-                    "factor": factor,
-                    "origin": origin,
-                }
-                yield "gear-factor", details, scale_columns(columns, factor, zero[list(columns)])
+                details = {"actuators": names, "factor": factor, "origin": origin}
+                yield "gear-factor", details, scale_columns(group, factor, start)
 
 
 def _list_sources(data: Measurements) -> Iterator[tuple[str, BoolArray]]:

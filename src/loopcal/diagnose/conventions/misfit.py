@@ -8,7 +8,7 @@ its own excluded rows. All functions are pure; see docs/theory/convention-check.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -27,11 +27,12 @@ from loopcal.findings import Quantity
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
+from loopcal.measure.observations import Observations
 from loopcal.mechanism.kinematics import find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 FEWEST = 3  # smallest number of equations beyond those of unknown frames that gives a misfit
@@ -48,13 +49,11 @@ FOLLOWED = 8
 
 
 class Effort(NamedTuple):
-    """Effort for unknown frames: candidates for their start values (None: all), steps of each, and
-    the iteration to the best frames. An interpretation that fits needs two or three steps of it.
-    """
+    """Effort for unknown frames. An interpretation that fits needs two or three steps of it."""
 
-    candidates: int | None
-    guess_steps: int
-    control: Halving
+    candidates: int | None  # for their start values; None: all
+    guess_steps: int  # steps of each candidate
+    control: Halving  # of the iteration to the best frames
 
 
 QUICK = Effort(2, 8, Halving(3, 2))  # to compare many interpretations before a few are judged
@@ -62,10 +61,7 @@ THOROUGH = Effort(None, 30, Halving(8, 6))  # to judge a few
 
 
 class Reach(NamedTuple):
-    """Measurements at the poses that a robot reaches, and the numbers of poses reached and tried.
-
-    All poses are kept where too few are reached.
-    """
+    """Measurements at the poses that a robot reaches; at all poses where it reaches too few."""
 
     data: Measurements
     n_reached: int
@@ -81,7 +77,7 @@ class Reach(NamedTuple):
 class Comparison:
     """Measurements in t interpretations of their values, compared with a robot at its values."""
 
-    data: Measurements  # the measurements, at poses that the robot reaches
+    data: Measurements  # at poses that the robot reaches
     problem: Problem  # of all interpretations
     # at the robot's values; None where the rows do not locate a target
     linearization: Linearization | None
@@ -96,12 +92,17 @@ class Comparison:
         linearization = self.linearization
         if linearization is None:
             return np.full(len(self.problem), np.nan)
-        return compute_misfit(compute_smallest_cost(linearization.factor), linearization.equations)
+        return _compute_misfit(linearization)
 
     @property
     def misfit(self) -> float:
         """Misfit of the first interpretation."""
         return float(self.misfits[0])
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the first interpretation has a misfit."""
+        return self.linearization is not None and bool(np.isfinite(self.misfit))
 
     def residuals(self) -> tuple[Residuals, ...]:
         """Return the residuals of every interpretation at the robot's values."""
@@ -113,8 +114,8 @@ class Comparison:
 
 
 def is_redundant(free: FreeParameters) -> bool:
-    """Return whether readings contradict each other by their errors, since the robot has more
-    actuators than freedoms; the readings of every pose are then rows, too.
+    """Return whether the robot has more actuators than freedoms, so that the readings of every pose
+    are rows, too.
     """
     return free.robot.program.sigma is not None
 
@@ -122,8 +123,8 @@ def is_redundant(free: FreeParameters) -> bool:
 def select_reached(free: FreeParameters, data: Measurements, *, follow: bool = False) -> Reach:
     """Select the poses that the robot reaches with the readings.
 
-    With `follow`, a few poses that are not reached at once are followed along a path before all
-    others are, because failures take longest.
+    With `follow`, paths lead to a few poses that are not reached at once, and to the others only if
+    these succeed, because failures take longest.
     """
     robot, q, n_tested = free.robot, data.readings, len(data.readings)
     reached = find_directly_reachable(robot, robot.values[None], q[None])[0]
@@ -152,17 +153,15 @@ def compare_with_robot(
     """Compare measurements with a robot, all rows included.
 
     data : at poses that the robot reaches. interpretations : of their values; default: as written.
-    start : (t, U), optional. Nuisance parameters to start from; default: guessed from the data.
+    start : (t, U) nuisance parameters to start from; default: guessed from the data.
     """
-    nuisance, rows, count = data.nuisance_parameters, [], max(len(interpretations), 1)
+    nuisance, rows = data.nuisance_parameters, []
+    read = [interpretation.apply(data) for interpretation in interpretations] or [data]
+    count = len(read)
     for i, o in enumerate(data.observations):
         if not len(o):
             continue
-        changes = [
-            interpretation.change if interpretation.observation == i else np.array
-            for interpretation in interpretations
-        ]
-        measured = np.stack([change(o.measured) for change in changes or [np.array]])
+        measured = np.stack([each.observations[i].measured for each in read])
         # a row that another interpretation leaves without some of its residuals is absent there
         same = (o.kind.detect_present(measured) == o.present).all(axis=-1)
         whitener = o.whitener * same[..., None, None]
@@ -185,15 +184,18 @@ def compare_with_robot(
 
 
 def exclude_far_rows(comparison: Comparison) -> Comparison:
-    """Compare without the rows of each interpretation that are far off its others.
-
-    Return the same comparison where there are none, or where a misfit is not finite.
+    """Compare without the rows of each interpretation that are far off its others; the same
+    comparison where there are none, or where a misfit is not finite.
     """
     linearization, problem, data = comparison.linearization, comparison.problem, comparison.data
     if linearization is None or not np.isfinite(comparison.misfits).all():
         return comparison
-    pairs = zip(comparison.residuals(), _expected_sd(problem, linearization), strict=True)
-    ratios = [_row_rms(residuals.whitened, sd) for residuals, sd in pairs]
+    ratios = []
+    for r, sd in zip(comparison.residuals(), _expected_sd(problem, linearization), strict=True):
+        # root mean square (t, r) of the present residuals; NaN for absent rows
+        present = (r.whitened != 0.0).sum(axis=-1)
+        total = ((r.whitened / sd) ** 2).sum(axis=-1)
+        ratios.append(np.sqrt(np.where(present > 0, total / np.maximum(present, 1), np.nan)))
     if problem.is_uncertain:
         ratios[-1][:] = np.nan  # readings are no rows of their own: they locate the pose
     together = np.concatenate(ratios, axis=1)
@@ -225,13 +227,11 @@ def compute_misfits(
     interpretations: Sequence[Interpretation],
     effort: Effort,
 ) -> FloatArray:
-    """Return the misfits (t,) of interpretations of the values without far rows, all at once; each
-    half by itself where one cannot be evaluated.
-    """
+    """Return the misfits (t,) of interpretations of the values without far rows."""
     if not interpretations:
         return np.zeros(0)
     together = compare_with_robot(free, data, interpretations, effort)
-    if together.linearization is None and len(interpretations) > 1:
+    if together.linearization is None and len(interpretations) > 1:  # one cannot be evaluated
         middle = len(interpretations) // 2
         halves = (interpretations[:middle], interpretations[middle:])
         return np.concatenate([compute_misfits(free, data, half, effort) for half in halves])
@@ -252,16 +252,14 @@ def compute_quick_misfit(free: FreeParameters, data: Measurements) -> float:
         linearization = problem.linearize(z, problem.start(z, seek=False))
         if not np.isfinite(linearization.cost[0]):
             return np.inf
-        return float(
-            compute_misfit(compute_smallest_cost(linearization.factor), linearization.equations)[0]
-        )
+        return float(_compute_misfit(linearization)[0])
 
 
 def compute_fitted_misfit(robot: Mechanism, data: Measurements) -> float:
-    """Return the misfit that a fit of redundant readings leaves, with tolerances as prior.
+    """Return the misfit that a fit of redundant readings leaves, with tolerances as prior; infinite
+    where the fit does not converge, and for other robots.
 
-    Redundant readings of a machine far from its file lead to no pose, so that nothing can be
-    compared there. The result is infinite where the fit does not converge, and for other robots.
+    Redundant readings of a machine far from its file lead to no pose to compare.
     """
     if robot.program.sigma is None:
         return np.inf
@@ -278,7 +276,7 @@ def _linearize(
     problem: Problem, data: Measurements, effort: Effort, start: FloatArray | None
 ) -> Linearization | None:
     """Linearize at the robot's values, from nuisance parameters `start` (t, U) or from guesses;
-    return None where the rows do not locate a target, which the fit words.
+    None where the rows do not locate a target, which the fit reports.
     """
     z = np.repeat(problem.free.deviation(problem.free.robot.values[None]), len(problem), axis=0)
     begin = problem.start(z, seek=False)
@@ -313,8 +311,8 @@ def _guess_start(problem: Problem, data: Measurements, effort: Effort) -> FloatA
 
 
 def _expected_sd(problem: Problem, linearization: Linearization) -> list[FloatArray]:
-    """Return the standard deviations (r, m) [1] of whitened residuals by tolerances and noise; by
-    noise alone for estimated poses, whose rows depend on each other.
+    """Return the standard deviations (r, m) of whitened residuals by tolerances and noise; by noise
+    alone for estimated poses, whose rows depend on each other.
     """
     result = [np.ones(rows.whitener.shape[1:3]) for rows in problem.rows]
     if problem.is_uncertain:
@@ -329,28 +327,19 @@ def _expected_sd(problem: Problem, linearization: Linearization) -> list[FloatAr
     return result
 
 
-def compute_smallest_cost(factor: FloatArray) -> FloatArray:
-    """Return the smallest |R z + r|^2 + |z|^2 (t,) of factors (t, p + 1, p + 1)."""
-    t, p = len(factor), factor.shape[-1] - 1
-    prior = np.broadcast_to(np.eye(p, p + 1), (t, p, p + 1))
-    return engine.fold(factor, prior)[:, -1, -1] ** 2 if p else factor[:, -1, -1] ** 2
+def _compute_misfit(linearization: Linearization, cost: FloatArray | None = None) -> FloatArray:
+    """Return the root mean square (t,) of a cost over the equations; NaN with too few.
 
-
-def compute_misfit(cost: FloatArray, rows: IntArray) -> FloatArray:
-    """Return the root mean square (t,) over the equations; NaN with too few."""
+    The default is the smallest |R z + r|^2 + |z|^2 of the factor.
+    """
+    if cost is None:
+        factor = linearization.factor
+        t, p = len(factor), factor.shape[-1] - 1
+        prior = np.broadcast_to(np.eye(p, p + 1), (t, p, p + 1))
+        cost = (engine.fold(factor, prior) if p else factor)[:, -1, -1] ** 2
+    rows = linearization.equations
     return np.where(rows >= FEWEST, np.sqrt(cost / np.maximum(rows, 1)), np.nan)
 
-
-def _row_rms(whitened: FloatArray, sd: FloatArray) -> FloatArray:
-    """Return the root mean square (t, r) of the present residuals (t, r, m) over their sd (r, m);
-    NaN for absent rows.
-    """
-    count = (whitened != 0.0).sum(axis=-1)
-    total = ((whitened / sd) ** 2).sum(axis=-1)
-    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
-
-
-# Judge single interpretations: their frames, their misfit, and whether their fit is evidence.
 
 # Factor by which another interpretation must fit better before data are refused: true data of a
 # robot far beyond its tolerances fit twice as well in none of them.
@@ -371,9 +360,7 @@ def judge_data(
 
 
 def compute_rms_residuals(comparison: Comparison) -> dict[Dimension, float]:
-    """Return root mean squares [m or rad] of the first interpretation's residuals by dimension,
-    without far rows.
-    """
+    """Return root mean squares [m or rad] of the first interpretation's residuals by dimension."""
     square: dict[Dimension, list[FloatArray]] = {}
     for s, r in zip(comparison.problem.rows, comparison.residuals(), strict=True):
         present = np.einsum("rmm->rm", s.whitener[0]) != 0.0
@@ -385,20 +372,25 @@ def compute_rms_residuals(comparison: Comparison) -> dict[Dimension, float]:
 
 def list_rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
     """Return these root mean squares in units of the robot's file."""
-    robot = comparison.problem.free.robot
-    sizes = compute_rms_residuals(comparison)
-    return tuple(robot.to_quantity(size, dimension) for dimension, size in sizes.items())
+    to_quantity = comparison.problem.free.robot.to_quantity
+    return tuple(to_quantity(size, d) for d, size in compute_rms_residuals(comparison).items())
 
 
 def guess_frames(
-    free: FreeParameters, data: Measurements, readings: FloatArray, reached: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Guess nuisance parameters (h, U) for h sets of readings (h, n, a), and return the median (h,)
-    of the sizes of whitened residuals with them, the robot as it is.
+    free: FreeParameters, data: Measurements, readings: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Guess nuisance parameters for sets of readings (h, n, a), the robot as it is.
 
-    Poses that the robot does not reach, by `reached` (h, n), are taken at home.
+    Returns the sets (k,) with which the robot reaches enough poses, their nuisance parameters
+    (k, U), and the median (k,) of the sizes of whitened residuals. Poses out of reach are taken at
+    home.
     """
-    robot, nuisance, h = free.robot, data.nuisance_parameters, len(readings)
+    robot, a = free.robot, readings.shape[-1]
+    reached = find_directly_reachable(robot, robot.values[None], readings.reshape(1, -1, a))
+    reached = reached.reshape(readings.shape[:2])
+    near = np.flatnonzero(reached.mean(axis=1) >= 1.0 - MOST_EXCLUDED)
+    readings, reached = readings[near], reached[near]
+    nuisance, h = data.nuisance_parameters, len(near)
     T = np.broadcast_to(robot.home_state.T.reshape(-1, 4, 4)[0], (*reached.shape, 4, 4)).copy()
     T[reached] = forward_trials(robot, robot.values[None], readings[reached][None]).T[0]
     measured = [np.broadcast_to(o.measured, (h, *o.measured.shape)) for o in data.observations]
@@ -411,49 +403,39 @@ def guess_frames(
             whitened = np.matmul(o.whitener, residual[..., None])[..., 0]
             sizes.append(np.linalg.norm(whitened, axis=-1))
     size = np.concatenate(sizes, axis=1)
-    return start, np.median(size, axis=1) if size.shape[1] else np.zeros(h)
+    return near, start, np.median(size, axis=1) if size.shape[1] else np.zeros(h)
 
 
 def is_informative(
     free: FreeParameters, data: Measurements, interpretation: Interpretation, misfit: float
 ) -> bool:
-    """Return whether values that shrink fit far better than controls without information."""
-    if not any(part.shrinks for part in interpretation.parts):
+    """Return whether values that shrink fit far better than controls without information: random
+    numbers of any size fit as well at any pose, and zeros in every unit.
+    """
+    if not interpretation.shrinks:
         return True
-    for control in _list_controls(data, interpretation):
-        comparison = judge_data(free, control)
-        if comparison is not None and comparison.misfit < BETTER * misfit:
+    changed, rng = interpretation.apply(data), np.random.default_rng(0)
+    shuffled = [o.measured[rng.permutation(len(o))] for o in changed.observations]
+    pairs = zip(data.observations, changed.observations, strict=True)
+    constant = [_make_constant(old.measured, new.measured) for old, new in pairs]
+    readings = _make_constant(data.readings, changed.readings)
+    for measured, q in ((shuffled, changed.readings), (constant, readings)):
+        observations = tuple(map(_with_measured, changed.observations, measured))
+        control = judge_data(free, replace(changed, readings=q, observations=observations))
+        if control is not None and control.misfit < BETTER * misfit:
             return False
     return True
 
 
-def _list_controls(data: Measurements, interpretation: Interpretation) -> Iterator[Measurements]:
-    """Yield data with the values of other rows, and with constants in place of changed values:
-    random numbers of any size fit as well at any pose, and zeros in every unit.
-    """
-    changed, rng = interpretation.apply(data), np.random.default_rng(0)
-    shuffled = (
-        replace(o, measured=o.measured[rng.permutation(len(o))]) for o in changed.observations
-    )
-    yield replace(changed, observations=tuple(shuffled))
-    pairs = zip(data.observations, changed.observations, strict=True)
-    constant = (
-        replace(new, measured=_make_constant(old.measured, new.measured)) for old, new in pairs
-    )
-    readings = _make_constant(data.readings, changed.readings)
-    yield replace(changed, readings=readings, observations=tuple(constant))
+def _with_measured(observations: Observations, measured: FloatArray) -> Observations:
+    return replace(observations, measured=measured)
 
 
 def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
     """Return a table with the median of its column in place of the values that changed."""
     is_changed = ~np.isclose(old, new, rtol=1e-12, atol=0.0, equal_nan=True)
-    if not is_changed.any():
-        return new
-    return np.where(is_changed, np.nanmedian(new, axis=0), new)
+    return np.where(is_changed, np.nanmedian(new, axis=0), new) if is_changed.any() else new
 
-
-# Refine the misfit of one interpretation by Gauss-Newton steps within the tolerances, or far
-# beyond them.
 
 # Gauss-Newton steps by which the stated convention and the best other one are compared finally; a
 # step that does not lower the cost ends them.
@@ -470,24 +452,19 @@ def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
 
     The misfit to first order is returned where it is smaller.
     """
-    if comparison.linearization is None or not np.isfinite(comparison.misfit):
+    if not comparison.is_finite:
         return comparison.misfit, comparison.data.nuisance_parameters.values()
     end = _minimize(comparison, 1.0, REFINEMENT)
-    values = (
-        np.zeros(0) if end.linearization.nuisance is None else end.linearization.nuisance.values[0]
-    )
-    refined = float(compute_misfit(end.cost, end.linearization.equations)[0])
-    return min(comparison.misfit, refined), values
+    nuisance = end.linearization.nuisance
+    values = np.zeros(0) if nuisance is None else nuisance.values[0]
+    return min(comparison.misfit, end.misfit), values
 
 
-def explains_after_fit(comparison: Comparison, allowed: float) -> bool:
-    """Return whether a robot far from nominal explains the first interpretation: whether its misfit
-    after a fit with tolerances `FAR_AWAY` times as large is at most `allowed`.
+def explains_after_fit(comparison: Comparison) -> bool:
+    """Return whether a robot far from nominal explains the first interpretation: after a fit with
+    tolerances `FAR_AWAY` times as large.
     """
-    if comparison.linearization is None or not np.isfinite(comparison.misfit):
-        return False
-    end = _minimize(comparison, FAR_AWAY, FIT)
-    return float(compute_misfit(end.cost, end.linearization.equations)[0]) <= allowed
+    return comparison.is_finite and _minimize(comparison, FAR_AWAY, FIT).misfit <= ALLOWED
 
 
 def _minimize(comparison: Comparison, scale: float, control: Halving) -> _Point:
@@ -495,10 +472,9 @@ def _minimize(comparison: Comparison, scale: float, control: Halving) -> _Point:
     assert comparison.linearization is not None
     first = np.arange(1)
     problem, linearization = comparison.problem.take(first), comparison.linearization.take(first)
-    z = linearization.deviation
+    z, p = linearization.deviation, problem.parameters
 
     def propose(point: _Point) -> _Step:
-        p = problem.parameters
         prior = np.concatenate([np.eye(p), point.step.T], axis=1) / scale
         whole = engine.fold(point.linearization.factor, prior[None])[0]
         direction = -np.linalg.solve(whole[:p, :p], whole[:p, p])[None]
@@ -512,25 +488,25 @@ def _minimize(comparison: Comparison, scale: float, control: Halving) -> _Point:
         total = point.step + share * step.direction
         return _Point(total, problem.linearize(z + total, point.linearization.next_start), scale)
 
-    end, _ = minimize_by_halving(
-        _Point(np.zeros_like(z), linearization, scale), propose, move, control
-    )
-    return end
+    start = _Point(np.zeros_like(z), linearization, scale)
+    return minimize_by_halving(start, propose, move, control)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A step (1, p) from the robot's values in tolerances, the linearization there, and the factor
-    by which tolerances are larger.
-    """
+    """A step from the robot's values, and the linearization there."""
 
-    step: FloatArray
+    step: FloatArray  # (1, p) in tolerances
     linearization: Linearization
-    scale: float
+    scale: float  # factor by which tolerances are larger
 
     @property
     def cost(self) -> FloatArray:
         return self.linearization.cost + ((self.step / self.scale) ** 2).sum(axis=1)
+
+    @property
+    def misfit(self) -> float:
+        return float(_compute_misfit(self.linearization, self.cost)[0])
 
 
 class _Step(NamedTuple):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from typing import NamedTuple
@@ -20,6 +20,7 @@ import numpy as np
 from loopcal.diagnose.conventions.interpretations import (
     Interpretation,
     combine,
+    interpret_readings,
     list_interpretations,
     list_reading_interpretations,
 )
@@ -27,7 +28,6 @@ from loopcal.diagnose.conventions.misfit import (
     ALLOWED,
     BETTER,
     EQUALLY,
-    MOST_EXCLUDED,
     QUICK,
     THOROUGH,
     Comparison,
@@ -48,7 +48,7 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.kind import Column, Kind
 from loopcal.measure.measurements import Measurements
-from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable
+from loopcal.mechanism.kinematics import compute_readings
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -64,7 +64,7 @@ BESIDE = 0.02  # share of the stroke by which readings may be outside: the strok
 class _Zero(NamedTuple):
     """Readings `sign q + base + c` of some actuators, with c between two limits."""
 
-    columns: tuple[int, ...]  # of the actuators
+    columns: list[int]  # of the actuators
     sign: float  # 1 or -1
     base: FloatArray  # (k,) of each of them [m or rad]
     # low, high: of c [m or rad]
@@ -73,19 +73,17 @@ class _Zero(NamedTuple):
 
     def apply(self, readings: FloatArray, constant: float) -> FloatArray:
         """Return the readings (n, a) with a value of c."""
-        chosen = list(self.columns)
         changed = np.array(readings)
-        changed[:, chosen] = self.sign * readings[:, chosen] + self.base + constant
+        changed[:, self.columns] = self.sign * readings[:, self.columns] + self.base + constant
         return changed
 
 
 def find_zero_interpretations(
     free: FreeParameters, data: Measurements, poses: IntArray, reversed_only: bool
 ) -> list[Interpretation]:
-    """Find the zeros with which the given robot fits best, the best first.
+    """Find the zeros with which the given robot fits best at some poses, the best first.
 
-    data : as written. poses : by which they are compared. reversed_only : only readings that are
-        counted in the opposite direction.
+    reversed_only : only readings that are counted in the opposite direction.
     """
     robot = free.robot
     zeros = [zero for zero in _list_zeros(free, data) if zero.sign < 0.0 or not reversed_only]
@@ -94,7 +92,12 @@ def find_zero_interpretations(
         if not zeros:
             return []
         grids = [np.linspace(zero.low, zero.high, SCANNED) for zero in zeros]
-        sizes = _compute_sizes(free, few, zeros, grids)
+        tested = zip(zeros, grids, strict=True)
+        readings = [zero.apply(few.readings, c) for zero, grid in tested for c in grid.tolist()]
+        sizes = np.full(len(readings), np.inf)
+        near, _, size = guess_frames(free, few, np.stack(readings))
+        sizes[near] = np.nan_to_num(size, nan=np.inf)
+        sizes = sizes.reshape(len(zeros), SCANNED)
         best = np.argsort(sizes.min(axis=1), kind="stable")[:BEST]
         best = best[np.isfinite(sizes.min(axis=1)[best])]
         zeros = [zeros[i] for i in best]
@@ -117,7 +120,7 @@ def find_zero_interpretations(
             "zeros": tuple(shown[:1] if same else shown),
         }
         change = partial(zero.apply, constant=constant)
-        result.append(Interpretation("reading-zero", details, "", None, change))
+        result.append(interpret_readings("reading-zero", details, change))
     return result
 
 
@@ -134,12 +137,8 @@ def _list_zeros(free: FreeParameters, data: Measurements) -> Iterator[_Zero]:
     low, high = np.array(strokes).T
     low, high = low - BESIDE * (high - low), high + BESIDE * (high - low)
     dimensions = [actuator.dimension for actuator in robot.actuators]
-    together = [
-        tuple(j for j, other in enumerate(dimensions) if other is dimension)
-        for dimension in dict.fromkeys(dimensions)
-    ]
-    singles = [(j,) for j in range(len(dimensions))]
-    for columns in dict.fromkeys([*together, *singles]):
+    groups = [[j for j, d in enumerate(dimensions) if d is each] for each in dimensions]
+    for columns in dict.fromkeys(map(tuple, [*groups, *([j] for j in range(len(groups)))])):
         chosen = list(columns)
         zero, start, ends = np.zeros(len(chosen)), home[chosen], (low + high)[chosen]
         bases = [(1.0, zero), (1.0, start), (-1.0, zero), (-1.0, start), (-1.0, ends)]
@@ -150,31 +149,7 @@ def _list_zeros(free: FreeParameters, data: Measurements) -> Iterator[_Zero]:
             least = float((low[chosen] - ends_of[0]).max())
             most = float((high[chosen] - ends_of[1]).min())
             if least < most:
-                yield _Zero(columns, sign, base, least, most)
-
-
-def _compute_sizes(
-    free: FreeParameters, data: Measurements, zeros: Sequence[_Zero], grids: Sequence[FloatArray]
-) -> FloatArray:
-    """Return the median residual sizes (h, SCANNED) of the given robot; infinite where it reaches
-    too few poses.
-    """
-    robot = free.robot
-    readings = np.stack(
-        [
-            zero.apply(data.readings, constant)
-            for zero, grid in zip(zeros, grids, strict=True)
-            for constant in grid.tolist()
-        ]
-    )
-    reached = find_directly_reachable(
-        robot, robot.values[None], readings.reshape(1, -1, readings.shape[-1])
-    ).reshape(readings.shape[:2])
-    near = np.flatnonzero(reached.mean(axis=1) >= 1.0 - MOST_EXCLUDED)
-    sizes = np.full(len(readings), np.inf)
-    if len(near):
-        sizes[near] = guess_frames(free, data, readings[near], reached[near])[1]
-    return np.nan_to_num(sizes, nan=np.inf).reshape(len(zeros), SCANNED)
+                yield _Zero(chosen, sign, base, least, most)
 
 
 # Interpretations of measurements with a frame, target or anchor that no file declares unknown.
@@ -182,28 +157,22 @@ def _compute_sizes(
 # Setup items that a user may forget to declare unknown. Surfaces with their frames and offsets
 # are none of them: the errors of the machine explain those, too.
 DECLARED = ("frame", "targets", "tool", "anchor")
+UNDECLARED = "undeclared-setup"  # the slip of such interpretations
 
 
-@dataclass(frozen=True, eq=False)
-class SetupInterpretation(Interpretation):
-    """Measurements some setup items of which are estimated; their values stay as written."""
+def list_setup_interpretations(data: Measurements, count: int) -> Iterator[Interpretation]:
+    """Yield measurements with `count` setup items unknown that are known as written, in all kinds
+    that allow them; two of them are the frame and another one.
+    """
 
-    items: tuple[str, ...] = ()  # of `DECLARED`, unknown in all kinds that allow them
-
-    def apply(self, data: Measurements) -> Measurements:
-        """Return the measurements with these items unknown."""
+    def declare_unknown(data: Measurements, items: tuple[str, ...]) -> Measurements:
         changed = []
         for rows in data.observations:
-            more = tuple(item for item in self.items if item in _list_known(rows.kind))
+            more = tuple(item for item in items if item in _list_known(rows.kind))
             unknown = (*rows.kind.unknown, *more)
             changed.append(replace(rows, kind=replace(rows.kind, unknown=unknown)))
         return replace(data, observations=tuple(changed))
 
-
-def list_setup_interpretations(data: Measurements, count: int) -> Iterator[SetupInterpretation]:
-    """Yield measurements with `count` setup items unknown that are known as written; two of them
-    are the frame and another one.
-    """
     known = [_list_known(rows.kind) if len(rows) else () for rows in data.observations]
     items = [item for item in DECLARED if any(item in names for names in known)]
     for chosen in combinations(items, count):
@@ -212,7 +181,8 @@ def list_setup_interpretations(data: Measurements, count: int) -> Iterator[Setup
         first = next(i for i, names in enumerate(known) if chosen[0] in names)
         unknown = (*data.observations[first].kind.unknown, *chosen)
         details = {"items": chosen, "unknown": tuple(dict.fromkeys(unknown))}
-        yield SetupInterpretation("undeclared-setup", details, "", first, np.array, chosen)
+        apply = partial(declare_unknown, items=chosen)
+        yield Interpretation(UNDECLARED, details, apply, of_values=True)
 
 
 def _list_known(kind: Kind) -> tuple[str, ...]:
@@ -246,14 +216,12 @@ LOWERED, MOST_BASES = 0.7, 3
 
 
 class Selection(NamedTuple):
-    """The selected interpretation, its comparison with the robot and its misfit, and others that
-    fit equally well.
-    """
+    """The selected interpretation."""
 
     interpretation: Interpretation
-    comparison: Comparison
+    comparison: Comparison  # of the data so interpreted
     misfit: float
-    alternatives: tuple[Interpretation, ...]
+    alternatives: tuple[Interpretation, ...]  # that fit equally well
 
 
 class Search(NamedTuple):
@@ -265,21 +233,15 @@ class Search(NamedTuple):
 
 
 class _Test(NamedTuple):
-    """An interpretation, its misfit by a few rows and, if that is promising, by all rows; infinite
-    if it was not computed.
-    """
+    """A tested interpretation; a misfit that was not computed is infinite."""
 
     interpretation: Interpretation
-    quick: float
-    misfit: float
+    quick: float  # misfit by a few rows
+    misfit: float  # and, if that is promising, by all rows
 
 
 def search_interpretations(
-    free: FreeParameters,
-    data: Measurements,
-    stated: Comparison | None,
-    misfit: float,
-    pairs: bool = True,
+    free: FreeParameters, data: Measurements, stated: Comparison | None, misfit: float, pairs: bool
 ) -> Search:
     """Search for the interpretation that fits far better than the stated one.
 
@@ -288,21 +250,19 @@ def search_interpretations(
         interpretation explains the data.
     """
     written = None if stated is None else stated.data
+    select = partial(_select_best, free, data, written, misfit)
     singles = _test_all(free, data, written, misfit)
     tried = dict(Counter(test.interpretation.slip for test in singles))
-    best = _select_best(free, data, written, singles, misfit, ALLOWED)
-    count = 0
+    best, count = select(singles, ALLOWED), 0
     if best is None and pairs:
         parameters = _test_parameters(free, data, written, misfit)
         tried |= Counter(test.interpretation.slip for test in parameters)
-        best = _select_best(free, data, written, parameters, misfit, ALLOWED)
+        best = select(parameters, ALLOWED)
     if best is None and pairs:
         tested = list(_test_pairs(free, data, written, singles, misfit))
-        count = len(tested)
-        best = _select_best(free, data, written, tested, misfit, ALLOWED)
+        best, count = select(tested, ALLOWED), len(tested)
     if best is None:
-        limit = misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST
-        best = _select_best(free, data, written, singles, misfit, limit)
+        best = select(singles, misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST)
         if best is not None and best.misfit > ALLOWED and not _is_robot_far(stated, best):
             best = None
     return Search(best, tried, count)
@@ -319,9 +279,8 @@ def _is_robot_far(stated: Comparison | None, chosen: Selection) -> bool:
         after = compute_rms_residuals(chosen.comparison)
         if any(FAR_BETTER * size < before.get(dimension, 0.0) for dimension, size in after.items()):
             return True
-    if not explains_after_fit(chosen.comparison, ALLOWED):
-        return False
-    return stated is None or not explains_after_fit(stated, ALLOWED)
+    explains = explains_after_fit(chosen.comparison)
+    return explains and (stated is None or not explains_after_fit(stated))
 
 
 def shares_poses(data: Measurements) -> bool:
@@ -336,8 +295,8 @@ def _test_all(
     misfit: float,
     nearest: int = NEAREST,
 ) -> list[_Test]:
-    """Test all single interpretations of data as written, `reached` where the robot reaches them;
-    those of the values only if it reaches enough poses.
+    """Test all single interpretations of data as written; those of the values only if the robot
+    reaches enough poses.
     """
     tests = []
     if reached is not None:
@@ -359,36 +318,31 @@ def _test_pairs(
     misfit: float,
 ) -> Iterator[_Test]:
     """Yield tests of pairs: the most promising single ones, each with all others after it."""
-    for of_readings in (False, True):
-        bases = sorted(
-            (
-                test
-                for test in singles
-                if (test.interpretation.observation is None) is of_readings
-                and test.quick < LOWERED * misfit
-            ),
-            key=lambda test: test.quick,
-        )
-        for base in bases[:MOST_BASES]:
+    for of_values in (True, False):
+        promising = [
+            test
+            for test in singles
+            if test.interpretation.of_values == of_values and test.quick < LOWERED * misfit
+        ]
+        for base in sorted(promising, key=lambda test: test.quick)[:MOST_BASES]:
             changed = base.interpretation.apply(data)
-            if of_readings:
+            if of_values:
+                changed_reached = None if reached is None else base.interpretation.apply(reached)
+            else:
                 reach = select_reached(free, changed)
                 changed_reached = reach.data if reach.is_enough else None
-            else:
-                changed_reached = None if reached is None else base.interpretation.apply(reached)
             bound = min(misfit, base.quick)
             for test in _test_all(free, changed, changed_reached, bound, NEAREST_IN_PAIRS):
-                yield test._replace(
-                    interpretation=combine(base.interpretation, test.interpretation)
-                )
+                pair = combine(base.interpretation, test.interpretation)
+                yield test._replace(interpretation=pair)
 
 
 def _select_best(
     free: FreeParameters,
     data: Measurements,
     reached: Measurements | None,
-    tested: Sequence[_Test],
     misfit: float,
+    tested: Sequence[_Test],
     limit: float,
 ) -> Selection | None:
     """Select the interpretation of the smallest misfit up to `limit` that is far better than
@@ -396,8 +350,7 @@ def _select_best(
     """
 
     def choose_data(interpretation: Interpretation) -> Measurements:
-        of_values = all(part.observation is not None for part in interpretation.parts)
-        return reached if of_values and reached is not None else data
+        return reached if interpretation.of_values and reached is not None else data
 
     better = [
         test
@@ -459,20 +412,19 @@ def _test_readings(
     robot, poses = free.robot, _select_few(data)
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     listed = list(list_reading_interpretations(data, robot.actuators, home))
-    readings = np.stack([interpretation.change(data.readings)[poses] for interpretation in listed])
-    reached = find_directly_reachable(
-        robot, robot.values[None], readings.reshape(1, -1, readings.shape[-1])
-    ).reshape(readings.shape[:2])
-    near = np.flatnonzero(reached.mean(axis=1) >= 1.0 - MOST_EXCLUDED)
-    start, size = guess_frames(free, data.take(poses), readings[near], reached[near])
+    readings = np.stack([each.apply(data).readings[poses] for each in listed])
+    near, start, size = guess_frames(free, data.take(poses), readings)
+
+    def judge(i: int, start: FloatArray | None = None, few: IntArray | None = None) -> float:
+        changed = listed[i].apply(data)
+        comparison = judge_data(free, changed if few is None else changed.take(few), start)
+        return np.inf if comparison is None else comparison.misfit
+
     screened, judged = np.full(len(listed), np.inf), np.full(len(listed), np.inf)
-    for i in np.sort(np.argsort(size, kind="stable")[:nearest]):
-        changed = listed[near[i]].apply(data)
-        comparison = judge_data(free, changed.take(poses), start[[i]])
-        screened[near[i]] = np.inf if comparison is None else comparison.misfit
-    for i in _select_promising(screened, misfit):
-        comparison = judge_data(free, listed[i].apply(data))
-        judged[i] = np.inf if comparison is None else comparison.misfit
+    for i in np.sort(np.argsort(size, kind="stable")[:nearest]).tolist():
+        screened[near[i]] = judge(int(near[i]), start[[i]], poses)
+    for i in _select_promising(screened, misfit).tolist():
+        judged[i] = judge(i)
     return _list_tests(listed, screened, judged)
 
 
@@ -485,10 +437,8 @@ def _test_parameters(
     few = _select_few(data)
     zeros = find_zero_interpretations(free, data, few, not misfit > GROSS)
     tests = [_test_one(free, data, few, zero, misfit) for zero in zeros]
-    if reached is None:
-        return tests
     for count in (1, 2):
-        if all(test.misfit > ALLOWED for test in tests):
+        if reached is not None and all(test.misfit > ALLOWED for test in tests):
             few = _select_few(reached)
             setups = list_setup_interpretations(reached, count)
             tests += [_test_one(free, reached, few, setup, misfit) for setup in setups]
@@ -531,34 +481,44 @@ def _select_promising(misfits: FloatArray, misfit: float) -> IntArray:
     return np.flatnonzero((misfits <= bound) & np.isfinite(misfits))
 
 
-# Find other orders of the actuators that explain data of a redundant robot as well as the
-# stated one, which explains them: the data cannot show which is true.
+# Data that another interpretation explains as well as the stated one cannot show which is true.
 
 # Number of measured residuals from which the order of a redundant robot's actuators is certain:
 # those of four positions, by which no machine of another order agrees with its redundant
-# readings.
+# readings. With fewer, poses are known from the readings.
 MEASURED = 12
 # Slips in the order of the actuators.
 ORDERS = ("swapped-readings", "reversed-readings", "permuted-readings")
+# Columns of a height, and standard deviations of the noise from which its sign matters.
+HEIGHT, SIGNIFICANT = (Column("z", Dimension.LENGTH),), 10.0
 
 
-def find_equal_orders(free: FreeParameters, data: Measurements) -> tuple[Interpretation, ...]:
-    """Find other orders of the actuators that explain data of a redundant robot as well as the
-    stated one, which explains them.
-
-    Only data whose measured rows are few leave that open: poses are then known from the readings.
+def report_equals(free: FreeParameters, data: Measurements, misfit: float) -> Finding | None:
+    """Report other orders of a redundant robot's actuators, or the other sign of heights, that
+    explain data as well as they are written; None without any.
     """
-    measured = sum(o.n_residuals for o in data.observations)
-    if not is_redundant(free) or measured >= MEASURED:
-        return ()
+    opposite = _compute_opposite_misfit(free, data)
+    if opposite <= max(EQUALLY * misfit, 1.0):
+        return report_finding(
+            "conventions.height-sign-undecided",
+            robot=free.robot.name,
+            misfit=misfit,
+            other_misfit=opposite,
+        )
+    if not is_redundant(free) or sum(o.n_residuals for o in data.observations) >= MEASURED:
+        return None
     few = data.take(select_measured(data))
-    equal = []
+    orders = []
     for interpretation in list_reading_interpretations(few, free.robot.actuators):
         if interpretation.slip in ORDERS:
             comparison = judge_data(free, interpretation.apply(few))
             if comparison is not None and refine_misfit(comparison)[0] <= ALLOWED:
-                equal.append(interpretation)
-    return tuple(equal)
+                orders.append(interpretation.describe())
+    if not orders:
+        return None
+    return report_finding(
+        "conventions.orders-undecided", robot=free.robot.name, alternatives=tuple(orders)
+    )
 
 
 def select_measured(data: Measurements) -> IntArray:
@@ -570,39 +530,7 @@ def select_measured(data: Measurements) -> IntArray:
     return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)
 
 
-# Report interpretations that explain data as well as the stated one, which explains them: the
-# data cannot show which is true.
-
-# Columns of a height, and standard deviations of the noise from which its sign matters.
-HEIGHT, SIGNIFICANT = (Column("z", Dimension.LENGTH),), 10.0
-
-
-def report_equals(free: FreeParameters, data: Measurements, misfit: float) -> Finding | None:
-    """Report other orders of the actuators, or the other sign of heights, that explain data as well
-    as they are written; None without any.
-    """
-    opposite = compute_opposite_misfit(free, data)
-    if opposite <= max(EQUALLY * misfit, 1.0):
-        return report_finding(
-            "conventions.height-sign-undecided",
-            robot=free.robot.name,
-            misfit=misfit,
-            other_misfit=opposite,
-        )
-    if not is_redundant(free):
-        return None
-
-    orders = find_equal_orders(free, data)
-    if not orders:
-        return None
-    return report_finding(
-        "conventions.orders-undecided",
-        robot=free.robot.name,
-        alternatives=tuple(order.describe() for order in orders),
-    )
-
-
-def compute_opposite_misfit(free: FreeParameters, data: Measurements) -> float:
+def _compute_opposite_misfit(free: FreeParameters, data: Measurements) -> float:
     """Return the misfit of data that consist of heights alone with the opposite sign of these; NaN
     for other data, and for heights within the noise.
     """
