@@ -30,12 +30,17 @@ from .diagnose.conventions.convention_check import check_conventions as check_co
 from .diagnose.conventions.convention_check import compare_conventions as compare_conventions
 from .diagnose.cross_validation import CrossValidation as CrossValidation
 from .diagnose.cross_validation import ModelChoice as ModelChoice
+from .diagnose.cross_validation import RegularizationCurves as RegularizationCurves
 from .diagnose.cross_validation import choose_model as choose_model
+from .diagnose.cross_validation import (
+    compute_regularization_curves as compute_regularization_curves,
+)
 from .diagnose.cross_validation import cross_validate as cross_validate
 from .diagnose.fit_examination import FitExamination as FitExamination
 from .diagnose.fit_examination import examine_fit as examine_fit
 from .diagnose.identifiable_parameters import Identifiability as Identifiability
 from .diagnose.identifiable_parameters import identifiability as identifiability
+from .diagnose.identifiable_parameters import suggest_measurements as suggest_measurements
 from .diagnose.intervals import Intervals as Intervals
 from .diagnose.intervals import JointRegion as JointRegion
 from .diagnose.intervals import SimultaneousIntervals as SimultaneousIntervals
@@ -46,11 +51,6 @@ from .diagnose.outliers import find_outliers as find_outliers
 from .diagnose.parameter_subset import choose_identifiable_subset as choose_identifiable_subset
 from .diagnose.posterior_sample import PosteriorSample as PosteriorSample
 from .diagnose.posterior_sample import sample_posterior as sample_posterior
-from .diagnose.regularization_curves import RegularizationCurves as RegularizationCurves
-from .diagnose.regularization_curves import (
-    compute_regularization_curves as compute_regularization_curves,
-)
-from .diagnose.suggestions import suggest_measurements as suggest_measurements
 from .diagnose.value_comparison import ValueComparison as ValueComparison
 from .diagnose.value_comparison import compare_with_truth as compare_with_truth
 from .diagnose.value_comparison import compare_with_values as compare_with_values

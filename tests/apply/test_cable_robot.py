@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
-from loopcal.diagnose.identifiable_parameters import identifiability
-from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
 from loopcal.diagnose.value_comparison import compare_with_values
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.diagnose.identifiable_parameters import identifiability
-from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares

@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopcal.diagnose.cross_validation import cross_validate
-from loopcal.diagnose.regularization_curves import compute_regularization_curves
+from loopcal.diagnose.cross_validation import compute_regularization_curves, cross_validate
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import GCV, MarginalLikelihood, Ridge, TruncatedSVD, TruncationGCV

@@ -3,8 +3,7 @@
 
 import pytest
 
-from loopcal.diagnose.identifiable_parameters import identifiability
-from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds import KINDS

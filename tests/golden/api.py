@@ -22,9 +22,9 @@ import loopcal as lc
 from loopcal import geometry
 from loopcal.diagnose.conventions.convention_check import compare_conventions
 from loopcal.diagnose.cross_validation import score_leave_one_out
+from loopcal.diagnose.identifiable_parameters import suggest_measurements
 from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.diagnose.start_values import check_start_values
-from loopcal.diagnose.suggestions import suggest_measurements
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS

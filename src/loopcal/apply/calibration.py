@@ -163,7 +163,7 @@ def _fit(
     chosen = robot if choice is None else choice.robot
     free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
     if fit_options.method is None and available < free:
-        from loopcal.diagnose.suggestions import describe_missing_equations
+        from loopcal.diagnose.identifiable_parameters import describe_missing_equations
 
         missing = describe_missing_equations(chosen, data) or ""
         counts: dict[str, Any] = {"equations": available, "parameters": free}
@@ -195,7 +195,7 @@ def _report(
     suggestions = None
     if fit.converged and fit.unidentifiable:
         from loopcal.diagnose.identifiable_parameters import identifiability
-        from loopcal.diagnose.suggestions import suggest_measurements
+        from loopcal.diagnose.identifiable_parameters import suggest_measurements
 
         analysis = identifiability(fit.robot, fitted, fit.options.rank_tolerance)
         suggestions = suggest_measurements(analysis)

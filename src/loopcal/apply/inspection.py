@@ -16,7 +16,7 @@ from loopcal.diagnose.parameter_subset import (
     choose_identifiable_subset,
     judge_useful_accuracy,
 )
-from loopcal.diagnose.suggestions import MeasurementSuggestion, suggest_measurements
+from loopcal.diagnose.identifiable_parameters import MeasurementSuggestion, suggest_measurements
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.families.joint_release import propose_added_joints

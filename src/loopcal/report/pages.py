@@ -10,8 +10,8 @@ from loopcal.apply.repeatability import Repeatability
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import Validation
 from loopcal.diagnose.bootstrap import Bootstrap
+from loopcal.diagnose.cross_validation import RegularizationCurves
 from loopcal.diagnose.posterior_sample import PosteriorSample
-from loopcal.diagnose.regularization_curves import RegularizationCurves
 from loopcal.estimate.result import Identification
 from loopcal.report.calibration_view import (
     view_calibration,

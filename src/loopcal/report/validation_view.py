@@ -35,9 +35,9 @@ from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 if TYPE_CHECKING:
     from loopcal.apply.run_comparison import RunComparison, RunSummary
     from loopcal.diagnose.bootstrap import Bootstrap
+    from loopcal.diagnose.cross_validation import RegularizationCurve, RegularizationCurves
     from loopcal.diagnose.intervals import Intervals, JointRegion, SimultaneousIntervals
     from loopcal.diagnose.posterior_sample import PosteriorSample
-    from loopcal.diagnose.regularization_curves import RegularizationCurve, RegularizationCurves
     from loopcal.estimate.result import Identification
     from loopcal.mechanism.model import Mechanism
 

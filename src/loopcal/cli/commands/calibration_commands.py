@@ -534,7 +534,7 @@ def report(run: Path, output: Path, pdf: bool, force: bool) -> Output:
 @file_option("-o", "--output", help="Folder to make, with the curves and their figure.")
 @library_option(
     "--folds",
-    of="loopcal.diagnose.regularization_curves:compute_regularization_curves",
+    of="loopcal.diagnose.cross_validation:compute_regularization_curves",
     type=Count("FOLDS", 2),
     metavar="N",
     help="Number of folds of poses where frames, targets or surfaces are unknown.",
@@ -567,7 +567,7 @@ def regularize(
       loopcal regularize hexapod-42 measurements.csv
       loopcal regularize robot.yaml measurements.csv -o curves
     """  # noqa: D301
-    from loopcal.diagnose.regularization_curves import compute_regularization_curves
+    from loopcal.diagnose.cross_validation import compute_regularization_curves
     from loopcal.estimate.options import FitOptions
     from loopcal.io.core.outputs import refuse_folder
     from loopcal.io.data.measurement_file import list_measurement_files

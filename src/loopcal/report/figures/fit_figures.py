@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from loopcal.apply.validation import owner_of
+from loopcal.diagnose.cross_validation import RegularizationCurves
 from loopcal.diagnose.identifiable_parameters import Identifiability
-from loopcal.diagnose.regularization_curves import RegularizationCurves
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.result import Identification, KindResiduals
 from loopcal.findings.wording import list_names
