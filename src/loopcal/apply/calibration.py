@@ -194,8 +194,7 @@ def _report(
     count.begin("looking for further measurements")
     suggestions = None
     if fit.converged and fit.unidentifiable:
-        from loopcal.diagnose.identifiable_parameters import identifiability
-        from loopcal.diagnose.identifiable_parameters import suggest_measurements
+        from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
 
         analysis = identifiability(fit.robot, fitted, fit.options.rank_tolerance)
         suggestions = suggest_measurements(analysis)

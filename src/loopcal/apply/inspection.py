@@ -9,14 +9,18 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from loopcal.apply.verdict import is_readings_alone, report_readings_gauge, sort_undetermined
-from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
+from loopcal.diagnose.identifiable_parameters import (
+    Identifiability,
+    MeasurementSuggestion,
+    identifiability,
+    suggest_measurements,
+)
 from loopcal.diagnose.parameter_subset import (
     IdentifiableSubset,
     UsefulAccuracy,
     choose_identifiable_subset,
     judge_useful_accuracy,
 )
-from loopcal.diagnose.identifiable_parameters import MeasurementSuggestion, suggest_measurements
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.families.joint_release import propose_added_joints
