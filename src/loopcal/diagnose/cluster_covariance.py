@@ -29,8 +29,8 @@ from loopcal.diagnose.error_frames import (
     locate_measured_poses,
 )
 from loopcal.diagnose.outliers import TESTABLE
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification

@@ -34,9 +34,8 @@ from loopcal.diagnose.row_errors import (
     join_errors,
 )
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import free_only, select_free_parameters
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
@@ -252,7 +251,7 @@ def score_leave_one_out(
     blocks, member = np.unique(linked_blocks(data), return_inverse=True)
     square, equations = np.zeros((len(blocks), len(penalty))), np.zeros(len(blocks))
     count, rows = (
-        problem.count_leverage_rows(member, len(blocks)),
+        problem.poses.count_rows(member, len(blocks)),
         problem.leverage_rows(linearization),
     )
     for numbers, A, r in iterate_blocks(rows, member, count):

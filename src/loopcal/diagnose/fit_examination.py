@@ -20,8 +20,8 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.identification import check_fitted_data, exclude_poses
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.measurements import Measurements

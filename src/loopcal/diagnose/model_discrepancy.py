@@ -31,9 +31,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.diagnose.residual_patterns import LEVEL
-from loopcal.estimate.added_covariance import add_covariance
-from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
+from loopcal.estimate.identification import exclude_poses
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.residual_test import (
@@ -42,7 +41,7 @@ from loopcal.estimate.residual_test import (
     choose_severity,
     count_sigma_degrees,
 )
-from loopcal.estimate.result import Identification
+from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.smooth_errors import SmoothErrors, describe_smooth_errors
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements

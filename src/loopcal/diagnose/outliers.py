@@ -37,8 +37,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.errors import LoopcalError
-from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import check_fitted_data, exclude_poses, identify
 from loopcal.estimate.linearization import LeverageRows, Linearization, Start
 from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
@@ -111,7 +110,7 @@ def compute_influence(
         roots.append(d.scale[:, None] * d.directions[0] * sd)
         changes.append((solved - linearization.deviation)[0])
     results = [make_empty_influence(u) for _ in fits]
-    total = problem.count_leverage_rows(member, u)
+    total = problem.poses.count_rows(member, u)
     rows = problem.leverage_rows(linearization, solution)
     for blocks, columns, r in iterate_blocks(rows, member, total):
         # nuisance parameters come first, in units of their standard deviation
@@ -163,7 +162,7 @@ def iterate_blocks(
     """Yield blocks of equal size together: numbers (b,), matrices (b, m, p), residuals (b, m).
 
     A block whose rows come with several chunks of poses waits until the last of them. `total` (u,)
-    is the number of rows of each block, see `Problem.count_leverage_rows`.
+    is the number of rows of each block, see `PoseRows.count_rows`.
     """
     waiting: list[tuple[IntArray, FloatArray]] = []
     for rows_of_block in rows_of_problem:
