@@ -1,4 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Golden results: numbers computed by loopcal before its redesign, and the code that computes them
-again.
-"""
+"""Golden results: numbers that loopcal computed, and the code that computes them again."""

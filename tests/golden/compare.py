@@ -31,8 +31,8 @@ engines:
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator, Mapping
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -67,12 +67,8 @@ def plain(value: Any) -> Any:
     return value
 
 
-def differences(
-    golden: Flat, found: Flat, exceptions: Mapping[str, float] | None = None
-) -> Iterator[str]:
-    """Yield a sentence for every value that is not what it was; `exceptions` are pattern of paths
-    -> tolerance as a share of the largest of an array.
-    """
+def differences(golden: Flat, found: Flat) -> Iterator[str]:
+    """Yield a sentence for every value that is not what it was."""
     for path in sorted(golden.keys() ^ found.keys()):
         yield f"{path}: {'is missing' if path in golden else 'is new'}"
     for path in sorted(golden.keys() & found.keys()):
@@ -85,16 +81,13 @@ def differences(
         if was.shape != now.shape:
             yield f"{path}: shape {now.shape} was {was.shape}"
             continue
-        other = [t for pattern, t in (exceptions or {}).items() if fnmatchcase(path, pattern)]
-        if (off := distance(path, was, now, golden, *other)) > 1.0:
+        if (off := distance(path, was, now, golden)) > 1.0:
             yield f"{path}: differs by {off:.3g} times its tolerance"
 
 
-def distance(
-    path: str, was: np.ndarray, now: np.ndarray, golden: Flat, other: float | None = None
-) -> float:
-    """Return the largest difference in units of its tolerance, the rule's or another share of the
-    largest; infinite where NaN or infinite ones are not the same.
+def distance(path: str, was: np.ndarray, now: np.ndarray, golden: Flat) -> float:
+    """Return the largest difference in units of its tolerance, infinite where NaN or infinite ones
+    are not the same.
     """
     finite = np.isfinite(was)
     if (
@@ -105,8 +98,7 @@ def distance(
     if not finite.any():
         return 0.0
     largest = np.abs(was[finite]).max()
-    by_rule = _allowed(path, was, largest, golden) if other is None else other * largest
-    allowed = np.broadcast_to(by_rule, was.shape)[finite]
+    allowed = np.broadcast_to(_allowed(path, was, largest, golden), was.shape)[finite]
     off = np.abs(now[finite] - was[finite])
     return float(np.max(np.where(off == 0.0, 0.0, off / np.maximum(allowed, np.finfo(float).tiny))))
 
@@ -171,24 +163,31 @@ def _short(value: Any) -> str:
     return text if len(text) < 200 else f"{text[:200]}..."
 
 
-def write(
-    information: Mapping[str, Any], results: Mapping[str, Flat], path: Path = FIXTURE
-) -> None:
+def write(results: Mapping[str, Flat]) -> None:
     """Write the fixture, one value a line so that changes can be read in git; NaN and Infinity as
     Python's json has them.
     """
-    lines = ["{", f'"information": {json.dumps(dict(information))},', '"results": {']
-    for i, (case, flat) in enumerate(results.items()):
-        lines.append(f"{json.dumps(case)}: {{")
+    cases = []
+    for case, flat in results.items():
         values = [
-            f"  {json.dumps(name)}: {json.dumps(value, separators=(',', ':'))}"
-            for name, value in flat.items()
+            f"  {json.dumps(k)}: {json.dumps(v, separators=(',', ':'))}" for k, v in flat.items()
         ]
-        lines.append(",\n".join(values))
-        lines.append("}" + ("," if i + 1 < len(results) else ""))
-    path.write_text("\n".join([*lines, "}", "}", ""]))
+        cases.append(f"{json.dumps(case)}: {{\n" + ",\n".join(values) + "\n}")
+    FIXTURE.write_text("{\n" + ",\n".join(cases) + "\n}\n")
 
 
-def read(path: Path = FIXTURE) -> dict[str, Flat]:
+def read() -> dict[str, Flat]:
     """Read the results of the fixture, case by case."""
-    return json.loads(path.read_text())["results"]
+    return json.loads(FIXTURE.read_text())
+
+
+def collect(chosen: tuple[str, ...]) -> None:
+    """Compute all cases anew, or those whose names begin with `chosen`, and write the fixture."""
+    from tests.golden.cases import CASES
+
+    kept = {n: flat for n, flat in (read() if chosen else {}).items() if not n.startswith(chosen)}
+    write({name: kept.get(name) or flatten(case()) for name, case in CASES.items()})
+
+
+if __name__ == "__main__":
+    collect(tuple(sys.argv[1:]))
