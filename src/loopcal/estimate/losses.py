@@ -30,7 +30,11 @@ LARGEST = 8.0
 
 
 class Loss(Protocol):
-    """The interface of a loss."""
+    """The interface of a loss.
+
+    A loss whose weight falls faster than 1 / distance has several minima. It states
+    `is_redescending = True`, and its fit starts from that with Huber's loss.
+    """
 
     def weight(self, distance: FloatArray, degrees: FloatArray) -> FloatArray:
         """Return the weight (u,) of blocks at distance d (u,) with this many residuals (u,)."""
@@ -100,6 +104,7 @@ class Tukey:
     """
 
     name: ClassVar[str] = "tukey"
+    is_redescending: ClassVar[bool] = True
     c: float = 4.685
 
     def __post_init__(self) -> None:

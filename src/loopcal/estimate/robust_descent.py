@@ -92,7 +92,7 @@ def descend_robustly(
         weight = Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)[member]
         weighted = problem.weighted(weight)
         fit = RobustFit(run(weighted, deviation, None), weighted, weight)
-    if isinstance(loss, Tukey):
+    if getattr(loss, "is_redescending", False):
         coarse = 100.0 * CONVERGED_CHANGE
         fit = _reweight(problem, member, Huber(), fit, estimate_scale, run, coarse)
     fit = _reweight(problem, member, loss, fit, estimate_scale, run, CONVERGED_CHANGE)
