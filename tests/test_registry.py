@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.metadata import EntryPoint
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -208,3 +210,15 @@ def test_a_method_and_a_rule_of_another_package_are_used_by_their_names(monkeypa
             assert named.estimate == pytest.approx(built.estimate, abs=0.0)
     finally:
         _list_entry_points.cache_clear()
+
+
+def test_every_place_that_is_named_in_a_string_exists(root) -> None:
+    named = {
+        place
+        for path in (root / "src").rglob("*.py")
+        for place in re.findall(r'"(loopcal(?:\.\w+)+:\w+)"', path.read_text("utf-8"))
+    }
+    assert len(named) > 30
+    for place in sorted(named):
+        module, _, name = place.partition(":")
+        assert hasattr(import_module(module), name), place

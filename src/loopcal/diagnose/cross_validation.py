@@ -171,6 +171,8 @@ def cross_validate(
 ) -> CrossValidation:
     """Fit `count` times without one fold, and predict the held-out fold.
 
+    Parameters
+    ----------
     robot, data, method, options : as for `identify`. A robot without free parameters is only used
         to predict. Excluded poses are neither fitted nor predicted.
     count : number of folds. seed : of their choice. progress : receives the folds that are done.
@@ -466,6 +468,8 @@ def choose_model(
 ) -> ModelChoice:
     """Choose the simplest set of free parameters that predicts held-out poses as well as any.
 
+    Parameters
+    ----------
     robot, data, method, options, count, seed : as for `cross_validate`; all candidates are subsets
         of the free parameters and have the same folds.
     nested : name -> parameters, each set within the next; default `list_parameter_sets`. The set

@@ -467,6 +467,8 @@ def suggest_measurements(
 ) -> tuple[MeasurementSuggestion, ...]:
     """Test every kind of measurement, one after the other, on the unidentifiable combinations.
 
+    Parameters
+    ----------
     sigma : standard deviations of the further instrument by dimension [SI].
     Returns one suggestion for each of `identifiability.unidentifiable`, in order.
     """

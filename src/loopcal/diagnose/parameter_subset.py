@@ -100,6 +100,8 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
 
     The result has as many free parameters as the rank, and does not depend on the machine.
 
+    Parameters
+    ----------
     identifiability : as from `identifiability(robot, data)`.
     Returns a subset whose `robot` has the chosen parameters free and the others fixed at their
     nominal values. Least squares can identify it.

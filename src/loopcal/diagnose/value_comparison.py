@@ -218,6 +218,8 @@ class ValueComparison(TableResult):
 def compare_with_truth(fit: Identification, truth: ArrayLike) -> ValueComparison:
     """Compare the parameters of a fit with true ones in the directions that its data determine.
 
+    Parameters
+    ----------
     truth : (parameters of the robot,) or (free parameters,) [SI], in the order of the table.
 
     Raises
@@ -241,6 +243,8 @@ def compare_with_values(
 ) -> ValueComparison:
     """Compare a fit with a stored answer: published values, or those of a firmware.
 
+    Parameters
+    ----------
     values : of parameters by name [SI], all of them or some (the others are free to differ); or a
         robot of the same structure, whose values are compared. Parameters that the fit keeps fixed
         must have the same value in both.

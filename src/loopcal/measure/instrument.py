@@ -135,6 +135,10 @@ class Sensor:
         each pose with the next one, and the last with the first. Targets on the base are measured
         twice by default, before and after the poses; only the number of their rows matters.
     session, group : text or (r,) text, see `Observations`.
+
+    Raises
+    ------
+    DataError : the noise does not have one number for each noise column of the kind.
     """
 
     kind: Kind

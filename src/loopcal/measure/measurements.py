@@ -344,6 +344,10 @@ class Measurements(TableResult):
         A row that compares poses gets the product of their weights. Uncertain readings are weighted
         like the rows of their pose: sigma / sqrt(weight). `Observations.with_weights` weights
         single rows.
+
+        Raises
+        ------
+        DataError : the number of weights is not that of the poses, or one is negative.
         """
         given = check_array(weight, "the weight of the poses", (self.n_poses,))
         observations = tuple(

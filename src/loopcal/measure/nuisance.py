@@ -35,6 +35,10 @@ class StatedValue:
     name : full name, such as `monday.tracker.x`.
     sd : standard deviation of a prior [SI]; 0 fixes the parameter.
     nominal : fixed value, or center of the prior [SI]; default: the nominal value of the kind.
+
+    Raises
+    ------
+    DataError : the standard deviation is negative, or a number is not finite.
     """
 
     name: str

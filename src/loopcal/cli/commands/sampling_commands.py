@@ -191,8 +191,8 @@ def bootstrap(
 )
 @library_option(
     "--rule",
-    of="loopcal.diagnose.joint_regions:compute_simultaneous_intervals",
-    type=Words("loopcal.diagnose.joint_regions:Rule"),
+    of="loopcal.diagnose.intervals:compute_simultaneous_intervals",
+    type=Words("loopcal.diagnose.intervals:Rule"),
     help="How --region makes intervals that hold together; maximum gives the narrowest.",
 )
 @draw_options
@@ -225,7 +225,7 @@ def sample(
       loopcal sample linear-delta measurements.csv --method map
       loopcal sample run --region -p radius -p 'tower*.angle'
     """  # noqa: D301
-    from loopcal.diagnose.joint_regions import compute_joint_region, compute_simultaneous_intervals
+    from loopcal.diagnose.intervals import compute_joint_region, compute_simultaneous_intervals
     from loopcal.diagnose.posterior_sample import sample_posterior
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.runs.run_folder import load_run

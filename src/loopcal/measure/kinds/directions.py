@@ -161,6 +161,11 @@ class Direction(AxisKind):
     axis : (3,), the axis on the platform, of any length. If the axis is unknown, its nominal value.
     axis_name : name of the axis; its parameters begin with it.
     Others : see `AxisKind`; "frame" and "axis" may be unknown.
+
+    Raises
+    ------
+    DataError : the length of the axis is zero, the frame is not a pose, or `unknown` lists
+        something else.
     """
 
     axis: FloatArray = checked(check_direction, "the axis", UPWARD)
@@ -259,6 +264,11 @@ class Inclination(DirectionKind):
     T_platform_sensor : (4, 4), mounting of the sensor; only its orientation matters.
     sensor : name of the sensor; the parameters of its mounting begin with it.
     unknown : which of "mounting" and "gravity" are unknown.
+
+    Raises
+    ------
+    DataError : the length of the vertical is zero, the mounting is not a pose, or `unknown` lists
+        something else.
     """
 
     up: FloatArray = checked(check_direction, "the vertical", UPWARD)
@@ -335,6 +345,11 @@ class Autocollimation(AxisKind):
         its nominal value.
     mirror : name of the mirror; its parameters begin with it.
     Others : see `AxisKind`; "frame" and "mirror" may be unknown.
+
+    Raises
+    ------
+    DataError : the length of the normal is zero, the frame is not a pose, or `unknown` lists
+        something else.
     """
 
     normal: FloatArray = checked(check_direction, "the normal of the mirror", UPWARD)

@@ -83,6 +83,10 @@ class Distance(LengthKind):
     anchor : (3,) [m], the fixed point in the frame. If the anchor is unknown, its nominal value.
     anchor_name : name of the fixed point. Kinds that use the same name share its parameters.
     Others : see `TargetKind`; "anchor", "targets" and "offset" (the zero of a wire) may be unknown.
+
+    Raises
+    ------
+    DataError : as `TargetKind`.
     """
 
     anchor: FloatArray = checked(check_point, "the anchor", np.zeros(3))

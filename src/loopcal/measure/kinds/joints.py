@@ -39,6 +39,10 @@ class JointSensor(Kind):
         have the same names.
     measures : "length" or "angle": the dimension of the joints.
     unknown : "offset": the value that each sensor shows where its joint is zero.
+
+    Raises
+    ------
+    DataError : no joint is named or one twice, or `unknown` lists something else.
     """
 
     joints: tuple[str, ...] = ("q1",)

@@ -511,6 +511,8 @@ class Kind(ABC):
 
         To first order, `evaluate(T, measured).residual = -linearize_noise(measured) noise`.
 
+        Parameters
+        ----------
         T : (t, r, 4, 4) true T_base_platform. noise : (t, r, m) in the noise columns.
         nuisance : (t or 1, r or 1, u), default nominal. joints : (t, r, j), default zero.
         """

@@ -148,6 +148,10 @@ class Pose(ToolKind):
         < 0.05`, E their rates), where it is a rotation error too.
     Others : see `ToolKind`.
 
+    Raises
+    ------
+    DataError : the orientation form does not exist or a frame is not a pose.
+
     Examples
     --------
     >>> from loopcal.geometry import make_pose, rotation_about_axis
@@ -326,6 +330,11 @@ class Component(ToolKind):
     orientation : form of the angles, "tilt-torsion" (phi theta psi) or "euler-" and an order (a b
         c). Required if an angle is measured.
     Others : see `ToolKind`.
+
+    Raises
+    ------
+    DataError : a component does not exist or is named twice, if angles have no declared
+        orientation, or if phi is measured without theta.
 
     Examples
     --------

@@ -59,6 +59,11 @@ class TargetKind(Kind):
     of : stage of a chain on whose platform the targets are; default: the end platform. "base" (of
         the kinds position, bearing and distance): the targets are fixed to the base. Their rows
         belong to no pose, and unknown ones keep their places in all sessions.
+
+    Raises
+    ------
+    DataError : shapes do not fit, a name occurs twice, `unknown` lists something that is not
+        allowed, or places of targets on the base are neither stated nor unknown.
     """
 
     targets: tuple[str, ...] = ("target",)
@@ -284,6 +289,10 @@ class Bearing(TargetKind):
     ----------
     form : "theodolite" or "camera".
     Others : see `TargetKind`; "frame" (the station) and "targets" may be unknown.
+
+    Raises
+    ------
+    DataError : as `TargetKind`, or for another form.
     """
 
     form: str = "theodolite"

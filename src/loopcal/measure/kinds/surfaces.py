@@ -216,6 +216,10 @@ class Sphere(SurfaceKind):
     ----------
     radius : sum of the radii of ball and probe [m]. If the surface is unknown, its nominal value.
     Others : see `SurfaceKind`; `through` is the center, and `along` does not matter.
+
+    Raises
+    ------
+    DataError : as `SurfaceKind`, and if the radius is not above zero.
     """
 
     surface: str = "sphere"

@@ -156,6 +156,8 @@ def map_in_flight(
 class Processes:
     """Worker processes on this computer.
 
+    Parameters
+    ----------
     workers : their number.
     """
 
