@@ -75,3 +75,11 @@ def test_examples_of_a_theory_page_give_the_printed_output(page: Path) -> None:
     )
     assert tried > 0
     assert failed == 0, "".join(report)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_code_that_a_page_names_exists(page: Path) -> None:
+    for line in re.findall(r"Code: .*?(?=; |\. |\.$|\n\n)", TEXTS[page], re.MULTILINE | re.DOTALL):
+        named = re.findall(r"`([^`]+)`", line)
+        assert named, line
+        assert [n for n in named if not (ROOT / "src" / "loopcal" / n).exists()] == []
