@@ -115,8 +115,9 @@ def usual_fit() -> lc.Identification:
 
 def report_fit(found: lc.Identification) -> Report:
     """Report estimates, standard deviations and diagnostics."""
-    check, result = found.residual_test, {"names": list(found.names)}
-    result |= {
+    check = found.residual_test
+    result: Report = {
+        "names": list(found.names),
         "status": found.status.name,
         "rank": found.rank,
         "fit": {
@@ -508,6 +509,7 @@ def compensate() -> Report:
         "readings": done.readings / done.robot.size,
         "reached": scale_pose(done.robot, done.reached),
     }
+    assert done.uncertainty is not None
     return {"reach": [r.value for r in done.reach], "kinematic": reached, "sd": done.uncertainty.sd}
 
 

@@ -238,7 +238,14 @@ MOST_EXPLAINED = 10  # poses for which explanations are tried, the farthest firs
 # Other poses that do not fit, the farthest first, with which the values of one are exchanged.
 MOST_EXCHANGED = 50
 # Data of the finding that only some explanations have.
-UNUSED = {"pairs": (), "other": "", "dimension": "", "factor": 1.0, "column": "", "left_out": ""}
+UNUSED: dict[str, Any] = {
+    "pairs": (),
+    "other": "",
+    "dimension": "",
+    "factor": 1.0,
+    "column": "",
+    "left_out": "",
+}
 # Factors by which values in another unit differ.
 FACTORS: dict[Dimension, tuple[float, ...]] = {
     Dimension.LENGTH: (1e3, 1e-3, 10.0, 0.1, 25.4, 1.0 / 25.4),

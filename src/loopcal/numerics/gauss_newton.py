@@ -80,7 +80,7 @@ class FixedFactors:
     """Damping that is divided by ten after an accepted step and multiplied by ten otherwise."""
 
     def __init__(self, first: FloatArray) -> None:
-        self.value = np.array(first)
+        self.value: FloatArray = np.array(first)
 
     def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
         """Adapt the damping of some trials."""
@@ -100,8 +100,8 @@ class Progress:
     """
 
     def __init__(self, trials: int) -> None:
-        self.marks = np.full((trials, 3), np.inf)
-        self.age = np.zeros(trials, dtype=np.int64)
+        self.marks: FloatArray = np.full((trials, 3), np.inf)
+        self.age: IntArray = np.zeros(trials, dtype=np.int64)
 
     def find_stalled(
         self, trials: IntArray, is_finite: BoolArray, *measures: FloatArray

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every kind refuses invalid settings and rows in one sentence."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -37,7 +39,7 @@ HEIGHT = Component(("z",), T_platform_tool=np.eye(4))
 POSES = zoo.make_poses(np.zeros((1, 6)))
 
 
-def observe(*rows, kind=POINTS, poses=None, sigma=1e-4):
+def observe(*rows: Any, kind: Any = POINTS, poses: Any = None, sigma: Any = 1e-4) -> Observations:
     """Return observations of the first poses."""
     poses = range(len(rows)) if poses is None else poses
     return Observations.from_sigma(kind, poses, rows, sigma)
@@ -80,7 +82,9 @@ REFUSED = {
     "the form of a bearing is 'telescope'; use theodolite or camera": (
         lambda: Bearing(form="telescope")
     ),
-    "the anchor: row 2 is nan; give a finite number": lambda: Distance(anchor=(0.0, np.nan, 0.0)),
+    "the anchor: row 2 is nan; give a finite number": lambda: Distance(
+        anchor=np.array([0.0, np.nan, 0.0])
+    ),
     "the direction of the surface is 0, 0, 0": lambda: Plane(along=np.zeros(3)),
     "the radius of a sphere is 0.0 m; give a length above 0": lambda: Sphere(radius=0.0),
     "the axis is 0, 0, 0": lambda: Direction(axis=np.zeros(3)),
@@ -174,15 +178,19 @@ REFUSED = {
     "measured: got the text 'data.csv'; give an array": (
         lambda: Observations.from_sigma(POINTS, [0], "data.csv", 1.0)
     ),
-    "noise: got a float; give Noise, such as": lambda: Sensor(POSE, 1e-5),
-    "give a tuple": lambda: Instrument(Sensor(POSE, Gaussian(np.ones(6)))),
+    "noise: got a float; give Noise, such as": (
+        lambda: Sensor(POSE, 1e-5)  # type: ignore[arg-type]
+    ),
+    "give a tuple": (
+        lambda: Instrument(Sensor(POSE, Gaussian(np.ones(6))))  # type: ignore[arg-type]
+    ),
     "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot": (
-        lambda: sample_truth("hexapod-42", 1, 0)
+        lambda: sample_truth("hexapod-42", 1, 0)  # type: ignore[arg-type]
     ),
     "instrument: got the text 'pose'; give Instrument": (
-        lambda: simulate(zoo.hexapod(), POSES, "pose", 1)
+        lambda: simulate(zoo.hexapod(), POSES, "pose", 1)  # type: ignore[arg-type]
     ),
-    "got the text '1 um'; give an array": lambda: Gaussian("1 um"),
+    "got the text '1 um'; give an array": lambda: Gaussian("1 um"),  # type: ignore[arg-type]
 }
 
 

@@ -28,7 +28,7 @@ def test_shipped_robot_closes_at_the_home_pose_of_its_file(name: str) -> None:
     tilt = geometry.log_so3(machine.home[:3, :3] @ home[:3, :3].T)
     if "phi" in machine.controlled and abs(tilt).max() < 1e-12:  # phi is anything at zero tilt
         read = [np.delete(r, machine.controlled.index("phi")) for r in read]
-    assert_allclose(*read, atol=1e-12)
+    assert_allclose(read[0], read[1], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

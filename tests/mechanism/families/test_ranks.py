@@ -106,7 +106,9 @@ def test_ranks_are_those_of_the_error_model(case: str) -> None:
     record, size, measured, unknown = CASES[case]
     seed = 5 if isinstance(record, Gough) else 7
     machine = perturb(build(record.expand()), size, seed) if size else build(record.expand())
-    n = {Gough: 150}.get(type(record), 120) if record.error_model == "complete" else 80
+    n = 80
+    if record.error_model == "complete":
+        n = 150 if isinstance(record, Gough) else 120
     solution = solve_random_poses(machine, n)
     D, T = scaled_sensitivity(machine, solution), solution.T
     kinds = KINDS[: len(measured)]

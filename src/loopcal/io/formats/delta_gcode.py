@@ -234,6 +234,9 @@ def _blank_asides(line: str) -> str:
 TOWERS, TRIMS = "XYZ", "ABC"
 
 
+Other = tuple[str, str, tuple[str, ...]]
+
+
 class DeltaFirmware(ABC):
     """Reader and writer of M665 and M666; the height of stop k is H + `sign` * adjustment_k.
 
@@ -249,7 +252,7 @@ class DeltaFirmware(ABC):
     is_one_in_a_line: ClassVar[bool] = False
     decimals: ClassVar[int]
     probe: ClassVar[Name | None] = None
-    others: ClassVar[tuple[str, str, tuple[str, ...]]]
+    others: ClassVar[Other]
 
     @abstractmethod
     def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
@@ -354,13 +357,17 @@ class DeltaFirmware(ABC):
 class Marlin(DeltaFirmware):
     """L is one length with trims; numbers of single precision resolve 0.00003 mm of 300 mm."""
 
-    name, program = "marlin", "Marlin"
-    remark = (
+    name: ClassVar[str] = "marlin"
+    program: ClassVar[str] = "Marlin"
+    remark: ClassVar[str] = (
         "; Delta geometry by loopcal, for Marlin without a bed probe: with one, add its Z offset "
         "(M851) to H\n"
     )
-    sign, is_one_in_a_line, decimals, probe = -1.0, True, 4, ("M851", "Z")
-    others = ("RepRapFirmware", "reprap", ("M307", "M584"))
+    sign: ClassVar[float] = -1.0
+    is_one_in_a_line: ClassVar[bool] = True
+    decimals: ClassVar[int] = 4
+    probe: ClassVar[Name | None] = ("M851", "Z")
+    others: ClassVar[Other] = ("RepRapFirmware", "reprap", ("M307", "M584"))
 
     def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
         """Yield a list of lengths."""
@@ -400,12 +407,14 @@ class Marlin(DeltaFirmware):
 class RepRapFirmware(DeltaFirmware):
     """L is a list of lengths; the firmware writes three decimals (M500)."""
 
-    name, program = "reprap", "RepRapFirmware"
-    remark = (
+    name: ClassVar[str] = "reprap"
+    program: ClassVar[str] = "RepRapFirmware"
+    remark: ClassVar[str] = (
         "; Delta geometry by loopcal; L with three lengths needs RepRapFirmware 2.03 or later\n"
     )
-    sign, decimals = 1.0, 3
-    others = ("Marlin", "marlin", ("M851",))
+    sign: ClassVar[float] = 1.0
+    decimals: ClassVar[int] = 3
+    others: ClassVar[Other] = ("Marlin", "marlin", ("M851",))
 
     def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
         """Yield the beginning of a report of Marlin."""
