@@ -173,9 +173,10 @@ def name_options(option: str, values: Iterable[str]) -> str:
 
 
 def with_hint(finding: Finding) -> str:
-    """Return the text of a finding, with the hint for the command that runs in parentheses."""
-    hint = hint_for(finding)
-    return str(finding) if hint is None else f"{finding} (Hint: {hint})"
+    """Return the text of a finding, with the hint for the command that runs."""
+    from loopcal.findings.wording import add_advice
+
+    return add_advice(finding, hint_for(finding))
 
 
 def list_hints(findings: Iterable[Finding]) -> list[str]:

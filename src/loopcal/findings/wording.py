@@ -35,6 +35,11 @@ SHOWN_NAMES = 10
 _PYTHON = string.Formatter()
 
 
+def add_advice(sentence: object, advice: str | None) -> str:
+    """Return a sentence, such as a finding, with advice in parentheses where there is any."""
+    return str(sentence) if advice is None else f"{sentence} (Hint: {advice})"
+
+
 class Quantity(NamedTuple):
     """A number with the symbol of its unit, such as `Quantity(0.19, "mm")`."""
 

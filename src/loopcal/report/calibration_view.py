@@ -14,7 +14,7 @@ from loopcal.apply.error_budget import Source
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.wording import count_decimals, list_names
+from loopcal.findings.wording import add_advice, count_decimals, list_names
 from loopcal.report.validation_view import (
     READING_NOISE,
     describe_improvements,
@@ -89,12 +89,12 @@ def build_height_map(heights: HeightErrors) -> Table | str:
     return build_table(
         "Height errors by point (predicted - measured); x, y in the base frame",
         rows,
-        (word_column("pose"), lambda row: row[0]),
+        ("pose", lambda row: row[0]),
         (Column("x", unit.symbol), lambda row: place(row[1][0])),
         (Column("y", unit.symbol), lambda row: place(row[1][1])),
         (Column("before", unit.symbol), lambda row: format_height(heights, row[2])),
         (Column("after", unit.symbol), lambda row: format_height(heights, row[3])),
-        (word_column("used"), lambda row: "held out" if row[4] else "in the fit"),
+        ("used", lambda row: "held out" if row[4] else "in the fit"),
     )
 
 
@@ -106,7 +106,7 @@ def format_height(heights: HeightErrors, error: float) -> str:
     return f"{round(float(error) / factor, decimals) + 0.0:.{decimals}f}"
 
 
-def view_heights(heights: HeightErrors | None, verbose: bool) -> list[Block]:
+def view_heights(heights: HeightErrors | None, verbose: bool = False) -> list[Block]:
     """Return the tables of a page: each of few points, and rms and largest error of many."""
     if heights is None:
         return []
@@ -128,12 +128,6 @@ def no_hint(_: Finding) -> None:
     """Return no advice."""
 
 
-def with_hint(finding: Finding, hint: Hint) -> str:
-    """Return the text of a finding, with its advice in parentheses where there is any."""
-    advice = hint(finding)
-    return str(finding) if advice is None else f"{finding} (Hint: {advice})"
-
-
 def view_calibration(
     report: CalibrationReport, verbose: bool = False, hint: Hint = no_hint
 ) -> list[Block]:
@@ -148,7 +142,7 @@ def view_calibration(
     task = ["", str(report.budget)] if report.states_expected_error else []
     blocks: list[Block] = [report.headline, *task, *_view_errors(report, verbose)]
     selected = report.findings if verbose else report.top_findings
-    blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in selected])]
+    blocks += ["", *format_list([(f.severity.value, add_advice(f, hint(f))) for f in selected])]
     if more := len(report.findings) - len(selected):
         blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")
     if fit.converged and not verbose and fit.regularization is not None:
@@ -220,7 +214,7 @@ def build_parameter_table(
     return build_table(
         caption,
         rows,
-        (word_column("name"), lambda row: row["name"]),
+        ("name", lambda row: row["name"]),
         (Column("nominal"), lambda row: format_exact_beside(row["nominal"], row["plus_minus"])),
         (
             Column("estimate"),
@@ -231,7 +225,7 @@ def build_parameter_table(
             Column(expanded),
             lambda row: format_uncertainty(row["plus_minus"]) if row.get("free", True) else "fixed",
         ),
-        (word_column("unit"), lambda row: row["unit"]),
+        ("unit", lambda row: row["unit"]),
     )
 
 
@@ -283,7 +277,7 @@ def build_prior_table(conflict: PriorConflict) -> Table:
         Field("statistic [1]", itemgetter(1), digits=3),
         Field("degrees or number", itemgetter(2), digits=3),
         Field("p", itemgetter(3), digits=2),
-        (word_column("parameters"), lambda row: list_names(row[4])),
+        ("parameters", lambda row: list_names(row[4])),
     )
 
 
@@ -390,8 +384,8 @@ def build_share_table(budget: Mapping[str, Any]) -> Table:
     return build_table(
         "Share of each source in the variance of the expected error",
         budget["sources"],
-        (word_column("source"), _name_source),
-        (word_column("type"), lambda line: line["evaluation"]),
+        ("source", _name_source),
+        ("type", lambda line: line["evaluation"]),
         *shares,
     )
 

@@ -20,7 +20,6 @@ from loopcal.report.calibration_view import (
     view_heights,
 )
 from loopcal.report.validation_view import (
-    find_error_units,
     view_bootstrap,
     view_comparison,
     view_posterior,
@@ -34,6 +33,11 @@ from loopcal.results.tables import Block
 register("page", CalibrationReport)(view_calibration)
 register("page", RegularizationCurves)(view_regularization)
 register("page", Repeatability)(view_repeatability)
+register("page", Validation)(view_validation)
+register("page", HeightErrors)(view_heights)
+register("page", Bootstrap)(view_bootstrap)
+register("page", PosteriorSample)(view_posterior)
+register("page", RunComparison)(view_comparison)
 
 
 @register("page", Identification)
@@ -42,37 +46,7 @@ def write_fit(fit: Identification) -> list[Block]:
     return [*view_fit(fit), *(f"{f.severity.value}: {f}" for f in fit.findings)]
 
 
-@register("page", Validation)
-def write_validation(validation: Validation) -> list[Block]:
-    """Return errors before and after calibration."""
-    return view_validation(validation, with_before=True, verbose=False)
-
-
-@register("page", HeightErrors)
-def write_heights(heights: HeightErrors) -> list[Block]:
-    """Return the table of the heights."""
-    return view_heights(heights, verbose=False)
-
-
 @register("page", Compensation)
 def write_compensation(result: Compensation) -> list[Block]:
     """Return the targets, and the findings of those that are not reached."""
     return [str(result), *view_compensation(result)]
-
-
-@register("page", Bootstrap)
-def write_bootstrap(result: Bootstrap) -> list[Block]:
-    """Return findings and intervals."""
-    return view_bootstrap(result, result.intervals())
-
-
-@register("page", PosteriorSample)
-def write_sample(sample: PosteriorSample) -> list[Block]:
-    """Return findings and intervals."""
-    return view_posterior(sample, sample.intervals())
-
-
-@register("page", RunComparison)
-def write_runs(comparison: RunComparison) -> list[Block]:
-    """Return the calibrations side by side."""
-    return view_comparison(comparison, find_error_units(comparison).__getitem__)

@@ -127,7 +127,7 @@ def _build_parameter_table(robot: Mechanism) -> Table:
     return build_table(
         "Parameters",
         zip(robot.parameters.entries, robot.values, strict=True),
-        (word_column("name"), lambda row: row[0].name),
+        ("name", lambda row: row[0].name),
         (Column("nominal"), lambda row: format_in(units[row[0].dimension], row[0].nominal, DIGITS)),
         (Column("value"), lambda row: format_in(units[row[0].dimension], row[1], DIGITS)),
         (
@@ -138,7 +138,7 @@ def _build_parameter_table(robot: Mechanism) -> Table:
                 3,
             ),
         ),
-        (word_column("unit"), lambda row: str(units[row[0].dimension])),
+        ("unit", lambda row: str(units[row[0].dimension])),
         (word_column(""), lambda row: "free" if row[0].free else "fixed"),
     )
 
@@ -231,14 +231,14 @@ def _build_ending_table(robot: Mechanism, units: Units) -> Table:
     return build_table(
         "Limb ends",
         robot.assembly.limbs,
-        (word_column("limb"), lambda limb: limb.name),
-        (word_column("ending"), lambda limb: limb.ending),
+        ("limb", lambda limb: limb.name),
+        ("ending", lambda limb: limb.ending),
         (
             Column("rod length"),
             lambda limb: _format(limb.length, length) if limb.ending == "distance" else ABSENT,
         ),
-        (word_column("unit"), lambda limb: length.symbol if limb.ending == "distance" else ""),
-        (word_column("driven by"), lambda limb: limb.actuator or ""),
+        ("unit", lambda limb: length.symbol if limb.ending == "distance" else ""),
+        ("driven by", lambda limb: limb.actuator or ""),
     )
 
 

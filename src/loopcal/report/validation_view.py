@@ -29,6 +29,7 @@ from loopcal.results.tables import (
     format_with_uncertainty,
     make_table,
     units_of,
+    word_column,
 )
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
@@ -154,9 +155,17 @@ def _build_error_table(
     caption: str, subject: str, rows: list[list[str]], with_before: bool
 ) -> Table:
     """Return a table of errors, without those before where there is no such geometry."""
-    titles = [subject, "metric", ">count", ">before", ">after", ">noise floor", "unit"]
+    titles = [
+        subject,
+        "metric",
+        Column("count"),
+        Column("before"),
+        Column("after"),
+        Column("noise floor"),
+        "unit",
+    ]
     if not with_before:
-        titles[3:5] = [">error"]
+        titles[3:5] = [Column("error")]
         rows = [row[:3] + row[4:] for row in rows]
     return make_table(caption, titles, rows)
 
@@ -177,7 +186,7 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
             statistics, unit = error.statistics(quantity), validation.units[quantity]
             cells = (format_in(unit, statistics[key], 3) for key in METRICS)
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
-    titles = ("error", "of", ">count", *(f">{m.words}" for m in METRICS.values()), "unit")
+    titles = ("error", "of", Column("count"), *(Column(m.words) for m in METRICS.values()), "unit")
     table = make_table(f"Error statistics (rows x targets), {validation.frame}", titles, rows)
     if with_before and is_correctable:
         return [table, "The actuators can correct all of the measured error."]
@@ -252,8 +261,17 @@ def view_repeatability(result: Repeatability, robot: Mechanism | None = None) ->
             for name, *estimates in named:
                 numbers = (format_in(unit, x, 3) for estimate in estimates for x in estimate)
                 rows.append((*first, name, *numbers, unit.symbol))
-        titles = ("pose", "target", "approach", ">visits", "of", ">AP", ">from", ">to")
-        titles = (*titles, ">RP", ">from", ">to", "unit")
+        titles = (
+            "pose",
+            "target",
+            "approach",
+            Column("visits"),
+            "of",
+            Column("AP"),
+            Column("from"),
+            Column("to"),
+        )
+        titles = (*titles, Column("RP"), Column("from"), Column("to"), "unit")
         kept = [i for i in range(len(titles)) if any(row[i] for row in rows)]
         caption = f"{quantity.capitalize()} by ISO 9283 with intervals of 95 %, {result.frame}"
         cells = ([row[i] for i in kept] for row in rows)
@@ -304,7 +322,11 @@ def _describe_run(run: RunSummary) -> str:
 def build_runs(comparison: RunComparison) -> Table:
     """Return robot, verdict and method of each run."""
     rows = [(run.name, _describe_run(run)) for run in comparison.runs]
-    return make_table("The compared runs", ("~run", "~robot, verdict, method"), rows)
+    return make_table(
+        "The compared runs",
+        (word_column("run", wraps=True), word_column("robot, verdict, method", wraps=True)),
+        rows,
+    )
 
 
 def build_estimates(comparison: RunComparison) -> Table:
@@ -322,7 +344,7 @@ def build_estimates(comparison: RunComparison) -> Table:
                 value, half = value / unit.factor_to_si, half / unit.factor_to_si
                 cells += [format_with_uncertainty(value, half), format_uncertainty(half)]
         rows.append((*cells, unit.symbol))
-    of_runs = (title for run in comparison.runs for title in (f">{run.name}", ">+/-"))
+    of_runs = (title for run in comparison.runs for title in (Column(run.name), Column("+/-")))
     caption = "Estimates and half-widths of their 95 % intervals"
     return make_table(caption, ("parameter", *of_runs, "unit"), rows)
 
@@ -341,7 +363,9 @@ def build_shifts(comparison: RunComparison) -> Table:
             cells.append(format_with_uncertainty(shift / factor, sd / factor))
             cells.append(f"{shift / sd:.1f}{'*' if is_significant else ' '}")
         rows.append((*cells, unit.symbol))
-    of_pairs = (title for pair in comparison.pairs for title in (f">{pair.second}", ">in sd"))
+    of_pairs = (
+        title for pair in comparison.pairs for title in (Column(pair.second), Column("in sd"))
+    )
     caption = SHIFTS.format(first=comparison.runs[0].name)
     return make_table(caption, ("parameter", *of_pairs, "unit"), rows)
 
@@ -363,8 +387,8 @@ def build_errors(comparison: RunComparison, show_unit: Callable[[str], Unit]) ->
         if has_common
         else "Errors after calibration at the held-out poses of each run, which are different poses"
     )
-    metrics = (f">{METRICS[key].words}" for key in SUMMARY)
-    return make_table(caption, ("run", "quantity", ">count", *metrics, "unit"), rows)
+    metrics = (Column(METRICS[key].words) for key in SUMMARY)
+    return make_table(caption, ("run", "quantity", Column("count"), *metrics, "unit"), rows)
 
 
 def tabulate_comparison(comparison: RunComparison) -> Table:
@@ -442,7 +466,7 @@ def view_regularization(curves: RegularizationCurves) -> list[Block]:
             (method, c.rule, f"{number} = {c.value:.4g}", *_format_score(*curve.score_at(c.value)))
             for c in curve.chosen
         ]
-    titles = ("method", "chosen by", "value", ">held-out error", ">standard error")
+    titles = ("method", "chosen by", "value", Column("held-out error"), Column("standard error"))
     chosen = make_table("Chosen values", titles, rows)
     return [*page, chosen, _tabulate_curve(curves.ridge), _tabulate_curve(curves.truncation)]
 
@@ -454,7 +478,9 @@ def _tabulate_curve(curve: RegularizationCurve) -> Table:
     score, error = curve.score.tolist(), curve.standard_error.tolist()
     places = np.unique(np.linspace(0, count - 1, min(ROWS, count)).round().astype(int))
     rows = ((f"{curve.values[i]:.4g}", *_format_score(score[i], error[i])) for i in places)
-    return make_table(method, (f">{number}", ">held-out error", ">standard error"), rows)
+    return make_table(
+        method, (Column(number), Column("held-out error"), Column("standard error")), rows
+    )
 
 
 def tabulate_points(curves: RegularizationCurves) -> Table:
@@ -464,7 +490,9 @@ def tabulate_points(curves: RegularizationCurves) -> Table:
         for curve in (curves.ridge, curves.truncation)
         for point in zip(curve.values, curve.score, curve.standard_error, strict=True)
     )
-    return make_table("", ("parameter", ">value", ">score", ">standard error"), rows)
+    return make_table(
+        "", ("parameter", Column("value"), Column("score"), Column("standard error")), rows
+    )
 
 
 def _format_score(score: float, error: float) -> tuple[str, str]:
@@ -517,7 +545,14 @@ def _build_interval_table(fit: Identification, intervals: Intervals) -> Table:
         shown = format_number(change, 2) if np.isfinite(lower) else ABSENT
         mark = "yes" if intervals.is_off[i] else ""
         rows.append((name, *cells, format_uncertainty(own), shown, mark, symbols[i]))
-    titles = ("name", ">estimate", ">from", ">to", ">stated +/-", Column("nonlinear", "%"))
+    titles = (
+        "name",
+        Column("estimate"),
+        Column("from"),
+        Column("to"),
+        Column("stated +/-"),
+        Column("nonlinear", "%"),
+    )
     caption = f"{100 * intervals.level:.4g} % intervals by {intervals.source}"
     return make_table(caption, (*titles, "off", "unit"), rows)
 
@@ -537,7 +572,13 @@ def view_region(
         )
         cells = (format_uncertainty(single), format_uncertainty(half))
         rows.append((name, format_with_uncertainty(value, half), *cells, unit.symbol))
-    titles = ("name", ">estimate", ">+/- one at a time", ">+/- all at once", "unit")
+    titles = (
+        "name",
+        Column("estimate"),
+        Column("+/- one at a time"),
+        Column("+/- all at once"),
+        "unit",
+    )
     blocks: list[Block] = [
         f"{robot.name}: {level} intervals that hold for {together}",
         f"Rule: {intervals.rule}.",

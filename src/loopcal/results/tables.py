@@ -59,17 +59,6 @@ def word_column(title: str, wraps: bool = False) -> Column:
     return Column(title, align="left", wraps=wraps)
 
 
-def read_column(title: str | Column) -> Column:
-    """Return the column of a title: of numbers after ">", of words that wrap after "~", else of
-    words.
-    """
-    if isinstance(title, Column):
-        return title
-    if title.startswith(">"):
-        return Column(title[1:])
-    return word_column(title.removeprefix("~"), wraps=title.startswith("~"))
-
-
 @dataclass(frozen=True)
 class Table:
     """Columns, rows of formatted cells, and a caption."""
@@ -193,8 +182,9 @@ class Table:
 def make_table(
     caption: str, columns: Iterable[str | Column], rows: Iterable[Iterable[str]]
 ) -> Table:
-    """Return a table of formatted cells; see `read_column` for titles."""
-    return Table(caption, tuple(map(read_column, columns)), tuple(map(tuple, rows)))
+    """Return a table of formatted cells; a title alone is a column of words."""
+    shown = (word_column(c) if isinstance(c, str) else c for c in columns)
+    return Table(caption, tuple(shown), tuple(map(tuple, rows)))
 
 
 def build_table(
@@ -204,7 +194,7 @@ def build_table(
     units: Mapping[Dimension, Unit] = MappingProxyType({}),
 ) -> Table:
     """Return a table from objects: fields of theirs, or columns with functions that give the cell
-    of a row.
+    of a row. A title alone is a column of words.
 
     units : in which fields with dimensions are shown.
     """
@@ -216,9 +206,9 @@ def build_table(
             shown.append(heading)
             cells.append([_format_field(column, row, units) for row in rows])
         else:
-            shown.append(read_column(column[0]))
+            shown.append(column[0])
             cells.append([column[1](row) for row in rows])
-    return Table(caption, tuple(shown), tuple(zip(*cells, strict=True)))
+    return make_table(caption, shown, zip(*cells, strict=True))
 
 
 def _format_field(field: Field, row: Any, units: Mapping[Dimension, Unit]) -> str:
