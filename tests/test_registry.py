@@ -78,21 +78,26 @@ def test_an_entry_replaces_one_of_a_user_but_none_of_loopcal() -> None:
         registry.register(object())
 
 
-def test_entry_points_of_other_packages_are_found_and_faulty_ones_refused(monkeypatch) -> None:
-    points = [
-        EntryPoint("e", "math:e", "things"),
-        EntryPoint("gone", "no_such_package:x", "things"),
-    ]
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points)
-    _list_entry_points.cache_clear()
-    registry: Registry[Any] = Registry("thing", "things", {"pi": "math:pi"})
-    try:
-        assert list(registry) == ["pi", "e", "gone"]
-        assert 2.7 < registry["e"] < 2.8
-        with pytest.raises(DataError, match="the thing 'gone' of no_such_package:x cannot be"):
-            registry["gone"]
-    finally:
+@pytest.fixture
+def offer(monkeypatch):
+    """A function that makes entry points those of all installed packages."""
+
+    def replace(*points: EntryPoint) -> None:
+        found = lambda group: [point for point in points if point.group == group]  # noqa: E731
+        monkeypatch.setattr("importlib.metadata.entry_points", found)
         _list_entry_points.cache_clear()
+
+    yield replace
+    _list_entry_points.cache_clear()
+
+
+def test_entry_points_of_other_packages_are_found_and_faulty_ones_refused(offer) -> None:
+    offer(EntryPoint("e", "math:e", "things"), EntryPoint("gone", "no_such_package:x", "things"))
+    registry: Registry[Any] = Registry("thing", "things", {"pi": "math:pi"})
+    assert list(registry) == ["pi", "e", "gone"]
+    assert 2.7 < registry["e"] < 2.8
+    with pytest.raises(DataError, match="the thing 'gone' of no_such_package:x cannot be"):
+        registry["gone"]
 
 
 @dataclass(frozen=True)
@@ -183,33 +188,25 @@ class KeepHalf:
         return decomposition.rank // 2
 
 
-def test_a_method_and_a_rule_of_another_package_are_used_by_their_names(monkeypatch) -> None:
-    points = {
-        "loopcal.methods": [EntryPoint("doubled", f"{__name__}:Doubled", "loopcal.methods")],
-        "loopcal.rules": [EntryPoint("half", f"{__name__}:KeepHalf", "loopcal.rules")],
-    }
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points.get(group, []))
-    _list_entry_points.cache_clear()
-    try:
-        robot = lc.load_robot("linear-delta")
-        poses = lc.sample_workspace(robot, 20, seed=1).coordinates
-        sensor = lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-5)))
-        data = lc.simulate(robot, poses, lc.Instrument((sensor,)), seed=1)
-        for plain, method in (
-            ({"method": "doubled"}, lc.MAP(2.0)),
-            (
-                {"method": {"name": "truncated-svd", "k": {"name": "half"}}},
-                lc.TruncatedSVD(KeepHalf()),
-            ),
-        ):
-            options = lc.FitOptions.from_dict(plain)
-            assert options.to_dict()["method"] == plain["method"]
-            named, built = (
-                lc.identify(robot, data, options=o) for o in (options, lc.FitOptions(method))
-            )
-            assert named.estimate == pytest.approx(built.estimate, abs=0.0)
-    finally:
-        _list_entry_points.cache_clear()
+def test_a_method_and_a_rule_of_another_package_are_used_by_their_names(offer) -> None:
+    offer(
+        EntryPoint("doubled", f"{__name__}:Doubled", "loopcal.methods"),
+        EntryPoint("half", f"{__name__}:KeepHalf", "loopcal.rules"),
+    )
+    robot = lc.load_robot("linear-delta")
+    poses = lc.sample_workspace(robot, 20, seed=1).coordinates
+    sensor = lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-5)))
+    data = lc.simulate(robot, poses, lc.Instrument((sensor,)), seed=1)
+    for plain, method in (
+        ({"method": "doubled"}, lc.MAP(2.0)),
+        ({"method": {"name": "truncated-svd", "k": {"name": "half"}}}, lc.TruncatedSVD(KeepHalf())),
+    ):
+        options = lc.FitOptions.from_dict(plain)
+        assert options.to_dict()["method"] == plain["method"]
+        named, built = (
+            lc.identify(robot, data, options=o) for o in (options, lc.FitOptions(method))
+        )
+        assert named.estimate == pytest.approx(built.estimate, abs=0.0)
 
 
 def test_every_place_that_is_named_in_a_string_exists(root) -> None:

@@ -102,7 +102,11 @@ def _add_patterns(
         return fit
     tool = ToolUncertainty(fit, locate_measured_poses(fit, data))
     for effect in effects:
-        root = rows.root @ (rows.gain.T @ effect.effect.columns) @ take_root(effect.moments)
+        root = (
+            rows.root
+            @ (rows.gain.T @ effect.effect.columns)
+            @ take_root(effect.moments, np.diag(effect.moments))
+        )
         finding = _report_effect(effect, tool.measure_growth(root))
         fit = add_covariance(fit, root, np.inf, finding)
     if patterns.is_correlated or is_small:
@@ -125,7 +129,10 @@ def _add_correlation(
         scaled = part.root / fit.tolerance[:, None]
         by_noise = np.linalg.lstsq(rows.root / fit.tolerance[:, None], scaled, rcond=None)[0]
         independent += by_noise @ by_noise.T
-    root = rows.root @ take_larger(errors.covariance, independent)
+    # what correlated errors cause beyond independent ones, where that is more
+    covariance = errors.covariance
+    more = take_root(covariance - independent, np.diag(covariance + independent))
+    root = rows.root @ more
     ratio = tool.measure_growth(root)
     if not patterns.is_correlated and ratio < NOTICEABLE:
         return fit
@@ -161,21 +168,10 @@ class ToolUncertainty:
         return float(np.sqrt(1.0 + max(shares, default=0.0)))
 
 
-def take_root(moments: FloatArray) -> FloatArray:
-    """Return a square root (c, r) of a matrix (c, c), in the directions, relative to their size, in
-    which it is positive.
+def take_root(matrix: FloatArray, squares: FloatArray) -> FloatArray:
+    """Return a root (c, r) of a matrix (c, c), in the directions, relative to the roots of
+    `squares` (c,), in which it is positive.
     """
-    return _take_root(moments, np.diag(moments))
-
-
-def take_larger(covariance: FloatArray, stated: FloatArray) -> FloatArray:
-    """Return a root (k, c) of what a covariance (k, k) has more than a stated one, in the
-    directions, relative to the sum of both, in which it is larger.
-    """
-    return _take_root(covariance - stated, np.diag(covariance + stated))
-
-
-def _take_root(matrix: FloatArray, squares: FloatArray) -> FloatArray:
     scale = np.sqrt(squares)
     scale = np.where(scale > 0.0, scale, 1.0)
     s, v = np.linalg.eigh(matrix / scale[:, None] / scale)

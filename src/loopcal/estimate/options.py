@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
@@ -161,10 +161,7 @@ class FitOptions:
         """
         beside = {key: plain[key] for key in SETTINGS if plain.get(key) is not None}
         given = {key: value for key, value in plain.items() if key not in SETTINGS}
-        known = [entry.name for entry in fields(cls)]
-        for key in given:
-            if key not in known:
-                raise DataError(f"{key!r} is not an option of a fit{suggest_names(key, known)}")
+        _refuse_unknown(given, cls, "not an option of a fit")
         for key in ("prior", "nuisance"):
             if given.get(key) is not None:
                 _refuse_object(given[key])
@@ -173,10 +170,7 @@ class FitOptions:
             method = {"name": method} if isinstance(method, str) else dict(method)
             method |= {SETTINGS[key][1]: value for key, value in beside.items()}
         control = given.pop("control", None) or {}
-        steps = [entry.name for entry in fields(StepControl)]
-        for key in control:
-            if key not in steps:
-                raise DataError(f"{key!r} is no limit of the steps{suggest_names(key, steps)}")
+        _refuse_unknown(control, StepControl, "no limit of the steps")
         given = {key: _from_plain(value) for key, value in given.items()}
         return cls(
             method=_make_entry(METHODS, method),
@@ -203,6 +197,14 @@ NO_LOSS = "none"
 
 OBJECT = "object"
 """Key of the text of an object that has no name."""
+
+
+def _refuse_unknown(given: Iterable[str], of_class: type[Any], what: str) -> None:
+    """Refuse keys that are no fields of a class."""
+    known = [entry.name for entry in fields(of_class)]
+    for key in given:
+        if key not in known:
+            raise DataError(f"{key!r} is {what}{suggest_names(key, known)}")
 
 
 def _to_plain(value: Any) -> Any:

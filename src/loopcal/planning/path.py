@@ -24,7 +24,7 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import POSITION, TILT, read_coordinates
+from loopcal.mechanism.platform_coordinates import TILT, list_dimensions, read_coordinates
 from loopcal.mechanism.solutions import inverse
 from loopcal.planning.constraints import (
     ConstraintCheck,
@@ -54,6 +54,11 @@ def locate_home(robot: Mechanism) -> FloatArray:
     return read_coordinates(robot.home, robot.controlled)
 
 
+def find_angles(names: tuple[str, ...]) -> BoolArray:
+    """Return which coordinates (c,) are angles."""
+    return np.array([d is Dimension.ANGLE for d in list_dimensions(names)])
+
+
 def interpolate_path(
     robot: Mechanism, start: FloatArray, end: FloatArray, share: float | FloatArray
 ) -> FloatArray:
@@ -61,7 +66,7 @@ def interpolate_path(
     end, (n, c) each.
     """
     names, s = robot.controlled, np.asarray(share, dtype=float)
-    angular = np.array([name not in POSITION for name in names])
+    angular = find_angles(names)
     step = end - start
     step = np.where(angular, geometry.wrap_angle(step), step)
     point = start + (s[..., None] if s.ndim else s) * step
@@ -77,7 +82,7 @@ def measure_distance(robot: Mechanism, start: FloatArray, end: FloatArray) -> Fl
     the robot's size.
     """
     names = robot.controlled
-    angular = np.array([name not in POSITION for name in names])
+    angular = find_angles(names)
     step = np.where(angular, robot.size * geometry.wrap_angle(end - start), end - start)
     if "phi" in names:
         places = [names.index(name) for name in TILT[:2]]
