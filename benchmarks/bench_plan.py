@@ -14,7 +14,7 @@ from loopcal.estimate.information import observe_poses
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import WorkspaceSample, sample_workspace
-from loopcal.planning.design_space import D, DesignProblem, PriorInformation
+from loopcal.planning.design_space import Criterion, DesignProblem, PriorInformation
 from loopcal.planning.exchange import choose_design, coordinate_exchange
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ def bench_coordinate_exchange() -> Metric:
 
     return measure_ratio(
         "plan.coordinate_exchange",
-        lambda: coordinate_exchange(lambda _, x: _rows(x), begin, levels, D(), start),
+        lambda: coordinate_exchange(lambda _, x: _rows(x), begin, levels, Criterion("D"), start),
         factorize,
         repeats=3,
         tolerance=0.5,
@@ -75,7 +75,9 @@ def bench_certified_design() -> list[Metric]:
     stacked = rows.reshape(-1, rows.shape[-1])
     return measure_time(
         "plan.certified_design",
-        lambda: choose_design(DesignProblem(rows, D(), PriorInformation.none(len(free))), 20),
+        lambda: choose_design(
+            DesignProblem(rows, Criterion("D"), PriorInformation.none(len(free))), 20
+        ),
         lambda: np.linalg.svd(stacked, full_matrices=False),
         limit=10.0,
         reference_name="svd",

@@ -16,8 +16,8 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.planning.design_space import Criterion, D, DesignProblem, I, PriorInformation
-from loopcal.planning.exchange import choose_design, fedorov_exchange
+from loopcal.planning.design_space import Criterion, DesignProblem, PriorInformation
+from loopcal.planning.exchange import choose_design, draw_groups, exchange_from_start
 
 CANDIDATES, POSES, STARTS, DRAWS, PREDICTED = 1000, 20, 20, 200, 200
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
@@ -26,6 +26,16 @@ SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
 
 DESIGNS = (*((case, "D") for case in CASES[:4]), *((case, "I") for case in CASES[:3]))
 """Hexapod and 3-PRS by full poses and by positions, with the criterion of the design."""
+
+
+def exchange_random_starts(problem: DesignProblem, n: int, starts: int) -> list[float]:
+    """Return the values of designs of n groups that are exchanged from random starts."""
+    candidates, values = problem.scale_candidates(n), []
+    for stream in np.random.default_rng(0).spawn(starts):
+        begin = draw_groups(candidates, stream, n, None)
+        score = exchange_from_start(candidates, begin, stream)[1][-1]
+        values.append(candidates.scoring.value(score))
+    return values
 
 
 def evaluate_design(case: Case, criterion_name: str) -> list[object]:
@@ -37,7 +47,9 @@ def evaluate_design(case: Case, criterion_name: str) -> list[object]:
     ]
     prior, p = PriorInformation.none(len(free)), len(free)
     criterion: Criterion = (
-        D() if criterion_name == "D" else I(twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
+        Criterion("D")
+        if criterion_name == "D"
+        else Criterion("I", twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
     )
     problem = DesignProblem(rows, criterion, prior)
     certified = choose_design(problem, POSES)
@@ -47,10 +59,7 @@ def evaluate_design(case: Case, criterion_name: str) -> list[object]:
         relaxed.efficiency(problem.evaluate(chosen))
         for chosen in (random.choice(CANDIDATES, POSES, replace=False) for _ in range(DRAWS))
     ]
-    plain = [
-        relaxed.efficiency(value)
-        for value in fedorov_exchange(problem, POSES, starts=STARTS).values
-    ]
+    plain = [relaxed.efficiency(value) for value in exchange_random_starts(problem, POSES, STARTS)]
     return [
         case.robot,
         case.measured,

@@ -113,6 +113,11 @@ class Study:
         )
 
 
+def set_options(problem: PlanningProblem, **changes: Any) -> PlanningProblem:
+    """Return a problem with other options that do not concern candidates and data."""
+    return replace(problem, options=replace(problem.options, **changes))
+
+
 def prepare_study(
     case: Case,
     seeds: int = SEEDS,
@@ -160,7 +165,7 @@ def instrument(case: Case, noise_factor: float = 1.0) -> Instrument:
 
 def measure_planned(study: Study, n: int) -> Errors:
     """Return the errors of all machines, measured at the same n planned poses."""
-    plan = plan_poses(study.problem.with_options(n_poses=n))
+    plan = plan_poses(set_options(study.problem, n_poses=n))
     seeds, machines, p = study.truth.shape
     tool = study.tool.reshape(-1, *study.tool.shape[2:])
     position, orientation = calibrate_machines(
@@ -297,7 +302,7 @@ def compare_noise(case: Case) -> list:
     row: list[object] = [case.robot, case.measured, GLANCE]
     for noise_factor in NOISE_FACTORS:
         study = prepare_study(case, SEEDS, 1, RANDOM[-1], CANDIDATES, noise_factor)
-        plan = plan_poses(study.problem.with_options(n_poses=GLANCE)).errors.after
+        plan = plan_poses(set_options(study.problem, n_poses=GLANCE)).errors.after
         curve = [float(np.median(predict_random(study, n))) for n in RANDOM]
         row.append(
             find_equal_number(

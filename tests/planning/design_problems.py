@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.planning.design_space import A, Criterion, D, DesignProblem, I, PriorInformation
+from loopcal.planning.design_space import Criterion, DesignProblem, PriorInformation
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -15,7 +15,7 @@ CASES = {
         nuisance,
         prior,
     )
-    for criterion in (D(), A(), I(L, 3))
+    for criterion in (Criterion("D"), Criterion("A"), Criterion("I", L, 3))
     for nuisance in (0, 2)
     for prior in (False, True)
 }
@@ -37,7 +37,7 @@ def make_problem(
     """Return a problem with or without the tolerances of the machine as the prior; by default D."""
     make = PriorInformation.from_tolerances if prior else PriorInformation.none
     start = make(rows.shape[2] - nuisance, nuisance)
-    return DesignProblem(rows, criterion or D(), start, repeats)
+    return DesignProblem(rows, criterion or Criterion("D"), start, repeats)
 
 
 def polynomial_rows(x: Array, degree: int) -> Array:

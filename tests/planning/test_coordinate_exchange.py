@@ -11,7 +11,12 @@ from loopcal.estimate.information import observe_poses
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.planning.design_space import A, D, PriorInformation, evaluate_criterion, factor_design
+from loopcal.planning.design_space import (
+    Criterion,
+    PriorInformation,
+    evaluate_criterion,
+    factor_design,
+)
 from loopcal.planning.exchange import coordinate_exchange
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import Array, Places, polynomial_rows
@@ -28,7 +33,10 @@ def parabola(_: Places, x: Array) -> Array:
 
 @pytest.mark.parametrize(
     ("criterion", "best"),
-    [(D(), [-1, -1, -1, -1, 0, 0, 0, 0, 1, 1, 1, 1]), (A(), [-1] * 3 + [0] * 6 + [1] * 3)],
+    [
+        (Criterion("D"), [-1, -1, -1, -1, 0, 0, 0, 0, 1, 1, 1, 1]),
+        (Criterion("A"), [-1] * 3 + [0] * 6 + [1] * 3),
+    ],
 )
 @pytest.mark.parametrize("seed", range(4))
 def test_every_start_converges_to_the_known_design_of_a_parabola(criterion, best, seed):
@@ -39,7 +47,7 @@ def test_every_start_converges_to_the_known_design_of_a_parabola(criterion, best
 
 
 def test_points_that_start_at_one_place_are_separated():
-    found = coordinate_exchange(parabola, np.zeros((6, 1)), LEVELS, D(), NONE)
+    found = coordinate_exchange(parabola, np.zeros((6, 1)), LEVELS, Criterion("D"), NONE)
     assert found.history[0] == -np.inf
     assert_allclose(np.sort(found.design[:, 0]), [-1, -1, 0, 0, 1, 1], atol=1e-12)
 
@@ -50,7 +58,9 @@ def test_forbidden_levels_are_never_chosen():
         rows[(x[:, 0] < -0.9) & (which % 2 == 0)] = np.nan
         return rows
 
-    found = coordinate_exchange(forbid_left_end, np.full((6, 1), 0.25), LEVELS, D(), NONE)
+    found = coordinate_exchange(
+        forbid_left_end, np.full((6, 1), 0.25), LEVELS, Criterion("D"), NONE
+    )
     assert (found.design[::2, 0] > -0.9).all()
     assert (found.design[1::2, 0] < -0.9).any()
 
@@ -62,7 +72,9 @@ def test_rows_of_all_levels_of_a_coordinate_are_evaluated_in_one_call():
         asked.append(len(which))
         return parabola(which, x)
 
-    found = coordinate_exchange(count_rows, np.linspace(-1, 1, 7)[:, None], LEVELS, D(), NONE)
+    found = coordinate_exchange(
+        count_rows, np.linspace(-1, 1, 7)[:, None], LEVELS, Criterion("D"), NONE
+    )
     sweeps = len(found.history) - 1
     assert asked[0] == 7
     assert asked[2:] == [7 * 5] * sweeps
@@ -71,15 +83,17 @@ def test_rows_of_all_levels_of_a_coordinate_are_evaluated_in_one_call():
 
 def test_coordinate_without_levels_is_not_changed():
     begin = np.random.default_rng(0).uniform(-1, 1, (6, 2))
-    found = coordinate_exchange(parabola, begin, [*LEVELS, np.zeros(0)], D(), NONE)
+    found = coordinate_exchange(parabola, begin, [*LEVELS, np.zeros(0)], Criterion("D"), NONE)
     assert_array_equal(found.design[:, 1], begin[:, 1])
 
 
 def test_forbidden_first_design_and_too_few_points_are_refused():
     with pytest.raises(EstimationError, match="group 1 of the first design is not allowed"):
-        coordinate_exchange(parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, D(), NONE)
+        coordinate_exchange(
+            parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, Criterion("D"), NONE
+        )
     with expect_refusal("plan.design-too-small", needed=3):
-        coordinate_exchange(parabola, np.zeros((2, 1)), LEVELS, D(), NONE)
+        coordinate_exchange(parabola, np.zeros((2, 1)), LEVELS, Criterion("D"), NONE)
 
 
 def test_design_that_stays_singular_is_refused():
@@ -89,7 +103,7 @@ def test_design_that_stays_singular_is_refused():
         return rows
 
     with expect_refusal("plan.design-singular", unknowns=3):
-        coordinate_exchange(fix_all_but_the_first, np.zeros((4, 1)), LEVELS, D(), NONE)
+        coordinate_exchange(fix_all_but_the_first, np.zeros((4, 1)), LEVELS, Criterion("D"), NONE)
 
 
 def test_exchange_of_hexapod_poses_halves_the_parameter_uncertainty():
@@ -109,11 +123,11 @@ def test_exchange_of_hexapod_poses_halves_the_parameter_uncertainty():
         m + h * np.array([-1.0, -0.5, 0.0, 0.5, 1.0]) for m, h in zip(middle, half, strict=True)
     ]
     found = coordinate_exchange(
-        linearize, drawn[:20], levels, D(), PriorInformation.none(len(free))
+        linearize, drawn[:20], levels, Criterion("D"), PriorInformation.none(len(free))
     )
     space, none = found.problem.space, PriorInformation.none(len(free))
     before, after = (
-        evaluate_criterion(A(), factor_design(rows, none, space), space.machine)
+        evaluate_criterion(Criterion("A"), factor_design(rows, none, space), space.machine)
         for rows in (linearize(np.arange(20), drawn[:20]), found.rows)
     )
     assert (np.diff(found.history) >= 0.0).all()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal.planning.design_space import A, D, E, I, PriorInformation, factor_design
+from loopcal.planning.design_space import Criterion, PriorInformation, factor_design
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import L, compute_covariance, draw_rows, make_problem
 
@@ -20,10 +20,10 @@ def test_criteria_equal_those_of_the_covariance_of_machine_parameters(nuisance, 
     problem = make_problem(draw_rows(nuisance=nuisance), None, nuisance, prior)
     C = compute_covariance(problem.rows[:5], problem.prior.rows, nuisance)
     expected = {
-        D(): -np.linalg.slogdet(C)[1],
-        A(): np.trace(C),
-        E(): np.linalg.eigvalsh(C)[-1],
-        I(L, 3): np.trace(L @ C @ L.T) / 3,
+        Criterion("D"): -np.linalg.slogdet(C)[1],
+        Criterion("A"): np.trace(C),
+        Criterion("E"): np.linalg.eigvalsh(C)[-1],
+        Criterion("I", L, 3): np.trace(L @ C @ L.T) / 3,
     }
     for criterion, value in expected.items():
         found = replace(problem, criterion=criterion).evaluate(np.arange(5))
@@ -61,14 +61,20 @@ def test_earlier_rows_count_the_same_as_rows_of_the_design():
     assert_allclose(found, known, rtol=CLOSE, atol=CLOSE)
 
 
-@pytest.mark.parametrize("criterion", [D(), A(), I(np.eye(4)), E()], ids=lambda c: c.name)
+@pytest.mark.parametrize(
+    "criterion",
+    [Criterion("D"), Criterion("A"), Criterion("I", np.eye(4)), Criterion("E")],
+    ids=lambda c: c.name,
+)
 def test_design_has_half_the_efficiency_of_its_twofold_repetition(criterion):
     problem = make_problem(draw_rows(), criterion)
     once, twice = (problem.evaluate(np.repeat(np.arange(12), k)) for k in (1, 2))
     assert problem.compare(once, twice) == pytest.approx(0.5, rel=CLOSE)
 
 
-@pytest.mark.parametrize(("criterion", "worst"), [(D(), -np.inf), (A(), np.inf)])
+@pytest.mark.parametrize(
+    ("criterion", "worst"), [(Criterion("D"), -np.inf), (Criterion("A"), np.inf)]
+)
 def test_singular_design_has_the_worst_criterion_value(criterion, worst):
     assert make_problem(draw_rows(), criterion).evaluate(np.array([0])) == worst
 

@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import loopcal as lc
+from evidence.planned import set_options
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
@@ -55,7 +56,7 @@ def tracker_problem():
 @pytest.fixture(scope="module")
 def planned(tracker_problem):
     """A plan of twelve poses."""
-    return plan_poses(tracker_problem.with_options(n_poses=12, hold_out=5))
+    return plan_poses(set_options(tracker_problem, n_poses=12, hold_out=5))
 
 
 @pytest.mark.parametrize(
@@ -203,7 +204,7 @@ def test_sample_size_reaches_the_goal_and_has_a_lower_bound():
     assert plan.errors.after.position <= goal
     assert plan.n_poses < 1.5 * needed.at_least
     with expect_refusal("plan.goal-unreachable", target="position", counted="poses") as data:
-        plan_poses(made.with_options(goal=0.05 * UM))
+        plan_poses(set_options(made, goal=0.05 * UM))
     assert data["goal"].value < data["bound"].value <= data["best"].value
 
 
@@ -219,7 +220,7 @@ def test_impossible_numbers_of_poses_are_refused_with_the_reason(
     tracker_problem, options, code, data
 ):
     with expect_refusal(code, **data):
-        plan_poses(tracker_problem.with_options(**options))
+        plan_poses(set_options(tracker_problem, **options))
 
 
 @pytest.mark.parametrize(
@@ -232,7 +233,7 @@ def test_impossible_numbers_of_poses_are_refused_with_the_reason(
 )
 def test_invalid_plan_options_are_refused(tracker_problem, options, message):
     with pytest.raises(EstimationError, match=message):
-        plan_poses(tracker_problem.with_options(**options))
+        plan_poses(set_options(tracker_problem, **options))
 
 
 def test_number_of_poses_and_goal_exclude_each_other():
@@ -248,7 +249,7 @@ def caliper_problem():
 
 
 def test_kinds_that_compare_poses_are_planned_in_pairs(caliper_problem):
-    planned = plan_poses(caliper_problem.with_options(n_poses=24, hold_out=4))
+    planned = plan_poses(set_options(caliper_problem, n_poses=24, hold_out=4))
     groups, held_out = planned.poses.groups, planned.poses.held_out
     judged = {i for pair in groups[held_out[groups].all(axis=1)] for i in pair}
     by_code = {finding.code: finding.data for finding in planned.findings}
@@ -263,7 +264,7 @@ def test_kinds_that_compare_poses_are_planned_in_pairs(caliper_problem):
     assert (held.all(axis=1) | ~held.any(axis=1)).all()
     assert held.all(axis=1).sum() == 2
     with pytest.raises(EstimationError, match="in multiples of 2"):
-        plan_poses(caliper_problem.with_options(n_poses=25))
+        plan_poses(set_options(caliper_problem, n_poses=25))
 
 
 def test_lower_bound_on_pairs_holds_for_all_pairs_of_twelve_poses(caliper_problem):
@@ -275,7 +276,7 @@ def test_lower_bound_on_pairs_holds_for_all_pairs_of_twelve_poses(caliper_proble
         chosen = np.flatnonzero(np.isin(members, few).all(axis=1))
         tried.append((caliper_problem.predict_errors(chosen), len(chosen)))
     reached, pairs = min(tried, key=lambda one: one[0].position if one[0] else np.inf)
-    goal = caliper_problem.with_options(goal=reached.position, target="position")
+    goal = set_options(caliper_problem, goal=reached.position, target="position")
     needed = find_sample_size(goal)
     assert needed.at_least is not None
     # were each pair counted as two poses, twelve poses would contradict what is said

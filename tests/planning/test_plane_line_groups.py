@@ -12,7 +12,7 @@ import loopcal as lc
 from loopcal.errors import EstimationError
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
-from loopcal.planning.design_space import D, PriorInformation
+from loopcal.planning.design_space import Criterion, PriorInformation
 from loopcal.planning.exchange import coordinate_exchange
 from loopcal.planning.plane_line_planning import PlaneLineGroups, linearize_surfaces
 from tests.findings.expectations import expect_refusal
@@ -156,7 +156,7 @@ def test_one_sweep_of_coordinate_exchange_reduces_the_sd_threefold(robot) -> Non
         lambda _, design: planned.linearize(design),
         first,
         planned.list_levels(),
-        D(),
+        Criterion("D"),
         PriorInformation.none(42),
         sweeps=1,
     )

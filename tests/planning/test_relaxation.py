@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal.planning.design_space import A, D, DesignProblem, I
+from loopcal.planning.design_space import Criterion, DesignProblem
 from loopcal.planning.relaxation import relax_design
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import (
@@ -28,11 +28,11 @@ MOMENTS = np.linalg.cholesky(
 @pytest.mark.parametrize(
     ("criterion", "nuisance", "shares", "value"),
     [
-        (D(), 0, (1 / 3, 1 / 3, 1 / 3), np.log(4 / 27)),
-        (A(), 0, (1 / 4, 1 / 2, 1 / 4), 8.0),
-        (I(MOMENTS), 0, (1 / 4, 1 / 2, 1 / 4), 32 / 15),
+        (Criterion("D"), 0, (1 / 3, 1 / 3, 1 / 3), np.log(4 / 27)),
+        (Criterion("A"), 0, (1 / 4, 1 / 2, 1 / 4), 8.0),
+        (Criterion("I", MOMENTS), 0, (1 / 4, 1 / 2, 1 / 4), 32 / 15),
         # 1 and x are not of interest: the Chebyshev points
-        (D(), 2, (1 / 4, 1 / 2, 1 / 4), np.log(1 / 4)),
+        (Criterion("D"), 2, (1 / 4, 1 / 2, 1 / 4), np.log(1 / 4)),
     ],
     ids=["D", "A", "I", "D of the highest coefficient"],
 )
@@ -40,14 +40,14 @@ def test_weights_and_values_for_a_parabola_are_the_known_ones(criterion, nuisanc
     x, n, q = make_grid(), 12, 3 - nuisance
     problem = make_problem(polynomial_rows(x, 2), criterion, nuisance, repeats=True)
     found = relax_design(problem, n, GAP)
-    known = value + q * np.log(n) if isinstance(criterion, D) else value / n
+    known = value + q * np.log(n) if criterion.is_d else value / n
     assert found.converged
     assert found.value == pytest.approx(known, rel=1e-6)  # relative: the gap asked for
     assert found.efficiency(known) == pytest.approx(1.0, abs=2 * GAP)
     # the optimum is flat about 0
     masses = [found.weights[abs(x - at) < 0.15].sum() / n for at in (-1.0, 0.0, 1.0)]
     assert_allclose(masses, shares, atol=2e-3)
-    if problem.criterion == D() and not nuisance:
+    if criterion.is_d and not nuisance:
         # variance of the prediction at most p, the equivalence theorem of Kiefer and Wolfowitz
         assert (n * found.slopes).max() == pytest.approx(3.0, rel=1e-5)
         assert_allclose(n * found.slopes[found.weights > 0.1], 3.0, rtol=1e-3)
@@ -64,7 +64,7 @@ def find_best_value(problem: DesignProblem, n: int) -> float:
     """Return the best criterion value of all subsets."""
     subsets = combinations(range(len(problem.rows)), n)
     values = [problem.evaluate(np.array(chosen)) for chosen in subsets]
-    return max(values) if isinstance(problem.criterion, D) else min(values)
+    return max(values) if problem.criterion.is_d else min(values)
 
 
 @pytest.mark.parametrize(("criterion", "nuisance", "prior"), CASES.values(), ids=CASES)
@@ -89,7 +89,7 @@ def test_bound_holds_for_an_early_stop():
 
 
 def test_relaxed_design_of_all_candidates_has_unit_weights():
-    found = relax_design(make_problem(draw_rows(), A()), 12)
+    found = relax_design(make_problem(draw_rows(), Criterion("A")), 12)
     assert found.value == found.bound
     assert_array_equal(found.weights, 1.0)
 
@@ -106,4 +106,4 @@ def test_unobservable_prediction_is_refused():
     rows = draw_rows()
     rows[:, :, 3] = 0.0
     with expect_refusal("plan.prediction-unobservable"):
-        relax_design(make_problem(rows, I(np.array([[0.0, 0.0, 0.0, 1.0]]))), 5)
+        relax_design(make_problem(rows, Criterion("I", np.array([[0.0, 0.0, 0.0, 1.0]]))), 5)

@@ -6,10 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.planning.design_space import (
-    A,
     Criterion,
-    D,
-    I,
     Scoring,
     compute_swap_terms,
     score_additions,
@@ -47,7 +44,11 @@ def test_gain_of_every_swap_and_addition_equals_that_of_the_new_design(criterion
     assert_allclose(score_additions(terms), anew, atol=1e-9)
 
 
-@pytest.mark.parametrize("criterion", [D(), A(), I(L, 3)], ids=lambda criterion: criterion.name)
+@pytest.mark.parametrize(
+    "criterion",
+    [Criterion("D"), Criterion("A"), Criterion("I", L, 3)],
+    ids=lambda criterion: criterion.name,
+)
 def test_swap_is_exact_if_the_design_without_the_candidate_is_singular(criterion):
     scoring, X = build_random_scoring(criterion, 0, False)
     R = scoring.factor(X[:2])  # four equations for four unknowns

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -132,45 +132,26 @@ def factor_design(rows: FloatArray, prior: PriorInformation, space: ObservableSp
     return factor_square(space.project(stacked))[o:, o:]
 
 
-# Criteria of optimal design: scalar figures of the covariance C of the machine's unknowns.
+@dataclass(frozen=True, eq=False)
+class Criterion:
+    """A scalar figure of the covariance C of the machine's unknowns, in tolerances.
 
-
-@dataclass(frozen=True)
-class D:
-    """Log determinant of the information on the machine: large where the volume of uncertainty is
-    small. The best design does not depend on scaling.
+    name : "D", log determinant of the information, large where the volume of uncertainty is small;
+        the best design does not depend on scaling. "I", mean variance of a prediction. "A", sum of
+        the variances of the observable directions. "E", variance of the worst of them; never
+        optimized.
+    weights : (k, p) for I: derivatives of all predicted quantities by the machine's unknowns.
+    count : number of predictions (poses) in `weights`; the sum of the variances is divided by it.
     """
 
-    name: ClassVar[str] = "D"
-
-
-@dataclass(frozen=True, eq=False)
-class I:  # noqa: E742
-    """Mean variance of a prediction."""
-
-    # (k, p) rows L: derivatives of all predicted quantities by the machine's unknowns [per
-    # tolerance]
-    weights: FloatArray
-    # number of predictions (poses) in `weights`; the sum of the variances is divided by it
+    name: Literal["D", "I", "A", "E"]
+    weights: FloatArray | None = None
     count: int = 1
-    name: ClassVar[str] = "I"
 
-
-@dataclass(frozen=True)
-class A:
-    """Sum of the variances of the observable directions, in squared tolerances."""
-
-    name: ClassVar[str] = "A"
-
-
-@dataclass(frozen=True)
-class E:
-    """Variance of the worst observable direction, in squared tolerances; never optimized."""
-
-    name: ClassVar[str] = "E"
-
-
-Criterion = D | I | A | E
+    @property
+    def is_d(self) -> bool:
+        """Whether larger values are better."""
+        return self.name == "D"
 
 
 def is_full_rank(singular_values: np.ndarray) -> bool:
@@ -191,17 +172,14 @@ def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatA
     """
     s = np.linalg.svd(factor, compute_uv=False)
     if not is_full_rank(s):
-        return -np.inf if isinstance(criterion, D) else np.inf
-    match criterion:
-        case D():
-            return float(2.0 * np.log(s).sum())
-        case A():
-            return float((1.0 / s**2).sum())
-        case E():
-            return float(1.0 / s[-1] ** 2) if s.size else 0.0
-        case I():
-            projected = divide_by_factor(criterion.weights @ machine, factor)
-            return float((projected**2).sum() / criterion.count)
+        return -np.inf if criterion.is_d else np.inf
+    if criterion.weights is not None:
+        projected = divide_by_factor(criterion.weights @ machine, factor)
+        return float((projected**2).sum() / criterion.count)
+    if criterion.is_d:
+        return float(2.0 * np.log(s).sum())
+    variances = 1.0 / s**2
+    return float(variances.sum() if criterion.name == "A" else variances.max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +210,7 @@ class DesignProblem:
         """Return the efficiency of a value relative to the best possible one, 0 to 1: the ratio of
         determinants to the power 1 / q for D, the ratio of variances for the others.
         """
-        if isinstance(self.criterion, D):
+        if self.criterion.is_d:
             return float(np.exp((value - best) / len(self.space)))
         return float(best / value)
 
@@ -273,7 +251,7 @@ class DesignProblem:
     def build_scoring(self, n: int) -> Scoring:
         """Return the scoring whose mean design is the prior and all groups with the weight of n."""
         criterion, space, prior = self.criterion, self.space, self.prior
-        if isinstance(criterion, E):
+        if criterion.name == "E":
             raise EstimationError("criterion E cannot be optimized; choose D, I or A")
         rows, weight = self.rows[self.allowed], n / len(self.allowed)
         o, p = space.nuisance.shape
@@ -283,12 +261,10 @@ class DesignProblem:
         reference = factor_rows(stacked @ blocks)
         transform = divide_by_factor(blocks, reference)
         inner, prediction = reference[p:, p:], None
-        if not isinstance(criterion, D):
-            L = (
-                criterion.weights @ space.machine / np.sqrt(criterion.count)
-                if isinstance(criterion, I)
-                else np.eye(len(space))
-            )
+        if not criterion.is_d:
+            L = np.eye(len(space))
+            if criterion.weights is not None:
+                L = criterion.weights @ space.machine / np.sqrt(criterion.count)
             prediction = factor_rows(divide_by_factor(L, inner))
             if not prediction.any():
                 raise EstimationError(report_finding("plan.prediction-unobservable"))

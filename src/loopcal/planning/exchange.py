@@ -22,7 +22,6 @@ from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
 from loopcal.planning.design_space import (
     Criterion,
-    D,
     DesignProblem,
     ObservableSpace,
     PriorInformation,
@@ -95,7 +94,7 @@ def choose_design(
     weights, slopes = relaxed.weights[usable], relaxed.slopes[usable]
     begins = [_round_weights(weights, n, problem.repeats)]
     begins += [_complete_design(candidates, np.searchsorted(usable, done), n) for done in first]
-    ends = [_exchange_from_start(candidates, begin, random) for begin in begins]
+    ends = [exchange_from_start(candidates, begin, random) for begin in begins]
     chosen, history = max(ends, key=lambda end: end[1][-1])
     _require_determined(history[-1], n, len(usable), scoring.space)
     steep = np.argsort(-slopes, kind="stable")[: max(AMONG * n, FEWEST)]
@@ -118,23 +117,6 @@ def choose_design(
     return CertifiedDesign(design, relaxed, relaxed.efficiency(design.value))
 
 
-def fedorov_exchange(problem: DesignProblem, n: int, seed: int = 0, starts: int = 20) -> Design:
-    """Choose n of N groups by exchange from random starts; return the best."""
-    candidates, ends = problem.scale_candidates(n), []
-    if starts < 1:
-        raise EstimationError(f"exchange needs a start; {starts} were requested, give 1 or more")
-    for stream in np.random.default_rng(seed).spawn(starts):
-        begin = _draw_groups(candidates, stream, n, None)
-        ends.append(_exchange_from_start(candidates, begin, stream))
-    scoring, scores = candidates.scoring, [history[-1] for _, history in ends]
-    chosen, history = ends[int(np.argmax(scores))]
-    _require_determined(history[-1], n, len(candidates), scoring.space)
-    values = tuple(scoring.value(score) for score in history)
-    final = tuple(scoring.value(score) for score in scores)
-    chosen = np.sort(candidates.indices[chosen])
-    return Design(chosen, values[-1], values, final, not _is_exhausted(history, n))
-
-
 def _require_determined(score: float, n: int, count: int, space: ObservableSpace) -> None:
     """Refuse the best of n of `count` groups where its score says that it is singular."""
     if not np.isfinite(score):
@@ -142,7 +124,7 @@ def _require_determined(score: float, n: int, count: int, space: ObservableSpace
         raise EstimationError(report_finding("plan.design-singular", **counts))
 
 
-def _exchange_from_start(
+def exchange_from_start(
     candidates: ScaledCandidates, chosen: IntArray, stream: np.random.Generator
 ) -> tuple[IntArray, list[float]]:
     """Exchange from one start; a singular start is first exchanged with a ridge."""
@@ -202,7 +184,7 @@ def _complete_design(candidates: ScaledCandidates, chosen: IntArray, n: int) -> 
     return chosen
 
 
-def _draw_groups(
+def draw_groups(
     candidates: ScaledCandidates, stream: np.random.Generator, n: int, weights: FloatArray | None
 ) -> IntArray:
     """Draw n of N groups, evenly or by weights; every group has a small weight, so that n exist."""
@@ -238,7 +220,7 @@ def _perturb(
     for done in range(times if len(candidates) > n or repeats else 0):
         progress(done, times, "exchanging poses")
         kept = random.permutation(best)[count:]
-        new = _draw_groups(candidates, random, n, weights)
+        new = draw_groups(candidates, random, n, weights)
         new = new if repeats else np.setdiff1d(new, kept, assume_unique=True)
         trial = np.concatenate([kept, new[:count]])
         if not candidates.is_determined(trial):
@@ -347,10 +329,10 @@ def search_size(
     while high - low > 1:
         n = min(max(n, low + 1), high - 1)
         value, step = value_of(n), step + 1
-        meets = value >= target if isinstance(criterion, D) else value <= target
+        meets = value >= target if criterion.is_d else value <= target
         low, high = (low, n) if meets else (n, high)
         if step % 2:
-            growth = np.exp((target - value) / q) if isinstance(criterion, D) else value / target
+            growth = np.exp((target - value) / q) if criterion.is_d else value / target
             n = int(np.ceil(n * min(growth, 4.0)))
         else:
             n = 2 * n if high == limit else (low + high) // 2

@@ -29,7 +29,12 @@ from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import evaluate_limits, workspace_ranges
 from loopcal.numerics.elimination import eliminate_columns
 from loopcal.planning.constraints import ConstraintChecker, Constraints, build_checker, list_reasons
-from loopcal.planning.design_space import D, PriorInformation, find_observable_space, is_allowed
+from loopcal.planning.design_space import (
+    Criterion,
+    PriorInformation,
+    find_observable_space,
+    is_allowed,
+)
 from loopcal.planning.exchange import MovedDesign, coordinate_exchange
 from loopcal.planning.path import check_paths, locate_home
 from loopcal.planning.result import POSE_FIELDS, Plan, PlannedPoses
@@ -461,7 +466,7 @@ def improve_groups(
         lambda _, moved: groups.linearize(moved, checker),
         design,
         groups.list_levels(),
-        D(),
+        Criterion("D"),
         PriorInformation.none(count) if is_complete else PriorInformation.from_tolerances(count),
         sweeps,
         progress,

@@ -18,15 +18,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.instrument import Instrument
 from loopcal.mechanism.model import Mechanism
 from loopcal.planning.constraints import N_POSES, PlanOptions
-from loopcal.planning.design_space import (
-    A,
-    Criterion,
-    D,
-    E,
-    evaluate_criterion,
-    factor_design,
-    is_allowed,
-)
+from loopcal.planning.design_space import Criterion, evaluate_criterion, factor_design, is_allowed
 from loopcal.planning.exchange import EXCHANGES, choose_design
 from loopcal.planning.path import order_poses
 from loopcal.planning.problem import (
@@ -161,7 +153,7 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
         after=after,
         frame=problem.prediction.frame.describe(axes=""),
     )
-    criteria: tuple[Criterion, ...] = (D(), by_error, A(), E())
+    criteria = (Criterion("D"), by_error, Criterion("A"), Criterion("E"))
     quality = DesignQuality(
         {c.name: _evaluate(problem, c, chosen) for c in criteria}, min(best.efficiency, 1.0), left
     )

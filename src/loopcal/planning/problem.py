@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -49,9 +49,7 @@ from loopcal.planning.candidates import Candidates, check_listed_poses, draw_can
 from loopcal.planning.constraints import N_POSES, Constraints, PlanOptions, Target
 from loopcal.planning.design_space import (
     Criterion,
-    D,
     DesignProblem,
-    I,
     ObservableSpace,
     PriorInformation,
     divide_by_factor,
@@ -186,10 +184,6 @@ class PlanningProblem:
         """The robot at its present values."""
         return self.free.robot
 
-    def with_options(self, **changes: Any) -> PlanningProblem:
-        """Return the same problem with other options that do not concern candidates and data."""
-        return replace(self, options=replace(self.options, **changes))
-
     @cached_property
     def space(self) -> ObservableSpace:
         """The directions in which designs are compared."""
@@ -230,7 +224,7 @@ class PlanningProblem:
         """Return criterion D, or I for a target; by default those of the options."""
         name, target = name or self.options.criterion, target or self.options.target
         if name == "D":
-            return D()
+            return Criterion("D")
         if name != "I":
             raise EstimationError(
                 f"unknown criterion {name!r}; allowed are I (mean predicted variance of poses) "
@@ -245,7 +239,7 @@ class PlanningProblem:
                 report_finding("plan.target-unobservable", robot=self.robot.name, target=target)
             )
         # the triangular factor of the rows gives the same trace from fewer rows
-        return I(factor_rows(rows), len(self.prediction))
+        return Criterion("I", factor_rows(rows), len(self.prediction))
 
     def pose_design(self, rows: FloatArray | None = None, name: str | None = None) -> DesignProblem:
         """Return the choice of groups by a criterion of this name; by default from all rows."""
