@@ -303,7 +303,7 @@ def test_candidate_pairs_are_distinct_and_better_than_random_pairs():
         assert (units.members[:, 0] < units.members[:, 1]).all()
         assert len(np.unique(units.members, axis=0)) == len(units.members)
     best = [
-        choose_design(make_problem(u.rows, prior=True), 12, perturbations=5).design.value
+        choose_design(make_problem(u.rows, prior=True), 12, perturbations=5).value
         for u in (ours, drawn)
     ]
     assert best[0] > best[1]

@@ -54,23 +54,18 @@ BOUND_GAP = 3e-3  # gap of the relaxation where only the size is needed
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A chosen set of groups."""
+    """A chosen set of groups with its certificate."""
 
     chosen: IntArray  # (n,) indices of the candidates, ascending
     value: float  # of the criterion
-    history: tuple[float, ...]  # values of the best start: after it began, and after each exchange
-    values: tuple[float, ...]  # final value of each start
-    # whether no single exchange improves it; False where the exchanges ran out
-    is_converged: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class CertifiedDesign:
-    """A design and its certificate."""
-
-    design: Design  # the chosen groups
     relaxed: RelaxedDesign  # weights and bound
-    efficiency: float  # lower bound on the efficiency relative to the best possible design
+    # whether no single exchange improves it; False where the exchanges ran out
+    is_converged: bool
+
+    @property
+    def efficiency(self) -> float:
+        """Lower bound on the efficiency relative to the best possible design."""
+        return self.relaxed.efficiency(self.value)
 
 
 def choose_design(
@@ -81,7 +76,7 @@ def choose_design(
     gap: float = 1e-3,
     first: Iterable[IntArray] = (),
     progress: Progress = report_no_progress,
-) -> CertifiedDesign:
+) -> Design:
     """Choose n of N groups, with a certificate.
 
     perturbations : their number; default PERTURBATIONS / n. gap : of the relaxation.
@@ -102,7 +97,7 @@ def choose_design(
     times = max(PERTURBATIONS // n, LEAST_PERTURBATIONS) if perturbations is None else perturbations
     if relaxed.efficiency(scoring.value(history[-1])) >= GOOD:
         times = 0
-    best, scores = _perturb(
+    best = _perturb(
         candidates.take(among),
         np.searchsorted(among, chosen),
         weights[among],
@@ -111,10 +106,8 @@ def choose_design(
         progress,
     )
     chosen, last = _exchange_groups(candidates, among[best], random)
-    values = tuple(scoring.value(score) for score in (*history, *scores, *last[1:]))
-    ends = (scoring.value(history[-1]), values[-1])
-    design = Design(np.sort(usable[chosen]), values[-1], values, ends, not _is_exhausted(last, n))
-    return CertifiedDesign(design, relaxed, relaxed.efficiency(design.value))
+    value = scoring.value(last[-1])
+    return Design(np.sort(usable[chosen]), value, relaxed, not _is_exhausted(last, n))
 
 
 def _require_determined(score: float, n: int, count: int, space: ObservableSpace) -> None:
@@ -208,14 +201,11 @@ def _perturb(
     times: int,
     random: np.random.Generator,
     progress: Progress,
-) -> tuple[IntArray, list[float]]:
-    """Perturb a design and exchange it among the candidates (N).
-
-    Returns the best groups (n,), and the scores of those that were better than all before.
-    """
+) -> IntArray:
+    """Return the best groups (n,) after perturbing a design and exchanging it among candidates."""
     # a design found again has the same score up to rounding: in one order, it is the same design
     n, repeats, best = len(best), candidates.repeats, np.sort(best)
-    scores = [candidates.scoring.score(candidates.factor(best))]
+    score = candidates.scoring.score(candidates.factor(best))
     count = min(n, max(2, round(PERTURBED * n)))
     for done in range(times if len(candidates) > n or repeats else 0):
         progress(done, times, "exchanging poses")
@@ -226,10 +216,9 @@ def _perturb(
         if not candidates.is_determined(trial):
             continue
         trial, history = _exchange_groups(candidates, trial, random)
-        if history[-1] >= scores[-1]:
-            best = np.sort(trial)
-            scores.append(history[-1])
-    return best, scores[1:]
+        if history[-1] >= score:
+            best, score = np.sort(trial), history[-1]
+    return best
 
 
 # Designs of several sizes.
@@ -241,27 +230,18 @@ def compute_design_curve(
     seed: int = 0,
     perturbations: int = CURVE_PERTURBATIONS,
     progress: Progress = report_no_progress,
-) -> list[CertifiedDesign]:
+) -> list[Design]:
     """Return designs of several sizes, ascending; each starts from the one before, too, so that
     none is worse than a smaller one.
 
     `progress` receives the sizes that are done.
     """
-    designs: list[CertifiedDesign] = []
+    designs: list[Design] = []
     for done, n in enumerate(sorted(set(sizes))):
         progress(done, len(set(sizes)), "computing the error by the number of poses")
-        first = [designs[-1].design.chosen] if designs else []
+        first = [designs[-1].chosen] if designs else []
         designs.append(choose_design(problem, n, seed, perturbations, first=first))
     return designs
-
-
-@dataclass(frozen=True, eq=False)
-class SmallestDesign:
-    """The smallest design found that meets a target."""
-
-    n: int  # its number of groups
-    at_least: int  # no smaller number of groups can meet the target
-    certified: CertifiedDesign  # the design
 
 
 def find_smallest_design(
@@ -270,8 +250,9 @@ def find_smallest_design(
     most: int | None = None,
     seed: int = 0,
     perturbations: int = CURVE_PERTURBATIONS,
-) -> SmallestDesign:
-    """Return the smallest design found whose criterion is at least as good as a target.
+) -> tuple[Design, int]:
+    """Return the smallest design found whose criterion is at least as good as a target, and the
+    size below which no design can be.
 
     target : value of the criterion (for I a variance: the square of an rms standard deviation).
     most : largest number of groups; default: all that are allowed.
@@ -285,13 +266,13 @@ def find_smallest_design(
         bounds[n] = relax_design(problem, n, BOUND_GAP).bound
         return bounds[n]
 
-    made: dict[int, CertifiedDesign] = {}
+    made: dict[int, Design] = {}
 
     def value_of(n: int) -> float:
         smaller = [k for k in made if k < n]
-        first = [made[max(smaller)].design.chosen] if smaller else []
+        first = [made[max(smaller)].chosen] if smaller else []
         made[n] = choose_design(problem, n, seed, perturbations, first=first)
-        return made[n].design.value
+        return made[n].value
 
     criterion, least, q = problem.criterion, problem.n_needed, len(problem.space)
     at_least = search_size(bound_of, least, most, min(2 * least, most), criterion, target, q)
@@ -302,9 +283,9 @@ def find_smallest_design(
         )
     n = search_size(value_of, at_least, most, at_least, criterion, target, q)
     if n > most:
-        best = made[most].design.value
+        best = made[most].value
         raise EstimationError(report_finding("plan.target-not-reached", best=best, **numbers))
-    return SmallestDesign(n, at_least, made[n])
+    return made[n], at_least
 
 
 def search_size(
@@ -355,12 +336,9 @@ class MovedDesign:
 
     design: FloatArray  # (u, c) coordinates
     rows: FloatArray  # (u, r, o + p) of it
-    value: float  # of the criterion
-    # value before the first sweep (-inf for D, inf for I and A where it is singular), and after
-    # each
+    # value of the criterion before the first sweep (-inf for D, inf for I and A where it is
+    # singular), and after each
     history: tuple[float, ...]
-    evaluated: int  # number of groups that were linearized in all
-    problem: DesignProblem  # of the groups that defined the observable directions
     # whether the last sweep gained hardly anything; False where the sweeps ran out
     is_converged: bool
 
@@ -406,7 +384,7 @@ def coordinate_exchange(
         R = scoring.factor(scoring.scale_rows(rows))
         return scoring.score(R) if is_determined(R) else -np.inf
 
-    history, evaluated, is_converged = [score_rows()], len(probes), False
+    history, is_converged = [score_rows()], False
     for sweep in range(sweeps):
         used = scoring if np.isfinite(history[-1]) else scoring.with_ridge(RIDGE)
         for c, values in enumerate(levels):
@@ -416,7 +394,6 @@ def coordinate_exchange(
             which, flat = np.repeat(indices, len(values)), moved.reshape(-1, design.shape[1])
             trials = linearize(which, flat) if len(values) else rows[:0]
             trials = trials.reshape(len(design), len(values), *rows.shape[1:])
-            evaluated += len(which)
             best = _choose_levels(used, rows, trials)
             accepted = np.flatnonzero(best >= 0)
             design[accepted, c] = np.asarray(values)[best[accepted]]
@@ -427,7 +404,7 @@ def coordinate_exchange(
             break
     _require_determined(history[-1], len(design), len(design), problem.space)
     values = tuple(scoring.value(score) for score in history)
-    return MovedDesign(design, rows, values[-1], values, evaluated, problem, is_converged)
+    return MovedDesign(design, rows, values, is_converged)
 
 
 def _choose_levels(scoring: Scoring, rows: FloatArray, trials: FloatArray) -> IntArray:

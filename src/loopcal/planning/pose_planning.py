@@ -138,7 +138,7 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
         counts = {"requested": n, "what": problem.counted, "available": left}
         raise EstimationError(report_finding("plan.too-few-candidates", **counts))
     best = choose_design(design, n, options.seed, PERTURBATIONS, gap=GAP, progress=progress)
-    chosen = best.design.chosen
+    chosen = best.chosen
     after = problem.predict_errors(chosen)
     assert after is not None, "the exchange determines every direction"
     by_error = problem.build_criterion("I")
@@ -159,7 +159,7 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
     )
     poses, is_order_short = _arrange_poses(problem, chosen, held_out)
     notes = _collect_notes(problem)
-    if not best.design.is_converged:
+    if not best.is_converged:
         counts = {"counted": problem.counted, "exchanges": EXCHANGES * n}
         notes.append(report_finding("plan.exchanges-exhausted", **counts))
     if not is_order_short:

@@ -60,7 +60,7 @@ from loopcal.planning.design_space import (
     is_allowed,
     is_full_rank,
 )
-from loopcal.planning.exchange import CertifiedDesign, compute_design_curve, find_smallest_design
+from loopcal.planning.exchange import Design, compute_design_curve, find_smallest_design
 from loopcal.planning.pose_groups import (
     GroupRows,
     combine_prior,
@@ -486,10 +486,10 @@ def find_sample_size(
     most = min(MOST // problem.poses_per_group, count)
     problem.require_equations(most)
     try:
-        smallest = find_smallest_design(design, goal**2, most, options.seed, PERTURBATIONS)
+        best, at_least = find_smallest_design(design, goal**2, most, options.seed, PERTURBATIONS)
     except EstimationError:
-        (best,) = compute_design_curve(design, [most], options.seed, 0)
-        reached, bound = (np.sqrt(v) for v in (best.design.value, best.relaxed.bound))
+        (last,) = compute_design_curve(design, [most], options.seed, 0)
+        reached, bound = (np.sqrt(v) for v in (last.value, last.relaxed.bound))
         raise EstimationError(
             report_finding(
                 "plan.goal-unreachable",
@@ -502,30 +502,27 @@ def find_sample_size(
                 bound=robot.to_quantity(float(bound), dimension),
             )
         ) from None
-    n = max(smallest.n, problem.min_groups)
+    n = max(len(best.chosen), problem.min_groups)
     others = np.geomspace(problem.min_groups, min(2 * n, count), SIZES - 1).round().astype(int)
     sizes = np.append(others, n).tolist()
     curve = compute_design_curve(design, sizes, options.seed, PERTURBATIONS, progress)
     # the design of the search, where that of the curve is less good
-    best = smallest.certified
-    is_better = [
-        len(made.design.chosen) == smallest.n and best.design.value <= made.design.value
-        for made in curve
+    size = len(best.chosen)
+    designs = [
+        best if len(made.chosen) == size and best.value <= made.value else made for made in curve
     ]
-    designs = [best if better else made for made, better in zip(curve, is_better, strict=True)]
-    made = _convert_curve(problem, designs)
-    return replace(made, goal=goal, enough=n, at_least=smallest.at_least)
+    return replace(_convert_curve(problem, designs), goal=goal, enough=n, at_least=at_least)
 
 
-def _convert_curve(problem: PlanningProblem, designs: list[CertifiedDesign]) -> ErrorCurve:
+def _convert_curve(problem: PlanningProblem, designs: list[Design]) -> ErrorCurve:
     """Return designs by their mean variance as a curve of errors."""
-    expected = [problem.predict_errors(made.design.chosen) for made in designs]
+    expected = [problem.predict_errors(made.chosen) for made in designs]
     bounds = np.array([made.relaxed.bound for made in designs])
     return ErrorCurve(
-        np.array([len(made.design.chosen) for made in designs], dtype=np.int64),
+        np.array([len(made.chosen) for made in designs], dtype=np.int64),
         tuple(errors for errors in expected if errors is not None),  # every design is determined
         problem.options.target,
-        np.sqrt([made.design.value for made in designs]),
+        np.sqrt([made.value for made in designs]),
         np.sqrt(np.maximum(bounds, 0.0)),
         counted=problem.counted,
         n_candidates=problem.n_candidates,
