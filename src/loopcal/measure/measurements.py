@@ -77,6 +77,7 @@ def anchor_rows(rows: Observations, observations: Sequence[Observations]) -> Int
     return np.array(poses, dtype=np.intp)
 
 
+OF_POSES = ("readings", "reading_sigma", "block", "is_held_out")  # attributes (n, ..), or None
 SAME_READING = 1e-9  # readings [m] or [rad] that differ by less belong to repeats of one pose
 
 
@@ -293,15 +294,13 @@ class Measurements(TableResult):
             target = place[rows.rows]
             kept = np.all(target.reshape(len(rows), rows.kind.poses_per_row) >= 0, axis=1)
             observations.append(replace(rows.take(kept), rows=target[kept]))
-        return replace(
-            self,
-            readings=self.readings[chosen],
-            observations=tuple(observations),
-            block=self.block[chosen],
-            labels=tuple(self.labels[i] for i in chosen),
-            reading_sigma=None if self.reading_sigma is None else self.reading_sigma[chosen],
-            is_held_out=self.is_held_out[chosen],
-        )
+        of_poses: dict[str, Any] = {
+            name: None if values is None else values[chosen]
+            for name in OF_POSES
+            for values in (getattr(self, name),)
+        }
+        labels = tuple(self.labels[i] for i in chosen)
+        return replace(self, observations=tuple(observations), labels=labels, **of_poses)
 
     def split(self, *, hold_out: float, seed: int) -> tuple[Self, Self]:
         """Split the poses at random into a set to fit and a held-out set.

@@ -12,7 +12,7 @@ import re
 import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import permutations
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,7 +30,7 @@ from loopcal.io.core.csv_table import (
     suggest_header,
 )
 from loopcal.mechanism.model import Mechanism
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 if TYPE_CHECKING:
@@ -218,10 +218,58 @@ class ContextColumn(Column):
         return "" if math.isnan(float(value)) else format_exact(float(value), 1.0)
 
 
-USE_COLUMN = TextColumn("use", (FIT, HELD_OUT))
-"""What the poses of a row are for, see `pose_use`; a plan fills it in before anything is measured,
-so that the choice does not depend on the results.
-"""
+@dataclass(frozen=True)
+class PoseColumn(TextColumn):
+    """A column of names that says something of poses: an attribute of `Measurements`.
+
+    `encode` makes the attribute (n,) from the cells of the poses (n,), which are empty where no row
+    states one; `decode` makes these cells from it, and `is_needed` says whether a file without the
+    column would mean something else. `conflict` words two different cells of a pose.
+    `is_required` where each pose that a file names must have a cell, in its first row.
+    """
+
+    attribute: str = field(kw_only=True)
+    encode: Callable[[Sequence[str]], np.ndarray] = field(kw_only=True)
+    decode: Callable[[np.ndarray], Sequence[str]] = field(kw_only=True)
+    is_needed: Callable[[np.ndarray], bool] = field(kw_only=True)
+    conflict: Callable[[str, str, str, str], str | Finding] = field(kw_only=True)
+    is_required: bool = field(default=False, kw_only=True)
+
+
+def _number_blocks(cells: Sequence[str]) -> IntArray:
+    """Return the numbers of named blocks; a pose without one is a block of its own."""
+    keys = [("block", cell) if cell else ("pose", str(i)) for i, cell in enumerate(cells)]
+    numbers = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    return np.array([numbers[key] for key in keys])
+
+
+# What the poses of a row are for. A plan fills it in before anything is measured, so that the
+# choice does not depend on the results.
+USE_COLUMN = PoseColumn(
+    "use",
+    (FIT, HELD_OUT),
+    attribute="is_held_out",
+    encode=lambda cells: np.array(cells) == HELD_OUT,
+    decode=lambda is_held_out: np.where(is_held_out, HELD_OUT, FIT).tolist(),
+    is_needed=lambda is_held_out: bool(is_held_out.any()),
+    conflict=lambda pose, use, other_use, place: report_finding(
+        "data.use-contradicted", pose=pose, use=use, other_use=other_use, place=place
+    ),
+)
+BLOCK_COLUMN = PoseColumn(
+    "block",
+    attribute="block",
+    encode=_number_blocks,
+    decode=lambda block: [str(number) for number in block],
+    is_needed=lambda block: len(set(block.tolist())) < len(block),
+    conflict=lambda pose, block, other, place: (
+        f"pose {pose!r} is in block {block!r} here and {other!r} in {place}; correct one"
+    ),
+    is_required=True,
+)
+POSE_COLUMNS = (USE_COLUMN, BLOCK_COLUMN)
+ROW_COLUMNS = ("session", "group")
+"""Columns, also settings, that name what rows share: fields of `Observations`."""
 
 
 class ColumnRule(NamedTuple):
@@ -264,7 +312,7 @@ RULES: tuple[ColumnRule, ...] = (
         "of the pose states it",
         USE_COLUMN,
     ),
-    _text_rule("poses of a block are never split between fit and validation", TextColumn("block")),
+    _text_rule("poses of a block are never split between fit and validation", BLOCK_COLUMN),
     _text_rule("label of the kind, in files with several kinds", TextColumn("kind")),
     _text_rule("rows of a session share unknown frames and targets", TextColumn("session")),
     _text_rule("rows of a group share a surface or the constant of a lock", TextColumn("group")),

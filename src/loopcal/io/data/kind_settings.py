@@ -42,6 +42,7 @@ from loopcal.io.core.yaml_file import (
     refuse_unknown_keys,
 )
 from loopcal.io.data.columns import (
+    ROW_COLUMNS,
     SIGMA,
     find_column_fault,
     list_columns,
@@ -542,14 +543,14 @@ def read_observations(
             values = np.where(np.isnan(values), pose_context[name][poses].mean(axis=1), values)
         if not np.isnan(values).all():
             beside[name] = values
+    names: dict[str, Any] = {name: _read_names(table, name, rows) for name in ROW_COLUMNS}
     with name_files(table.path):
         observations = Observations(
             entry.kind,
             poses[:, 0] if links == 1 else poses,
             measured,
             covariance,
-            session=_read_names(table, "session", rows),
-            group=_read_names(table, "group", rows),
+            **names,
             context=beside,
             source=str(table.path),
             is_noise_assumed=entry.is_noise_assumed,

@@ -15,25 +15,25 @@ files has the same readings in both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from loopcal.errors import DataError, FileError, suggest_names
-from loopcal.findings import report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import Table, read_table, read_template, require_columns
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.core.yaml_file import Location, find_reference, refuse_unknown_keys
 from loopcal.io.data.columns import (
     COMMANDED,
-    HELD_OUT,
     LINK,
+    POSE_COLUMNS,
     SIGMA,
-    USE_COLUMN,
     NumberColumn,
+    PoseColumn,
     TextColumn,
     get_dimension,
     list_columns,
@@ -48,7 +48,7 @@ from loopcal.io.data.kind_settings import (
 )
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
 from loopcal.mechanism.model import Mechanism
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import EXAMPLES, SMALLEST_SD, find_sd_fault
 
 if TYPE_CHECKING:
@@ -62,35 +62,62 @@ FEWEST = 2
 rotation, and no other target would reveal its error.
 """
 
+READING_NOISE = "reading_noise"
+ROUNDING = 1e-12
+"""Difference, relative or in m or rad, up to which readings in different units are the same."""
 
-def _check_base_targets(tables: Sequence[Table], kinds: Sequence[Sequence[KindRows]]) -> None:
+T = TypeVar("T")
+
+
+@dataclass(eq=False)
+class _File:
+    """One of the files that are read together.
+
+    `kinds` and times or temperatures (`context`) of its rows; `is_base` (rows,) are rows that
+    measure the base and belong to no pose. `names` of the poses of each row, and the `first` row of
+    each pose. `readings` and `sigma` (rows, a) [SI] are NaN where a row states none; `read` are the
+    poses with readings in this file, `unread` those whose readings were not taken. `members` are
+    the poses of each row by index.
+    """
+
+    table: Table
+    kinds: tuple[KindRows, ...]
+    context: Mapping[str, FloatArray]
+    is_base: BoolArray
+    names: tuple[str, ...]
+    readings: FloatArray
+    sigma: FloatArray
+    first: dict[str, int] = field(default_factory=dict)
+    read: frozenset[str] = frozenset()
+    unread: frozenset[str] = frozenset()
+    members: list[tuple[int, ...]] = field(default_factory=list)
+
+
+def _check_base_targets(kinds: Sequence[tuple[Table, Sequence[KindRows]]]) -> None:
     """Refuse a target on the base that is also on a platform, a single target on the base, and
     targets in a frame in which no pose is measured; FileError at the settings of the kind.
     """
     from loopcal.measure.measurements import list_moving_targets
 
-    all_kinds = [entry.kind for of_file in kinds for entry in of_file]
+    all_kinds = [entry.kind for _, entries in kinds for entry in entries]
     known = {target for kind in all_kinds if kind.is_of_base for target in kind.target_columns}
     moving = [kind for kind in all_kinds if not kind.is_of_base]
     frames = tuple(dict.fromkeys(name for kind in moving if (name := _find_frame(kind))))
-    for table, of_file in zip(tables, kinds, strict=True):
-        for entry in (entry for entry in of_file if entry.kind.is_of_base):
-            place = (*entry.location, "targets")
-            if shared := list_moving_targets(entry.kind, all_kinds):
-                finding = report_finding("data.target-on-two-bodies", targets=shared)
-                raise table.settings.error(finding, place)
-            name = _find_frame(entry.kind)
-            if not name:
-                targets = tuple(entry.kind.target_columns)
-                finding = report_finding("data.base-frame-known", targets=targets)
-                raise table.settings.error(finding, (*entry.location, "of"))
-            if moving and name not in frames:
-                finding = report_finding("data.base-frame-unused", frame=name, frames=frames)
-                key = "frame" if name != "frame" else "unknown"
-                raise table.settings.error(finding, (*entry.location, key))
-            if len(known) < FEWEST:
-                finding = report_finding("data.single-base-target", targets=tuple(known))
-                raise table.settings.error(finding, place)
+    of_base = ((t, entry) for t, entries in kinds for entry in entries if entry.kind.is_of_base)
+    for table, entry in of_base:
+        name, key, finding = _find_frame(entry.kind), "targets", None
+        if shared := list_moving_targets(entry.kind, all_kinds):
+            finding = report_finding("data.target-on-two-bodies", targets=shared)
+        elif not name:
+            targets, key = tuple(entry.kind.target_columns), "of"
+            finding = report_finding("data.base-frame-known", targets=targets)
+        elif moving and name not in frames:
+            finding = report_finding("data.base-frame-unused", frame=name, frames=frames)
+            key = "frame" if name != "frame" else "unknown"
+        elif len(known) < FEWEST:
+            finding = report_finding("data.single-base-target", targets=tuple(known))
+        if finding is not None:
+            raise table.settings.error(finding, (*entry.location, key))
 
 
 def _find_frame(kind: Kind) -> str:
@@ -98,55 +125,11 @@ def _find_frame(kind: Kind) -> str:
     return str(getattr(kind, "frame", "")) if "frame" in kind.unknown else ""
 
 
-READING_NOISE = "reading_noise"
-ROUNDING = 1e-12
-"""Difference, relative or in m or rad, up to which readings in different units are the same."""
-
-
-class PoseRows(NamedTuple):
-    """The n poses of some files.
-
-    `readings` and their standard deviations `sigma` are (n, a) [SI], NaN where not read; `sigma`
-    is None where no file states any. Poses with the same number in `block` (n,) are never split.
-    `members` are the poses of each row of each file.
+def _join_poses(files: Sequence[_File], robot: Mechanism) -> dict[str, tuple[int, int]]:
+    """Return pose -> number of the file and row with its readings, and enter the `members` of all
+    rows; FileError for a pose without readings or with contradicting ones, or an unknown pose in a
+    comparison.
     """
-
-    labels: tuple[str, ...]
-    readings: FloatArray
-    sigma: FloatArray | None
-    block: IntArray
-    members: tuple[tuple[tuple[int, ...], ...], ...]
-
-
-class _FilePoses(NamedTuple):
-    """The poses of one file.
-
-    `names` of each row; `first` row of each pose; `readings` and `sigma` (rows, a), NaN where a row
-    states none; `read` are the poses with readings in this file, `unread` those whose readings were
-    not taken.
-    """
-
-    table: Table
-    names: tuple[str, ...]
-    first: dict[str, int]
-    readings: FloatArray
-    sigma: FloatArray
-    read: frozenset[str]
-    unread: frozenset[str]
-
-
-def _read_pose_rows(
-    tables: Sequence[Table], robot: Mechanism, of_base: Sequence[BoolArray]
-) -> PoseRows:
-    """Read the columns `pose` and `block`, and those of readings or commanded coordinates.
-
-    `of_base` : (rows,) of each file, rows that measure the base and belong to no pose.
-
-    FileError : a pose without readings or with contradicting ones, an unknown pose in a
-    comparison. DataError : a commanded pose that the controller cannot reach.
-    """
-    several = len(tables) > 1
-    files = [_read_file(*each, robot, several) for each in zip(tables, of_base, strict=True)]
     read = frozenset().union(*(file.read for file in files))
     origin: dict[str, tuple[int, int]] = {}
     for i, file in enumerate(files):
@@ -164,38 +147,55 @@ def _read_pose_rows(
         _refuse_contradictions(file, files, repeated)
     if not origin:
         why = "no row has readings; add a row with readings for each pose"
-        if all(rows.all() for rows in of_base):
+        if all(file.is_base.all() for file in files):
             why = "all rows measure targets on the base, so that there is no pose"
             why += "; give the file of the poses, too"
-        raise tables[0].row_error(0, why)
+        raise files[0].table.row_error(0, why)
     number = {name: i for i, name in enumerate(origin)}
-
-    def find_members(table: Table, row: int, cell: str) -> tuple[int, ...]:
-        if cell in number:
-            return (number[cell],)
-        names = [part.strip() for part in cell.split(LINK)]
-        for name in names:
-            if name not in number:
+    for file in files:
+        for row, (cell, is_base) in enumerate(zip(file.names, file.is_base.tolist(), strict=True)):
+            names = [] if is_base else [cell]
+            if not is_base and cell not in number:
+                names = [part.strip() for part in cell.split(LINK)]
+            for name in (name for name in names if name not in number):
                 sentence = f"unknown pose {name!r}{suggest_names(name, number)}"
-                raise table.row_error(row, f"{sentence}; add a row with its readings")
-        return tuple(number[name] for name in names)
+                raise file.table.row_error(row, f"{sentence}; add a row with its readings")
+            file.members.append(tuple(number[name] for name in names))
+    return origin
 
-    members = tuple(
-        tuple(
-            () if is_base[row] else find_members(file.table, row, cell)
-            for row, cell in enumerate(file.names)
-        )
-        for file, is_base in zip(files, of_base, strict=True)
-    )
-    begin = np.cumsum([0, *(len(file.names) for file in files)])
-    file, row = np.array(tuple(origin.values())).T
-    places = begin[file] + row
-    readings = np.concatenate([file.readings for file in files])[places]
-    sigma = None
-    if any(_states_reading_noise(table, robot) for table in tables):
-        stated = np.concatenate([file.sigma for file in files])[places]
-        sigma = np.where(np.isnan(stated), robot.stated_sigma, stated)
-    return PoseRows(tuple(origin), readings, sigma, _number_blocks(files, list(origin)), members)
+
+def _enter(
+    stated: dict[int, tuple[T, Table, int]],
+    table: Table,
+    pairs: Iterable[tuple[int, int]],
+    cells: Sequence[T],
+    conflict: Callable[[int, T, T, str], str | Finding],
+) -> None:
+    """Enter what rows state of poses, from pairs of row and pose; FileError for another cell of a
+    pose than before.
+    """
+    for row, pose in pairs:
+        cell, other, place = stated.setdefault(pose, (cells[row], table, row))
+        if cell != cells[row]:
+            raise table.row_error(row, conflict(pose, cells[row], cell, other.place(place)))
+
+
+def _read_pose_column(
+    column: PoseColumn, files: Sequence[_File], labels: Sequence[str]
+) -> np.ndarray:
+    """Return the attribute (n,) that a column of poses states."""
+    stated: dict[int, tuple[str, Table, int]] = {}
+    for file in (file for file in files if column.name in file.table.units):
+        cells = column.parse(file.table)
+        pairs = [(row, i) for row, cell in enumerate(cells) if cell for i in file.members[row]]
+        if column.is_required:
+            pairs = [(row, file.members[row][0]) for row in file.first.values()]
+        for row, _ in pairs:
+            if not cells[row]:
+                sentence = f"column {column.name!r} is empty; write a name or a number"
+                raise file.table.row_error(row, sentence)
+        _enter(stated, file.table, pairs, cells, lambda i, *what: column.conflict(labels[i], *what))
+    return column.encode([stated[i][0] if i in stated else "" for i in range(len(labels))])
 
 
 def _has_readings(table: Table, robot: Mechanism) -> bool:
@@ -204,91 +204,88 @@ def _has_readings(table: Table, robot: Mechanism) -> bool:
     return any(column in names or column.startswith(COMMANDED) for column in table.names)
 
 
-def _read_file(table: Table, is_base: BoolArray, robot: Mechanism, several: bool) -> _FilePoses:
-    """Read the poses of one file, which the rows (rows,) of the base do not name."""
-    from loopcal.measure.readings import solve_commanded_poses
-
+def _read_file(table: Table, kinds: tuple[KindRows, ...], robot: Mechanism, several: bool) -> _File:
+    """Read the names of the poses of one file, which the rows of the base do not name, and their
+    readings where it has any.
+    """
+    is_base = np.zeros(len(table), dtype=bool)
+    for entry in (entry for entry in kinds if entry.kind.is_of_base):
+        is_base[entry.rows] = True
     actuators = [actuator.name for actuator in robot.actuators]
-    of_pose = ("pose", "use", "block", *actuators, *(COMMANDED + c for c in robot.controlled))
-    for name in (name for name in of_pose if name in table.units):
+    nothing = np.full((len(table), len(actuators)), np.nan)
+    names = table.pose_names()
+    file = _File(table, kinds, read_context(table), is_base, names, nothing, nothing)
+    of_pose = ("pose", *(column.name for column in POSE_COLUMNS), *actuators)
+    for name in (*of_pose, *(COMMANDED + c for c in robot.controlled)):
         cells = table.text(name)
         for row in np.flatnonzero(is_base).tolist():
             if cells[row]:
                 sentence = f"this row measures the base and belongs to no pose, but column {name!r}"
                 raise table.row_error(row, f"{sentence} is {cells[row]!r}; leave it empty")
     if is_base.all() and len(is_base):
-        nothing = np.full((len(table), len(robot.actuators)), np.nan)
-        names = ("",) * len(table)
-        return _FilePoses(table, names, {}, nothing, nothing, frozenset(), frozenset())
+        return file
     if several and "pose" not in table.units:
         sentence = "files are joined by the names of poses, and this file names none"
         raise table.header_error(f"{sentence}; add a column 'pose'")
-    names = TextColumn("pose").parse(table) if "pose" in table.units else table.pose_names()
-    first = _find_first_rows(table, names, np.flatnonzero(~is_base))
-    blank = np.full((len(names), len(robot.actuators)), np.nan)
-    if several and not _has_readings(table, robot):
-        return _FilePoses(table, names, first, blank, blank, frozenset(), frozenset())
+    if "pose" in table.units:
+        file.names = names = TextColumn("pose").parse(table)
+    for row in np.flatnonzero(~is_base).tolist():
+        if not names[row]:
+            raise table.row_error(row, "column 'pose' is empty; write a name or a number")
+        if LINK not in names[row]:
+            file.first.setdefault(names[row], row)
+    if not several or _has_readings(table, robot):
+        _read_readings(file, robot, several)
+    return file
+
+
+def _read_readings(file: _File, robot: Mechanism, several: bool) -> None:
+    """Enter the readings of a file, which a controller computes from commanded coordinates."""
+    from loopcal.measure.readings import solve_commanded_poses
+
+    table, names = file.table, file.names
     controller = _load_controller(table, robot)
-    columns = _reading_columns(table, robot, controller)
+    columns = _list_reading_columns(table, robot, controller)
     rows = np.column_stack([column.parse(table) for column in columns])
+    absent = np.isnan(rows)
     may_be_absent = controller is None and _states_reading_noise(table, robot)
     begin = np.array(
-        [-1 if base else first.get(name, -1) for name, base in zip(names, is_base, strict=True)]
+        [
+            -1 if base else file.first.get(name, -1)
+            for name, base in zip(names, file.is_base, strict=True)
+        ]
     )
     if not may_be_absent:
         # with several files, another one may state all readings of a pose
-        absent, is_first = np.isnan(rows), begin == np.arange(len(rows))
+        is_first = begin == np.arange(len(rows))
         hint = f", or state '{READING_NOISE}', so that empty means not read"
         for row in np.flatnonzero(is_first & absent.any(axis=1) & ~(several & absent.all(axis=1))):
             sentence = f"column {columns[int(np.argmax(absent[row]))].name!r} is empty"
             act = f"write its value{hint if controller is None else ''}"
             raise table.row_error(int(row), f"{sentence}; {act}")
-    _refuse_other_readings(table, names, rows, begin)
-    is_unread = np.asarray(np.isnan(rows).all(axis=1))
-    unread = frozenset(name for name, row in first.items() if is_unread[row])
-    read = frozenset(first) - unread
+    is_same = ((rows == rows[begin]) | (absent & absent[begin])).all(axis=1) & (begin >= 0)
+    for row in np.flatnonzero(~is_same & ~absent.all(axis=1)).tolist():
+        sentence = f"the row of {names[row]!r} compares poses and has no readings of its own"
+        act = "leave these cells empty"
+        if begin[row] >= 0:
+            sentence = f"pose {names[row]!r} has other readings in line {table.lines[begin[row]]}"
+            act = "correct them, or rename one of the two poses"
+        raise table.row_error(row, f"{sentence}; {act}")
+    file.unread = frozenset(name for name, row in file.first.items() if absent[row].all())
+    file.read = frozenset(file.first) - file.unread
+    file.readings = rows
     if controller is not None:
-        chosen = [first[name] for name in first if name in read]
+        file.readings = np.full(file.readings.shape, np.nan)
+        chosen = [row for name, row in file.first.items() if name in file.read]
         if chosen:
-            poses, places = [names[row] for row in chosen], [table.place(row) for row in chosen]
-            blank[chosen] = solve_commanded_poses(controller, rows[chosen], poses, places).q
-        rows = blank
-    sigma = _read_reading_sigma(table, robot, rows)
-    return _FilePoses(
-        table, names, first, rows, sigma, read, unread if may_be_absent else frozenset()
-    )
+            poses, places = [names[row] for row in chosen], table.places(chosen)
+            solution = solve_commanded_poses(controller, rows[chosen], poses, places)
+            file.readings[chosen] = solution.q
+    file.sigma = _read_reading_sigma(table, robot, file.readings)
+    file.unread = file.unread if may_be_absent else frozenset()
 
 
-def _refuse_other_readings(
-    table: Table, names: tuple[str, ...], rows: FloatArray, begin: IntArray
-) -> None:
-    """Raise FileError where readings (rows, a) differ from those in the first row `begin` (rows,)
-    of their pose, or belong to a row of two poses, where `begin` is -1.
-    """
-    absent = np.isnan(rows)
-    is_same = (rows == rows[begin]) | (absent & absent[begin])
-    is_wrong = (begin < 0) | ~is_same.all(axis=1)
-    for row in np.flatnonzero(is_wrong & ~absent.all(axis=1)):
-        if begin[row] < 0:
-            sentence = f"the row of {names[row]!r} compares poses and has no readings of its own"
-            raise table.row_error(int(row), f"{sentence}; leave these cells empty")
-        line = table.lines[begin[row]]
-        sentence = f"pose {names[row]!r} has other readings in line {line}"
-        raise table.row_error(int(row), f"{sentence}; correct them, or rename one of the two poses")
-
-
-def _find_first_rows(table: Table, names: tuple[str, ...], rows: IntArray) -> dict[str, int]:
-    """Return pose -> its first row, in the order of the file."""
-    first: dict[str, int] = {}
-    for row in rows.tolist():
-        if not names[row]:
-            raise table.row_error(row, "column 'pose' is empty; write a name or a number")
-        if LINK not in names[row]:
-            first.setdefault(names[row], row)
-    return first
-
-
-def _reading_columns(
+def _list_reading_columns(
     table: Table, robot: Mechanism, controller: Mechanism | None
 ) -> list[NumberColumn]:
     """Return the columns of the readings, or of the coordinates of the controller."""
@@ -376,7 +373,7 @@ def _read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) ->
 
 
 def _refuse_contradictions(
-    file: _FilePoses, files: Sequence[_FilePoses], repeated: Mapping[int, tuple[int, int]]
+    file: _File, files: Sequence[_File], repeated: Mapping[int, tuple[int, int]]
 ) -> None:
     """Raise FileError where two files state different readings, or sigmas, of one pose.
 
@@ -384,59 +381,18 @@ def _refuse_contradictions(
     """
     if not repeated:
         return
-    rows = np.array(tuple(repeated))
-    number, other = np.array(tuple(repeated.values())).T
-    begin = np.cumsum([0, *(len(each.names) for each in files)])
+    rows, others = list(repeated), list(repeated.values())
     for what in ("readings", "sigma"):
         a = getattr(file, what)[rows]
-        b = np.concatenate([getattr(each, what) for each in files])[begin[number] + other]
+        b = np.array([getattr(files[i], what)[row] for i, row in others])
         same = np.isclose(a, b, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
         unstated = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
         for i in np.flatnonzero(~(same | unstated).all(axis=1)):
-            row, place = int(rows[i]), files[number[i]].table.place(int(other[i]))
-            sentence = f"pose {file.names[row]!r} has other {what} here than in {place}"
+            number, other = others[i]
+            place = files[number].table.place(other)
+            sentence = f"pose {file.names[rows[i]]!r} has other {what} here than in {place}"
             act = "correct them, or rename the pose in one of the files"
-            raise file.table.row_error(row, f"{sentence}; {act}")
-
-
-def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArray:
-    """Return block numbers (n,): by the column `block` of a pose's first row, else each alone."""
-    if not any("block" in file.table.units for file in files):
-        return np.arange(len(labels))
-    named: dict[str, tuple[str, str]] = {}
-    for file in (file for file in files if "block" in file.table.units):
-        cells = file.table.text("block")
-        for name, row in file.first.items():
-            if not cells[row]:
-                raise file.table.row_error(row, "column 'block' is empty; write a name or a number")
-            block, place = named.setdefault(name, (cells[row], file.table.place(row)))
-            if block != cells[row]:
-                sentence = f"pose {name!r} is in block {cells[row]!r} here and {block!r} in {place}"
-                raise file.table.row_error(row, f"{sentence}; correct one")
-    keys = [("block", named[name][0]) if name in named else ("pose", name) for name in labels]
-    numbers = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    return np.array([numbers[key] for key in keys])
-
-
-def _read_held_out(tables: Sequence[Table], poses: PoseRows) -> BoolArray:
-    """Return which poses (n,) the files hold out; FileError for two different uses of one pose."""
-    stated: dict[int, tuple[str, str]] = {}
-    for table, members in zip(tables, poses.members, strict=True):
-        for row, cell in enumerate(USE_COLUMN.parse(table)):
-            for pose in members[row] if cell else ():
-                use, place = stated.setdefault(pose, (cell, table.place(row)))
-                if use != cell:
-                    finding = report_finding(
-                        "data.use-contradicted",
-                        pose=poses.labels[pose],
-                        use=cell,
-                        other_use=use,
-                        place=place,
-                    )
-                    raise table.row_error(row, finding)
-    is_held_out = np.zeros(len(poses.labels), dtype=bool)
-    is_held_out[[pose for pose, (use, _) in stated.items() if use == HELD_OUT]] = True
-    return is_held_out
+            raise file.table.row_error(rows[i], f"{sentence}; {act}")
 
 
 FORMAT = 1
@@ -501,23 +457,27 @@ def _join_tables(
     from loopcal.measure.data_checks import check_duplicates, check_strokes
     from loopcal.measure.measurements import Measurements
 
-    kinds = [read_kinds(table, robot, len(tables) > 1) for table in tables]
-    if not any(kinds):
+    several = len(tables) > 1
+    kinds = [(table, read_kinds(table, robot, several)) for table in tables]
+    if not any(of_file for _, of_file in kinds):
         sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
         raise FileError(sentence, tables[0].path)
-    _check_base_targets(tables, kinds)
-    of_base = [np.zeros(len(table), dtype=bool) for table in tables]
-    for is_base, of_file in zip(of_base, kinds, strict=True):
-        for entry in (entry for entry in of_file if entry.kind.is_of_base):
-            is_base[entry.rows] = True
-    poses = _read_pose_rows(tables, robot, of_base)
-    context = [read_context(table) for table in tables]
-    beside_poses = _collect_pose_context(tables, kinds, poses.members, context, len(poses.labels))
+    _check_base_targets(kinds)
+    files = [_read_file(*each, robot, several) for each in kinds]
+    origin = _join_poses(files, robot)
+    labels = tuple(origin)
+    readings = np.array([files[i].readings[row] for i, row in origin.values()])
+    sigma = None
+    if any(_states_reading_noise(table, robot) for table in tables):
+        stated = np.array([files[i].sigma[row] for i, row in origin.values()])
+        sigma = np.where(np.isnan(stated), robot.stated_sigma, stated)
+    beside_poses = _collect_pose_context(files, len(labels))
     read = [
-        [read_observations(table, robot, entry, members, beside, beside_poses) for entry in of_file]
-        for table, of_file, members, beside in zip(
-            tables, kinds, poses.members, context, strict=True
-        )
+        [
+            read_observations(file.table, robot, entry, file.members, file.context, beside_poses)
+            for entry in file.kinds
+        ]
+        for file in files
     ]
     # A file in which nothing was measured yet, the sheet of a plan, only contributes readings and
     # uses of poses that the others name; if no file has a measured value, all rows are kept.
@@ -526,11 +486,11 @@ def _join_tables(
         read = [of if filled else [] for of, filled in zip(read, is_filled, strict=True)]
     settings = [
         (
-            table.settings,
+            file.table.settings,
             [rows for rows, _ in of_file],
-            {name: sd for entry in entries for name, sd in entry.shared_errors.items()},
+            {name: sd for entry in file.kinds for name, sd in entry.shared_errors.items()},
         )
-        for table, of_file, entries in zip(tables, read, kinds, strict=True)
+        for file, of_file in zip(files, read, strict=True)
         if of_file
     ]
     with name_files(*(table.path for table in tables)):
@@ -541,14 +501,13 @@ def _join_tables(
         )
         data = Measurements(
             robot.name,
-            poses.readings,
+            readings,
             tuple(rows for rows, _ in of_poses),
-            poses.block,
-            poses.labels,
-            poses.sigma,
-            read_stated_values(settings, poses.labels),
-            _read_held_out(tables, poses),
-            tuple(rows for rows, _ in on_base),
+            labels=labels,
+            reading_sigma=sigma,
+            stated_values=read_stated_values(settings, labels),
+            base_observations=tuple(rows for rows, _ in on_base),
+            **{c.attribute: _read_pose_column(c, files, labels) for c in POSE_COLUMNS},
         )
         first: dict[int, str] = {}  # place of the first row of each pose, such as `data.csv:12`
         for rows, places in reversed(of_poses):
@@ -557,11 +516,44 @@ def _join_tables(
         check_strokes(data, robot, allow=allow_outside_stroke, places=first)
         check_duplicates(data, allow=allow_duplicates, places=[at for _, at in of_poses + on_base])
     # Poses that only an unfilled sheet names were planned, not measured.
-    is_named = np.zeros(len(poses.labels), dtype=bool)
-    for of_file, left, of_rows in zip(kinds, read, poses.members, strict=True):
-        if left or not of_file:
-            is_named[[pose for members in of_rows for pose in members]] = True
+    is_named = np.zeros(len(labels), dtype=bool)
+    for file, left in zip(files, read, strict=True):
+        if left or not file.kinds:
+            is_named[[pose for members in file.members for pose in members]] = True
     return data if is_named.all() else data.take(is_named)
+
+
+def _collect_pose_context(files: Sequence[_File], n: int) -> dict[str, FloatArray]:
+    """Return name -> (n,) times and temperatures of rows that only hold readings, else NaN."""
+    stated: dict[str, dict[int, tuple[float, Table, int]]] = {}
+    for file in (file for file in files if file.context):
+        measuring = {
+            int(row)
+            for entry in file.kinds
+            for row in entry.rows
+            if len(file.members[row]) == entry.kind.poses_per_row
+        }
+        alone = [
+            (row, poses[0])
+            for row, poses in enumerate(file.members)
+            if row not in measuring and len(poses) == 1
+        ]
+        for name, values in file.context.items():
+            sentence = f"column {name!r} has another value in an earlier row of this pose"
+            pairs = [(row, pose) for row, pose in alone if not np.isnan(values[row])]
+            if pairs:
+                _enter(
+                    stated.setdefault(name, {}),
+                    file.table,
+                    pairs,
+                    values.tolist(),
+                    lambda *_, sentence=sentence: f"{sentence}; correct one",
+                )
+    nothing = (np.nan, None, 0)
+    return {
+        name: np.array([of_pose.get(i, nothing)[0] for i in range(n)])
+        for name, of_pose in stated.items()
+    }
 
 
 def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
@@ -636,36 +628,6 @@ def _read_tables(path: Paths) -> tuple[Table, ...]:
     return tuple(tables)
 
 
-def _collect_pose_context(
-    tables: Sequence[Table],
-    kinds: Sequence[tuple[KindRows, ...]],
-    members: Sequence[Sequence[tuple[int, ...]]],
-    context: Sequence[Mapping[str, FloatArray]],
-    n: int,
-) -> dict[str, FloatArray]:
-    """Return name -> (n,) times and temperatures of rows that only hold readings, else NaN."""
-    of_poses: dict[str, FloatArray] = {}
-    for table, of_file, of_rows, beside in zip(tables, kinds, members, context, strict=True):
-        if not beside:
-            continue
-        measuring = {
-            int(row)
-            for entry in of_file
-            for row in entry.rows
-            if len(of_rows[row]) == entry.kind.poses_per_row
-        }
-        for name, values in beside.items():
-            for row, poses in enumerate(of_rows):
-                if row in measuring or len(poses) != 1 or np.isnan(values[row]):
-                    continue
-                pose = of_poses.setdefault(name, np.full(n, np.nan))
-                if not np.isnan(pose[poses[0]]) and pose[poses[0]] != values[row]:
-                    sentence = f"column {name!r} has another value in an earlier row of this pose"
-                    raise table.row_error(row, f"{sentence}; correct one")
-                pose[poses[0]] = values[row]
-    return of_poses
-
-
 def load_instrument(path: str | Path, robot: Mechanism) -> Instrument:
     """Return the instrument of a measurement file, which measures every pose."""
     table = read_table(path)
@@ -709,7 +671,7 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     """Return the instrument with the noise that the settings of a table state."""
     from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 
-    _check_base_targets((table,), (kinds,))
+    _check_base_targets([(table, kinds)])
     sensors = []
     for entry in kinds:
         for column in entry.kind.noise_columns:

@@ -18,10 +18,10 @@ from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import format_flow_mapping, quote_scalar
 from loopcal.io.data.columns import (
     COVARIANCE,
-    FIT,
-    HELD_OUT,
     LINK,
     MEASURED,
+    POSE_COLUMNS,
+    ROW_COLUMNS,
     SIGMA,
     USE_COLUMN,
     Column,
@@ -110,7 +110,7 @@ def format_measurements(
     check_redundancy(robot, kinds)
     labels, known = _label_kinds(kinds), list_columns(robot, kinds)
     tables = [_tabulate_rows(rows, robot) for rows in observations]
-    reading_noise, of_poses = _tabulate_poses(data, robot)
+    reading_noise, readings = _tabulate_readings(data, robot)
     texts = [
         format_kind(rows.kind, noise, robot.tool, rows.is_noise_assumed)
         | ({} if rows.instrument is None else {"instrument": format_instrument(rows.instrument)})
@@ -121,13 +121,17 @@ def format_measurements(
     for key, text in (("unknowns", knowledge), ("reading_noise", reading_noise)):
         lines += [f"# {key}: {text}"] if text else []
 
-    has_use = states_use or bool(data.is_held_out.any())
-    names = ["pose", *([USE_COLUMN.name] if has_use else [])]
-    names += [*(["block"] if len(set(data.block.tolist())) < data.n_poses else [])]
-    for name in ("session", "group"):
+    uses = {
+        column.name: column.decode(values)
+        for column in POSE_COLUMNS
+        if column.is_needed(values := getattr(data, column.attribute))
+        or (states_use and column is USE_COLUMN)
+    }
+    names = ["pose", *uses]
+    for name in ROW_COLUMNS:
         is_stated = any((getattr(rows, name) != "").any() for rows in observations)
         names += [name] if is_stated else []
-    names += [*(["kind"] if len(kinds) > 1 else []), *of_poses]
+    names += [*(["kind"] if len(kinds) > 1 else []), *readings]
     names += [name for rows in observations for name in rows.context]
     names += [name for _, table in tables for name in table]
     for name in (name for _, table in tables for name in table):
@@ -142,7 +146,7 @@ def format_measurements(
     for label, rows, (_, table) in zip(labels, observations, tables, strict=True):
         for i in np.flatnonzero(rows.weight):  # rows of weight 0 are not written
             cells = {name: values[i] for name, values in {**rows.context, **table}.items()}
-            cells |= {"kind": label, "session": rows.session[i], "group": rows.group[i]}
+            cells |= {"kind": label} | {name: getattr(rows, name)[i] for name in ROW_COLUMNS}
             poses = [] if rows.kind.is_of_base else np.atleast_1d(rows.rows[i]).tolist()
             body.append((poses, cells))
     measured = {poses[0] for poses, _ in body if len(poses) == 1}
@@ -151,9 +155,7 @@ def format_measurements(
         pose = LINK.join(data.labels[pose] for pose in poses)
         cells |= {"pose": pose}
         if len(poses) == 1:
-            cells[USE_COLUMN.name] = HELD_OUT if data.is_held_out[poses[0]] else FIT
-            cells |= {name: values[poses[0]] for name, values in of_poses.items()}
-            cells["block"] = data.block[poses[0]]
+            cells |= {name: values[poses[0]] for name, values in {**uses, **readings}.items()}
         texts = (c.format(cells[c.name]) if c.name in cells else "" for c in columns)
         lines.append(format_row(texts))
     return "\n".join(lines) + "\n"
@@ -234,7 +236,7 @@ def _label_kinds(kinds: Sequence[Kind]) -> list[str]:
 def _refuse_names(data: Measurements) -> None:
     """Raise DataError for names of poses, sessions and groups that a file cannot hold."""
     names = [("pose", name) for name in data.labels]
-    for what in ("session", "group"):
+    for what in ROW_COLUMNS:
         names += [(what, n) for rows in data.all_observations for n in getattr(rows, what).tolist()]
     for what, name in dict.fromkeys(names):
         if (fault := find_fault(name)) is not None:
@@ -252,7 +254,7 @@ def _refuse_names(data: Measurements) -> None:
         raise DataError(f"two poses are named {name!r}, but names must differ; rename one")
 
 
-def _tabulate_poses(data: Measurements, robot: Mechanism) -> tuple[str, dict[str, FloatArray]]:
+def _tabulate_readings(data: Measurements, robot: Mechanism) -> tuple[str, dict[str, FloatArray]]:
     """Return the setting of reading noise, and column -> (n,) readings and other noise [SI].
 
     The noise of an actuator is in the setting where it is the same in all poses.
