@@ -34,7 +34,7 @@ from loopcal.estimate.fit_linearization import (
     linearize_fit,
     linearize_rows_of,
 )
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
@@ -44,7 +44,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import are_nonzero, substitute_backward
@@ -428,10 +427,9 @@ def compute_error_budget(
     frame : in which the errors of poses are stated, see `choose_error_frame`; "relative" means
         relative to the home pose.
     """
-    check_fitted_data(fit, data)
+    data = prepare_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals):
         return None
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     is_workspace = True
     try:
         drawn = sample_workspace(fit.robot, POSES, SEED).solution

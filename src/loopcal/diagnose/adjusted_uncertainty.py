@@ -37,13 +37,12 @@ from loopcal.diagnose.residual_patterns import (
     find_patterns,
 )
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.solutions import Solution
 from loopcal.numerics.statistics import compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray
@@ -72,10 +71,9 @@ def adjust_uncertainty(
     Estimates stay. No variance becomes smaller. A fit that did not converge, has no intervals, or
     has weights by a loss is returned as it is. `linear` : see `linearize_fit`.
     """
-    check_fitted_data(fit, data)
+    data = prepare_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
         return fit
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     linear = linearize_fit(fit, data) if linear is None else linear
     rows = collect_residual_rows(fit, data, linear)
     if linear.solution.linearized is None or fit.poses is not None:
@@ -276,7 +274,7 @@ def check_heavy_tails(
     reported = (f for f in fit.findings if f.severity is Severity.WARNING)
     if any(f.code.startswith(PATTERNS) and f.code != NO_PATTERN for f in reported):
         return nothing
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    data = prepare_fitted_data(fit, data)
     linear = linearize_fit(fit, data) if linear is None else linear
     rows = collect_residual_rows(fit, data, linear)
     if rows is None:

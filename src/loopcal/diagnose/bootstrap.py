@@ -15,9 +15,9 @@ See docs/theory/resampling.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, get_args
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -28,24 +28,29 @@ from loopcal.diagnose.cluster_covariance import (
     compute_robust_spread,
     divide_into_clusters,
 )
-from loopcal.diagnose.intervals import NAMED, OFF, Intervals, compare_ends, report_intervals
+from loopcal.diagnose.intervals import (
+    ENDS,
+    NAMED,
+    OFF,
+    Intervals,
+    compare_ends,
+    mask_intervals,
+    report_intervals,
+)
 from loopcal.diagnose.outliers import TESTABLE
 from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
-from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.observation_rows import ObservationRows, linked_blocks
+from loopcal.estimate.identification import prepare_fitted_data
+from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.pose_linearization import linearize_rows
-from loopcal.estimate.problem import Problem
 from loopcal.estimate.resampling import ResampleFits, Resamples, draw_centers, fit_resamples
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_single_level
@@ -54,96 +59,99 @@ from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 
-@dataclass(frozen=True, eq=False)
-class ObservedColumns:
-    """The whitened rows of one kind (one trial)."""
+class ObservedValues(NamedTuple):
+    """The M present measured values of a fit (one trial), by block, kind, row and component."""
 
-    residual: FloatArray  # (r, m)
-    # (r, m, U) by the nuisance parameters, in units of their standard deviations
-    by_nuisance: FloatArray
-    # (r, m, p) by the machine's deviations, as the nuisance parameters follow it
-    by_parameters: FloatArray
-    # (r, links, m, k) by the coordinates of each linked pose; None where poses have none
-    by_coordinates: FloatArray | None
+    block: IntArray  # (M,)
+    kind: IntArray  # (M,)
+    row: IntArray  # (M,)
+    component: IntArray  # (M,)
+    residual: FloatArray  # (M,) whitened
+    by_nuisance: FloatArray  # (M, U) in units of the standard deviations of nuisance parameters
+    by_parameters: FloatArray  # (M, p) deviations of the machine, as nuisance parameters follow it
+    poses: IntArray  # (M, links) that each value sees
+    by_coordinates: FloatArray  # (M, links, k) their coordinates; k is 0 where poses have none
 
 
-def list_observed_columns(
-    problem: Problem, linearization: Linearization
-) -> tuple[ObservedColumns, ...]:
-    """Return the rows of every kind of a problem, at its linearization (one trial)."""
+def list_observed_values(linear: FitLinearization, clusters: Clusters) -> ObservedValues:
+    """Return the measured values of a fit at its linearization, block by block."""
+    problem, linearization = linear.problem, linear.linearization
     z, trials, estimate = linearization.deviation, problem.trials, linearization.nuisance
     fixed = None if estimate is None else estimate.values
     solution = problem.poses.solve(z, trials, linearization.next_start, problem.control, fixed)
-    root = None if estimate is None else estimate.elimination.joint_root()[0]
-    width = 0 if root is None else len(root)
-    kinds = []
-    for rows in problem.rows:
-        shape = rows.whitener.shape[1:3]
-        by_nuisance = np.zeros((*shape, width))
-        by_parameters = np.zeros((*shape, problem.parameters))
-        kinds.append(ObservedColumns(np.zeros(shape), by_nuisance, by_parameters, None))
+    root = np.zeros((0, 0)) if estimate is None else estimate.elimination.joint_root()[0]
+    links = max(rows.poses_by_link.shape[1] for rows in problem.rows)
+    parts, coordinates = [], []
     for block, poses in problem.poses.iterate_poses(solution, z):
         for i, (numbers, rows) in enumerate(zip(block.row_numbers, block.rows, strict=True)):
-            if not len(numbers):
+            of_kind = problem.rows[i]
+            place, component = np.nonzero(of_kind.is_present[0, numbers])
+            if not len(place):
                 continue
-            kind, own = kinds[i], linearize_rows(rows, poses, trials, fixed)
-            columns = own.by_parameters[0]
+            own, row = linearize_rows(rows, poses, trials, fixed), numbers[place]
+            by_parameters = own.by_parameters[0]
+            by_nuisance = np.zeros((*by_parameters.shape[:2], len(root)))
             if own.by_nuisance is not None and estimate is not None:
-                wide = spread_columns(own.by_nuisance, rows.nuisance, width)[0]
-                columns = columns + wide @ estimate.elimination.slope[0]
-                kind.by_nuisance[numbers] = wide @ root
-            kind.residual[numbers], kind.by_parameters[numbers] = own.residual[0], columns
+                wide = spread_columns(own.by_nuisance, rows.nuisance, len(root))[0]
+                by_parameters = by_parameters + wide @ estimate.elimination.slope[0]
+                by_nuisance = wide @ root
+            seen = of_kind.poses_by_link[row]
+            parts.append(
+                (
+                    *(clusters.member[of_kind.first_poses[row]], np.full(len(row), i)),
+                    *(row, component, own.residual[0][place, component]),
+                    *(by_nuisance[place, component], by_parameters[place, component]),
+                    seen[:, np.minimum(np.arange(links), seen.shape[1] - 1)],
+                )
+            )
+            coordinates.append(np.zeros((len(row), 1, 0)))
             if own.by_coordinates is not None:
-                by_coordinates = kind.by_coordinates
-                if by_coordinates is None:
-                    shape = (len(kind.residual), *own.by_coordinates.shape[2:])
-                    by_coordinates = np.zeros(shape)
-                    kinds[i] = replace(kind, by_coordinates=by_coordinates)
-                by_coordinates[numbers] = own.by_coordinates[0]
-    return tuple(kinds)
+                coordinates[-1] = own.by_coordinates[0][place, :, component]
+    columns = list(map(np.concatenate, zip(*parts, strict=True)))
+    by_coordinates = np.zeros((len(columns[0]), links, max(c.shape[2] for c in coordinates)))
+    first = 0
+    for part in coordinates:
+        by_coordinates[first : first + len(part), : part.shape[1], : part.shape[2]] = part
+        first += len(part)
+    values = ObservedValues(*columns, by_coordinates)
+    order = np.lexsort((values.component, values.row, values.kind, values.block))
+    return ObservedValues(*(column[order] for column in values))
 
 
 @dataclass(frozen=True, eq=False)
 class BlockErrors:
     """Errors of the M present measured values, block by block, corrected for leverage."""
 
+    values: ObservedValues
     residual: FloatArray  # (M,) whitened residuals at the truth of the resamples
     error: FloatArray  # (M,) those at the estimate, corrected for leverage
-    block: IntArray  # (M,) number of the block of each, ascending
-    count: int  # of blocks
     # of every block (M_g, d) an orthonormal basis of the directions without residuals
     untested: tuple[FloatArray, ...]
-    # of every kind, where (r, m) its components are among the M; -1 where absent
-    places: tuple[IntArray, ...]
+    shapes: tuple[tuple[int, int], ...]  # (r, m) of every kind
 
     def draw(
-        self, factor: FloatArray, sigma: float, rng: np.random.Generator
+        self, factor: FloatArray | int, sigma: float, rng: np.random.Generator
     ) -> tuple[FloatArray, ...]:
         """Return offsets (t, r, m) of every kind that replace the residuals by errors.
 
-        factor : (t, count) by which the error of each block is multiplied.
-        sigma : standard deviation of errors in untested directions.
+        factor : (t, blocks) by which the error of each block is multiplied; or t, for independent
+            normal errors. sigma : standard deviation of these, and of untested directions.
         """
-        offset = factor[:, self.block] * self.error - self.residual
-        for g, basis in enumerate(self.untested):
-            if basis.shape[1]:
-                drawn = rng.standard_normal((len(factor), basis.shape[1]))
-                offset[:, self.block == g] += sigma * drawn @ basis.T
-        return self._by_kind(offset)
-
-    def draw_normal(
-        self, count: int, sigma: float, rng: np.random.Generator
-    ) -> tuple[FloatArray, ...]:
-        """Return offsets (count, r, m) of every kind that replace the residuals by independent
-        normal errors.
-        """
-        drawn = sigma * rng.standard_normal((count, len(self.residual)))
-        return self._by_kind(drawn - self.residual)
-
-    def _by_kind(self, values: FloatArray) -> tuple[FloatArray, ...]:
-        """Return values (t, M) as arrays (t, r, m) of every kind, 0 where absent."""
-        padded = np.concatenate([values, np.zeros((len(values), 1))], axis=1)
-        return tuple(padded[:, places] for places in self.places)
+        block = self.values.block
+        if isinstance(factor, int):
+            offset = sigma * rng.standard_normal((factor, len(block))) - self.residual
+        else:
+            offset = factor[:, block] * self.error - self.residual
+            for g, basis in enumerate(self.untested):
+                if basis.shape[1]:
+                    drawn = rng.standard_normal((len(factor), basis.shape[1]))
+                    offset[:, block == g] += sigma * drawn @ basis.T
+        by_kind = []
+        for i, shape in enumerate(self.shapes):
+            own = self.values.kind == i
+            by_kind.append(np.zeros((len(offset), *shape)))
+            by_kind[i][:, self.values.row[own], self.values.component[own]] = offset[:, own]
+        return tuple(by_kind)
 
 
 def compute_block_errors(
@@ -154,77 +162,28 @@ def compute_block_errors(
     shift : (p,) in tolerances, from the estimate to the truth of the resamples, at which the rows
         have the residuals that the errors replace.
     """
-    problem, kinds = linear.problem, list_observed_columns(linear.problem, linear.linearization)
-    columns = []
-    for number, of_kind in enumerate(problem.rows):
-        row, component = np.nonzero(of_kind.is_present[0])
-        block = clusters.member[of_kind.first_poses[row]]
-        columns.append(np.stack([block, np.full(len(row), number), row, component]))
-    cells = np.concatenate(columns, axis=1)
-    cells = _Cells(*cells[:, np.lexsort((cells[1], cells[0]))])
+    values = list_observed_values(linear, clusters)
     V = linear.decomposition.scale[:, None] * linear.decomposition.directions[0]
     total = linear.decomposition.singular_values[0] ** 2 + linear.penalty[0]
     V = V[:, linear.is_estimated] / np.sqrt(total[linear.is_estimated])
-    residual, error = np.zeros(len(cells.block)), np.zeros(len(cells.block))
+    residual, error = values.residual.copy(), np.zeros(len(values.block))
     untested = []
     for g in range(clusters.count):
-        mine = np.flatnonzero(cells.block == g)
-        cells_of_kinds = [cells.within(mine, i) for i in range(len(kinds))]
-        pairs = list(zip(kinds, cells_of_kinds, strict=True))
-        residual[mine] = np.concatenate([kind.residual[own_cells] for kind, own_cells in pairs])
-        by_nuisance = np.concatenate([kind.by_nuisance[own_cells] for kind, own_cells in pairs])
-        by_parameters = np.concatenate([kind.by_parameters[own_cells] for kind, own_cells in pairs])
-        half = np.concatenate([by_nuisance, by_parameters @ V], axis=1)
-        poses = _pose_columns(problem.rows, kinds, cells_of_kinds)
-        error[mine], lost = _correct(residual[mine], half, poses)
+        mine = np.flatnonzero(values.block == g)
+        by_parameters = values.by_parameters[mine]
+        half = np.concatenate([values.by_nuisance[mine], by_parameters @ V], axis=1)
+        poses = np.unique(values.poses[mine])
+        k = values.by_coordinates.shape[2]
+        by_poses = np.zeros((len(mine), len(poses), k))
+        for link in range(values.poses.shape[1]):
+            place = np.searchsorted(poses, values.poses[mine, link])
+            by_poses[np.arange(len(mine)), place] += values.by_coordinates[mine, link]
+        by_poses = by_poses.reshape(len(mine), len(poses) * k)
+        error[mine], lost = _correct(residual[mine], half, by_poses)
         residual[mine] += by_parameters @ shift
         untested.append(lost)
-    places = tuple(cells.places(i, kind.residual.shape) for i, kind in enumerate(kinds))
-    return BlockErrors(residual, error, cells.block, clusters.count, tuple(untested), places)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """The present components of all rows, sorted by block and kind: (M,) each."""
-
-    block: IntArray
-    kind: IntArray
-    row: IntArray
-    component: IntArray
-
-    def within(self, cells: IntArray, kind: int) -> tuple[IntArray, IntArray]:
-        """Return rows and components of those of some cells that are of one kind."""
-        mine = cells[self.kind[cells] == kind]
-        return self.row[mine], self.component[mine]
-
-    def places(self, kind: int, shape: tuple[int, ...]) -> IntArray:
-        """Return the cell (r, m) of each component of a kind; -1 where absent."""
-        places = np.full(shape, -1)
-        mine = np.flatnonzero(self.kind == kind)
-        places[self.row[mine], self.component[mine]] = mine
-        return places
-
-
-def _pose_columns(
-    rows: Sequence[ObservationRows],
-    kinds: Sequence[ObservedColumns],
-    cells_of_kinds: Sequence[tuple[IntArray, IntArray]],
-) -> FloatArray:
-    """Return the columns (M, K) of a block's cells by the coordinates of its poses."""
-    if all(kind.by_coordinates is None for kind in kinds):
-        return np.zeros((sum(len(row) for row, _ in cells_of_kinds), 0))
-    linked = [r.poses_by_link[row] for r, (row, _) in zip(rows, cells_of_kinds, strict=True)]
-    poses = np.unique(np.concatenate([of_kind.ravel() for of_kind in linked]))
-    blocks = []
-    for kind, names, (row, component) in zip(kinds, linked, cells_of_kinds, strict=True):
-        assert kind.by_coordinates is not None
-        k = kind.by_coordinates.shape[-1]
-        wide = np.zeros((len(row), len(poses), k))
-        for link in range(names.shape[1]):
-            place = np.searchsorted(poses, names[:, link])
-            wide[np.arange(len(row)), place] += kind.by_coordinates[row, link, component]
-        blocks.append(wide.reshape(len(row), len(poses) * k))
-    return np.concatenate(blocks)
+    shapes = tuple(rows.whitener.shape[1:3] for rows in linear.problem.rows)
+    return BlockErrors(values, residual, error, tuple(untested), shapes)
 
 
 def _correct(
@@ -447,7 +406,6 @@ class Bootstrap(TableResult):
             raise EstimationError(f"kind of interval is {kind!r}; it must be one of {words}")
         estimate, weight = self.fit.estimate, np.full(len(self.draws), 1.0 / len(self.draws))
         ends = compare_ends(self.draws, weight, self.linear, weight, level)
-        known = np.where(self.is_known, 1.0, np.nan)
         half = 0.5 * (ends.linear[1] - ends.linear[0])
         with np.errstate(divide="ignore", invalid="ignore"):
             shift, error = (ends.quantile - ends.linear) / half, ends.error / half
@@ -455,18 +413,16 @@ class Bootstrap(TableResult):
         degrees = self.scatter.degrees if self.scheme != "normal" else np.inf
         widen = coverage_factor(degrees, level) / coverage_factor(np.inf, level)
         linear = estimate + (ends.linear - estimate) * (widen if kind == "widened" else 1.0)
-        return Intervals(
-            names=self.fit.names,
-            level=level,
-            source=f"{self.scheme} bootstrap, {kind}",
-            center=self.draws.mean(axis=0) * known,
-            sd=self.draws.std(axis=0, ddof=1) * known,
-            lower=lower * known,
-            upper=upper * known,
-            linear_lower=linear[0] * known,
-            linear_upper=linear[1] * known,
-            shift=shift * known,
-            shift_error=error * known,
+        return mask_intervals(
+            self.is_known,
+            self.fit.names,
+            level,
+            f"{self.scheme} bootstrap, {kind}",
+            center=self.draws.mean(axis=0),
+            sd=self.draws.std(axis=0, ddof=1),
+            **dict(zip(ENDS, (lower, upper, *linear), strict=True)),
+            shift=shift,
+            shift_error=error,
         )
 
     @property
@@ -539,7 +495,7 @@ def bootstrap(
     EstimationError : the fit did not converge, the data have no such unit, or fewer than two
         resamples converged.
     """
-    check_fitted_data(fit, data)
+    data = prepare_fitted_data(fit, data)
     if scheme not in get_args(Scheme):
         raise EstimationError(f"scheme is {scheme!r}; it must be wild, pairs or normal")
     if count < 2:
@@ -550,13 +506,16 @@ def bootstrap(
         raise EstimationError(report_finding("sampling.without-intervals"))
     if scheme == "pairs" and isinstance(fit.method, MAP) and callable(fit.method.inflation):
         raise EstimationError(report_finding("sampling.pairs-with-rule"))
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     blocks, linear = choose_blocks(data, unit), linearize_fit(fit, data)
-    draw = _Draw(fit, linear, blocks, scheme, np.random.default_rng(np.random.SeedSequence(seed)))
-    batches = []
+    rng, errors, batches = np.random.default_rng(np.random.SeedSequence(seed)), None, []
+    if scheme != "pairs":
+        shift = _shift_truth(linear, isinstance(fit.method, MAP))
+        errors = compute_block_errors(linear, blocks, shift)
     for first in range(0, count, BATCH):
         progress(first, count, "fitting resamples")
-        batches.append(fit_resamples(fit, linear, draw(min(BATCH, count - first))))
+        size = min(BATCH, count - first)
+        resamples = _draw_resamples(fit, linear, blocks, errors, scheme, size, rng)
+        batches.append(fit_resamples(fit, linear, resamples))
     progress(count, count, "fitting resamples")
     fits = ResampleFits.join(batches)
     kept = fits.take(np.flatnonzero(fits.converged))
@@ -576,85 +535,63 @@ def bootstrap(
     )
 
 
-class _Draw:
-    """Draws resamples of the rows of a fit."""
+def _shift_truth(linear: FitLinearization, is_prior: bool) -> FloatArray:
+    """Return the step (p,) from the estimate to the truth of the resamples.
 
-    def __init__(
-        self,
-        fit: Identification,
-        linear: FitLinearization,
-        blocks: Clusters,
-        scheme: Scheme,
-        rng: np.random.Generator,
-    ) -> None:
-        self.fit, self.linear, self.blocks = fit, linear, blocks
-        self.scheme, self.rng = scheme, rng
-        self.is_prior = isinstance(fit.method, MAP)
-        self.errors = None
-        if scheme != "pairs":
-            self.errors = compute_block_errors(linear, blocks, self._shift_truth())
+    The penalty of a ridge or a truncation is no observation and stays as it is. Then the truth is
+    the least-squares solution, so that the resamples scatter about the estimate.
+    """
+    d, z = linear.decomposition, linear.linearization.deviation
+    if is_prior:
+        return np.zeros(z.shape[1])
+    return (d.deviation(d.solution(np.where(d.used, 0.0, np.inf))) - z)[0]
 
-    def __call__(self, count: int) -> Resamples:
-        """Draw `count` resamples."""
-        G, sigma = self.blocks.count, self.fit.residual_test.sigma_scale
-        equations = np.full(count, int(self.linear.linearization.equations[0]))
-        weight, offset = None, None
-        if self.errors is None:
-            drawn = self.rng.multinomial(G, np.full(G, 1.0 / G), count)
-            weight = drawn[:, self.blocks.member].astype(np.float64)
-            total = np.zeros(self.blocks.count, dtype=np.int64)
-            for rows in self.linear.problem.rows:
-                present = rows.is_present[0].sum(axis=1)
-                owner = self.blocks.member[rows.first_poses]
-                total += np.bincount(owner, present, self.blocks.count).astype(np.int64)
-            equations = equations + (drawn - 1) @ total
-        elif self.scheme == "normal":
-            offset = self.errors.draw_normal(count, sigma, self.rng)
-        else:
-            offset = self.errors.draw(self._draw_factors(count), sigma, self.rng)
-        center, prior, nuisance = self._draw_priors(count)
-        return Resamples(weight, offset, center, prior, nuisance, equations)
 
-    def _shift_truth(self) -> FloatArray:
-        """Return the step (p,) from the estimate to the truth of the resamples.
+def _draw_resamples(
+    fit: Identification,
+    linear: FitLinearization,
+    blocks: Clusters,
+    errors: BlockErrors | None,
+    scheme: Scheme,
+    count: int,
+    rng: np.random.Generator,
+) -> Resamples:
+    """Draw `count` resamples of the rows of a fit, and of its priors.
 
-        The penalty of a ridge or a truncation is no observation and stays as it is. Then the truth
-        is the least-squares solution, so that the resamples scatter about the estimate.
-        """
-        d, z = self.linear.decomposition, self.linear.linearization.deviation
-        if self.is_prior:
-            return np.zeros(z.shape[1])
-        unpenalized = np.where(d.used, 0.0, np.inf)
-        return (d.deviation(d.solution(unpenalized)) - z)[0]
-
-    def _draw_factors(self, count: int) -> FloatArray:
-        """Return random factors (count, G) of mean 0 and variance 1."""
-        sign = self.rng.choice([-1.0, 1.0], (count, self.blocks.count))
-        if self.blocks.count >= FEW_BLOCKS:
-            return sign
-        return sign * self.rng.choice(WEBB, sign.shape)
-
-    def _draw_priors(self, count: int) -> tuple[FloatArray, FloatArray | None, FloatArray]:
-        """Return drawn centers of the tolerances, errors of the rows of an earlier calibration, and
-        means of the priors of nuisance parameters.
-
-        They scatter about the truth of the resamples where errors of rows are drawn, and about the
-        given values where the residuals keep their bias.
-        """
-        linear, fit, rng = self.linear, self.fit, self.rng
-        is_recentered = self.errors is not None
-        z, nuisance = linear.linearization.deviation, linear.problem.nuisance
-        center = np.zeros((count, z.shape[1]))
-        if self.is_prior:
-            center = draw_centers(linear, count, rng) + (z if is_recentered else 0.0)
-        prior = None
-        if fit.options.prior is not None:
-            rows = fit.options.prior.added(linear.problem)
-            at_estimate = rows.residuals(z) if is_recentered else 0.0
-            prior = rng.standard_normal((count, rows.constant.shape[1])) - at_estimate
-        if nuisance is None:
-            return center, prior, np.zeros((count, 0))
-        has_prior, table = nuisance.has_prior, nuisance.local.table
-        sd = np.where(has_prior, np.nan_to_num(table.tolerance), 0.0)
-        mean = fit.nuisance.estimate if is_recentered else table.nominal
-        return center, prior, mean + sd * rng.standard_normal((count, len(sd)))
+    Priors scatter about the truth of the resamples where errors of rows are drawn, and about the
+    given values where the residuals keep their bias.
+    """
+    G, sigma = blocks.count, fit.residual_test.sigma_scale
+    equations = np.full(count, int(linear.linearization.equations[0]))
+    weight, offset = None, None
+    if errors is None:
+        drawn = rng.multinomial(G, np.full(G, 1.0 / G), count)
+        weight = drawn[:, blocks.member].astype(np.float64)
+        total = np.zeros(G, dtype=np.int64)
+        for rows in linear.problem.rows:
+            present = rows.is_present[0].sum(axis=1)
+            total += np.bincount(blocks.member[rows.first_poses], present, G).astype(np.int64)
+        equations = equations + (drawn - 1) @ total
+    elif scheme == "normal":
+        offset = errors.draw(count, sigma, rng)
+    else:  # factors of mean 0 and variance 1
+        factor = rng.choice([-1.0, 1.0], (count, G))
+        if G < FEW_BLOCKS:
+            factor = factor * rng.choice(WEBB, factor.shape)
+        offset = errors.draw(factor, sigma, rng)
+    z, nuisance = linear.linearization.deviation, linear.problem.nuisance
+    center = np.zeros((count, z.shape[1]))
+    if isinstance(fit.method, MAP):
+        center = draw_centers(linear, count, rng) + (0.0 if errors is None else z)
+    prior = None
+    if fit.options.prior is not None:
+        rows = fit.options.prior.added(linear.problem)
+        at_estimate = 0.0 if errors is None else rows.residuals(z)
+        prior = rng.standard_normal((count, rows.constant.shape[1])) - at_estimate
+    means = np.zeros((count, 0))
+    if nuisance is not None:
+        table = nuisance.local.table
+        sd = np.where(nuisance.has_prior, np.nan_to_num(table.tolerance), 0.0)
+        mean = table.nominal if errors is None else fit.nuisance.estimate
+        means = mean + sd * rng.standard_normal((count, len(sd)))
+    return Resamples(weight, offset, center, prior, means, equations)

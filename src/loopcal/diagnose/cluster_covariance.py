@@ -30,13 +30,12 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.outliers import TESTABLE
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.elimination import find_connected_groups, fold_at
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.results.description import Field, fields
@@ -175,8 +174,7 @@ def check_clusters(
     frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means relative
         to the home pose.
     """
-    check_fitted_data(fit, data)
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    data = prepare_fitted_data(fit, data)
     units = divide_into_clusters(data)
     if not units:
         return _not_compared("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)

@@ -21,11 +21,10 @@ from loopcal.diagnose.error_frames import (
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import transmit_readings
 from loopcal.numerics.statistics import find_distinct
@@ -234,13 +233,12 @@ def examine_fit(
         other tests begin.
     frame : in which expected errors are stated, see `choose_error_frame`.
     """
-    check_fitted_data(fit, data)
+    prepared = prepare_fitted_data(fit, data)
     outliers = find_outliers(fit, data, progress=progress)
     progress(0, 1, "testing for common errors and heavy tails")
     linear = None
     if fit.converged and fit.residual_test.intervals:
-        filled = fill_in_reading_sigma(fit.robot, data)
-        linear = linearize_fit(fit, exclude_poses(filled, fit.options.excluded_poses))
+        linear = linearize_fit(fit, prepared)
     return FitExamination(
         outliers,
         check_lack_of_fit(fit, data),
@@ -276,7 +274,7 @@ def compute_reading_errors(
     if fit.poses is None:
         return None
     robot, estimated, sigma = fit.robot, fit.poses.readings, fit.poses.sigma
-    recorded = exclude_poses(data, fit.options.excluded_poses).readings
+    recorded = data.readings
     compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
     reading = np.where(compared, recorded - estimated, np.nan)
     _, tau = robot.slots(robot.values[None])

@@ -177,6 +177,14 @@ class Intervals(TableResult):
         return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
+def mask_intervals(
+    is_known: BoolArray, names: tuple[str, ...], level: float, source: str, **columns: FloatArray
+) -> Intervals:
+    """Return intervals with columns (.., p) that are NaN where no parameter is known (p,)."""
+    known = {name: np.where(is_known, values, np.nan) for name, values in columns.items()}
+    return Intervals(names, level, source, **known)
+
+
 class EndDifference(NamedTuple):
     """The ends of intervals of draws; arrays (2, p)."""
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from loopcal.diagnose.residual_patterns import LEVEL
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
-from loopcal.estimate.identification import exclude_poses
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.residual_test import (
@@ -45,7 +45,6 @@ from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.smooth_errors import SmoothErrors, describe_smooth_errors
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.statistics import (
     VarianceComponent,
     compute_chi_square_tail,
@@ -305,9 +304,9 @@ class LackOfFit:
 
 def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     """Test a fit against the pure error of repeated poses."""
-    if fill_in_reading_sigma(fit.robot, data).reading_sigma is not None:
+    data = prepare_fitted_data(fit, data)
+    if data.reading_sigma is not None:
         return _untested("residuals.repeats-with-uncertain-readings")
-    data = exclude_poses(data, fit.options.excluded_poses)
     member = data.repeats
     times = np.bincount(member)
     pure, degrees = _pure_error(fit, data, member)

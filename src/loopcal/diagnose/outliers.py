@@ -37,7 +37,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.errors import LoopcalError
-from loopcal.estimate.identification import check_fitted_data, exclude_poses, identify
+from loopcal.estimate.identification import identify, prepare_fitted_data
 from loopcal.estimate.linearization import LeverageRows, Linearization, Start
 from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
@@ -49,7 +49,6 @@ from loopcal.estimate.result import Identification
 from loopcal.estimate.robust_descent import estimate_scale_of, measure_block_distances
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import (
     compute_chi_square_quantile,
@@ -567,8 +566,7 @@ def find_outliers(
     level : probability of naming any block where none is wrong.
     progress : receives the rounds of the search.
     """
-    check_fitted_data(fit, data)
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    data = prepare_fitted_data(fit, data)
     problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
     member = np.unique(linked_blocks(data), return_inverse=True)[1]
     labels = list_block_labels(data.labels, member)

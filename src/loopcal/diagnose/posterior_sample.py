@@ -17,17 +17,19 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal.diagnose.intervals import (
+    ENDS,
     OFF,
     Intervals,
     compare_ends,
     effective_size,
     fit_tail_shape,
+    mask_intervals,
     normalize_weights,
     report_intervals,
 )
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.prior import WithPrior
 from loopcal.estimate.resampling import repeat_trial, resample_rows
@@ -35,7 +37,6 @@ from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
@@ -213,21 +214,17 @@ class PosteriorSample(TableResult):
         half = coverage_factor(self.degrees, level) * self.linear_sd
         linear = self.linear_mean + np.array([[-1.0], [1.0]]) * half
         change = ends.quantile - ends.linear
-        known = np.where(np.isfinite(self.linear_sd), 1.0, np.nan)
-        mean = self.linear_mean + (self.weight - self.linear_weight) @ self.draws
         center = self.weight @ self.draws
-        return Intervals(
-            names=self.fit.names,
-            level=level,
-            source="posterior",
-            center=mean * known,
-            sd=np.asarray(np.sqrt(self.weight @ (self.draws - center) ** 2)) * known,
-            lower=(linear[0] + change[0]) * known,
-            upper=(linear[1] + change[1]) * known,
-            linear_lower=linear[0] * known,
-            linear_upper=linear[1] * known,
-            shift=change / half * known,
-            shift_error=ends.error / half * known,
+        return mask_intervals(
+            np.isfinite(self.linear_sd),
+            self.fit.names,
+            level,
+            "posterior",
+            center=self.linear_mean + (self.weight - self.linear_weight) @ self.draws,
+            sd=np.sqrt(self.weight @ (self.draws - center) ** 2),
+            **dict(zip(ENDS, (*(linear + change), *linear), strict=True)),
+            shift=change / half,
+            shift_error=ends.error / half,
         )
 
     @property
@@ -275,7 +272,7 @@ def sample_posterior(
     EstimationError : the fit did not converge, has no intervals, or was made by a method that
         states no prior; or no draw is possible.
     """
-    check_fitted_data(fit, data)
+    data = prepare_fitted_data(fit, data)
     if count < 100:
         raise EstimationError(f"{count} draws: give at least 100")
     if not fit.converged:
@@ -285,7 +282,6 @@ def sample_posterior(
         raise EstimationError(report_finding("sampling.method-without-prior", method=name))
     if not fit.residual_test.intervals:
         raise EstimationError(report_finding("sampling.without-intervals"))
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     density = describe_density(fit, linearize_fit(fit, data))
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     proposal = _Proposal.of(density)

@@ -74,14 +74,17 @@ def check_types(robot: object, data: object) -> None:
     check_type(data, Measurements, "data", "as from load_measurements('data.csv', robot)")
 
 
-def check_fitted_data(fit: Identification, data: Measurements) -> None:
-    """Raise DataError unless the data have as many poses as the fit was made from."""
+def prepare_fitted_data(fit: Identification, data: Measurements) -> Measurements:
+    """Return the measurements of a fit as it used them: with the sigma of their readings, without
+    excluded poses. Raises DataError unless they have as many poses as the fit was made from.
+    """
     if data.n_poses != len(fit.pose_weights):
         raise DataError(
             f"the data have {data.n_poses} poses, but the fit was made from "
             f"{len(fit.pose_weights)}; give the measurements that were fitted, without held-out "
             "poses"
         )
+    return exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
 
 
 def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
