@@ -18,10 +18,10 @@ from loopcal.diagnose.outliers import (
     PartialFit,
     _summarize,
     compute_influence,
+    find_ambiguous,
     find_outliers,
     fit_without,
-    list_suspected_in_turn,
-    search_suspects,
+    search_blocks,
 )
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -136,7 +136,6 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
             )
         without = -np.linalg.lstsq(held[:, :-1], held[:, -1], rcond=None)[0]
         residual = A[own, :-1] @ without + A[own, -1]
-        assert result.deleted[j] == pytest.approx(residual @ residual, rel=1e-7)
         G = A[own, :-1] @ np.linalg.inv(held[:, :-1].T @ held[:, :-1]) @ A[own, :-1].T
         expected = residual @ np.linalg.solve(np.eye(12) + G, residual)
         assert result.distance[j] == pytest.approx(expected, rel=1e-6)
@@ -434,13 +433,12 @@ def test_cyclic_outlier_search_is_not_converged_and_lists_its_suspects():
         distance = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
         distance[0 if excluded[1] else 1] = 100.0
         one = np.ones(6, dtype=np.int64)
-        influence = Influence(np.full(6, 0.1), one, distance, one, distance)
+        influence = Influence(np.full(6, 0.1), one, distance, one)
         return PartialFit(excluded, influence, 1.0, 4)
 
-    whole = ask(np.zeros(6, dtype=bool))
-    visited = search_suspects(ask, whole, whole, 0.01, 3)
-    assert [np.flatnonzero(state.excluded).tolist() for state in visited] == [[1], [0]]
-    (group,) = list_suspected_in_turn(visited)
+    search = search_blocks(ask, np.zeros(6, dtype=bool), 0.05)
+    assert [np.flatnonzero(state.excluded).tolist() for state in search.fits] == [[1], [0]]
+    (group,) = find_ambiguous(search)
     assert np.flatnonzero(group).tolist() == [0, 1]
     fit = identify(*probe_delta(12, {}))
     shared = {"blocks": 6, "single_poses": True}

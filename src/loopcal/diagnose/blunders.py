@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations, permutations
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from loopcal.diagnose.conventions.interpretations import list_orders, permute_columns, with_measured
 from loopcal.diagnose.outliers import (
     BlockSearch,
     Influence,
@@ -64,8 +64,7 @@ class HeldOutBlocks(NamedTuple):
         influence = make_empty_influence(u)
         for numbers, H, residual, present in self.groups:
             tested = compare_blocks(H, residual, present, triangle, y, ~excluded[numbers])
-            for array, values in zip(influence, tested, strict=True):
-                array[numbers] = values
+            influence.fill(numbers, tested)
         inside, scale = (influence.degrees > 0) & ~excluded, 1.0
         if inside.any():
             distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
@@ -233,7 +232,6 @@ def compare_blocks(
     return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 
-MOST_PERMUTED = 4  # targets of which all orders are tried; of more only exchanges of two
 MOST_EXPLAINED = 10  # poses for which explanations are tried, the farthest first
 # Other poses that do not fit, the farthest first, with which the values of one are exchanged.
 MOST_EXCHANGED = 50
@@ -336,29 +334,15 @@ def _worst_p_value(check: HeldOutCheck, data: Measurements) -> float:
 def _permute_targets(data: Measurements) -> Iterator[Reading]:
     """Give the data with the targets of one kind in another order."""
     for i, rows in enumerate(data.observations):
-        names = tuple(rows.kind.target_columns)
-        columns = [list(places) for places in rows.kind.target_columns.values()]
-        k = len(names)
-        if k < 2 or not len(rows) or len({len(places) for places in columns}) > 1:
+        names, columns = list(rows.kind.target_columns), list(rows.kind.target_columns.values())
+        if len(names) < 2 or not len(rows) or len({len(places) for places in columns}) > 1:
             continue
-        for order in _list_orders(k):
-            measured = np.array(rows.measured)
-            for target, source in enumerate(order):
-                measured[:, columns[target]] = rows.measured[:, columns[source]]
+        for order in list_orders(len(names)):
+            sources = [column for source in order for column in columns[source]]
+            change = permute_columns([column for places in columns for column in places], sources)
             moved = [j for j, source in enumerate(order) if j != source]
             pairs = [{"target": names[j], "holds": names[order[j]]} for j in moved]
-            yield {"pairs": pairs}, _with_measured(data, i, measured)
-
-
-def _list_orders(k: int) -> Iterator[Sequence[int]]:
-    """Give the other orders of k targets: all of a few, else exchanges of two."""
-    if k <= MOST_PERMUTED:
-        yield from (order for order in permutations(range(k)) if list(order) != list(range(k)))
-        return
-    for a, b in combinations(range(k), 2):
-        order = list(range(k))
-        order[a], order[b] = b, a
-        yield order
+            yield {"pairs": pairs}, _with_measured(data, i, change(rows.measured))
 
 
 def _exchange_poses(
@@ -426,7 +410,7 @@ def _leave_out(data: Measurements, what: str) -> Iterator[Reading]:
 
 def _with_measured(data: Measurements, i: int, measured: FloatArray) -> Measurements:
     """Return measurements with other values of one kind; rows that become invalid are absent."""
-    observations, measured = list(data.observations), np.array(measured)
-    measured[[row for row, _ in observations[i].kind.find_invalid_rows(measured)]] = np.nan
-    observations[i] = replace(observations[i], measured=measured)
-    return replace(data, observations=tuple(observations))
+    measured = np.array(measured)
+    kind = data.observations[i].kind
+    measured[[row for row, _ in kind.find_invalid_rows(measured)]] = np.nan
+    return with_measured(data, i, measured)

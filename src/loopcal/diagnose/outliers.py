@@ -72,15 +72,17 @@ UNDETERMINED = 1e6
 
 
 class Influence(NamedTuple):
-    """One entry for each of u blocks."""
+    """The influence of u blocks, one entry for each."""
 
     leverage: FloatArray  # (u,) trace of w G: number of parameters that the block determines
     residuals: IntArray  # (u,) number of residuals
     distance: FloatArray  # (u,) d^2
     degrees: IntArray  # (u,) its degrees of freedom
-    # (u,) squared norm of the whitened leave-one-out residual r_(j), over the directions that can
-    # be tested
-    deleted: FloatArray
+
+    def fill(self, blocks: IntArray, values: Influence) -> None:
+        """Set the entries of some blocks."""
+        for array, of_blocks in zip(self, values, strict=True):
+            array[blocks] = of_blocks
 
 
 def compute_influence(
@@ -117,17 +119,15 @@ def compute_influence(
         present = np.any(A != 0.0, axis=2) | np.any(nuisance != 0.0, axis=2) | (r != 0.0)
         for result, root, change in zip(results, roots, changes, strict=True):
             half = np.concatenate([nuisance, A @ root], axis=2)
-            tested = compute_block_influence(half, r + A @ change, present, weight[blocks])
-            for array, values in zip(result, tested, strict=True):
-                array[blocks] = values
+            residual = r + A @ change
+            result.fill(blocks, compute_block_influence(half, residual, present, weight[blocks]))
     return results
 
 
 def make_empty_influence(blocks: int) -> Influence:
     """Return an influence of zeros, to be filled."""
-    leverage, distance, deleted = np.zeros((3, blocks))
-    residuals, degrees = np.zeros((2, blocks), np.int64)
-    return Influence(leverage, residuals, distance, degrees, deleted)
+    (leverage, distance), (residuals, degrees) = np.zeros((2, blocks)), np.zeros((2, blocks), int)
+    return Influence(leverage, residuals, distance, degrees)
 
 
 def compute_block_influence(
@@ -144,14 +144,12 @@ def compute_block_influence(
     # absent rows are zero: eigenvectors of value zero and residual zero, subtracted below
     tested = (remaining > TESTABLE) & ((1.0 - w) * g < UNPREDICTABLE)
     square = np.matmul(residual[:, None, :], vectors)[:, 0] ** 2
-    safe = np.where(tested, remaining, 1.0)
-    normed = square / (safe * (1.0 + (1.0 - w) * g))
+    normed = square / (np.where(tested, remaining, 1.0) * (1.0 + (1.0 - w) * g))
     return Influence(
         (w * g).sum(axis=1),
         present.sum(axis=1),
         np.where(tested, normed, 0.0).sum(axis=1),
         tested.sum(axis=1) - (~present).sum(axis=1),
-        np.where(tested, square / safe**2, 0.0).sum(axis=1),
     )
 
 
@@ -265,7 +263,8 @@ class BlockSearch:
 def search_blocks(
     refit: Refit, low_weight: BoolArray, level: float, progress: Progress = report_no_progress
 ) -> BlockSearch:
-    """Search the blocks that the others do not explain.
+    """Search the blocks that the others do not explain: exclude suspects until the same ones are
+    suspected twice.
 
     low_weight : (u,) blocks with a small weight in a robust fit; the search begins without them.
     level : probability of any suspect where all blocks are right.
@@ -274,8 +273,19 @@ def search_blocks(
     if low_weight.any() and (without := refit(low_weight)).determines_as_much(whole):
         first = without
     limit = compute_single_level(level, whole.tested)
-    fits = search_suspects(refit, whole, first, limit, int(MOST_EXCLUDED * whole.tested), progress)
-    return BlockSearch(refit, whole, limit, fits)
+    most, fits = int(MOST_EXCLUDED * whole.tested), [first]
+    while len(fits) <= MOST_ROUNDS:
+        progress(len(fits) - 1, MOST_ROUNDS, "searching for outliers")
+        last = fits[-1]
+        beyond = np.flatnonzero(last.p_value() < limit)
+        order = beyond[np.argsort(-last.ratio[beyond], kind="stable")][:most]
+        after = _exclude_farthest(refit, order, whole)
+        repeated = [i for i, old in enumerate(fits) if (old.excluded == after.excluded).all()]
+        if repeated:  # the last one again, or a cycle
+            fits = fits[repeated[0] :]
+            break
+        fits.append(after)
+    return BlockSearch(refit, whole, limit, tuple(fits))
 
 
 def fit_without(
@@ -288,6 +298,11 @@ def fit_without(
     noise: str,
 ) -> PartialFit:
     """Fit linearly without the excluded blocks (u,), and compute the influence of every block.
+
+    Each block is judged by the noise that the other fitted blocks show, so that a wrong block
+    cannot hide in it: the sum of squares that no parameter explains is lower by d_j^2 without block
+    j, and its degrees of freedom by those of d_j^2 (least squares; no prior contributes). Where
+    fewer than five are left, stated noise counts as it is.
 
     fit : its method and rank tolerance are used. problem : of its data, unweighted.
     member : (n,) block of each pose. deviation, start : (1, p) to linearize at, and a warm start.
@@ -303,72 +318,32 @@ def fit_without(
     # poses that are estimated depend on the excluded rows, which the influence needs
     shared = None if problem.is_uncertain else solution
     influence, plain = compute_influence(problem, kept, member, d, fits, weight, shared)
-    left, is_given = float(d.rows[0] - d.rank[0]), noise == "given"
-    judging = judge_noise(float(d.unexplained[0]), left, plain, excluded, is_given)
-    scale, directions = 1.0 if is_given else np.nan, int(np.isfinite(penalty).sum())
-    if left < (FEWEST_DEGREES if is_given else 1):
-        return PartialFit(excluded, influence, scale, directions, judging)
-    scale = float(np.sqrt(max(d.unexplained[0] / left, SMALLEST_NOISE)))
-    return PartialFit(excluded, influence, scale, directions, judging, left)
-
-
-def judge_noise(
-    unexplained: float, degrees: float, plain: Influence, excluded: BoolArray, is_given: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Return the noise that the fitted blocks show to each block, see `PartialFit`: without its own
-    residuals, so that a wrong block cannot hide in it. No prior contributes.
-
-    The sum of squares that no parameter explains is lower by d_j^2 without block j, and its
-    degrees of freedom by those of d_j^2 (least squares). Where fewer than five are left, stated
-    noise counts as it is.
-
-    unexplained, degrees : sum of squares of all fitted blocks that no parameter explains.
-    plain : influence (u,) on the fit by least squares.
-    """
+    unexplained, degrees = float(d.unexplained[0]), float(d.rows[0] - d.rank[0])
+    is_given = noise == "given"
+    fewest, otherwise, scale = (FEWEST_DEGREES, np.inf, 1.0) if is_given else (1, 0.0, np.nan)
     left = degrees - np.where(excluded, 0, plain.degrees)
     square = unexplained - np.where(excluded, 0.0, plain.distance)
-    is_shown = left >= (FEWEST_DEGREES if is_given else 1)
+    is_shown = left >= fewest
     variance = np.maximum(square / np.where(is_shown, left, 1.0), SMALLEST_NOISE)
-    otherwise = np.inf if is_given else 0.0
-    return np.where(is_shown, variance, 1.0), np.where(is_shown, left, otherwise)
+    judging = (np.where(is_shown, variance, 1.0), np.where(is_shown, left, otherwise))
+    if degrees >= fewest:
+        scale = float(np.sqrt(max(unexplained / degrees, SMALLEST_NOISE)))
+    directions = int(np.isfinite(penalty).sum())
+    return PartialFit(
+        excluded, influence, scale, directions, judging, degrees if degrees >= fewest else 0.0
+    )
 
 
-def search_suspects(
-    refit: Refit,
-    whole: PartialFit,
-    first: PartialFit,
-    limit: float,
-    most: int,
-    progress: Progress = report_no_progress,
-) -> tuple[PartialFit, ...]:
-    """Exclude suspects until the same ones are suspected twice.
-
-    whole : the fit to all blocks. first : where the search begins.
-    limit : p-value below which a block is a suspect. most : largest number of excluded blocks.
-    Returns the fit without the suspects, or all fits of a cycle.
-    """
-    fits = [first]
-    while len(fits) <= MOST_ROUNDS:
-        progress(len(fits) - 1, MOST_ROUNDS, "searching for outliers")
-        last = fits[-1]
-        beyond = np.flatnonzero(last.p_value() < limit)
-        order = beyond[np.argsort(-last.ratio[beyond], kind="stable")][:most]
-        after = _exclude_farthest(refit, order, whole)
-        if (after.excluded == last.excluded).all():
-            return (last,)
-        repeated = [i for i, old in enumerate(fits) if (old.excluded == after.excluded).all()]
-        if repeated:
-            return tuple(fits[repeated[0] :])
-        fits.append(after)
-    return tuple(fits)
-
-
-def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) -> list[BoolArray]:
-    """Return groups (u,) of blocks of which excluding one does as well as excluding another.
+def find_ambiguous(search: BlockSearch, progress: Progress = report_no_progress) -> list[BoolArray]:
+    """Return groups (u,) of blocks of which any may be wrong: those suspected in turn, or those of
+    which excluding one does as well as excluding another.
 
     With i back in the fit, excluding block j lowers chi-square by d_j^2, and excluding i after that
     by at least d_i^2 - d_j^2; so only a j whose d_j^2 comes near d_i^2 can replace i.
     """
+    if not search.is_converged:
+        excluded = np.array([fit.excluded for fit in search.fits])
+        return [excluded.any(axis=0) & ~excluded.all(axis=0)]
     refit, whole, end, limit = search.refit, search.whole, search.end, search.limit
     groups: list[BoolArray] = []
     suspects = np.flatnonzero(end.excluded)
@@ -394,17 +369,15 @@ def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) ->
             groups.append(group)
     joined: list[BoolArray] = []  # groups that share a block are one
     for group in groups:
-        shared = [other for other in joined if (other & group).any()]
         apart = [other for other in joined if not (other & group).any()]
+        shared = [other for other in joined if (other & group).any()]
         joined = [*apart, np.any([group, *shared], axis=0)]
     return joined
 
 
 def _may_have_rivals(end: PartialFit, i: int, far: float) -> bool:
-    """Return whether any d_j^2 may come within `far` of d_i^2 with block i back in the fit; this
-    saves a fit where one of very many blocks is far off.
-
-    Block i moves the fit by at most d_i in the norm of the information, and d_j by at most
+    """Return whether any d_j^2 may come within `far` of d_i^2 with block i back in the fit: it
+    moves the fit by at most d_i in the norm of the information, and d_j by at most
     sqrt(g / (1 - g)) d_i, where the largest eigenvalue g of G_j is at most the leverage of j.
     """
     leverage, distance = end.influence.leverage, np.sqrt(end.influence.distance) / end.scale
@@ -414,17 +387,9 @@ def _may_have_rivals(end: PartialFit, i: int, far: float) -> bool:
     return bool((largest**2 > distance[i] ** 2 - far).any())
 
 
-def list_suspected_in_turn(fits: tuple[PartialFit, ...]) -> list[BoolArray]:
-    """Return the one group (u,) of the blocks that only some of the fits exclude."""
-    excluded = np.array([fit.excluded for fit in fits])
-    group: BoolArray = np.any(excluded, axis=0) & ~np.all(excluded, axis=0)
-    return [group]
-
-
 def _exclude_farthest(refit: Refit, order: IntArray, whole: PartialFit) -> PartialFit:
     """Exclude as many blocks of the order as possible without losing a direction, by bisection."""
-    possible, impossible, best = 0, len(order) + 1, whole
-    count = len(order)
+    possible, impossible, best, count = 0, len(order) + 1, whole, len(order)
     while impossible - possible > 1:
         excluded = np.zeros_like(whole.excluded)
         excluded[order[:count]] = True
@@ -583,12 +548,8 @@ def find_outliers(
     noise = fit.residual_test.noise
     refit = partial(fit_without, fit, problem, member, deviation=z, start=start, noise=noise)
     search = search_blocks(refit, low_weight, level, progress)
-    if search.is_converged:
-        groups = find_rivals(search, progress)
-    else:
-        groups = list_suspected_in_turn(search.fits)
-    fits, end, tested = search.fits, search.end, search.whole.tested
-    always = np.all([each.excluded for each in fits], axis=0)
+    groups, end, tested = find_ambiguous(search, progress), search.end, search.whole.tested
+    always = np.all([each.excluded for each in search.fits], axis=0)
     ambiguous = np.any(groups, axis=0) if groups else np.zeros_like(always)
     p_value, degrees = end.p_value(), end.influence.degrees
     outliers = tuple(
@@ -606,18 +567,16 @@ def find_outliers(
     summary = _summarize(fit, len(outliers), suspected, level, shared, is_converged=is_converged)
     if noise == "given" and outliers and end.contradicts_noise:
         summary = (report_finding("outliers.larger-noise", times=end.scale, **shared), *summary)
-    influence, factor = end.influence, end.scale
     return OutlierCheck(
-        outliers, conflicts, is_converged, level, tested, labels, influence, factor, summary
+        outliers, conflicts, is_converged, level, tested, labels, end.influence, end.scale, summary
     )
 
 
 def _refit_robustly(
     fit: Identification, data: Measurements, member: IntArray, progress: Progress
 ) -> Identification:
-    """Return a robust fit; the fit itself where it does not converge.
-
-    `member` (n,) is the block of each pose. Of many blocks, an even choice is fitted.
+    """Return a robust fit of an even choice of blocks, of which `member` (n,) is that of each pose;
+    the fit itself where it does not converge.
     """
     count = int(member.max()) + 1
     if count > MOST_ROBUST:

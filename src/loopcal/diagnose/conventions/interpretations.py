@@ -62,6 +62,13 @@ class Interpretation:
         return f"<Interpretation: {self.finding}>"
 
 
+def with_measured(data: Measurements, i: int, measured: FloatArray) -> Measurements:
+    """Return measurements with other values (r, c) of one kind."""
+    observations = list(data.observations)
+    observations[i] = replace(observations[i], measured=measured)
+    return replace(data, observations=tuple(observations))
+
+
 def combine(first: Interpretation, second: Interpretation) -> Interpretation:
     """Return the combination of two interpretations, the first applied first."""
     parts = (first, second)
@@ -133,9 +140,7 @@ def list_interpretations(data: Measurements) -> Iterator[Interpretation]:
     """
 
     def apply(data: Measurements, i: int, change: Change) -> Measurements:
-        observations = list(data.observations)
-        observations[i] = replace(observations[i], measured=change(observations[i].measured))
-        return replace(data, observations=tuple(observations))
+        return with_measured(data, i, change(data.observations[i].measured))
 
     names = [rows.kind.name for rows in data.observations]
     for i, rows in enumerate(data.observations):
