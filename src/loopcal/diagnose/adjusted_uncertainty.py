@@ -67,9 +67,8 @@ def adjust_uncertainty(
     fit: Identification, data: Measurements, linear: FitLinearization | None = None
 ) -> Identification:
     """Return a fit whose covariance allows for what the residuals of its data show, and says why.
-
-    Estimates stay. No variance becomes smaller. A fit that did not converge, has no intervals, or
-    has weights by a loss is returned as it is. `linear` : see `linearize_fit`.
+    Estimates stay, and no variance becomes smaller. A fit that did not converge, has no intervals,
+    or has weights by a loss is returned as it is. `linear` : see `linearize_fit`.
     """
     data = prepare_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
@@ -115,9 +114,8 @@ def _add_patterns(
 def _add_correlation(
     fit: Identification, patterns: ResidualPatterns, tool: ToolUncertainty
 ) -> Identification:
-    """Return a fit with what correlated errors add to the covariance by independent ones.
-
-    Where residuals are too small and no test shows a correlation, it is added if it matters: the
+    """Return a fit with what correlated errors add to the covariance by independent ones. Where
+    residuals are too small and no test shows a correlation, it is added if it matters: the
     parameters may have taken up errors that are too slow for the tests.
     """
     rows = patterns.rows
@@ -262,11 +260,10 @@ def check_heavy_tails(
     outliers: Sequence[str] = (),
     linear: FitLinearization | None = None,
 ) -> HeavyTails:
-    """Test whether large residuals are more frequent than normal noise makes them.
-
-    A fit with a loss, without intervals, or with uncertain readings is not tested, nor one whose
-    residuals depend on something: this makes some of them larger, and is reported already.
-    `outliers` : labels of poses that are known to be wrong. `linear` : see `linearize_fit`.
+    """Test whether large residuals are more frequent than normal noise makes them. Not tested are a
+    fit with a loss, without intervals, or with uncertain readings, and one whose residuals depend
+    on something, which makes some of them larger. `outliers` : labels of poses that are known to be
+    wrong.
     """
     nothing = HeavyTails(0, *[np.nan] * 4)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:

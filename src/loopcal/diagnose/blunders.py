@@ -189,12 +189,10 @@ def check_held_out_rows(
     kept: tuple[str, ...],
     uncertainty: FitUncertainty | None = None,
 ) -> HeldOutCheck | None:
-    """Search the held-out blocks that neither the fit nor the other blocks explain.
-
-    robot, values, uncertainty : see `Predictor`. data : held-out rows whose poses are reached.
-    kept : names of the nuisance parameters that the fit determined; the others were fitted to these
-        rows.
-    Returns None without any block that can be tested.
+    """Search the held-out blocks that neither the fit nor the other blocks explain; None without
+    any block that can be tested.
+    robot, values, kept, uncertainty : see `Predictor`. data : held-out rows whose poses are
+        reached.
     """
     table = data.nuisance_parameters.table
     unknown = tuple(p.name for p in table.entries if p.free and p.name not in kept)

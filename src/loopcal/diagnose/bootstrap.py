@@ -190,7 +190,6 @@ def _correct(
     residual: FloatArray, half: FloatArray, poses: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the corrected errors (M,) of a block, and a basis (M, d) of its untested directions.
-
     half : (M, w) with half half' the leverage of the block by setup and machine. poses : (M, K)
         columns of the coordinates of its poses, whose range has leverage 1.
     """
@@ -287,7 +286,6 @@ UNITS = ("pose", "block", "session", "day")  # names of units
 
 def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters:
     """Return the blocks of poses that are resampled together.
-
     unit : "pose", "block", "session" or "day", or the number of consecutive poses of a block, in
         the order of the column `time`, or else of the file. None takes the largest unit with at
         least `ENOUGH_BLOCKS` blocks, or else the smallest.

@@ -57,11 +57,9 @@ class Clusters:
 
 
 def divide_into_clusters(data: Measurements) -> tuple[Clusters, ...]:
-    """Return the possible divisions of n poses with at least `FEWEST_CLUSTERS` clusters, those of
-    the largest units first.
-
-    Days are runs of poses without a break of `NIGHT` in the column `time`, sessions those of the
-    rows. Units that share a pose, a block or a row that compares poses are one cluster.
+    """Return the possible divisions of n poses with at least `FEWEST_CLUSTERS` clusters, the
+    largest units first. Days are runs of poses without a break of `NIGHT` in the column `time`.
+    Units that share a pose, a block or a row that compares poses are one cluster.
     """
     blocks = linked_blocks(data)
     count = int(blocks.max()) + 1
@@ -79,7 +77,6 @@ def divide_into_clusters(data: Measurements) -> tuple[Clusters, ...]:
 
 def _pose_sessions(data: Measurements) -> IntArray:
     """Return pairs (k, 2) of a pose and a session that measured it; none without named sessions.
-
     Rows without a session belong to those of the same pose, or else to one session.
     """
     poses = [np.zeros(0, dtype=np.int64)]
@@ -166,11 +163,8 @@ def check_clusters(
     frame: str = FITTED,
     linear: FitLinearization | None = None,
 ) -> ClusterCheck:
-    """Compare the stated uncertainty with one that allows common errors within clusters of poses.
-
-    The clusters are the largest independent units of which there are enough, see
-    `divide_into_clusters`.
-
+    """Compare the stated uncertainty with one that allows common errors within clusters of poses,
+    the largest independent units of which there are enough.
     frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means relative
         to the home pose.
     """
@@ -187,9 +181,8 @@ def check_clusters(
 
 
 class RobustSpread(NamedTuple):
-    """The cluster-robust covariance C_robust = L (I + spread) L' of a fit with C = L L'.
-
-    With the scores h_g of the G clusters, spread = sum_g (h_g h_g' - E_g), E_g the expectation for
+    """The cluster-robust covariance C_robust = L (I + spread) L' of a fit with C = L L'. With the
+    scores h_g of the G clusters, spread = sum_g (h_g h_g' - E_g), E_g the expectation for
     independent errors. Each cluster has h rows, turned into the eigenvectors of its leverage H_gg.
     """
 
@@ -269,10 +262,8 @@ class RobustSpread(NamedTuple):
 def compute_robust_spread(
     fit: Identification, clusters: Clusters, linear: FitLinearization
 ) -> RobustSpread:
-    """Return the cluster-robust covariance of a fit, beside the stated one.
-
-    fit : with intervals. clusters : the cluster of each pose; of more than `MOST_CLUSTERS`, an
-        even choice stands for all. linear : of the fit and its data, see `linearize_fit`.
+    """Return the cluster-robust covariance of a fit with intervals, beside the stated one. Of more
+    than `MOST_CLUSTERS` clusters, an even choice stands for all. `linear` : see `linearize_fit`.
     """
     clusters, times = choose_clusters(clusters)
     d, p = linear.decomposition, len(fit.names)

@@ -144,9 +144,8 @@ class LeaveOneOut:
 
 
 def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
-    """Draw the poses held out in each of `count` folds: whole blocks, folds of nearly equal size.
-
-    Poses that a row compares, such as a distance, are in one block: otherwise no fold has the row.
+    """Draw the poses held out in each of `count` folds of nearly equal size: whole blocks, because
+    otherwise no fold would have a row that compares poses, such as a distance.
     """
     names, member = np.unique(linked_blocks(data), return_inverse=True)
     if count < 2 or len(names) < count:
@@ -228,9 +227,8 @@ def cross_validate(
 def score_leave_one_out(
     robot: Mechanism, data: Measurements, methods: tuple[Method, ...]
 ) -> LeaveOneOut:
-    """Score methods that keep the columns as they are: ridge, truncation, least squares, MAP.
-
-    robot : linearization point; best the robot of a fit. methods : at least one.
+    """Score methods that keep the columns as they are: ridge, truncation, least squares, MAP;
+    `robot` is the linearization point, best the robot of a fit.
     """
     free = select_free_parameters(robot)
     problem = problem_of(free, data)
@@ -419,11 +417,9 @@ class ModelChoice(TableResult):
 
 
 def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
-    """Return nested sets of a robot's free parameters: offsets, lengths, ideal, complete.
-
-    The names of the shipped families tell offsets and lengths. "lengths" contains the offsets,
-    "ideal" all lengths and ratios (joints where they are, axes as designed), "complete" everything.
-    A set that adds nothing is omitted.
+    """Return nested sets of a robot's free parameters, those that add something: offsets, then also
+    lengths, then all lengths and ratios ("ideal": joints where they are, axes as designed), then
+    all ("complete"). The names of the shipped families tell offsets and lengths.
     """
     free = [p for p in robot.parameters.entries if p.free]
     offsets = {p.name for p in free if OFFSETS.search(p.name)}
@@ -441,10 +437,8 @@ def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
 
 
 def list_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
-    """Return the nested sets of a robot, and the set that its controller stores, by size.
-
-    The controller's set, `Assembly.stored_parameters`, takes the place of a nested one that is
-    equal. Parameters that are fixed are left out.
+    """Return the nested sets of a robot, and the set that its controller stores, by size. That set,
+    `Assembly.stored_parameters`, takes the place of a nested one that is equal.
     """
     sets = nest_parameter_sets(robot)
     free = [p.name for p in robot.parameters.entries if p.free]

@@ -149,11 +149,9 @@ def choose_error_frame(
     origin_name: str = "1",
 ) -> ErrorFrame:
     """Return a frame for the errors of poses of a calibrated robot.
-
     frame : "fitted" fits the motions of the base and platform frames that the measurements do not
         determine, and is the base frame of the robot file where they determine all; "base" is that
-        base frame in any case; "relative" is the first pose; the name of the frame of an
-        instrument, such as "tracker", is that frame.
+        base frame in any case; "relative" is the first pose; otherwise the frame of an instrument.
     origin : pose (1,) of the calibrated robot to which others are relative. origin_name : its name.
     """
     robot = posterior.robot
@@ -212,10 +210,8 @@ def refer_errors(
     followed: FollowedMotion | None = None,
 ) -> ErrorFrame:
     """Return the frame in which errors are stated.
-
-    reference : poses over which frames are fitted.
-    motions : (12, k) that the measurements do not determine; those that `followed` leaves are
-        fitted, unless the frame is "base".
+    reference : poses over which frames are fitted. motions : (12, k) that the measurements do not
+        determine; those that `followed` leaves are fitted, unless the frame is "base".
     """
     T, twists, over = reference
     p = twists.shape[2]
@@ -264,9 +260,8 @@ def check_frame(frame: str, allowed: Sequence[str]) -> None:
 
 
 def list_unfixed_motions(posterior: Posterior) -> FloatArray:
-    """Return an orthonormal basis (12, k) of the motions of frames that a fit does not determine.
-
-    They are those of its measurements, and those of the directions that it does not determine.
+    """Return an orthonormal basis (12, k) of the motions of frames that a fit does not determine:
+    those of its measurements, and of the directions that it does not determine.
     """
     known = np.zeros((MOTIONS, 0)) if posterior.frames is None else posterior.frames.unfixed
     if posterior.determined.all():
@@ -352,10 +347,8 @@ class ToolErrors(NamedTuple):
 
 
 def linearize_tool_errors(posterior: Posterior, solution: Solution, frame: str) -> ToolErrors:
-    """Return the derivatives of the errors of the tool at poses, and the frame in words.
-
-    solution : poses that the calibrated robot reaches.
-    frame : see `choose_error_frame`; "relative" means relative to the home pose.
+    """Return the derivatives of the errors of the tool at poses that the robot reaches, and the
+    frame in words. `frame` : see `choose_error_frame`; "relative" means relative to the home pose.
     """
     robot = posterior.robot
     chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")

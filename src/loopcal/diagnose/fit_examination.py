@@ -109,12 +109,9 @@ class CalibrationGain:
 def estimate_calibration_gain(
     fit: Identification, data: Measurements, frame: str = FITTED
 ) -> CalibrationGain:
-    """Compare the errors expected after calibration with those that the tolerances allow.
-
-    fit : an identification; its tolerances must be stated. data : the measurements it was made
-        from, or other readings.
-    frame : in which the errors are stated, see `choose_error_frame`; "relative"
-        means relative to the home pose.
+    """Compare the errors expected after calibration with those that the stated tolerances allow.
+    data : the measurements that were fitted, or other readings. frame : in which the errors are
+        stated, see `choose_error_frame`; "relative" means relative to the home pose.
     """
 
     def predict_nothing(code: str, **data: Any) -> CalibrationGain:

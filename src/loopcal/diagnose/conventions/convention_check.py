@@ -224,9 +224,8 @@ class Contradiction(NamedTuple):
 
 
 def find_contradiction(stated: Comparison, misfit: float, better: float) -> Contradiction | None:
-    """Find stated setup parameters without which measurements fit better by this factor.
-
-    Returns the parameter that alone explains the misfit, or else all stated ones; None without any.
+    """Return the stated setup parameter that alone explains the misfit, or else all stated ones,
+    without which measurements fit better by this factor; None without any.
     """
     present = set(stated.data.nuisance_parameters.table.names)
     names = tuple(value.name for value in stated.data.stated_values if value.name in present)
@@ -247,10 +246,9 @@ def find_moved_setups(
 ) -> tuple[tuple[str, ...], float] | None:
     """Return the frames, targets and surfaces that were moved since a fit, or all that may have
     moved, and the factor by which errors decrease when they are fitted again; None without any.
-
     names : of those whose values are kept.
-    sizes : from the names that are fitted again to the root mean square [1] of whitened errors,
-        per degree of freedom, and the number of equations left; NaN and 0 where the rows do not
+    sizes : from the names that are fitted again to the root mean square [1] of whitened errors, per
+        degree of freedom, and the number of equations left; NaN and 0 where the rows do not
         determine them.
     """
     names = tuple(names)
@@ -314,17 +312,17 @@ def _compare_interpretations(
 
     `has_errors` : readings that count as exact here have errors, which may explain a misfit.
     """
-    reach = select_reached(free, thinned, follow=True)
+    reached, n_reached, n_tried = select_reached(free, thinned, follow=True)
     stated, against, misfit = None, None, np.inf
-    if reach.is_enough:
-        whole = compare_with_robot(free, reach.data)
+    if reached is not None:
+        whole = compare_with_robot(free, reached)
         misfit = whole.misfit
         if misfit > ALLOWED:
             stated = exclude_far_rows(whole)
             misfit = min(misfit, refine_misfit(stated)[0])
         if not misfit > ALLOWED:
             if stated is None or not stated.excluded or not whole.misfit > IMPLAUSIBLE:
-                return ConventionCheck(misfit, finding=report_equals(free, reach.data, misfit))
+                return ConventionCheck(misfit, finding=report_equals(free, reached, misfit))
             finding = report_finding(
                 "conventions.rows-far-off",
                 count=len(stated.excluded),
@@ -336,8 +334,8 @@ def _compare_interpretations(
             against = find_contradiction(stated, misfit, BETTER)
     if against is not None and against.misfit <= ALLOWED:
         return _contradict(misfit, against)
-    search = search_interpretations(free, thinned, stated, misfit, misfit > IMPLAUSIBLE)
-    chosen = search.selection
+    find_pairs = misfit > IMPLAUSIBLE
+    chosen, tried, pairs = search_interpretations(free, thinned, stated, misfit, find_pairs)
     # those beyond unknown frames: of the data as written or as read, whichever has fewer
     compared = (stated, None if chosen is None else chosen.comparison)
     linear = [c.linearization for c in compared if c is not None]
@@ -348,8 +346,8 @@ def _compare_interpretations(
         "robot": free.robot.name,
         "misfit": misfit,
         "residuals": () if stated is None else list_rms_residuals(stated),
-        "reached": reach.n_reached if stated is None else None,
-        "poses": reach.n_tested,
+        "reached": n_reached if stated is None else None,
+        "poses": n_tried,
     }
     if chosen is not None and has_enough:
         return _refuse(description, misfit, chosen)
@@ -358,9 +356,7 @@ def _compare_interpretations(
     if not misfit > IMPLAUSIBLE or has_errors:
         return ConventionCheck(misfit)
     if has_enough:
-        finding = report_finding(
-            "conventions.unexplained", **description, tried=search.tried, pairs=search.pairs
-        )
+        finding = report_finding("conventions.unexplained", **description, tried=tried, pairs=pairs)
         return ConventionCheck(misfit, finding=finding)
     listed = () if chosen is None else (chosen.interpretation, *chosen.alternatives)
     finding = report_finding(
@@ -421,11 +417,10 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
 def explain_outside_strokes(
     robot: Mechanism, data: Measurements, described: Mapping[str, Any] | None = None
 ) -> Finding | None:
-    """Find the interpretation that puts all readings inside their strokes and fits the data.
-
+    """Find the interpretation that puts all readings inside their strokes and fits the data:
+    `conventions.strokes-explained`, or `conventions.strokes-contradicted` if the data fit as they
+    are written; None if nothing explains them.
     described : these readings, as of `describe_outside_strokes`; default: without places.
-    Returns `conventions.strokes-explained`, or `conventions.strokes-contradicted` if the data fit
-    as they are written; None if nothing explains them.
     """
     described = describe_outside_strokes(data, robot) if described is None else described
     if described is None:

@@ -133,10 +133,9 @@ SINGLE_COLUMN_FACTORS = (1e3, 1e-3, 25.4, 1.0 / 25.4, DEGREES, 1.0 / DEGREES, 0.
 
 
 def list_interpretations(data: Measurements) -> Iterator[Interpretation]:
-    """Yield all other interpretations of measured values, the likelier slip of each family first.
-
-    An interpretation that the kind itself rules out (a negative distance, an impossible tilt), or
-    that changes no number, is omitted.
+    """Yield all other interpretations of measured values, the likelier slip of each family first,
+    without those that the kind rules out (a negative distance, an impossible tilt), or that change
+    no number.
     """
 
     def apply(data: Measurements, i: int, change: Change) -> Measurements:
@@ -315,9 +314,7 @@ def list_reading_interpretations(
     data: Measurements, actuators: Sequence[Actuator], home: FloatArray | None = None
 ) -> Iterator[Interpretation]:
     """Yield all other interpretations of the readings of actuators, the likelier slips first.
-
-    home : (a,) readings of the home pose [SI]; wrong gear factors are also counted from there, as
-        for a machine that is homed to a reading other than 0.
+    home : (a,) readings of the home pose [SI], from which wrong gear factors are counted, too.
     """
     for source, poses in _list_sources(data):
         for dimension in dict.fromkeys(actuator.dimension for actuator in actuators):
@@ -371,10 +368,9 @@ def _list_reading_slips(actuators: Sequence[Actuator]) -> Iterator[Slip]:
 
 
 def list_orders(count: int) -> list[tuple[int, ...]]:
-    """Return other orders of `count` actuators.
-
-    All orders of up to `MOST_PERMUTED`. For more: each two swapped, neighbors swapped in all pairs,
-    odd before even numbers and the reverse of that, and the cyclic orders in both directions.
+    """Return other orders of `count` actuators: all of up to `MOST_PERMUTED`. For more: each two
+    swapped, neighbors swapped in all pairs, odd before even numbers and the reverse, and the cyclic
+    orders in both directions.
     """
     numbers = tuple(range(count))
     if count <= MOST_PERMUTED:

@@ -27,7 +27,6 @@ from loopcal.findings import Quantity
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
-from loopcal.measure.observations import Observations
 from loopcal.mechanism.kinematics import find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
@@ -58,19 +57,6 @@ class Effort(NamedTuple):
 
 QUICK = Effort(2, 8, Halving(3, 2))  # to compare many interpretations before a few are judged
 THOROUGH = Effort(None, 30, Halving(8, 6))  # to judge a few
-
-
-class Reach(NamedTuple):
-    """Measurements at the poses that a robot reaches; at all poses where it reaches too few."""
-
-    data: Measurements
-    n_reached: int
-    n_tested: int
-
-    @property
-    def is_enough(self) -> bool:
-        """Whether the robot reaches enough of the poses."""
-        return self.n_reached >= (1.0 - MOST_EXCLUDED) * self.n_tested
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +106,16 @@ def is_redundant(free: FreeParameters) -> bool:
     return free.robot.program.sigma is not None
 
 
-def select_reached(free: FreeParameters, data: Measurements, *, follow: bool = False) -> Reach:
-    """Select the poses that the robot reaches with the readings.
+def select_reached(
+    free: FreeParameters, data: Measurements, *, follow: bool = False
+) -> tuple[Measurements | None, int, int]:
+    """Return the measurements at the poses that the robot reaches with the readings, None where it
+    reaches too few; and how many it reaches of how many that were tried.
 
     With `follow`, paths lead to a few poses that are not reached at once, and to the others only if
     these succeed, because failures take longest.
     """
-    robot, q, n_tested = free.robot, data.readings, len(data.readings)
+    robot, q, tried = free.robot, data.readings, len(data.readings)
     reached = find_directly_reachable(robot, robot.values[None], q[None])[0]
     if follow and reached.sum() < (1.0 - MOST_EXCLUDED) * len(q):
         hard = np.flatnonzero(~reached)
@@ -136,11 +125,11 @@ def select_reached(free: FreeParameters, data: Measurements, *, follow: bool = F
         if len(rest) and reached[sampled].mean() >= 1.0 - MOST_EXCLUDED:
             reached[rest] = forward(robot, q[rest]).converged
         else:
-            n_tested -= len(rest)
-    reach = Reach(data, int(reached.sum()), n_tested)
-    if reached.all() or not reach.is_enough:
-        return reach
-    return reach._replace(data=data.take(reached))
+            tried -= len(rest)
+    count = int(reached.sum())
+    if count < (1.0 - MOST_EXCLUDED) * tried:
+        return None, count, tried
+    return data if reached.all() else data.take(reached), count, tried
 
 
 def compare_with_robot(
@@ -150,10 +139,9 @@ def compare_with_robot(
     effort: Effort = THOROUGH,
     start: FloatArray | None = None,
 ) -> Comparison:
-    """Compare measurements with a robot, all rows included.
-
-    data : at poses that the robot reaches. interpretations : of their values; default: as written.
-    start : (t, U) nuisance parameters to start from; default: guessed from the data.
+    """Compare measurements, at poses that the robot reaches, with it, all rows included.
+    interpretations : of their values; default: as written. start : (t, U) nuisance parameters to
+        start from; default: guessed from the data.
     """
     nuisance, rows = data.nuisance_parameters, []
     read = [interpretation.apply(data) for interpretation in interpretations] or [data]
@@ -239,10 +227,8 @@ def compute_misfits(
 
 
 def compute_quick_misfit(free: FreeParameters, data: Measurements) -> float:
-    """Return an upper bound of the misfit of measurements as written, in one step of a fit.
-
-    Unknown frames start only from their nominal values. The result is infinite where a pose is out
-    of reach, and NaN with too few rows.
+    """Return an upper bound of the misfit of measurements as written, in one step of a fit from the
+    nominal values of unknown frames; infinite where a pose is out of reach, NaN with too few rows.
     """
     if not find_directly_reachable(free.robot, free.robot.values[None], data.readings[None]).all():
         return np.inf
@@ -257,9 +243,8 @@ def compute_quick_misfit(free: FreeParameters, data: Measurements) -> float:
 
 def compute_fitted_misfit(robot: Mechanism, data: Measurements) -> float:
     """Return the misfit that a fit of redundant readings leaves, with tolerances as prior; infinite
-    where the fit does not converge, and for other robots.
-
-    Redundant readings of a machine far from its file lead to no pose to compare.
+    where it does not converge, and for other robots. Such readings of a machine far from its file
+    lead to no pose to compare.
     """
     if robot.program.sigma is None:
         return np.inf
@@ -352,11 +337,11 @@ def judge_data(
     """Compare measurements with the robot without far rows, quickly from a given start; None where
     it reaches too few poses.
     """
-    reach = select_reached(free, data)
-    if not reach.is_enough:
+    reached = select_reached(free, data)[0]
+    if reached is None:
         return None
     effort = THOROUGH if start is None else QUICK
-    return exclude_far_rows(compare_with_robot(free, reach.data, (), effort, start))
+    return exclude_far_rows(compare_with_robot(free, reached, (), effort, start))
 
 
 def compute_rms_residuals(comparison: Comparison) -> dict[Dimension, float]:
@@ -379,11 +364,9 @@ def list_rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
 def guess_frames(
     free: FreeParameters, data: Measurements, readings: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Guess nuisance parameters for sets of readings (h, n, a), the robot as it is.
-
-    Returns the sets (k,) with which the robot reaches enough poses, their nuisance parameters
-    (k, U), and the median (k,) of the sizes of whitened residuals. Poses out of reach are taken at
-    home.
+    """Guess nuisance parameters for sets of readings (h, n, a), the robot as it is: the sets (k,)
+    with which the robot reaches enough poses, their nuisance parameters (k, U), and the median (k,)
+    of the sizes of whitened residuals. Poses out of reach are taken at home.
     """
     robot, a = free.robot, readings.shape[-1]
     reached = find_directly_reachable(robot, robot.values[None], readings.reshape(1, -1, a))
@@ -420,15 +403,12 @@ def is_informative(
     constant = [_make_constant(old.measured, new.measured) for old, new in pairs]
     readings = _make_constant(data.readings, changed.readings)
     for measured, q in ((shuffled, changed.readings), (constant, readings)):
-        observations = tuple(map(_with_measured, changed.observations, measured))
+        pairs = zip(changed.observations, measured, strict=True)
+        observations = tuple(replace(o, measured=values) for o, values in pairs)
         control = judge_data(free, replace(changed, readings=q, observations=observations))
         if control is not None and control.misfit < BETTER * misfit:
             return False
     return True
-
-
-def _with_measured(observations: Observations, measured: FloatArray) -> Observations:
-    return replace(observations, measured=measured)
 
 
 def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
@@ -448,9 +428,7 @@ FAR_AWAY, FIT = 30.0, Halving(steps=12, attempts=5)
 
 def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
     """Return the misfit of the first interpretation after Gauss-Newton steps within the tolerances,
-    and its nuisance parameters (U,) there.
-
-    The misfit to first order is returned where it is smaller.
+    or to first order where that is smaller, and its nuisance parameters (U,) there.
     """
     if not comparison.is_finite:
         return comparison.misfit, comparison.data.nuisance_parameters.values()

@@ -9,7 +9,7 @@ data: the most promising ones are applied, and all others are tested on the resu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -53,8 +53,6 @@ from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-# Interpretations of actuator readings that are counted from another zero, in either direction.
-
 # Number of constants in a scan, factor by which the next scan is narrower, and number of scans.
 SCANNED, NARROWER, SCANS = 25, 8.0, 4
 BEST = 3  # number of hypotheses that are scanned again
@@ -81,9 +79,8 @@ class _Zero(NamedTuple):
 def find_zero_interpretations(
     free: FreeParameters, data: Measurements, poses: IntArray, reversed_only: bool
 ) -> list[Interpretation]:
-    """Find the zeros with which the given robot fits best at some poses, the best first.
-
-    reversed_only : only readings that are counted in the opposite direction.
+    """Return the zeros, at most three, with which the given robot fits best at some poses, the best
+    first; only of readings that are counted in the opposite direction with `reversed_only`.
     """
     robot = free.robot
     zeros = [zero for zero in _list_zeros(free, data) if zero.sign < 0.0 or not reversed_only]
@@ -224,14 +221,6 @@ class Selection(NamedTuple):
     alternatives: tuple[Interpretation, ...]  # that fit equally well
 
 
-class Search(NamedTuple):
-    """A finished search."""
-
-    selection: Selection | None  # the interpretation that explains the data; None without one
-    tried: dict[str, int]  # slip -> number of single interpretations that were tested
-    pairs: int  # number of pairs
-
-
 class _Test(NamedTuple):
     """A tested interpretation; a misfit that was not computed is infinite."""
 
@@ -242,12 +231,14 @@ class _Test(NamedTuple):
 
 def search_interpretations(
     free: FreeParameters, data: Measurements, stated: Comparison | None, misfit: float, pairs: bool
-) -> Search:
+) -> tuple[Selection | None, dict[str, int], int]:
     """Search for the interpretation that fits far better than the stated one.
 
     data : as written. stated : their comparison at the poses that the robot reaches; None where it
         reaches too few. misfit : of the data as written. pairs : test pairs if no single
         interpretation explains the data.
+    Returns the interpretation that explains the data, None without one; the number of single
+    interpretations that were tested by slip, and the number of pairs.
     """
     written = None if stated is None else stated.data
     select = partial(_select_best, free, data, written, misfit)
@@ -265,14 +256,12 @@ def search_interpretations(
         best = select(singles, misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST)
         if best is not None and best.misfit > ALLOWED and not _is_robot_far(stated, best):
             best = None
-    return Search(best, tried, count)
+    return best, tried, count
 
 
 def _is_robot_far(stated: Comparison | None, chosen: Selection) -> bool:
-    """Return whether an interpretation that leaves a misfit is true for a robot far from nominal.
-
-    Such a robot explains the data in this interpretation, and not as they are written; or the
-    residuals of the given robot become far smaller, not only their misfit.
+    """Return whether an interpretation that leaves a misfit is true for a robot far from nominal:
+    it explains the data so, and not as they are written; or its residuals become far smaller, too.
     """
     if stated is not None:
         before = compute_rms_residuals(stated)
@@ -288,6 +277,24 @@ def shares_poses(data: Measurements) -> bool:
     return any(o.kind.poses_per_row > 1 or bool((o.group != "").any()) for o in data.observations)
 
 
+def _test(
+    listed: Sequence[Interpretation],
+    screened: FloatArray,
+    judge: Callable[[IntArray], FloatArray | list[float]],
+    misfit: float,
+) -> list[_Test]:
+    """Return the tests of interpretations with misfits by a few rows: `judge` computes the misfits
+    by all rows of the best that may belong to a far better fit than `misfit`.
+    """
+    finite = np.sort(screened[np.isfinite(screened)])
+    bound = min(PROMISING * misfit / BETTER, *finite[MOST_JUDGED - 1 : MOST_JUDGED], np.inf)
+    promising = np.flatnonzero((screened <= bound) & np.isfinite(screened))
+    judged = np.full(len(listed), np.inf)
+    judged[promising] = judge(promising)
+    numbers = (np.nan_to_num(misfits, nan=np.inf).tolist() for misfits in (screened, judged))
+    return [_Test(*row) for row in zip(listed, *numbers, strict=True)]
+
+
 def _test_all(
     free: FreeParameters,
     data: Measurements,
@@ -295,19 +302,34 @@ def _test_all(
     misfit: float,
     nearest: int = NEAREST,
 ) -> list[_Test]:
-    """Test all single interpretations of data as written; those of the values only if the robot
-    reaches enough poses.
+    """Test all single interpretations of data as written: those of the values, together, only if
+    the robot reaches enough poses; those of the readings by their reach, and the `nearest` ones by
+    residuals before parameters change.
     """
-    tests = []
+    tests: list[_Test] = []
     if reached is not None:
-        listed, few = list(list_interpretations(reached)), reached.take(_select_few(reached))
-        screened = compute_misfits(free, few, listed, QUICK)
-        promising = _select_promising(screened, misfit)
-        judged = np.full(len(listed), np.inf)
-        chosen = [listed[i] for i in promising]
-        judged[promising] = compute_misfits(free, reached, chosen, THOROUGH)
-        tests = _list_tests(listed, screened, judged)
-    return tests + _test_readings(free, data, misfit, nearest)
+        of_values, few = list(list_interpretations(reached)), reached.take(_select_few(reached))
+
+        def judge_values(promising: IntArray) -> FloatArray:
+            return compute_misfits(free, reached, [of_values[i] for i in promising], THOROUGH)
+
+        screened = compute_misfits(free, few, of_values, QUICK)
+        tests = _test(of_values, screened, judge_values, misfit)
+    robot, poses = free.robot, _select_few(data)
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
+    listed = list(list_reading_interpretations(data, robot.actuators, home))
+    readings = np.stack([each.apply(data).readings[poses] for each in listed])
+    near, start, size = guess_frames(free, data.take(poses), readings)
+
+    def judge(i: int, start: FloatArray | None = None, few: IntArray | None = None) -> float:
+        changed = listed[i].apply(data)
+        comparison = judge_data(free, changed if few is None else changed.take(few), start)
+        return np.inf if comparison is None else comparison.misfit
+
+    screened = np.full(len(listed), np.inf)
+    for i in np.sort(np.argsort(size, kind="stable")[:nearest]).tolist():
+        screened[near[i]] = judge(int(near[i]), start[[i]], poses)
+    return tests + _test(listed, screened, lambda promising: list(map(judge, promising)), misfit)
 
 
 def _test_pairs(
@@ -326,11 +348,10 @@ def _test_pairs(
         ]
         for base in sorted(promising, key=lambda test: test.quick)[:MOST_BASES]:
             changed = base.interpretation.apply(data)
-            if of_values:
-                changed_reached = None if reached is None else base.interpretation.apply(reached)
+            if not of_values:
+                changed_reached = select_reached(free, changed)[0]
             else:
-                reach = select_reached(free, changed)
-                changed_reached = reach.data if reach.is_enough else None
+                changed_reached = None if reached is None else base.interpretation.apply(reached)
             bound = min(misfit, base.quick)
             for test in _test_all(free, changed, changed_reached, bound, NEAREST_IN_PAIRS):
                 pair = combine(base.interpretation, test.interpretation)
@@ -403,82 +424,35 @@ def _select_few(data: Measurements) -> IntArray:
     return find_distinct(np.linspace(0, n - 1, count).astype(np.intp))
 
 
-def _test_readings(
-    free: FreeParameters, data: Measurements, misfit: float, nearest: int
-) -> list[_Test]:
-    """Test all interpretations of the readings: the reach of all, the residuals before parameters
-    change of those in reach, and the misfit of the `nearest` ones.
-    """
-    robot, poses = free.robot, _select_few(data)
-    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
-    listed = list(list_reading_interpretations(data, robot.actuators, home))
-    readings = np.stack([each.apply(data).readings[poses] for each in listed])
-    near, start, size = guess_frames(free, data.take(poses), readings)
-
-    def judge(i: int, start: FloatArray | None = None, few: IntArray | None = None) -> float:
-        changed = listed[i].apply(data)
-        comparison = judge_data(free, changed if few is None else changed.take(few), start)
-        return np.inf if comparison is None else comparison.misfit
-
-    screened, judged = np.full(len(listed), np.inf), np.full(len(listed), np.inf)
-    for i in np.sort(np.argsort(size, kind="stable")[:nearest]).tolist():
-        screened[near[i]] = judge(int(near[i]), start[[i]], poses)
-    for i in _select_promising(screened, misfit).tolist():
-        judged[i] = judge(i)
-    return _list_tests(listed, screened, judged)
-
-
 def _test_parameters(
     free: FreeParameters, data: Measurements, reached: Measurements | None, misfit: float
 ) -> list[_Test]:
     """Test interpretations that have parameters of their own: setup items that are not declared
     unknown, and other zeros of the readings.
     """
-    few = _select_few(data)
-    zeros = find_zero_interpretations(free, data, few, not misfit > GROSS)
-    tests = [_test_one(free, data, few, zero, misfit) for zero in zeros]
+
+    def test_each(listed: Sequence[Interpretation], data: Measurements) -> list[_Test]:
+        few = _select_few(data)
+
+        def screen(interpretation: Interpretation) -> float:
+            changed = select_reached(free, interpretation.apply(data).take(few))[0]
+            if changed is None:
+                return np.inf
+            return exclude_far_rows(compare_with_robot(free, changed, (), QUICK)).misfit
+
+        def judge(i: int) -> float:
+            comparison = judge_data(free, listed[i].apply(data))
+            return np.inf if comparison is None else refine_misfit(comparison)[0]
+
+        screened = np.array(list(map(screen, listed)))
+        return _test(listed, screened, lambda promising: list(map(judge, promising)), misfit)
+
+    zeros = find_zero_interpretations(free, data, _select_few(data), not misfit > GROSS)
+    tests = test_each(zeros, data)
     for count in (1, 2):
         if reached is not None and all(test.misfit > ALLOWED for test in tests):
-            few = _select_few(reached)
-            setups = list_setup_interpretations(reached, count)
-            tests += [_test_one(free, reached, few, setup, misfit) for setup in setups]
+            tests += test_each(list(list_setup_interpretations(reached, count)), reached)
     return tests
-
-
-def _test_one(
-    free: FreeParameters,
-    data: Measurements,
-    few: IntArray,
-    interpretation: Interpretation,
-    misfit: float,
-) -> _Test:
-    """Test one interpretation by a few poses and, if that is promising, by all rows."""
-    changed = interpretation.apply(data)
-    screened = judged = np.inf
-    reach = select_reached(free, changed.take(few))
-    if reach.is_enough:
-        quick = exclude_far_rows(compare_with_robot(free, reach.data, (), QUICK))
-        screened = float(np.nan_to_num(quick.misfit, nan=np.inf))
-    if screened <= PROMISING * misfit / BETTER:
-        comparison = judge_data(free, changed)
-        if comparison is not None and np.isfinite(comparison.misfit):
-            judged = refine_misfit(comparison)[0]
-    return _Test(interpretation, screened, judged)
-
-
-def _list_tests(
-    listed: Sequence[Interpretation], screened: FloatArray, judged: FloatArray
-) -> list[_Test]:
-    """Return tests; a misfit of too few rows is infinite."""
-    numbers = (np.nan_to_num(misfits, nan=np.inf).tolist() for misfits in (screened, judged))
-    return [_Test(*row) for row in zip(listed, *numbers, strict=True)]
-
-
-def _select_promising(misfits: FloatArray, misfit: float) -> IntArray:
-    """Return the places of the best misfits that may belong to a far better fit than `misfit`."""
-    finite = np.sort(misfits[np.isfinite(misfits)])
-    bound = min(PROMISING * misfit / BETTER, *finite[MOST_JUDGED - 1 : MOST_JUDGED], np.inf)
-    return np.flatnonzero((misfits <= bound) & np.isfinite(misfits))
 
 
 # Data that another interpretation explains as well as the stated one cannot show which is true.
