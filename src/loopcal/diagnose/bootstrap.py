@@ -107,15 +107,14 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
             coordinates.append(np.zeros((len(row), 1, 0)))
             if own.by_coordinates is not None:
                 coordinates[-1] = own.by_coordinates[0][place, :, component]
-    columns = list(map(np.concatenate, zip(*parts, strict=True)))
+    columns: list[Any] = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
     by_coordinates = np.zeros((len(columns[0]), links, max(c.shape[2] for c in coordinates)))
     first = 0
     for part in coordinates:
         by_coordinates[first : first + len(part), : part.shape[1], : part.shape[2]] = part
         first += len(part)
-    values = ObservedValues(*columns, by_coordinates)
-    order = np.lexsort((values.component, values.row, values.kind, values.block))
-    return ObservedValues(*(column[order] for column in values))
+    order = np.lexsort(columns[3::-1])  # by block, kind, row and component
+    return ObservedValues(*(column[order] for column in (*columns, by_coordinates)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -343,7 +343,8 @@ def find_ambiguous(search: BlockSearch, progress: Progress = report_no_progress)
     """
     if not search.is_converged:
         excluded = np.array([fit.excluded for fit in search.fits])
-        return [excluded.any(axis=0) & ~excluded.all(axis=0)]
+        in_turn: BoolArray = np.any(excluded, axis=0) & ~np.all(excluded, axis=0)
+        return [in_turn]
     refit, whole, end, limit = search.refit, search.whole, search.end, search.limit
     groups: list[BoolArray] = []
     suspects = np.flatnonzero(end.excluded)
