@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-from xml.etree.ElementTree import Element, SubElement, indent, register_namespace, tostring
+from xml.etree.ElementTree import Element, indent, register_namespace, tostring
 
 from loopcal.errors import DataError
 from loopcal.io.core.records import read_record
@@ -27,12 +27,6 @@ from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from loopcal.io.runs.run_folder import Run
-
-
-# What a digital calibration certificate states beside the results: laboratory, customer,
-# dates.
-
-WHAT = "certificate file"
 
 TEMPLATE = """\
 # What a digital calibration certificate states beside the results. Fill in every text.
@@ -115,44 +109,35 @@ def load_administration(path: str | Path) -> Administration:
     ------
     FileError : a key is missing or unknown, a text is empty, or not a date or code, at its line.
     """
-    file = read_yaml(path, WHAT, has_names=False)
+    file = read_yaml(path, "certificate file", has_names=False)
     record = read_record(file, file.content, Administration, None)
-    for owner, keys in NEEDED.items():
-        for key in keys:
-            if not getattr(getattr(record, owner), key).strip():
-                raise file.error(f"'{owner}.{key}' is empty; fill it in", (owner, key))
+    needed = [(owner, key) for owner, keys in NEEDED.items() for key in keys]
+    for owner, key in needed:
+        if not getattr(getattr(record, owner), key).strip():
+            raise file.error(f"'{owner}.{key}' is empty; fill it in", (owner, key))
     if not record.number.strip():
         raise file.error("'number' is empty; fill it in", ("number",))
     if not record.persons or not all(person.name.strip() for person in record.persons):
         raise file.error("'persons' needs at least one name; fill it in", ("persons",))
-    _check_codes(file, record)
-    for key in ("begin", "end", "issued"):
-        _check_date(file, key, getattr(record, key))
-    if record.end < record.begin:
-        raise file.error(
-            f"end is {record.end}, before begin, {record.begin}; correct one", ("end",)
-        )
-    return record
-
-
-def _check_codes(file: YamlFile, record: Administration) -> None:
-    """Refuse codes of countries and languages that the schema does not accept."""
-    codes = {("country",): record.country}
-    codes |= {("laboratory", "country"): record.laboratory.country}
-    codes |= {("customer", "country"): record.customer.country}
-    for place, code in codes.items():
+    countries = {("country",): record.country}
+    countries |= {(o, "country"): getattr(record, o).country for o in ("laboratory", "customer")}
+    for place, code in countries.items():
         if not re.fullmatch("[A-Z]{2}", code):
             name = ".".join(place)
             raise file.error(f"{name!r} is {code!r}; write two capital letters, as DE", place)
     if not re.fullmatch("[a-z]{2}", record.language):
         sentence = f"language is {record.language!r}; write two lower-case letters, as en"
         raise file.error(sentence, ("language",))
+    for key in ("begin", "end", *(["issued"] if record.issued else [])):
+        _check_date(file, key, getattr(record, key))
+    if record.end < record.begin:
+        sentence = f"end is {record.end}, before begin, {record.begin}; correct one"
+        raise file.error(sentence, ("end",))
+    return record
 
 
 def _check_date(file: YamlFile, key: str, text: str) -> None:
-    """Refuse a text that is no date of the form 2026-01-31; `issued` may be left out."""
-    if key == "issued" and not text:
-        return
+    """Refuse a text that is no date of the form 2026-01-31."""
     try:
         is_date = date.fromisoformat(text).isoformat() == text
     except ValueError:
@@ -191,6 +176,14 @@ CONFORMITY = {
 NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that no XML document may hold."""
 
+IN_WORDS = ("name", "description", "declaration", "noQuantity")
+"""Elements whose text is that of an element `content`."""
+
+Content = Mapping[str, Any]
+"""Elements by name, in order: a text, elements, or a list for several of one name. Names without a
+prefix are of the DCC. Elements without any content are left out.
+"""
+
 
 def format_certificate(run: Run, administration: Administration) -> str:
     """Return the certificate of a run as XML.
@@ -213,199 +206,169 @@ def format_certificate(run: Run, administration: Administration) -> str:
         register_namespace(prefix, uri)
     root = Element(f"{{{DCC}}}digitalCalibrationCertificate", schemaVersion=VERSION)
     root.set(f"{{{XSI}}}schemaLocation", f"{DCC} {DCC}/v{VERSION}/dcc.xsd")
-    _add_administration(_add(root, "administrativeData"), run, administration)
-    result = _add(_add(root, "measurementResults"), "measurementResult")
-    _add_text(result, "name", "Geometric calibration")
-    method = _add(_add(result, "usedMethods"), "usedMethod")
-    _add_text(method, "name", "Identification of geometric parameters, validated on held-out poses")
-    _add(method, "norm", "JCGM 100:2008")
-    _add_software(_add(result, "usedSoftware"), run)
-    _add_instruments(result, run.result.get("instruments") or [])
-    _add_results(_add(result, "results"), run.result)
-    _add_statements(_add(result, "measurementMetaData"), run.result)
+    release = str(run.result["made_by"].get("versions", {}).get("loopcal", "unknown"))
+    software = {"software": {"name": "loopcal", "release": release}}
+    method = "Identification of geometric parameters, validated on held-out poses"
+    instruments = [_describe_instrument(facts) for facts in run.result.get("instruments") or []]
+    result = {
+        "name": "Geometric calibration",
+        "usedMethods": {"usedMethod": {"name": method, "norm": "JCGM 100:2008"}},
+        "usedSoftware": software,
+        "measuringEquipments": {"measuringEquipment": instruments},
+        "results": {"result": list(_list_results(run.result))},
+        "measurementMetaData": {"metaData": list(_list_statements(run.result))},
+    }
+    administrative = {"dccSoftware": software, **_describe_administration(administration)}
+    measured = {"measurementResult": result}
+    _add(root, {"administrativeData": administrative, "measurementResults": measured})
     indent(root)
     return tostring(root, "unicode", xml_declaration=False).join(
         ['<?xml version="1.0" encoding="UTF-8"?>\n', "\n"]
     )
 
 
-def _add(parent: Element, name: str, text: str | None = None) -> Element:
-    """Add an element of the DCC."""
-    element = SubElement(parent, f"{{{DCC}}}{name}")
-    if text is not None:
-        # XML does not hold all characters: the others become visible escapes
-        element.text = NOT_XML.sub(lambda match: escape(match.group()), text).strip() or "-"
-    return element
+def _add(parent: Element, content: Content) -> None:
+    """Add elements."""
+    for name, value in content.items():
+        for entry in value if isinstance(value, list) else [value]:
+            prefix, _, local = name.rpartition(":")
+            element = Element(f"{{{SI if prefix else DCC}}}{local}")
+            if not isinstance(entry, str):
+                _add(element, entry)
+            elif entry and name in IN_WORDS:
+                _add(element, {"content": entry})
+            elif entry:
+                # XML does not hold all characters: the others become visible escapes
+                text = NOT_XML.sub(lambda match: escape(match.group()), entry)
+                element.text = text.strip() or "-"
+            if element.text or len(element):
+                parent.append(element)
 
 
-def _add_text(parent: Element, name: str, text: str) -> None:
-    """Add an element with a text in words."""
-    _add(_add(parent, name), "content", text)
+def _identify(numbers: Mapping[str, str], issuer: str) -> Content:
+    """Return numbers that identify something, by what they are."""
+    entries = ((name, value) for name, value in numbers.items() if value)
+    return {"identification": [{"issuer": issuer, "value": v, "name": n} for n, v in entries]}
 
 
-def _add_software(parent: Element, run: Run) -> None:
-    """Add the program that computed the results."""
-    software = _add(parent, "software")
-    _add_text(software, "name", "loopcal")
-    versions = run.result["made_by"].get("versions", {})
-    _add(software, "release", str(versions.get("loopcal", "unknown")))
-
-
-def _add_administration(parent: Element, run: Run, facts: Administration) -> None:
-    """Add the administrative data, in the order of the schema."""
-    _add_software(_add(parent, "dccSoftware"), run)
-    core = _add(parent, "coreData")
-    _add(core, "countryCodeISO3166_1", facts.country)
-    _add(core, "usedLangCodeISO639_1", facts.language)
-    _add(core, "mandatoryLangCodeISO639_1", facts.language)
-    _add(core, "uniqueIdentifier", facts.number)
-    _add(core, "beginPerformanceDate", facts.begin)
-    _add(core, "endPerformanceDate", facts.end)
-    _add(core, "performanceLocation", facts.place)
-    if facts.issued:
-        _add(core, "issueDate", facts.issued)
+def _describe_administration(facts: Administration) -> Content:
+    """Return the administrative data, in the order of the schema."""
     machine = facts.machine
-    item = _add(_add(parent, "items"), "item")
-    _add_text(item, "name", machine.name)
-    if machine.manufacturer:
-        _add_text(_add(item, "manufacturer"), "name", machine.manufacturer)
-    if machine.model:
-        _add(item, "model", machine.model)
-    _add_identifications(item, {"serial number": machine.serial_number}, "manufacturer")
-    _add_contact(_add(_add(parent, "calibrationLaboratory"), "contact"), facts.laboratory)
-    persons = _add(parent, "respPersons")
-    for i, person in enumerate(facts.persons):
-        entry = _add(persons, "respPerson")
-        _add_text(_add(entry, "person"), "name", person.name)
-        if person.role:
-            _add(entry, "role", person.role)
-        _add(entry, "mainSigner", "true" if i == 0 else "false")
-    _add_contact(_add(parent, "customer"), facts.customer)
+    item = {
+        "name": machine.name,
+        "manufacturer": {"name": machine.manufacturer},
+        "model": machine.model,
+        "identifications": _identify({"serial number": machine.serial_number}, "manufacturer"),
+    }
+    persons = [
+        {
+            "person": {"name": person.name},
+            "role": person.role,
+            "mainSigner": "false" if i else "true",
+        }
+        for i, person in enumerate(facts.persons)
+    ]
+    return {
+        "coreData": {
+            "countryCodeISO3166_1": facts.country,
+            "usedLangCodeISO639_1": facts.language,
+            "mandatoryLangCodeISO639_1": facts.language,
+            "uniqueIdentifier": facts.number,
+            "beginPerformanceDate": facts.begin,
+            "endPerformanceDate": facts.end,
+            "performanceLocation": facts.place,
+            "issueDate": facts.issued,
+        },
+        "items": {"item": item},
+        "calibrationLaboratory": {"contact": _describe_contact(facts.laboratory)},
+        "respPersons": {"respPerson": persons},
+        "customer": _describe_contact(facts.customer),
+    }
 
 
-def _add_contact(parent: Element, contact: Contact) -> None:
-    """Add name and address."""
-    _add_text(parent, "name", contact.name)
-    if contact.email:
-        _add(parent, "eMail", contact.email)
-    location = _add(parent, "location")
-    place = {"street": contact.street, "postCode": contact.post_code, "city": contact.city}
-    for name, text in place.items():
-        if text:
-            _add(location, name, text)
-    _add(location, "countryCode", contact.country)
+def _describe_contact(contact: Contact) -> Content:
+    """Return name and address."""
+    location = {
+        "street": contact.street,
+        "postCode": contact.post_code,
+        "city": contact.city,
+        "countryCode": contact.country,
+    }
+    return {"name": contact.name, "eMail": contact.email, "location": location}
 
 
-def _add_identifications(parent: Element, values: Mapping[str, str], issuer: str) -> None:
-    """Add numbers that identify something."""
-    listed = _add(parent, "identifications")
-    for name, value in values.items():
-        identification = _add(listed, "identification")
-        _add(identification, "issuer", issuer)
-        _add(identification, "value", value)
-        _add_text(identification, "name", name)
+def _describe_instrument(facts: Mapping[str, str]) -> Content:
+    """Return an instrument that the measurement files state."""
+    sources = ("laboratory", "standard", "calibrated", "due", "measured")
+    description = "; ".join(f"{key} {facts[key]}" for key in sources if key in facts)
+    known = {"serial number": "serial_number", "certificate": "certificate"}
+    numbers = {name: facts.get(key, "") for name, key in known.items()}
+    return {
+        "name": facts.get("name") or facts.get("model") or "instrument",
+        "description": description,
+        "manufacturer": {"name": facts.get("manufacturer", "")},
+        "model": facts.get("model", ""),
+        "identifications": _identify(numbers, "other"),
+    }
 
 
-def _add_instruments(parent: Element, instruments: list[Mapping[str, str]]) -> None:
-    """Add the instruments that the measurement files state."""
-    if not instruments:
-        return
-    equipments = _add(parent, "measuringEquipments")
-    for facts in instruments:
-        equipment = _add(equipments, "measuringEquipment")
-        _add_text(equipment, "name", facts.get("name") or facts.get("model") or "instrument")
-        dates = [f"{k} {facts[k]}" for k in ("calibrated", "due", "measured") if k in facts]
-        sources = [f"{k} {facts[k]}" for k in ("laboratory", "standard") if k in facts]
-        if dates or sources:
-            _add_text(equipment, "description", "; ".join([*sources, *dates]))
-        if "manufacturer" in facts:
-            _add_text(_add(equipment, "manufacturer"), "name", facts["manufacturer"])
-        if "model" in facts:
-            _add(equipment, "model", facts["model"])
-        known = {"serial number": "serial_number", "certificate": "certificate"}
-        numbers = {name: facts[key] for name, key in known.items() if key in facts}
-        if numbers:
-            _add_identifications(equipment, numbers, "other")
-
-
-def _add_results(parent: Element, content: Mapping[str, Any]) -> None:
-    """Add the parameters, and the errors at held-out poses."""
-    data = _add_result(parent, "Identified parameters")
+def _list_results(content: Mapping[str, Any]) -> Iterator[Content]:
+    """Yield the parameters, and the errors at held-out poses."""
+    parameters = []
     for row in content["fit"]["parameters"]:
         unit = find_unit(row["unit"] or "1")
         values = (row["estimate"], row["plus_minus"], row["sd"])
         scaled = (None if x is None else x * unit.factor_to_si for x in values)
-        _add_quantity(data, row["name"], UNITS.get(unit.dimension, r"\one"), *scaled)
+        parameters.append(_quantity(row["name"], UNITS.get(unit.dimension, r"\one"), *scaled))
+    yield {"name": "Identified parameters", "data": {"quantity": parameters}}
     errors = content.get("validation")
     if not errors:
         return
-    rows = [
-        (f"{quantity} error {when} calibration, {word}", unit_name, errors[when][quantity][key])
+    quantities = [
+        _quantity(f"{quantity} error {when} calibration, {word}", unit, errors[when][quantity][key])
         for when in ("before", "after")
-        for quantity, unit_name in (("position", r"\metre"), ("orientation", r"\radian"))
+        for quantity, unit in (("position", r"\metre"), ("orientation", r"\radian"))
         if quantity in errors[when]
         for key, word in (("rms", "root mean square"), ("max", "largest"))
     ]
-    if rows:
-        data = _add_result(parent, f"Errors at held-out poses, {errors['frame']}")
-        for name, unit_name, value in rows:
-            _add_quantity(data, name, unit_name, value)
+    if quantities:
+        name = f"Errors at held-out poses, {errors['frame']}"
+        yield {"name": name, "data": {"quantity": quantities}}
 
 
-def _add_result(parent: Element, name: str) -> Element:
-    """Add a result, and return the element of its data."""
-    result = _add(parent, "result")
-    _add_text(result, "name", name)
-    return _add(result, "data")
-
-
-def _add_quantity(
-    parent: Element,
+def _quantity(
     name: str,
     unit: str,
     value: float | None,
     expanded: float | None = None,
     sd: float | None = None,
-) -> None:
-    """Add a value [SI] with its expanded uncertainty; a text where it is not determined."""
-    quantity = _add(parent, "quantity")
-    _add_text(quantity, "name", name)
+) -> Content:
+    """Return a value [SI] with its expanded uncertainty; a text where it is not determined."""
     if value is None or not math.isfinite(value):
-        _add_text(quantity, "noQuantity", "not determined by the measurements")
-        return
-    real = SubElement(quantity, f"{{{SI}}}real")
-    for key, text in (("value", repr(float(value))), ("unit", unit)):
-        SubElement(real, f"{{{SI}}}{key}").text = text
-    if not expanded or not sd:
-        return
-    univariate = SubElement(real, f"{{{SI}}}measurementUncertaintyUnivariate")
-    uncertainty = SubElement(univariate, f"{{{SI}}}expandedMU")
-    numbers = {
-        "valueExpandedMU": expanded,
-        "coverageFactor": expanded / sd,
-        "coverageProbability": PROBABILITY,
-    }
-    for key, number in numbers.items():
-        SubElement(uncertainty, f"{{{SI}}}{key}").text = repr(float(number))
+        return {"name": name, "noQuantity": "not determined by the measurements"}
+    real: dict[str, Any] = {"si:value": repr(float(value)), "si:unit": unit}
+    if expanded and sd:
+        uncertainty = {
+            "si:valueExpandedMU": repr(float(expanded)),
+            "si:coverageFactor": repr(float(expanded / sd)),
+            "si:coverageProbability": repr(PROBABILITY),
+        }
+        real["si:measurementUncertaintyUnivariate"] = {"si:expandedMU": uncertainty}
+    return {"name": name, "si:real": real}
 
 
-def _add_statements(parent: Element, content: Mapping[str, Any]) -> None:
-    """Add the verdict with what it is subject to, and the statement on each limit."""
+def _list_statements(content: Mapping[str, Any]) -> Iterator[Content]:
+    """Yield the verdict with what it is subject to, and the statement on each limit."""
     stated = [f for f in content.get("findings") or () if f["severity"] == "warning"]
     expected = (content.get("expected_error") or {}).get("finding")
     if expected and content.get("states_expected_error"):
         stated.append(expected)
     headline = content.get("headline")  # absent in runs of earlier versions
-    sentences = [*([headline] if headline else []), *(f["text"] for f in stated)]
-    verdict = _add(parent, "metaData")
-    _add_text(verdict, "name", "Verdict, warnings and expected error")
-    _add_text(verdict, "declaration", " ".join((*sentences, SCOPE)))
-    judged = ((content.get("validation") or {}).get("conformity")) or {}
+    sentences = [*([headline] if headline else []), *(f["text"] for f in stated), SCOPE]
+    yield {"name": "Verdict, warnings and expected error", "declaration": " ".join(sentences)}
+    judged = (content.get("validation") or {}).get("conformity") or {}
     for quantity, stated in judged.items():
-        meta = _add(parent, "metaData")
         unit, scale = ("mm", 1e3) if quantity == "position" else ("deg", math.degrees(1.0))
-        _add_text(meta, "name", f"Conformity of the largest {quantity} error at held-out poses")
-        _add(meta, "norm", "ISO 14253-1:2017")
         numbers = {
             "estimate": "Estimate",
             "expanded": "expanded uncertainty",
@@ -418,5 +381,9 @@ def _add_statements(parent: Element, content: Mapping[str, Any]) -> None:
             f"{', '.join(lengths)}, probability of conformity {100 * stated['probability']:.3g} %; "
             f"conformity is accepted from {100 * stated['level']:.3g} %. {PREDICTED}"
         )
-        _add_text(meta, "declaration", declaration)
-        _add(meta, "conformity", CONFORMITY[stated["decision"]])
+        yield {
+            "name": f"Conformity of the largest {quantity} error at held-out poses",
+            "norm": "ISO 14253-1:2017",
+            "declaration": declaration,
+            "conformity": CONFORMITY[stated["decision"]],
+        }
