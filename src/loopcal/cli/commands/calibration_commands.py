@@ -569,10 +569,10 @@ def regularize(
     """  # noqa: D301
     from loopcal.diagnose.cross_validation import compute_regularization_curves
     from loopcal.estimate.options import FitOptions
-    from loopcal.io.core.outputs import refuse_folder
+    from loopcal.io.core.outputs import refuse_folder, write_result_folder
     from loopcal.io.data.measurement_file import list_measurement_files
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
-    from loopcal.io.runs.result_files import CURVES, write_curves
+    from loopcal.io.runs.result_files import CURVES, CURVES_FORMAT, PICTURE, POINTS
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.report.figures.fit_figures import draw_regularization
     from loopcal.report.pictures import render_figure
@@ -595,8 +595,9 @@ def regularize(
     if output is not None:
         picture = render_figure(draw_regularization(curves), ".png")
         made_by = collect_provenance(["loopcal", *sys.argv[1:]], inputs, {"folds": seed})
-        document = {**curves.to_dict(), "made_by": made_by}
-        write_curves(output, document, tabulate_points(curves).to_csv(), picture, force)
+        document = {"format": CURVES_FORMAT, **curves.to_dict(), "made_by": made_by}
+        files = {POINTS: tabulate_points(curves).to_csv().encode(), PICTURE: picture}
+        write_result_folder(output, CURVES, document, files, force)
     written = ["", f"Written to {output}: curves.json, curves.csv, curves.png"]
     return Output(
         curves.to_dict(), lambda: [*view_regularization(curves), *(written if output else [])]

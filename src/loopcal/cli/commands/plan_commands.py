@@ -257,14 +257,16 @@ def _write_plan(
     output: Path, result: Plan | SurfacePlan, inputs: Mapping[str, Path], seed: int, force: bool
 ) -> str:
     """Write the folder of a plan; return its files in words."""
+    from loopcal.io.core.outputs import write_result_folder
     from loopcal.io.runs.plan_folder import (
         DATA,
+        FORMAT,
+        PLAN,
         SHEET,
         format_plan_data,
         format_sheet,
         format_surface_data,
         format_surface_sheet,
-        write_plan_folder,
     )
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning.result import Plan, list_stops
@@ -279,9 +281,10 @@ def _write_plan(
             figures["curve.png"] = draw_curve(result.robot, result.curve)
     else:
         texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
-    document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
+    document = {"format": FORMAT, **result.to_dict()}
+    document["made_by"] = collect_provenance(sys.argv, inputs, {"plan": seed})
     pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
-
-    write_plan_folder(output, texts, document, pictures, force)
+    contents = {name: text.encode() for name, text in texts.items()} | pictures
+    write_result_folder(output, PLAN, document, contents, force)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
     return f"{files}, pictures" if pictures else files

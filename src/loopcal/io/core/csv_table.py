@@ -389,6 +389,12 @@ def format_row(cells: Iterable[str]) -> str:
     )
 
 
+def format_columns(columns: Mapping[str, Iterable[str]]) -> str:
+    """Return columns of cells by heading as CSV text."""
+    rows = zip(*columns.values(), strict=True)
+    return "".join(format_row(cells) + "\n" for cells in (columns, *rows))
+
+
 def read_settings(path: str | Path) -> YamlFile:
     """Return the settings of a measurement file; raise FileError as `read_table`."""
     return _read_settings(as_path(path, WHAT), _read_lines(path))[0]

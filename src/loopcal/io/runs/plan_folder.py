@@ -15,16 +15,16 @@ measured.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import format_row, parse_exact
-from loopcal.io.core.outputs import FolderKind, write_result_folder
+from loopcal.io.core.outputs import FolderKind
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN, get_dimension
 from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
 from loopcal.mechanism.model import Mechanism
@@ -114,20 +114,6 @@ def find_plan_sheet(data: Path) -> Path:
         sentence = f"this sheet has no readings, and there is no {SHEET} beside it"
         raise FileError(f"{sentence}; fill in the readings, or name the file in its plan", data)
     return beside
-
-
-def write_plan_folder(
-    path: Path,
-    texts: Mapping[str, str],
-    document: Mapping[str, Any],
-    pictures: Mapping[str, bytes],
-    force: bool = False,
-) -> None:
-    """Write the folder of a plan whole or not at all, see `write_result_folder`: texts and
-    pictures by name, and plan.json, to whose content `format` and `files` are added.
-    """
-    files = {name: text.encode() for name, text in texts.items()} | dict(pictures)
-    write_result_folder(path, PLAN, {"format": FORMAT, **document}, files, force)
 
 
 def _list_columns(robot: Mechanism) -> tuple[list[str], list[float]]:
