@@ -58,13 +58,13 @@ def test_rank_and_condition_of_every_set_are_those_of_its_columns(printers):
         names = candidate.parameters
         only = replace(robot, parameters=robot.parameters.with_free(names))
         expected = lc.identifiability(only, data)
-        assert candidate.conditioning.rank == expected.rank == len(names)
-        assert candidate.conditioning.condition == pytest.approx(expected.condition, rel=1e-6)
-    by_name = {c.name: c.conditioning.condition for c in choice.candidates}
+        assert candidate.rank == expected.rank == len(names)
+        assert candidate.condition == pytest.approx(expected.condition, rel=1e-6)
+    by_name = {c.name: c.condition for c in choice.candidates}
     assert by_name["controller"] < 0.3 * by_name["complete"]
     assert by_name["complete"] == pytest.approx(46, abs=0.5)  # docs/delta-printers.md
     document = choice.to_dict()["candidates"][-1]
-    assert document.conditioning.rank == 9
+    assert document.rank == 9
 
 
 def test_real_printer_with_wrong_stops_gets_a_comparison_of_six_and_nine(printers):
@@ -93,9 +93,9 @@ def test_sets_with_too_few_equations_are_listed_and_not_compared(printers):
             assert candidate.validation is None
             assert candidate.name in choice.finding.data["not_compared"]
             assert candidate.name in str(choice.finding)
-        ranks = {c.name: c.conditioning.rank for c in large}
+        ranks = {c.name: c.rank for c in large}
         assert ranks == {"controller": 6, "lengths": 7, "complete": 7}
-        assert np.isinf(choice.candidates[-1].conditioning.condition)
+        assert np.isinf(choice.candidates[-1].condition)
 
 
 def test_any_robot_file_can_state_what_its_controller_stores(tmp_path: Path):

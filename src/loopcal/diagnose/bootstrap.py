@@ -114,7 +114,8 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
         by_coordinates[first : first + len(part), : part.shape[1], : part.shape[2]] = part
         first += len(part)
     order = np.lexsort(columns[3::-1])  # by block, kind, row and component
-    return ObservedValues(*(column[order] for column in (*columns, by_coordinates)))
+    columns.append(by_coordinates)
+    return ObservedValues(*(column[order] for column in columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,14 +403,14 @@ class Bootstrap(TableResult):
             words = ", ".join(get_args(IntervalKind))
             raise EstimationError(f"kind of interval is {kind!r}; it must be one of {words}")
         estimate, weight = self.fit.estimate, np.full(len(self.draws), 1.0 / len(self.draws))
-        ends = compare_ends(self.draws, weight, self.linear, weight, level)
-        half = 0.5 * (ends.linear[1] - ends.linear[0])
+        quantile, linear, error = compare_ends(self.draws, weight, self.linear, weight, level)
+        half = 0.5 * (linear[1] - linear[0])
         with np.errstate(divide="ignore", invalid="ignore"):
-            shift, error = (ends.quantile - ends.linear) / half, ends.error / half
-        lower, upper = self._ends(kind, level, ends.quantile)
+            shift, shift_error = (quantile - linear) / half, error / half
+        lower, upper = self._ends(kind, level, quantile)
         degrees = self.scatter.degrees if self.scheme != "normal" else np.inf
         widen = coverage_factor(degrees, level) / coverage_factor(np.inf, level)
-        linear = estimate + (ends.linear - estimate) * (widen if kind == "widened" else 1.0)
+        linear = estimate + (linear - estimate) * (widen if kind == "widened" else 1.0)
         return mask_intervals(
             self.is_known,
             self.fit.names,
@@ -419,7 +420,7 @@ class Bootstrap(TableResult):
             sd=self.draws.std(axis=0, ddof=1),
             **dict(zip(ENDS, (lower, upper, *linear), strict=True)),
             shift=shift,
-            shift_error=error,
+            shift_error=shift_error,
         )
 
     @property

@@ -22,7 +22,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -302,15 +302,6 @@ CONTROLLER = "controller"  # name of the set that the controller of the machine 
 NOT_COMPARED = ("fit.too-few-equations", "model.fold-not-converged")
 
 
-class Conditioning(NamedTuple):
-    """How data determine a set of parameters: number of directions, and condition number of their
-    columns in tolerances; infinite where the rank is below the number of parameters.
-    """
-
-    rank: int
-    condition: float
-
-
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """One set of free parameters."""
@@ -320,15 +311,16 @@ class Candidate:
     # cross-validation; None where without a fold too few equations remain, or the fit does not
     # converge
     validation: CrossValidation | None
-    conditioning: Conditioning  # by all data, at the values before calibration
+    rank: int  # number of directions that all data determine at the values before calibration
+    condition: float  # number of the columns in tolerances; infinite without full rank
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("name"),
         Field("parameters", show=lambda names: str(len(names))),
         Field("score", unit="sigma^2", digits=4),
         Field("standard_error", unit="sigma^2", title="+/-", digits=2),
-        Field("rank", "conditioning.rank", unit="1"),
-        Field("condition", "conditioning.condition", unit="1", digits=3),
+        Field("rank", unit="1"),
+        Field("condition", unit="1", digits=3),
     )
 
     @property
@@ -405,15 +397,7 @@ class ModelChoice(TableResult):
         return f"<ModelChoice: {self.chosen.name} of {', '.join(c.name for c in self.candidates)}>"
 
     def __str__(self) -> str:
-        heading = f"{'free':<12} {'parameters':>10} {'rank':>4} {'condition':>9}"
-        lines = [f"{heading} {'held-out score':>14} {'+/-':>9}"]
-        for c in self.candidates:
-            rank, condition = c.conditioning
-            lines.append(
-                f"{c.name:<12} {len(c.parameters):>10} {rank:>4} {condition:>9.3g} "
-                f"{c.score:>14.4g} {c.standard_error:>9.2g}"
-            )
-        return "\n".join([*lines, str(self.finding)])
+        return f"{self.compare_sets().to_text()}\n{self.finding}"
 
 
 def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
@@ -507,7 +491,7 @@ def choose_model(
 
     conditions = _rate_conditioning(robot, data, [names for _, names in named], options)
     candidates = tuple(
-        Candidate(name, names, validate_set(i, names), conditions[i])
+        Candidate(name, names, validate_set(i, names), *conditions[i])
         for i, (name, names) in enumerate(named)
     )
     best = min(candidates, key=lambda c: c.score)
@@ -518,22 +502,21 @@ def choose_model(
 
 def _rate_conditioning(
     robot: Mechanism, data: Measurements, sets: Sequence[Sequence[str]], options: FitOptions
-) -> list[Conditioning]:
+) -> list[tuple[int, float]]:
     """Return rank and condition of the columns of each set, in tolerances."""
     if not robot.parameters.free.any():
-        return [Conditioning(0, 1.0) for _ in sets]
+        return [(0, 1.0) for _ in sets]
     free = select_free_parameters(robot)
     data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
     columns: FloatArray = collect_information(free, data)[0][0, :-1, :-1]
     rated = []
     for names in sets:
         if not names:
-            rated.append(Conditioning(0, 1.0))
+            rated.append((0, 1.0))
             continue
         s = np.linalg.svd(columns[:, [free.names.index(name) for name in names]], compute_uv=False)
         rank = int(are_nonzero(s, options.rank_tolerance).sum())
-        is_full = rank == len(names)
-        rated.append(Conditioning(rank, float(s[0] / s[-1]) if is_full else np.inf))
+        rated.append((rank, float(s[0] / s[-1]) if rank == len(names) else np.inf))
     return rated
 
 

@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -185,22 +185,16 @@ def mask_intervals(
     return Intervals(names, level, source, **known)
 
 
-class EndDifference(NamedTuple):
-    """The ends of intervals of draws; arrays (2, p)."""
-
-    quantile: FloatArray  # of draws
-    linear: FloatArray  # of linear draws
-    error: FloatArray  # standard error of their difference
-
-
 def compare_ends(
     draws: FloatArray,
     weight: FloatArray,
     linear: FloatArray,
     linear_weight: FloatArray,
     level: float,
-) -> EndDifference:
-    """Compare ends of intervals of draws and linear draws (T, p), with weights (T,) of sum 1."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the ends (2, p) of intervals of draws and of linear draws (T, p), with weights (T,) of
+    sum 1, and the standard error of their difference.
+    """
     tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
     quantile = weighted_quantiles(draws, weight, tails)
     reference = weighted_quantiles(linear, linear_weight, tails)
@@ -212,7 +206,7 @@ def compare_ends(
         own = weight[:, None] * ((draws <= quantile[i]) - tail)
         other = linear_weight[:, None] * ((linear <= reference[i]) - tail)
         error[i] = np.sqrt(((own - other) ** 2).sum(axis=0)) * sd / density
-    return EndDifference(quantile, reference, error)
+    return quantile, reference, error
 
 
 def report_intervals(intervals: Intervals, agrees: str, differs: str) -> list[Finding]:

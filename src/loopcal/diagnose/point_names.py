@@ -6,13 +6,15 @@ Each session is examined by itself, since the instrument may have moved between 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.position import Position, name_point
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
@@ -36,183 +38,205 @@ FEWEST_POSES = 4  # poses on each side of a moment at which an instrument may ha
 LEAST_SHARE = 1e-9  # share of the extent of all points below which a distance is rounding
 
 
-@dataclass(frozen=True)
-class PointCheck:
-    """The points of a table against their predictions."""
+def examine_points(robot: Mechanism, data: Measurements, unit: str) -> tuple[Finding, ...]:
+    """Return findings on points that are far from where the nominal robot predicts them; raise
+    DataError for wrong names and units, and for an instrument that moved.
 
-    distance: float  # median distance of a point from its prediction [m]
-    limit: float  # of near points [m]
-    # (row, target) of points and the (row, target) whose prediction they fit
-    renamed: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = ()
-    # (row, target) of points that fit no prediction, and their distance [m]
-    far: tuple[tuple[tuple[int, int], float], ...] = ()
-    # first row after the instrument has moved; None where it stood still
-    moved_before: int | None = None
-    # ratio of the distances with one instrument frame to those with two; 0: no move. Between
-    # `DOUBTED` and `MOVED` the move is likely, but geometric errors hide it
-    move_gain: float = 0.0
-    # 1 where the points of each row fit the row before, -1 where they fit the next one
-    shift: int = 0
-    shifted_from: int = 0  # first row whose name is shifted
-    # median distance with the names as they are [m], where they are shifted
-    distance_as_named: float = float("nan")
-
-
-def check_point_names(kind: Position, T: FloatArray, measured: FloatArray) -> PointCheck | None:
-    """Compare measured points with the predictions of the nominal robot.
-
-    kind : of the rows, mounted on the robot's tool. T : (r, 4, 4) platform pose of each row.
-    measured : (r, 3 k) [m] points of k targets in the frame of the instrument, NaN where missing.
-    Returns None where there are too few points.
+    Rows of other kinds than `position` are not examined. unit : in which the points were read.
     """
-    points = measured.reshape(len(T), len(kind.targets), 3)
-    is_present: BoolArray = np.asarray(~np.isnan(points).any(axis=2))
+    findings: list[Finding] = []
+    solution = forward(robot, data.readings)
+    for rows in data.observations:
+        if not isinstance(rows.kind, Position):
+            continue
+        for session in np.unique(rows.session):
+            chosen = np.flatnonzero((rows.session == session) & solution.converged[rows.rows])
+            poses = rows.rows[chosen]
+            points = rows.measured[chosen].reshape(len(chosen), len(rows.kind.targets), 3)
+            labels = [data.labels[i] for i in poses]
+            table = _Points(robot, rows.kind, solution.T[poses], points, labels)
+            _refuse_other_unit(table, unit)
+            findings += _examine(table)
+    return tuple(findings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Points of k targets at the platform poses T (r, 4, 4) [m] of r rows."""
+
+    robot: Mechanism
+    kind: Position  # mounted on the robot's tool
+    T: FloatArray
+    points: FloatArray  # (r, k, 3) [m] in the frame of the instrument, NaN where missing
+    labels: list[str]  # of the poses
+
+    @cached_property
+    def is_present(self) -> BoolArray:
+        """(r, k) measured points."""
+        return np.asarray(~np.isnan(self.points).any(axis=2))
+
+    @property
+    def extent(self) -> float:
+        """Largest extent of the poses along an axis [m]."""
+        return float(np.ptp(self.T[:, :3, 3], axis=0).max(initial=0.0))
+
+    def fit(
+        self, T: FloatArray, points: FloatArray, used: BoolArray
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return predictions (n, k, 3) with the frame and targets that fit used points best, and
+        distances (n, k); None where the points do not determine them.
+        """
+        measured = np.where(used[..., None], points, np.nan).reshape(len(T), -1)
+        try:
+            candidates = self.kind.guess_values(T, measured)
+        except DataError:  # collinear points
+            return None
+        best = None
+        for values in np.atleast_2d(candidates):
+            predicted = self.kind.locate_targets(T, values)[0]
+            distance = np.linalg.norm(predicted - points, axis=2)
+            if best is None or np.median(distance[used]) < np.median(best[1][used]):
+                best = (predicted, distance)
+        return best
+
+    def measure(
+        self, poses: IntArray, rows: IntArray, summarize: Callable[[FloatArray], float]
+    ) -> float:
+        """Return a summary of the distances of the points of rows (n,) from their predictions at
+        the poses of other rows (n,); infinite where there are none.
+        """
+        used = self.is_present[rows]
+        fitted = self.fit(self.T[poses], self.points[rows], used) if used.any() else None
+        return np.inf if fitted is None else float(summarize(fitted[1][used]))
+
+    def name(self, place: tuple[int, int]) -> str:
+        """Return the name of a point, a row and a target."""
+        return name_point(self.labels[place[0]], self.kind.targets[place[1]], self.kind.targets)
+
+    def to_quantity(self, distance: float) -> Quantity:
+        """Return a distance [m] in the unit of the robot's file."""
+        return self.robot.to_quantity(distance, Dimension.LENGTH)
+
+
+def _refuse_other_unit(table: _Points, stated: str) -> None:
+    """Raise DataError where the points fit in another unit of length than the stated one."""
+
+    def measure(scale: float) -> float:
+        fitted = table.fit(table.T, scale * table.points, table.is_present)
+        return np.inf if fitted is None else float(np.median(fitted[1][table.is_present]))
+
+    as_written = measure(1.0)
+    if not as_written > SCALE_SHARE * table.extent:
+        return
+    factors = {s: find_unit(s).factor_to_si for s in list_symbols(Dimension.LENGTH)}
+    scale = find_unit(stated, Dimension.LENGTH).factor_to_si
+    distances = {s: measure(factor / scale) for s, factor in factors.items() if s != stated}
+    unit = min(distances, key=distances.__getitem__)
+    if distances[unit] * MOVED < as_written:
+        typical, before = table.to_quantity(distances[unit]), table.to_quantity(as_written)
+        numbers = {"unit": unit, "typical": typical, "before": before}
+        raise DataError(report_finding("sheet.points-unit", stated=stated, **numbers))
+
+
+def _examine(table: _Points) -> list[Finding]:
+    """Compare the points with the predictions of the nominal robot; no finding with too few."""
+    kind, is_present = table.kind, table.is_present
     unknowns = 6 * ("frame" in kind.unknown) + 3 * len(kind.targets) * ("targets" in kind.unknown)
     if 3 * is_present.sum() < 2 * unknowns + 6:
-        return None
-    extent = float(np.ptp(points[is_present], axis=0).max(initial=0.0))
-    fitted = _fit_without_far_points(kind, T, points, is_present, LEAST_SHARE * extent)
-    if fitted is None:
-        return None
-    predicted, distance, limit = fitted
-    is_far = is_present & ~(distance <= limit)
-    typical = float(np.median(distance[is_present & ~is_far]))
-    shift = _find_shift(kind, T, points, is_present, typical)
-    if shift is None and typical > SCALE_SHARE * _measure_extent(T):
-        shift = _find_late_shift(kind, T, points, is_present, typical)
-    if shift is not None:
-        by, first, then = shift
-        return PointCheck(then, limit, shift=by, shifted_from=first, distance_as_named=typical)
-    split, gain = _find_move(kind, T, points, is_present)
-    if gain > MOVED:
-        return PointCheck(typical, limit, moved_before=split, move_gain=gain)
-    places = np.argwhere(is_far)
-    check = PointCheck(typical, limit)
-    if len(places):
-        check = _rename(points, predicted, places, distance, typical, limit)
-    if check.renamed or split is None:
-        return check
-    return replace(check, moved_before=split, move_gain=gain)
-
-
-def _measure_extent(T: FloatArray) -> float:
-    """Return the largest extent of poses (r, 4, 4) along an axis [m]."""
-    return float(np.ptp(T[:, :3, 3], axis=0).max(initial=0.0))
-
-
-def _rename(
-    points: FloatArray,
-    predicted: FloatArray,
-    places: IntArray,
-    distance: FloatArray,
-    typical: float,
-    limit: float,
-) -> PointCheck:
-    """Return which of the far points at `places` fit the prediction of another one.
-
-    A point may also have the place of a point that was not measured.
-    """
-    from scipy.optimize import linear_sum_assignment  # loaded late: only few points are far
-
-    is_open = np.isnan(points).any(axis=2)
-    candidates = np.concatenate([places, np.argwhere(is_open)])
-    far_points = points[tuple(places.T)]
-    expected = predicted[tuple(candidates.T)]
-    between = np.linalg.norm(far_points[:, None] - expected[None], axis=2)
-    rows, columns = linear_sum_assignment(np.minimum(between, limit))
-    renamed, far = [], []
-    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
-        place = (int(places[row][0]), int(places[row][1]))
-        if between[row, column] <= limit and column != row:
-            other = (int(candidates[column][0]), int(candidates[column][1]))
-            renamed.append((place, other))
-        else:
-            far.append((place, float(distance[place])))
-    return PointCheck(typical, limit, tuple(renamed), tuple(far))
-
-
-def _fit_without_far_points(
-    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, least: float
-) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return predictions (r, k, 3), distances (r, k) and the limit of near points [m].
-
-    None where the points do not determine frame and targets.
-    """
-    used, result = is_present, None
+        return []
+    least = LEAST_SHARE * float(np.ptp(table.points[is_present], axis=0).max(initial=0.0))
+    used, predicted, distance, limit = is_present, table.points, np.zeros(0), 0.0
     for _ in range(FITS):
-        fitted = _fit(kind, T, points, used)
+        fitted = table.fit(table.T, table.points, used)
         if fitted is None:
-            return None
+            return []
         predicted, distance = fitted
         limit = FAR * max(float(np.median(distance[is_present])), least)
-        result = (predicted, distance, limit)
         near: BoolArray = is_present & (distance <= limit)
         if (near == used).all():
             break
         used = near
-    return result
+    is_far = is_present & ~(distance <= limit)
+    typical = float(np.median(distance[is_present & ~is_far]))
+    _refuse_shift(table, typical)
+    split, gain = _find_move(table)
+    ends: dict[str, Any] = {}
+    if split is not None:
+        ends = {"first": table.labels[split], "last": table.labels[split - 1]}
+    if gain > MOVED:
+        raise DataError(report_finding("sheet.instrument-moved", **ends))
+    far = _rename(table, predicted, np.argwhere(is_far), limit)
+    findings = []
+    if ends:
+        findings.append(report_finding("sheet.instrument-perhaps-moved", **ends, gain=gain))
+    if far:
+        points = tuple(
+            {"item": table.name(place), "distance": table.to_quantity(float(distance[place]))}
+            for place in far
+        )
+        typically = table.to_quantity(typical)
+        findings.append(report_finding("sheet.points-far", points=points, typical=typically))
+    return findings
 
 
-def _fit(
-    kind: Position, T: FloatArray, points: FloatArray, used: BoolArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return predictions (r, k, 3) with the best frame and targets, and distances (r, k)."""
-    measured = np.where(used[..., None], points, np.nan).reshape(len(T), -1)
-    try:
-        candidates = kind.guess_values(T, measured)
-    except DataError:  # collinear points
-        return None
-    best = None
-    for values in np.atleast_2d(candidates):
-        predicted = kind.locate_targets(T, values)[0]
-        distance = np.linalg.norm(predicted - points, axis=2)
-        if best is None or np.median(distance[used]) < np.median(best[1][used]):
-            best = (predicted, distance)
-    return best
-
-
-def _find_shift(
-    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, typical: float
-) -> tuple[int, int, float] | None:
-    """Return by how many rows names are shifted, 0 for the first row, and the median distance then;
-    None where the names as they are fit nearly as well.
+def _rename(
+    table: _Points, predicted: FloatArray, places: IntArray, limit: float
+) -> list[tuple[int, int]]:
+    """Raise DataError where far points at `places` (f, 2) fit the prediction of another one of
+    them, or of a point that was not measured; return the places otherwise.
     """
-    best = None
-    for shift in (1, -1):
-        poses = T[:-1] if shift > 0 else T[1:]
-        of_rows = slice(1, None) if shift > 0 else slice(None, -1)
-        fitted = _fit(kind, poses, points[of_rows], is_present[of_rows])
-        if fitted is None or not is_present[of_rows].any():
-            continue
-        distance = float(np.median(fitted[1][is_present[of_rows]]))
-        if distance * MOVED < typical and (best is None or distance < best[2]):
-            best = (shift, 0, distance)
-    return best
+    far = [(int(row), int(target)) for row, target in places]
+    if not far:
+        return far
+    from scipy.optimize import linear_sum_assignment  # loaded late: only few points are far
+
+    candidates = np.concatenate([places, np.argwhere(~table.is_present)])
+    far_points, expected = table.points[tuple(places.T)], predicted[tuple(candidates.T)]
+    between = np.linalg.norm(far_points[:, None] - expected[None], axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(between, limit))
+    renamed = tuple(
+        {"found": table.name(far[row]), "place": table.name(tuple(candidates[column].tolist()))}
+        for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
+        if between[row, column] <= limit and column != row
+    )
+    if renamed:
+        numbers = {"count": len(renamed), "limit": table.to_quantity(limit)}
+        raise DataError(report_finding("sheet.points-misnamed", points=renamed, **numbers))
+    return [far[row] for row in rows]
 
 
-def _find_late_shift(
-    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, typical: float
-) -> tuple[int, int, float] | None:
-    """Return like `_find_shift` a shift that begins at a later row: a pose was left out, or counted
-    twice, and the numbers went on.
+def _refuse_shift(table: _Points, typical: float) -> None:
+    """Raise DataError where names that are shifted by a row fit far better, from the first row on,
+    or from a later one: a pose was left out, or counted twice, and the numbers went on.
+
+    typical : median distance with the names as they are [m].
     """
-    n, best = len(T), None
-    for shift in (1, -1):
-        rows = n if shift > 0 else n - 1
+    n = len(table.T)
 
-        def measure(first: int, shift: int = shift, rows: int = rows) -> float:
-            poses = T[np.arange(rows) - shift * (np.arange(rows) >= first)]
-            fitted = _fit(kind, poses, points[:rows], is_present[:rows])
-            if fitted is None or not is_present[:rows].any():
-                return np.inf
-            return float(np.mean(fitted[1][is_present[:rows]]))
+    def measure(shift: int, first: int, summarize: Callable[[FloatArray], float]) -> float:
+        rows = np.arange(int(shift > 0 and not first), n if shift > 0 else n - 1)
+        return table.measure(rows - shift * (rows >= first), rows, summarize)
 
-        first = _find_smallest(measure, 1, rows - 1)
-        if first is not None:
-            distance = measure(first)
-            if distance * MOVED < typical and (best is None or distance < best[2]):
-                best = (shift, first, distance)
-    return best
+    best = min((measure(shift, 0, np.median), -shift, 0) for shift in (1, -1))
+    if not best[0] * MOVED < typical and typical > SCALE_SHARE * table.extent:
+        late = []
+        for shift in (1, -1):
+            first = _find_smallest(
+                lambda first, shift=shift: measure(shift, first, np.mean),
+                1,
+                n - 1 if shift > 0 else n - 2,
+            )
+            if first is not None:
+                late.append((measure(shift, first, np.mean), -shift, first))
+        best = min(late, default=best)
+    then, shift, first = best[0], -best[1], best[2]
+    if then * MOVED < typical:
+        numbers = {"typical": table.to_quantity(then), "before": table.to_quantity(typical)}
+        facts = {"is_late": shift > 0, **numbers}
+        if first:
+            later = report_finding("sheet.points-shifted-later", first=table.labels[first], **facts)
+            raise DataError(later)
+        raise DataError(report_finding("sheet.points-shifted", **facts))
 
 
 def _find_smallest(measure: Callable[[int], float], low: int, high: int) -> int | None:
@@ -230,145 +254,30 @@ def _find_smallest(measure: Callable[[int], float], low: int, high: int) -> int 
     return min(values, key=values.__getitem__) if values else None
 
 
-def _find_move(
-    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray
-) -> tuple[int | None, float]:
+def _find_move(table: _Points) -> tuple[int | None, float]:
     """Return the row before which the instrument may have moved, and by which ratio the root mean
     square of distances per degree of freedom falls; (None, 0) up to the ratio `DOUBTED`.
 
     Both sides are fitted with frames and targets of their own.
     """
-    if "frame" not in kind.unknown:
+    if "frame" not in table.kind.unknown:
         return None, 0.0
+    n, unknowns = len(table.T), 6 + 3 * len(table.kind.targets)
 
     def measure(start: int, end: int) -> float:
-        fitted = _fit(kind, T[start:end], points[start:end], is_present[start:end])
-        if fitted is None:
-            return np.inf
-        return float((fitted[1][is_present[start:end]] ** 2).sum())
+        rows = np.arange(start, end)
+        return table.measure(rows, rows, lambda distance: (distance**2).sum())
 
-    per_pose = max(1, 3 * len(kind.targets))
-    unknowns = 6 + 3 * len(kind.targets)
-    fewest = max(FEWEST_POSES, -(-3 * unknowns // per_pose))
-    split = _find_smallest(
-        lambda place: measure(0, place) + measure(place, len(T)), fewest, len(T) - fewest
-    )
+    def divide(place: int) -> float:
+        return measure(0, place) + measure(place, n)
+
+    fewest = max(FEWEST_POSES, -(-3 * unknowns // max(1, 3 * len(table.kind.targets))))
+    split = _find_smallest(divide, fewest, n - fewest)
     if split is None:
         return None, 0.0
-    unsplit, divided = measure(0, len(T)), measure(0, split) + measure(split, len(T))
-    numbers = 3 * int(is_present.sum())
+    unsplit, divided = measure(0, n), divide(split)
+    numbers = 3 * int(table.is_present.sum())
     share = (numbers - 2 * unknowns) / (numbers - unknowns)
     if not (share > 0.0 and np.isfinite(unsplit) and divided * DOUBTED**2 < unsplit * share):
         return None, 0.0
     return split, float(np.sqrt(unsplit * share / divided)) if divided > 0.0 else np.inf
-
-
-def find_other_scale(
-    kind: Position, T: FloatArray, measured: FloatArray, scales: Mapping[str, float]
-) -> tuple[str, float, float] | None:
-    """Return which scale explains points that the nominal robot does not; None where it does.
-
-    kind, T, measured : see `check_point_names`. scales : name -> factor [1] that may be missing.
-    Returns Name, median distance with this factor, and median distance without it [m].
-    """
-    points = measured.reshape(len(T), len(kind.targets), 3)
-    used: BoolArray = np.asarray(~np.isnan(points).any(axis=2))
-
-    def measure(scale: float) -> float:
-        fitted = _fit(kind, T, scale * points, used)
-        return np.inf if fitted is None else float(np.median(fitted[1][used]))
-
-    as_written = measure(1.0)
-    if not as_written > SCALE_SHARE * _measure_extent(T):
-        return None
-    distances = {name: measure(scale) for name, scale in scales.items()}
-    if not distances:
-        return None
-    name = min(distances, key=distances.__getitem__)
-    if not distances[name] * MOVED < as_written:
-        return None
-    return name, distances[name], as_written
-
-
-def examine_points(robot: Mechanism, data: Measurements, unit: str) -> tuple[Finding, ...]:
-    """Return findings on points that are far from where the nominal robot predicts them.
-
-    Rows of other kinds than `position` are not examined.
-
-    unit : in which the points were read, for messages.
-    """
-    findings: list[Finding] = []
-    solution = forward(robot, data.readings)
-    for rows in data.observations:
-        kind = rows.kind
-        if not isinstance(kind, Position):
-            continue
-        for session in np.unique(rows.session):
-            chosen = np.flatnonzero((rows.session == session) & solution.converged[rows.rows])
-            T, measured = solution.T[rows.rows[chosen]], rows.measured[chosen]
-            _refuse_other_unit(robot, kind, T, measured, unit)
-            check = check_point_names(kind, T, measured)
-            if check is not None:
-                labels = [data.labels[i] for i in rows.rows[chosen]]
-                findings += _report_point_check(robot, check, labels, kind.targets)
-    return tuple(findings)
-
-
-def _refuse_other_unit(
-    robot: Mechanism, kind: Position, T: FloatArray, measured: FloatArray, stated: str
-) -> None:
-    """Raise DataError where the points fit in another unit of length than the stated one."""
-    scale = find_unit(stated, Dimension.LENGTH).factor_to_si
-    known = {s: find_unit(s).factor_to_si for s in list_symbols(Dimension.LENGTH)}
-    others = {symbol: factor / scale for symbol, factor in known.items() if symbol != stated}
-    other = find_other_scale(kind, T, measured, others)
-    if other is not None:
-        typical, before = (robot.to_quantity(d, Dimension.LENGTH) for d in other[1:])
-        finding = report_finding(
-            "sheet.points-unit", stated=stated, unit=other[0], typical=typical, before=before
-        )
-        raise DataError(finding)
-
-
-def _report_point_check(
-    robot: Mechanism, check: PointCheck, labels: Sequence[str], targets: Sequence[str]
-) -> list[Finding]:
-    """Return what a check says about far points; raise DataError for names and moves."""
-
-    def name(place: tuple[int, int]) -> str:
-        return name_point(labels[place[0]], targets[place[1]], targets)
-
-    findings: list[Finding] = []
-    if check.moved_before is not None:
-        first, last = labels[check.moved_before], labels[check.moved_before - 1]
-        if check.move_gain > MOVED:
-            raise DataError(report_finding("sheet.instrument-moved", first=first, last=last))
-        findings.append(
-            report_finding(
-                "sheet.instrument-perhaps-moved", first=first, last=last, gain=check.move_gain
-            )
-        )
-    if check.shift:
-        typical, before = (
-            robot.to_quantity(distance, Dimension.LENGTH)
-            for distance in (check.distance, check.distance_as_named)
-        )
-        facts = {"is_late": check.shift > 0, "typical": typical, "before": before}
-        if not check.shifted_from:
-            raise DataError(report_finding("sheet.points-shifted", **facts))
-        first = labels[check.shifted_from]
-        raise DataError(report_finding("sheet.points-shifted-later", first=first, **facts))
-    if check.renamed:
-        points = tuple({"found": name(a), "place": name(b)} for a, b in check.renamed)
-        limit = robot.to_quantity(check.limit, Dimension.LENGTH)
-        raise DataError(
-            report_finding("sheet.points-misnamed", points=points, count=len(points), limit=limit)
-        )
-    if not check.far:
-        return findings
-    far = tuple(
-        {"item": name(place), "distance": robot.to_quantity(distance, Dimension.LENGTH)}
-        for place, distance in check.far
-    )
-    typical = robot.to_quantity(check.distance, Dimension.LENGTH)
-    return [*findings, report_finding("sheet.points-far", points=far, typical=typical)]

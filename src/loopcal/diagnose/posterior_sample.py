@@ -210,10 +210,11 @@ class PosteriorSample(TableResult):
 
         A quantile is the linear one plus the difference of the two in the same draws.
         """
-        ends = compare_ends(self.draws, self.weight, self.draws, self.linear_weight, level)
+        weights = (self.weight, self.draws, self.linear_weight)
+        quantile, drawn, error = compare_ends(self.draws, *weights, level)
         half = coverage_factor(self.degrees, level) * self.linear_sd
         linear = self.linear_mean + np.array([[-1.0], [1.0]]) * half
-        change = ends.quantile - ends.linear
+        change = quantile - drawn
         center = self.weight @ self.draws
         return mask_intervals(
             np.isfinite(self.linear_sd),
@@ -224,7 +225,7 @@ class PosteriorSample(TableResult):
             sd=np.sqrt(self.weight @ (self.draws - center) ** 2),
             **dict(zip(ENDS, (*(linear + change), *linear), strict=True)),
             shift=change / half,
-            shift_error=ends.error / half,
+            shift_error=error / half,
         )
 
     @property
