@@ -39,6 +39,9 @@ from .diagnose.cross_validation import cross_validate as cross_validate
 from .diagnose.fit_examination import FitExamination as FitExamination
 from .diagnose.fit_examination import examine_fit as examine_fit
 from .diagnose.identifiable_parameters import Identifiability as Identifiability
+from .diagnose.identifiable_parameters import (
+    choose_identifiable_subset as choose_identifiable_subset,
+)
 from .diagnose.identifiable_parameters import identifiability as identifiability
 from .diagnose.identifiable_parameters import suggest_measurements as suggest_measurements
 from .diagnose.intervals import Intervals as Intervals
@@ -48,7 +51,6 @@ from .diagnose.intervals import compute_joint_region as compute_joint_region
 from .diagnose.intervals import compute_simultaneous_intervals as compute_simultaneous_intervals
 from .diagnose.outliers import OutlierCheck as OutlierCheck
 from .diagnose.outliers import find_outliers as find_outliers
-from .diagnose.parameter_subset import choose_identifiable_subset as choose_identifiable_subset
 from .diagnose.posterior_sample import PosteriorSample as PosteriorSample
 from .diagnose.posterior_sample import sample_posterior as sample_posterior
 from .diagnose.value_comparison import ValueComparison as ValueComparison

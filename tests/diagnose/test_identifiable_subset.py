@@ -8,8 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.diagnose.identifiable_parameters import identifiability
-from loopcal.diagnose.parameter_subset import choose_identifiable_subset
+from loopcal.diagnose.identifiable_parameters import choose_identifiable_subset, identifiability
 from loopcal.errors import MechanismError
 from loopcal.estimate.information import observe_poses
 from loopcal.findings import Finding

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.diagnose.start_values import StartVerdict, check_start_values
+from loopcal.diagnose.fit_examination import StartVerdict, check_start_values
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber, Tukey

@@ -11,8 +11,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.diagnose.gauge_freedoms import interpret_combinations
-from loopcal.diagnose.identifiable_parameters import identifiability
-from loopcal.diagnose.parameter_subset import judge_useful_accuracy
+from loopcal.diagnose.identifiable_parameters import identifiability, judge_useful_accuracy
 from loopcal.errors import EstimationError
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares

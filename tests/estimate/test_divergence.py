@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.diagnose.start_values import StartVerdict, check_start_values
+from loopcal.diagnose.fit_examination import StartVerdict, check_start_values
 from loopcal.estimate.descent import StepControl
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions

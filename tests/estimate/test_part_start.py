@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import loopcal.estimate.pose_blocks as blocks_module
-from loopcal.diagnose.start_values import check_start_values
+from loopcal.diagnose.fit_examination import check_start_values
 from loopcal.errors import EstimationError
 from loopcal.estimate import fit_descent as module
 from loopcal.estimate import unfixed_motions

@@ -21,10 +21,9 @@ from loopcal.apply.verdict import (
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
-from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
-from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets, report_moved_targets
+from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
+from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
-from loopcal.diagnose.start_values import check_start_values
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
 from loopcal.estimate.identification import check_types, exclude_poses, identify
@@ -109,7 +108,7 @@ def calibrate(
         # no pose can be reached from a frame that does not fit, and a fit would blame the robot
         for shape in compare_shapes(data):
             if shape.chi_square > GROSS**2 * shape.degrees:
-                raise DataError(report_moved_targets(shape))
+                raise DataError(shape.finding)
     count = StepCounter(progress, STEPS)
     count.begin("checking conventions")
     allowed = {"allow_still": options.allow_still}

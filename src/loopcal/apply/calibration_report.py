@@ -31,9 +31,8 @@ if TYPE_CHECKING:
     from loopcal.apply.validation import Validation
     from loopcal.diagnose.conventions.convention_check import ConventionCheck
     from loopcal.diagnose.cross_validation import ModelChoice
-    from loopcal.diagnose.fit_examination import FitExamination, ReadingError
+    from loopcal.diagnose.fit_examination import FitExamination, ReadingError, StartCheck
     from loopcal.diagnose.identifiable_parameters import MeasurementSuggestion
-    from loopcal.diagnose.start_values import StartCheck
     from loopcal.diagnose.value_comparison import ValueComparison
     from loopcal.estimate.recalibration import Change
 

@@ -11,15 +11,13 @@ from typing import Any, ClassVar
 from loopcal.apply.verdict import is_readings_alone, report_readings_gauge, sort_undetermined
 from loopcal.diagnose.identifiable_parameters import (
     Identifiability,
-    MeasurementSuggestion,
-    identifiability,
-    suggest_measurements,
-)
-from loopcal.diagnose.parameter_subset import (
     IdentifiableSubset,
+    MeasurementSuggestion,
     UsefulAccuracy,
     choose_identifiable_subset,
+    identifiability,
     judge_useful_accuracy,
+    suggest_measurements,
 )
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
@@ -112,7 +110,7 @@ def analyze_identifiability(
     choose_subset : also choose a smallest set of parameters that says the same.
     rank_tolerance : share of the largest singular value below which one counts as zero.
     useful : accuracy of lengths [m] and angles [rad] to which combinations are to be determined;
-        see `loopcal.diagnose.parameter_subset.judge_useful_accuracy`.
+        see `loopcal.diagnose.identifiable_parameters.judge_useful_accuracy`.
     """
     analysis = identifiability(robot, data, rank_tolerance)
     subset = choose_identifiable_subset(analysis) if choose_subset else None

@@ -11,8 +11,8 @@ from typing import Any
 
 from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation import FEW_ROWS, Validation
+from loopcal.diagnose.fit_examination import StartCheck, StartVerdict
 from loopcal.diagnose.gauge_freedoms import GaugeFreedoms, find_gauge_freedoms
-from loopcal.diagnose.start_values import StartCheck, StartVerdict
 from loopcal.estimate.null_space import Combination
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.residual_test import SIGNIFICANCE, ResidualTest, coverage_factor

@@ -43,7 +43,6 @@ from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.mechanism.solutions import Solution
 from loopcal.numerics.statistics import compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS
@@ -97,14 +96,21 @@ def _add_patterns(
     is_small = any(finding.code == TOO_SMALL for finding in fit.findings)
     if not (effects or patterns.is_correlated or is_small):
         return fit
-    tool = ToolUncertainty(fit, locate_measured_poses(fit, data))
+    # orientation and position (3 n, p) of evenly chosen measured poses, frames fitted, by the
+    # parameters [per SI], and the sum of the variances of each that the fit states
+    solution = locate_measured_poses(fit, data)
+    solution = solution.take(choose_evenly(len(solution.q), MOST_POSES))
+    posterior = fit.posterior
+    D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
+    effects_of = [D[:, rows].reshape(-1, D.shape[-1]) for rows in (slice(0, 3), slice(3, 6))]
+    tool = [(E, float(((E @ posterior.root) ** 2).sum())) for E in effects_of]
     for effect in effects:
         root = (
             rows.root
             @ (rows.gain.T @ effect.effect.columns)
             @ take_root(effect.moments, np.diag(effect.moments))
         )
-        finding = _report_effect(effect, tool.measure_growth(root))
+        finding = _report_effect(effect, _measure_growth(tool, root))
         fit = add_covariance(fit, root, np.inf, finding)
     if patterns.is_correlated or is_small:
         fit = _add_correlation(fit, patterns, tool)
@@ -112,7 +118,7 @@ def _add_patterns(
 
 
 def _add_correlation(
-    fit: Identification, patterns: ResidualPatterns, tool: ToolUncertainty
+    fit: Identification, patterns: ResidualPatterns, tool: Sequence[tuple[FloatArray, float]]
 ) -> Identification:
     """Return a fit with what correlated errors add to the covariance by independent ones. Where
     residuals are too small and no test shows a correlation, it is added if it matters: the
@@ -129,7 +135,7 @@ def _add_correlation(
     covariance = errors.covariance
     more = take_root(covariance - independent, np.diag(covariance + independent))
     root = rows.root @ more
-    ratio = tool.measure_growth(root)
+    ratio = _measure_growth(tool, root)
     if not patterns.is_correlated and ratio < NOTICEABLE:
         return fit
     finding = report_finding(
@@ -142,26 +148,12 @@ def _add_correlation(
     return add_covariance(fit, root, errors.degrees, finding)
 
 
-class ToolUncertainty:
-    """The uncertainty of some evenly chosen measured poses as a fit states it, frames fitted."""
-
-    # orientation and position (3 n, p) by deviations of the parameters [per SI], and the sum of the
-    # variances of each [SI]
-    parts: tuple[tuple[FloatArray, float], ...]
-
-    def __init__(self, fit: Identification, measured: Solution) -> None:
-        posterior = fit.posterior
-        solution = measured.take(choose_evenly(len(measured.q), MOST_POSES))
-        D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
-        effects = [D[:, rows].reshape(-1, D.shape[-1]) for rows in (slice(0, 3), slice(3, 6))]
-        self.parts = tuple((E, _sum_squares(E @ posterior.root)) for E in effects)
-
-    def measure_growth(self, root: FloatArray) -> float:
-        """Return the factor by which a covariance of root (p, k) [SI] increases the standard
-        uncertainty, the larger one of position and orientation.
-        """
-        shares = [_sum_squares(E @ root) / stated for E, stated in self.parts if stated > 0.0]
-        return float(np.sqrt(1.0 + max(shares, default=0.0)))
+def _measure_growth(parts: Sequence[tuple[FloatArray, float]], root: FloatArray) -> float:
+    """Return the factor by which a covariance of root (p, k) [SI] increases the standard
+    uncertainty, the larger one of the parts: position and orientation.
+    """
+    shares = [float(((E @ root) ** 2).sum()) / stated for E, stated in parts if stated > 0.0]
+    return float(np.sqrt(1.0 + max(shares, default=0.0)))
 
 
 def take_root(matrix: FloatArray, squares: FloatArray) -> FloatArray:
@@ -172,10 +164,6 @@ def take_root(matrix: FloatArray, squares: FloatArray) -> FloatArray:
     scale = np.where(scale > 0.0, scale, 1.0)
     s, v = np.linalg.eigh(matrix / scale[:, None] / scale)
     return np.asarray(scale[:, None] * v[:, s > 0.0] * np.sqrt(s[s > 0.0]))
-
-
-def _sum_squares(values: FloatArray) -> float:
-    return float((values**2).sum())
 
 
 def _report_effect(effect: EffectSizes, ratio: float) -> Finding:

@@ -5,7 +5,8 @@ expected gain.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -20,26 +21,28 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
+from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.identification import prepare_fitted_data
+from loopcal.estimate.identification import identify, prepare_fitted_data
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import transmit_readings
-from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
-from loopcal.typing import FloatArray, Progress, report_no_progress
+from loopcal.typing import Progress, report_no_progress
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
 
-# Correlation above which the error of one parameter is mostly that of another (81 % of its
-# variance).
-STRONG = 0.9
+STRONG = 0.9  # correlation above which one error is mostly another (81 % of its variance)
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,7 @@ class CorrelatedGroup:
     """Parameters that correlations of estimates above STRONG link, directly or in a chain."""
 
     names: tuple[str, ...]  # in the order of the table
-    # pair, correlation: the two most strongly correlated ones
-    pair: tuple[str, str]
+    pair: tuple[str, str]  # the two most strongly correlated ones
     correlation: float
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields("*", "finding")
@@ -91,11 +93,9 @@ MOST_POSES = 200  # largest number of poses at which errors are predicted, evenl
 class CalibrationGain:
     """Expected errors of the platform at the measured poses."""
 
-    # position_before, position_after: expected position error, root mean square over poses [m]
-    position_before: float
+    position_before: float  # root mean square over poses [m]
     position_after: float
-    # angle_before, angle_after: the same of the orientation [rad]
-    angle_before: float
+    angle_before: float  # of the orientation [rad]
     angle_after: float
     is_worthwhile: bool | None  # whether either becomes smaller; None where it cannot be predicted
     finding: Finding  # the expected errors, or the reason why there are none
@@ -132,40 +132,29 @@ def estimate_calibration_gain(
         return predict_nothing("model.gain-without-intervals")
     effects = linearize_tool_errors(fit.posterior, solution, frame)
     D, own = effects.by_parameters, (effects.by_frame, effects.by_discrepancy)
-    size = fit.robot.size
-    angle_before, position_before = _rms_errors(
-        (D * (free.tolerance / posterior.unit)) @ free.correlation_root(), size
+    expected = (D * (free.tolerance / posterior.unit)) @ free.correlation_root()
+    squares = map(compute_mean_squares, (expected, np.concatenate([D @ factor, *own], axis=2)))
+    # before and after, by orientation and position: 0 where they are rounding, such as the
+    # orientation of a delta
+    limits = (ROUNDING, ROUNDING * fit.robot.size)
+    angles, positions = (
+        tuple(root * (root > limit) for root in map(float, np.sqrt(pair)))
+        for pair, limit in zip(zip(*squares, strict=True), limits, strict=True)
     )
-    angle_after, position_after = _rms_errors(np.concatenate([D @ factor, *own], axis=2), size)
-    pairs = ((position_before, position_after), (angle_before, angle_after))
-    is_worthwhile = any(before > GAIN * after for before, after in pairs if before > 0.0)
+    pairs = {Dimension.LENGTH: positions, Dimension.ANGLE: angles}
+    is_worthwhile = any(before > GAIN * after for before, after in pairs.values() if before > 0.0)
+    position, orientation = (
+        tuple(fit.robot.to_quantity(size, dimension) for size in pair) if pair[0] > 0.0 else None
+        for dimension, pair in pairs.items()
+    )
     finding = report_finding(
         "model.expected-gain" if is_worthwhile else "model.no-expected-gain",
-        position=_quantities(fit.robot, Dimension.LENGTH, *pairs[0]),
-        orientation=_quantities(fit.robot, Dimension.ANGLE, *pairs[1]),
+        position=position,
+        orientation=orientation,
         **effects.reference.data,
     )
-    return CalibrationGain(
-        position_before, position_after, angle_before, angle_after, is_worthwhile, finding
-    )
-
-
-def _rms_errors(factor: FloatArray, size: float) -> tuple[float, float]:
-    """Return root mean squares of orientation [rad] and position [m] from factors (n, 6, k).
-
-    They are 0 where they are rounding, such as the orientation of a delta of this size [m].
-    """
-    orientation, position = (float(np.sqrt(square)) for square in compute_mean_squares(factor))
-    return orientation * (orientation > ROUNDING), position * (position > ROUNDING * size)
-
-
-def _quantities(
-    robot: Mechanism, dimension: Dimension, before: float, after: float
-) -> tuple[Quantity, Quantity] | None:
-    """Return errors before and after in the unit of the robot's file; None where they are zero."""
-    if not before > 0.0:
-        return None
-    return robot.to_quantity(before, dimension), robot.to_quantity(after, dimension)
+    (before, after), (angle_before, angle_after) = positions, angles
+    return CalibrationGain(before, after, angle_before, angle_after, is_worthwhile, finding)
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,3 +293,138 @@ def compute_reading_errors(
             )
         )
     return tuple(errors) or None
+
+
+# Whether the geometry from which a fit starts is as good as the fit. Where the start is the truth
+# and the noise is as stated, the gain chi_square(start) - chi_square(fit) has a chi-square
+# distribution with as many degrees of freedom as fitted directions. Where the noise is not stated,
+# or contradicts the residuals of the fit, the gain per direction over the residual per degree of
+# freedom has an F distribution.
+#
+# Klipper's fit of a delta printer minimizes w * sum(height error^2) + sum(distance error^2) with w
+# = number of distances / (number of heights / 2) where there are distances, and 1 otherwise, over
+# radius, two tower angles and three end stops, and over the arms where there are distances (source:
+# the module `delta_calibrate` of Klipper). With sigmas of 1 mm / sqrt(w) and 1 mm this is the chi-
+# square in mm^2 of `identify`, so the stored values can be checked against the optimum.
+
+# Share of the start's cost below which a gain is rounding: the last digits of a file.
+NO_GAIN = 1e-3
+MM = 1e-3
+SMALL = 0.01  # changes below this are not listed [mm, deg]
+
+
+class StartVerdict(Enum):
+    """The start values of a fit, compared with the fit."""
+
+    BEST = "best"
+    WITHIN_NOISE = "within noise"
+    NOT_CALIBRATED = "not calibrated"
+    OPEN = "open"
+
+
+@dataclass(frozen=True)
+class StartCheck:
+    """The geometry from which a fit started, compared with the fit."""
+
+    verdict: StartVerdict
+    before: float  # rms of the residuals of the start in units of the stated sigma [1]
+    after: float  # and of the fit
+    p_value: float  # of such a gain if the start is the truth; NaN where there is no test
+    finding: Finding  # the result
+
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
+        verdict="verdict.value", before="", after="", p_value="", finding=""
+    )
+
+
+@dataclass(frozen=True)
+class StoredAnswer:
+    """A stored geometry and the optimum of the firmware's cost, from the same probes."""
+
+    stored: float  # its cost [mm^2]
+    best: float
+    # parameter, stored value, best value and unit, of those that differ
+    moved: tuple[tuple[str, float, float, str], ...]
+
+    @property
+    def is_optimum(self) -> bool:
+        """Whether the optimum is no better, except for the decimals of a file."""
+        return self.stored - self.best <= NO_GAIN * self.stored
+
+    @property
+    def finding(self) -> Finding:
+        """The comparison as a finding."""
+        if self.is_optimum:
+            return report_finding("residuals.stored-is-optimum", stored=self.stored, best=self.best)
+        return report_finding("residuals.stored-not-optimum", **vars(self))
+
+    def __str__(self) -> str:
+        return str(self.finding)
+
+
+def check_start_values(fit: Identification) -> StartCheck:
+    """Compare the geometry from which a fit started with the fit, on the fitted measurements."""
+    first, last = float(fit.history.cost[0]), float(fit.history.cost[-1])
+    rows = sum(int(np.isfinite(r.raw).sum()) for r in fit.residuals)
+    before, after = np.sqrt(first / rows), np.sqrt(last / rows)
+
+    def judged(verdict: StartVerdict, p_value: float, code: str, **data: Any) -> StartCheck:
+        finding = report_finding(f"residuals.start-{code}", **data)
+        return StartCheck(verdict, before, after, p_value, finding)
+
+    if not fit.converged:
+        return judged(StartVerdict.OPEN, float("nan"), "not-comparable")
+    gain = max(first - last, 0.0)
+    if gain <= NO_GAIN * first:
+        return judged(StartVerdict.BEST, 1.0, "is-best")
+    test = fit.residual_test
+    # the stated noise explains the residuals of the fit, or none are left
+    is_consistent = test.noise == "given" and not test.failed
+    p_value = float("nan")  # of a larger gain by this noise, else by that of the residuals
+    if is_consistent:
+        p_value = float(compute_chi_square_tail(fit.rank, gain))
+    elif test.dof >= 1.0 and last > 0.0:
+        p_value = float(compute_f_tail(fit.rank, test.dof, gain / fit.rank / (last / test.dof)))
+    ratio = float(before / after) if after > 0.0 else None
+    if p_value < SIGNIFICANCE:
+        return judged(StartVerdict.NOT_CALIBRATED, p_value, "not-calibrated", ratio=ratio)
+    if test.dof < FEWEST_DEGREES and not is_consistent:
+        return judged(StartVerdict.OPEN, p_value, "needs-sigma", ratio=ratio)
+    if test.failed:
+        return judged(StartVerdict.OPEN, p_value, "undecided", ratio=ratio)
+    return judged(StartVerdict.WITHIN_NOISE, p_value, "within-noise", ratio=ratio)
+
+
+def compare_stored_geometry(robot: Mechanism, measured: Measurements) -> StoredAnswer | None:
+    """Compare the stored geometry of a printer with the optimum of the firmware's cost; None where
+    the probes do not determine one.
+
+    measured : heights and distances; their sigmas do not matter.
+    """
+    count = {o.kind.poses_per_row: len(o) for o in measured.observations}
+    w = 2.0 * count[2] / count[1] if count.get(1) and count.get(2) else 1.0
+    sigma = {1: MM / np.sqrt(w), 2: MM}
+    weighted = tuple(
+        Observations.from_sigma(o.kind, o.rows, o.measured, sigma[o.kind.poses_per_row])
+        for o in measured.observations
+    )
+    try:
+        fit = identify(robot, replace(measured, observations=weighted), LeastSquares())
+    except EstimationError:
+        return None  # fewer probes than parameters, or a geometry that cannot reach them
+    if not fit.converged or fit.rank < len(fit.names):
+        return None
+    is_angle = np.array([name.endswith(".angle") for name in fit.names])
+    unit = np.where(is_angle, np.pi / 180.0, MM)
+    stored = fit.initial.values[fit.free_parameters.places] / unit
+    best = fit.estimate / unit
+    symbols = ["deg" if angle else "mm" for angle in is_angle]
+    return StoredAnswer(
+        float(fit.history.cost[0]),
+        float(fit.history.cost[-1]),
+        tuple(
+            (name, float(first), float(last), symbol)
+            for name, first, last, symbol in zip(fit.names, stored, best, symbols, strict=True)
+            if abs(last - first) > SMALL
+        ),
+    )

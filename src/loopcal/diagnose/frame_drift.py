@@ -29,7 +29,7 @@ from loopcal.measure.observations import Observations
 from loopcal.numerics.decomposition import decompose, empty_factor
 from loopcal.numerics.statistics import compute_any_probability, compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import find_unit
+from loopcal.units import Unit, find_unit
 
 # Probability, for each of the two tests, of a report although no frame and no target moved.
 LEVEL = 0.01
@@ -44,23 +44,35 @@ RANK = 1e-9
 class FrameDrift:
     """The largest motion of the frame of an instrument from the first measurement of a session."""
 
-    # frame, session: their names
     frame: str
     session: str
     targets: tuple[str, ...]  # on the base
-    # number of the measurement in its session at which the motion is most significant, from 1
-    row: int
+    row: int  # number of the measurement at which the motion is most significant, from 1
     rows: int  # number of measurements of the session
-    # shift, shift_sd: displacement at the center of the targets [m]
-    shift: float
+    shift: float  # displacement at the center of the targets [m]
     shift_sd: float
-    # angle, angle_sd: [rad]
-    angle: float
+    angle: float  # [rad]
     angle_sd: float
     # chi_square, degrees: of the test that the frame kept its place in the whole session
     chi_square: float
     degrees: int
     p_value: float  # probability of a larger chi-square without motion
+
+    def report(self, shown: Unit) -> Finding:
+        """Return the finding of the motion, with angles in a unit."""
+        return report_finding(
+            "residuals.frame-moved",
+            frame=self.frame,
+            session=self.session,
+            row=self.row,
+            rows=self.rows,
+            shift=Quantity(1e3 * self.shift, "mm"),
+            shift_sd=Quantity(1e3 * self.shift_sd, "mm"),
+            angle=Quantity(self.angle / shown.factor_to_si, shown.symbol),
+            angle_sd=Quantity(self.angle_sd / shown.factor_to_si, shown.symbol),
+            p_value=self.p_value,
+            tiny=self.p_value < TINY,
+        )
 
 
 class ShapeTest(NamedTuple):
@@ -68,14 +80,19 @@ class ShapeTest(NamedTuple):
 
     frame: str  # in which they were measured
     targets: tuple[str, ...]  # on the base
-    # targets without each of which the noise explains the others. With three targets there is
-    # often more than one
+    # targets without each of which the noise explains the others; of three often more than one
     suspects: tuple[str, ...]
     is_stated: bool  # whether their places are stated, and compared, too
-    # chi_square, degrees: of what no motion of frames explains
-    chi_square: float
+    chi_square: float  # of what no motion of frames explains
     degrees: int
     p_value: float  # probability of a larger chi-square if no target moved
+
+    @property
+    def finding(self) -> Finding:
+        """The targets that did not keep their distances."""
+        names = ("targets", "suspects", "is_stated", "chi_square", "degrees")
+        data = {name: getattr(self, name) for name in names}
+        return report_finding("residuals.base-targets-moved", **data)
 
 
 class _Repeats(NamedTuple):
@@ -89,43 +106,16 @@ class _Repeats(NamedTuple):
     session: list[str]
 
 
-class _Solution(NamedTuple):
-    """Unknowns (c,) of whitened rows, a root (c, r) of their covariance, and the sum of squares."""
-
-    values: FloatArray
-    root: FloatArray
-    cost: float
-
-
 def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Finding, ...]:
-    """Return findings on frames that moved within a session, and on targets that moved.
-
-    angle : symbol of the unit in which angles are reported.
+    """Return findings on frames that moved within a session, and on targets that moved; `angle` is
+    the symbol of the unit of angles.
     """
     shapes = compare_shapes(data)
-    changed = [
-        shape for shape in shapes if compute_any_probability(shape.p_value, len(shapes)) < LEVEL
-    ]
+    changed = [s for s in shapes if compute_any_probability(s.p_value, len(shapes)) < LEVEL]
     drifts = estimate_frame_drifts(_leave_out(data, changed))
-    shown = find_unit(angle)
-    findings = [report_moved_targets(shape) for shape in changed]
-    findings += [
-        report_finding(
-            "residuals.frame-moved",
-            frame=drift.frame,
-            session=drift.session,
-            row=drift.row,
-            rows=drift.rows,
-            shift=Quantity(1e3 * drift.shift, "mm"),
-            shift_sd=Quantity(1e3 * drift.shift_sd, "mm"),
-            angle=Quantity(drift.angle / shown.factor_to_si, shown.symbol),
-            angle_sd=Quantity(drift.angle_sd / shown.factor_to_si, shown.symbol),
-            p_value=drift.p_value,
-            tiny=drift.p_value < TINY,
-        )
-        for drift in drifts
-        if compute_any_probability(drift.p_value, len(drifts)) < LEVEL
-    ]
+    moved = [d for d in drifts if compute_any_probability(d.p_value, len(drifts)) < LEVEL]
+    findings = [shape.finding for shape in changed]
+    findings += [drift.report(find_unit(angle)) for drift in moved]
     used = {name for rows in data.observations for name in rows.session.tolist()}
     open_frames = [rows for rows in data.base_observations if "frame" in rows.kind.unknown]
     on_base = dict.fromkeys(name for rows in open_frames for name in rows.session.tolist())
@@ -133,18 +123,6 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
         names = tuple(f"session {name!r}" if name else "rows without a session" for name in unused)
         findings.append(report_finding("data.base-session-unused", sessions=names))
     return tuple(findings)
-
-
-def report_moved_targets(shape: ShapeTest) -> Finding:
-    """Return the finding of targets that did not keep their distances."""
-    return report_finding(
-        "residuals.base-targets-moved",
-        targets=shape.targets,
-        suspects=shape.suspects,
-        is_stated=shape.is_stated,
-        chi_square=shape.chi_square,
-        degrees=shape.degrees,
-    )
 
 
 def _leave_out(data: Measurements, changed: Sequence[ShapeTest]) -> Measurements:
@@ -199,13 +177,8 @@ def compare_shapes(data: Measurements) -> tuple[ShapeTest, ...]:
                 suspects.append(name)
         tail = float(compute_chi_square_tail(degrees, full))
         names = (kind.frame, kind.targets, tuple(suspects))
-        tests.append(ShapeTest(*names, _states_places(kind), full, degrees, tail))
+        tests.append(ShapeTest(*names, "targets" not in kind.unknown, full, degrees, tail))
     return tuple(tests)
-
-
-def _states_places(kind: Position) -> bool:
-    """Return whether the places of targets are known."""
-    return "targets" not in kind.unknown
 
 
 def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[_Repeats]:
@@ -229,7 +202,7 @@ def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[
         points = measured.reshape(len(measured), -1, 3)
         whitener = np.concatenate([rows.whitener[i] for rows, i in pairs])
         session = np.concatenate([rows.session[i] for rows, i in pairs])
-        if with_places and _states_places(kind) and kind.places is not None:
+        if with_places and "targets" not in kind.unknown and kind.places is not None:
             points = np.concatenate([kind.places[None], points])
             whitener = np.concatenate([np.eye(kind.places.size)[None] / EXACT, whitener])
             session = np.concatenate([[""], session])
@@ -240,25 +213,21 @@ def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[
 
 def _spans_plane(points: FloatArray) -> bool:
     """Return whether at least three of points (k, 3) are measured and not collinear."""
-    from loopcal.geometry import FLATNESS
-
     measured = points[np.isfinite(points).all(axis=1)]
     if len(measured) < 3:
         return False
     extent = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
-    return bool(extent[1] > FLATNESS * extent[0])
+    return bool(extent[1] > geometry.FLATNESS * extent[0])
 
 
 def _align_each(repeats: _Repeats) -> _Repeats:
     """Return the measurements, each moved to the first one with which it shares enough targets."""
-    from loopcal.geometry import align_point_sets
-
     points, whitener = repeats.points.copy(), repeats.whitener.copy()
     for i in range(1, len(points)):
         for first in points[:i]:
             both = np.isfinite(first + points[i]).all(axis=1)
             if _spans_plane(np.where(both[:, None], first, np.nan)):
-                T = align_point_sets(points[i, both], first[both])
+                T = geometry.align_point_sets(points[i, both], first[both])
                 points[i] = points[i] @ T[:3, :3].T + T[:3, 3]
                 back = np.kron(np.eye(len(first)), T[:3, :3].T)  # to the axes of its noise
                 whitener[i] = whitener[i] @ back
@@ -295,8 +264,10 @@ def _spread_motions(rows: FloatArray) -> FloatArray:
     return spread.reshape(E * m, -1)
 
 
-def _solve(A: FloatArray, b: FloatArray) -> _Solution:
-    """Return the least-squares solution of whitened rows A x = b, shortest in scaled columns."""
+def _solve(A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return the least-squares solution (c,) of whitened rows A x = b, shortest in scaled columns,
+    a root (c, r) of its covariance, and the sum of squares.
+    """
     rows = np.concatenate([A, b[:, None]], axis=1)
     factor = engine.fold(empty_factor(1, A.shape[1]), rows[None])
     length = np.linalg.norm(A, axis=0)
@@ -306,25 +277,25 @@ def _solve(A: FloatArray, b: FloatArray) -> _Solution:
     penalty = np.where(used, 0.0, np.inf)
     values = decomposition.deviation(decomposition.solution(penalty))[0]
     root = scale[:, None] * decomposition.noise_roots(penalty)[0][:, used[0]]
-    return _Solution(values, root, float(decomposition.remaining(penalty)[0]))
+    return values, root, float(decomposition.remaining(penalty)[0])
 
 
 def _estimate_drift(repeats: _Repeats) -> FrameDrift:
     """Return the motion of one frame in one session."""
     rows, values, radius = _build_rows(repeats)
     E, m = values.shape
-    free, b = _solve(_spread_motions(rows), values.ravel()), values.ravel()
-    still = _solve(rows[:, :, :m].reshape(E * m, m), b)
-    chi_square, degrees = still.cost - free.cost, free.root.shape[1] - still.root.shape[1]
+    solution, roots, cost = _solve(_spread_motions(rows), values.ravel())
+    _, still, still_cost = _solve(rows[:, :, :m].reshape(E * m, m), values.ravel())
+    chi_square, degrees = still_cost - cost, roots.shape[1] - still.shape[1]
     best, largest = 1, -1.0
     for i in range(1, E):
         chosen = slice(m + 6 * (i - 1), m + 6 * i)
         # the squared length of the motion in units of its uncertainty
-        u, s, _ = np.linalg.svd(free.root[chosen], full_matrices=False)
-        size = float((((u.T @ free.values[chosen]) / s) ** 2).sum())
+        u, s, _ = np.linalg.svd(roots[chosen], full_matrices=False)
+        size = float((((u.T @ solution[chosen]) / s) ** 2).sum())
         best, largest = (i, size) if size > largest else (best, largest)
     chosen = slice(m + 6 * (best - 1), m + 6 * best)
-    motion, root = free.values[chosen], free.root[chosen]
+    motion, root = solution[chosen], roots[chosen]
     angle, angle_sd = _measure_length(motion[:3] / radius, root[:3] / radius)
     shift, shift_sd = _measure_length(motion[3:], root[3:])
     tail = float(compute_chi_square_tail(degrees, chi_square))
@@ -350,5 +321,5 @@ def _solve_without(
     kept = np.repeat(is_kept, 3)
     columns = np.concatenate([kept, np.ones(6, dtype=bool)])
     left = rows[:, kept][:, :, columns]
-    solved = _solve(_spread_motions(left), values[:, kept].ravel())
-    return solved.cost, 3 * int(is_seen[:, is_kept].sum()) - solved.root.shape[1]
+    _, root, cost = _solve(_spread_motions(left), values[:, kept].ravel())
+    return cost, 3 * int(is_seen[:, is_kept].sum()) - root.shape[1]

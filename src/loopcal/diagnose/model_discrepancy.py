@@ -282,12 +282,9 @@ class LackOfFit:
     """Lack of fit against the pure error of repeated poses."""
 
     groups: int  # number of poses that were repeated
-    # pure, pure_degrees: sum of squares between repeats in units of the stated sigma, and its
-    # degrees of freedom
-    pure: float
+    pure: float  # sum of squares between repeats in units of the stated sigma
     pure_degrees: int
-    # lack, lack_degrees: the remaining sum of squares of the fit, and its degrees of freedom
-    lack: float
+    lack: float  # the remaining sum of squares of the fit
     lack_degrees: float
     sigma_scale: float  # repeatability over the stated sigma
     p_value: float  # probability of a larger F if the model is right; NaN where there is no test
@@ -320,10 +317,8 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
         return _untested("residuals.repeats-with-weights", groups, pure, degrees, scale)
     if lack_degrees < 1.0 or pure <= 0.0:
         return _untested("residuals.repeats-only", groups, pure, degrees, scale)
-    from scipy.special import fdtrc
-
     ratio = max(lack, 0.0) / lack_degrees / (pure / degrees)
-    p_value = float(fdtrc(lack_degrees, degrees, ratio))
+    p_value = float(compute_f_tail(lack_degrees, degrees, ratio))
     findings = [report_finding("residuals.explained")]
     if p_value < REPEATS_LEVEL:
         findings = [report_finding("residuals.lack-of-fit", ratio=float(np.sqrt(ratio)))]
@@ -362,9 +357,8 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
     return total, degrees
 
 
-def _untested(
-    code: str, groups: int = 0, pure: float = 0.0, degrees: int = 0, scale: float = np.nan
-) -> LackOfFit:
-    """Return the reason why there is no test."""
-    finding = report_finding(code)
-    return LackOfFit(groups, pure, degrees, np.nan, np.nan, scale, np.nan, None, (finding,))
+def _untested(code: str, *numbers: float) -> LackOfFit:
+    """Return the reason why there is no test; groups, pure, degrees and scale may be known."""
+    groups, pure, degrees, scale = numbers or (0, 0.0, 0, np.nan)
+    untested = (np.nan, np.nan, scale, np.nan, None, (report_finding(code),))
+    return LackOfFit(int(groups), pure, int(degrees), *untested)

@@ -346,7 +346,7 @@ def import_(
       loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
-    from loopcal.diagnose.start_values import compare_stored_geometry
+    from loopcal.diagnose.fit_examination import compare_stored_geometry
     from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.formats.import_export import choose_format, list_formats, save_imported
