@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -102,7 +102,7 @@ class WorkerLostError(Exception):
 
 
 class Pool(Protocol):
-    """Workers as `map_in_flight` sees them. A handle stands for a task that was submitted."""
+    """Workers as an executor sees them. A handle stands for a task that was submitted."""
 
     def count_slots(self) -> int:
         """Return how many tasks may be in flight now; workers may come and go."""
@@ -121,39 +121,46 @@ class Pool(Protocol):
         ...
 
 
-def map_in_flight(
-    pool: Pool, function: Callable[[T], R], tasks: Iterable[T | None]
-) -> Generator[Answer[T, R], None, None]:
-    """Keep every slot of a pool filled, and yield answers; see `Executor.map_blocks`. Tasks that
-    lost their worker come last.
-    """
-    waiting, in_flight = iter(tasks), dict[Any, T]()
-    returned, losses = deque[T](), Counter[str]()
-    while True:
-        while len(in_flight) < pool.count_slots():
-            task = next(waiting, None)
-            if task is None and returned:
-                task = returned.popleft()
-            if task is None:
-                break
-            in_flight[pool.submit(function, task, losses[task.key])] = task
-        if not in_flight:
-            return
-        for handle in pool.wait(list(in_flight)):
-            task = in_flight.pop(handle)
-            try:
-                result, seconds = pool.take(handle)
-            except WorkerLostError:
-                losses[task.key] += 1
-                if losses[task.key] < MOST_LOSSES:
-                    returned.append(task)
-                    continue
-                result, seconds = None, 0.0
-            yield Answer(task, result, seconds, losses.pop(task.key, 0))
+class _PooledExecutor:
+    """Base of executors whose workers are a pool that is opened for each iteration."""
+
+    def _open(self) -> AbstractContextManager[Pool]:
+        raise NotImplementedError
+
+    def map_blocks(
+        self, function: Callable[[T], R], tasks: Iterable[T | None]
+    ) -> Generator[Answer[T, R], None, None]:
+        """Keep every slot of the pool filled, and yield answers; see `Executor.map_blocks`. Tasks
+        that lost their worker come last.
+        """
+        waiting, in_flight = iter(tasks), dict[Any, T]()
+        returned, losses = deque[T](), Counter[str]()
+        with self._open() as pool:
+            while True:
+                while len(in_flight) < pool.count_slots():
+                    task = next(waiting, None)
+                    if task is None and returned:
+                        task = returned.popleft()
+                    if task is None:
+                        break
+                    in_flight[pool.submit(function, task, losses[task.key])] = task
+                if not in_flight:
+                    return
+                for handle in pool.wait(list(in_flight)):
+                    task = in_flight.pop(handle)
+                    try:
+                        result, seconds = pool.take(handle)
+                    except WorkerLostError:
+                        losses[task.key] += 1
+                        if losses[task.key] < MOST_LOSSES:
+                            returned.append(task)
+                            continue
+                        result, seconds = None, 0.0
+                    yield Answer(task, result, seconds, losses.pop(task.key, 0))
 
 
 @dataclass(frozen=True)
-class Processes:
+class Processes(_PooledExecutor):
     """Worker processes on this computer.
 
     Parameters
@@ -163,15 +170,14 @@ class Processes:
 
     workers: int
 
-    def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T | None]
-    ) -> Generator[Answer[T, R], None, None]:
-        """Compute tasks by processes; see `Executor.map_blocks`."""
+    @contextmanager
+    def _open(self) -> Iterator[Pool]:
         pool = _ProcessPool(self.workers)
         try:
-            yield from map_in_flight(pool, function, tasks)
+            yield pool
         finally:
-            pool.stop()
+            for worker in (*pool.free, *pool.busy.values()):
+                worker.shutdown(kill_workers=True)
 
 
 class _ProcessPool:
@@ -179,8 +185,8 @@ class _ProcessPool:
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._free: list[Any] = []
-        self._busy: dict[Any, Any] = {}
+        self.free: list[Any] = []
+        self.busy: dict[Any, Any] = {}
 
     def count_slots(self) -> int:
         return self._size
@@ -189,13 +195,13 @@ class _ProcessPool:
         from loky import ProcessPoolExecutor
 
         worker = (
-            self._free.pop()
-            if self._free
+            self.free.pop()
+            if self.free
             else ProcessPoolExecutor(1, initializer=_begin_worker, initargs=(os.getpid(),))
         )
         with use_one_thread(), _without_interrupts():  # the first task starts the process
             future = worker.submit(compute_timed, function, task)
-        self._busy[future] = worker
+        self.busy[future] = worker
         return future
 
     def wait(self, handles: Collection[Any]) -> Iterable[Any]:
@@ -206,18 +212,14 @@ class _ProcessPool:
     def take(self, handle: Any) -> tuple[Any, float]:
         from loky import BrokenProcessPool
 
-        worker = self._busy.pop(handle)
+        worker = self.busy.pop(handle)
         try:
             answer = handle.result()
         except BrokenProcessPool as error:
             worker.shutdown()
             raise WorkerLostError from error
-        self._free.append(worker)
+        self.free.append(worker)
         return answer
-
-    def stop(self) -> None:
-        for worker in [*self._free, *self._busy.values()]:
-            worker.shutdown(kill_workers=True)
 
 
 def _begin_worker(driver: int) -> None:
@@ -261,7 +263,7 @@ PERIOD = 1.0
 
 
 @dataclass(frozen=True)
-class Dask:
+class Dask(_PooledExecutor):
     """The workers of a dask cluster (`dask.distributed`).
 
     Parameters
@@ -272,15 +274,27 @@ class Dask:
     address: str
     patience: float = PATIENCE
 
-    def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T | None]
-    ) -> Generator[Answer[T, R], None, None]:
-        """Compute tasks on the cluster; see `Executor.map_blocks`.
-
-        The scheduler itself computes the tasks of a lost worker again, a few times.
-        """
-        with _connect_to_dask(self.address, self.patience) as client:
-            yield from map_in_flight(_DaskPool(client, self.address), function, tasks)
+    @contextmanager
+    def _open(self) -> Iterator[Pool]:
+        """Connect to the scheduler, which itself computes the tasks of a lost worker again."""
+        distributed = import_optional("distributed", "dask", StudyError)
+        address, patience = self.address, self.patience
+        try:
+            client = distributed.Client(address, timeout=patience, set_as_default=False)
+        except (OSError, ValueError) as error:
+            finding = report_finding("workers.cluster-not-reached", address=address)
+            raise StudyError(finding) from error
+        try:
+            try:
+                client.wait_for_workers(1, timeout=patience)
+            except TimeoutError:
+                code = "workers.cluster-without-workers"
+                finding = report_finding(code, address=address, seconds=patience)
+                raise StudyError(finding) from None
+            yield _DaskPool(client, address)
+        finally:
+            with suppress(OSError, TimeoutError):
+                client.close()
 
 
 class _DaskPool:
@@ -328,30 +342,8 @@ def _report_lost(address: str) -> StudyError:
     return StudyError(report_finding("workers.cluster-lost", address=address))
 
 
-@contextmanager
-def _connect_to_dask(address: str, patience: float) -> Iterator[Any]:
-    """Yield a client of a scheduler that has a worker."""
-    distributed = import_optional("distributed", "dask", StudyError)
-    try:
-        client = distributed.Client(address, timeout=patience, set_as_default=False)
-    except (OSError, ValueError) as error:
-        finding = report_finding("workers.cluster-not-reached", address=address)
-        raise StudyError(finding) from error
-    try:
-        try:
-            client.wait_for_workers(1, timeout=patience)
-        except TimeoutError:
-            code = "workers.cluster-without-workers"
-            finding = report_finding(code, address=address, seconds=patience)
-            raise StudyError(finding) from None
-        yield client
-    finally:
-        with suppress(OSError, TimeoutError):
-            client.close()
-
-
 @dataclass(frozen=True)
-class Ray:
+class Ray(_PooledExecutor):
     """The workers of a ray cluster.
 
     Parameters
@@ -364,17 +356,31 @@ class Ray:
     address: str | None = None
     processors: int | None = None
 
-    def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T | None]
-    ) -> Generator[Answer[T, R], None, None]:
-        """Compute tasks on the cluster; see `Executor.map_blocks`."""
-        with _connect_to_ray(self.address, self.processors) as ray:
-            pool = _RayPool(ray)
+    @contextmanager
+    def _open(self) -> Iterator[Pool]:
+        """Use the cluster of this process, or join or start one."""
+        ray = import_optional("ray", "ray", StudyError)
+        is_ours = not ray.is_initialized()
+        if is_ours:
+            # it would report its use to its makers
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+            address = self.address or os.environ.get("RAY_ADDRESS")
+            settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+            if address is None:
+                settings |= {"num_cpus": self.processors, "include_dashboard": False}
             try:
-                yield from map_in_flight(pool, function, tasks)
-            finally:
-                for reference in pool.in_flight:
-                    ray.cancel(reference, force=True)
+                ray.init(address=address, **settings)
+            except (ConnectionError, RuntimeError, ValueError) as error:
+                finding = report_finding("workers.cluster-not-reached", address=address or "ray")
+                raise StudyError(finding) from error
+        pool = _RayPool(ray)
+        try:
+            yield pool
+        finally:
+            for reference in pool.in_flight:
+                ray.cancel(reference, force=True)
+            if is_ours:
+                ray.shutdown()
 
 
 class _RayPool:
@@ -411,26 +417,3 @@ class _RayPool:
             exceptions.OutOfMemoryError,
         ) as error:
             raise WorkerLostError from error
-
-
-@contextmanager
-def _connect_to_ray(address: str | None, processors: int | None) -> Iterator[Any]:
-    """Yield ray with a cluster in use."""
-    ray = import_optional("ray", "ray", StudyError)
-    if ray.is_initialized():
-        yield ray
-        return
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would report its use to its makers
-    address = address or os.environ.get("RAY_ADDRESS")
-    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if address is None:
-        settings |= {"num_cpus": processors, "include_dashboard": False}
-    try:
-        ray.init(address=address, **settings)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        finding = report_finding("workers.cluster-not-reached", address=address or "ray")
-        raise StudyError(finding) from error
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
