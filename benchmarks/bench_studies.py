@@ -5,7 +5,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -14,8 +14,9 @@ from benchmarks.harness import Metric
 from loopcal.studies.driver import RunReport
 from loopcal.studies.execution.executors import Answer, Executor, Processes, Serial
 from loopcal.studies.running import read_source, run_study
-from loopcal.studies.simulation.block import BlockResult, BlockTask, PosesTask, compute_task
+from loopcal.studies.simulation.block import BlockTask, PosesTask, compute_task
 from loopcal.studies.simulation.machines import CellPoses
+from loopcal.typing import FloatArray
 
 STUDY = """\
 format: 1
@@ -31,19 +32,20 @@ WORKERS, REPEATS = 2, 3
 
 
 @dataclass(frozen=True, eq=False)
-class TimedResult(BlockResult):
-    """A block. `processor` : seconds of processor time that it took."""
+class TimedResult:
+    """Scores of a block. `processor` : seconds of processor time that it took."""
 
+    scores: FloatArray
     processor: float
 
 
-def compute_timed_task(task: BlockTask | PosesTask) -> BlockResult | CellPoses:
+def compute_timed_task(task: BlockTask | PosesTask) -> TimedResult | CellPoses:
     """Compute a task, a block with its processor time."""
     begin = time.process_time()
     result = compute_task(task)
     if isinstance(result, CellPoses):
         return result
-    return TimedResult(result.key, result.values, time.process_time() - begin)
+    return TimedResult(result, time.process_time() - begin)
 
 
 @dataclass
@@ -62,6 +64,7 @@ class Timed:
             if isinstance(answer.result, TimedResult):
                 self.times.append((time.perf_counter(), answer.seconds))
                 self.processor[answer.task.key] = answer.result.processor
+                answer = replace(answer, result=answer.result.scores)  # noqa: PLW2901
             yield answer
 
     @property

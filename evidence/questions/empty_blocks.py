@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from loopcal.studies.execution.executors import Answer, Executor, R, T
-from loopcal.studies.simulation.block import BlockResult, PosesTask, compute_task
+from loopcal.studies.simulation.block import PosesTask, compute_task
 from loopcal.studies.simulation.machines import CellPoses
 from loopcal.studies.specification.scores import COLUMNS
+from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class EmptyBlocks:
         return self.executor.map_blocks(leave_empty, tasks)
 
 
-def leave_empty(task: Any) -> BlockResult | CellPoses:
+def leave_empty(task: Any) -> FloatArray | CellPoses:
     """Return the poses of a task, or a block of zeros."""
     if isinstance(task, PosesTask):
         return compute_task(task)
     trials = json.loads(task.content)["trials"]
-    return BlockResult(task.key, np.zeros((trials, len(COLUMNS))))
+    return np.zeros((trials, len(COLUMNS)))

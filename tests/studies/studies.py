@@ -49,4 +49,4 @@ def compute_cells(study: Study) -> list[dict[str, FloatArray]]:
     """Return name -> (B,) score of the first block of each cell."""
     names = [column.name for column in study.columns]
     tasks = [task for task in list_tasks(study) if task.block == 0]
-    return [dict(zip(names, compute_block(task).values.T, strict=True)) for task in tasks]
+    return [dict(zip(names, compute_block(task).T, strict=True)) for task in tasks]

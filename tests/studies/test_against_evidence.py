@@ -49,7 +49,7 @@ def test_coverage_and_rank_agree(case):
         methods={method: MethodLevel(method)},
         effects={"noise": EffectsLevel(noise=noise)},
     )
-    values = np.concatenate([compute_block(task).values for task in list_tasks(study)])
+    values = np.concatenate([compute_block(task) for task in list_tasks(study)])
     scores = dict(zip((column.name for column in study.columns), values.T, strict=True))
     assert_array_equal(scores["outcome"], 0)
     assert_array_equal(scores["rank"], rank)
@@ -97,7 +97,7 @@ def test_medians_of_errors_agree(robot):
     names = [column.name for column in study.columns]
     errors: dict[str, np.ndarray] = {}
     for task in list_tasks(study):
-        scores = dict(zip(names, compute_block(task).values.T, strict=True))
+        scores = dict(zip(names, compute_block(task).T, strict=True))
         errors[study.cells[task.cell].levels["method"]] = np.log(1e6 * scores["position"])
         errors["before"] = np.log(1e6 * scores["position_before"])
     assert set(errors) == {"before", *METHODS}

@@ -215,14 +215,14 @@ from loopcal.studies.simulation.block import compute_block, list_tasks
 from tests.studies.studies import make_study
 study = make_study(replicates=12)
 tasks = list(list_tasks(study))[:: int(sys.argv[1])]
-values = {task.block: compute_block(task).values for task in tasks}
+values = {task.block: compute_block(task) for task in tasks}
 print(hashlib.sha256(b"".join(values[b].tobytes() for b in sorted(values))).hexdigest())
 """
 
 
 def test_blocks_have_the_same_bits_in_every_process():
     study = make_study(replicates=12)
-    values = [compute_block(task).values.tobytes() for task in list_tasks(study)]
+    values = [compute_block(task).tobytes() for task in list_tasks(study)]
     here = hashlib.sha256(b"".join(values)).hexdigest()
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "3", "OMP_NUM_THREADS": "3"}
     command = [sys.executable, "-c", CHILD, "-1"]  # in the opposite order, with other threads
@@ -234,7 +234,7 @@ def test_a_replayed_trial_gives_the_scores_of_its_block():
     study = make_study(replicates=12)
     _, task = list_tasks(study)
     column = [c.name for c in study.columns].index("parameters")
-    expected = compute_block(task).values[2, column]
+    expected = compute_block(task)[2, column]
     trial = replay_trial(study, 0, 8)
     fit = identify(trial.robot, trial.data, options=trial.options)
     places = fit.free_parameters.places
@@ -253,7 +253,7 @@ def test_a_trial_is_the_same_in_blocks_of_any_size():
 
 def test_blocks_differ():
     study = make_study(replicates=12)
-    first, second = (compute_block(task).values for task in list_tasks(study))
+    first, second = (compute_block(task) for task in list_tasks(study))
     assert np.all(first[:, 1] != second[:, 1])
 
 
@@ -261,12 +261,9 @@ def test_columns_are_those_of_the_study():
     study = make_study()
     (task,) = list_tasks(study)
     result = compute_block(task)
-    assert result.key == task.key
-    assert result.values.shape == (6, len(study.columns))
-    assert result.values.dtype == np.float64
+    assert result.shape == (6, len(study.columns))
+    assert result.dtype == np.float64
     assert study.columns[0].name == "outcome"
-    undefined = {
-        c.name for c, v in zip(study.columns, result.values.T, strict=True) if np.isnan(v).any()
-    }
+    undefined = {c.name for c, v in zip(study.columns, result.T, strict=True) if np.isnan(v).any()}
     assert all(name.startswith(ROTATION_FREE) for name in undefined)
     assert CAMERA.components == ("x", "y", "z")

@@ -227,7 +227,7 @@ def test_the_content_of_a_task_is_all_that_a_block_needs():
     (task,) = list_tasks(make_study())
     content = json.dumps(json.loads(task.content), sort_keys=True)  # another layout
     again = compute_block(replace(task, cell=99, content=content))
-    assert again.values.tobytes() == compute_block(task).values.tobytes()
+    assert again.tobytes() == compute_block(task).tobytes()
 
 
 # --- damaged files

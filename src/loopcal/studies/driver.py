@@ -21,7 +21,6 @@ from loopcal.studies.execution.executors import MOST_LOSSES, Executor
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.questions import explain_failures
 from loopcal.studies.simulation.block import (
-    BlockResult,
     BlockTask,
     PosesTask,
     compute_block,
@@ -226,12 +225,13 @@ def run_blocks(
                 else:
                     given_up += [f"cell {cell}, poses" for cell in schedule.give_up(task)]
                 continue
-            if not isinstance(result, BlockResult):
+            if result is None:
                 given_up.append(f"cell {task.cell}, block {task.block}")
                 continue
-            levels, values = study.cells[task.cell].levels, result.values
-            if store.add_block(task.key, levels, task.block, values, answer.seconds):
-                computed, trials = computed + 1, trials + len(values)
+            assert not isinstance(result, CellPoses)
+            levels = study.cells[task.cell].levels
+            if store.add_block(task.key, levels, task.block, result, answer.seconds):
+                computed, trials = computed + 1, trials + len(result)
             progress(before + computed, total, "computing blocks")
     wall = time.perf_counter() - begin
     return RunReport(total, before, computed, trials, tuple(given_up), losses, wall, seconds)
@@ -325,10 +325,10 @@ def estimate_time(
             planning += time.perf_counter() - begin
         task = make_block_task(compute_key(content), number, content, poses[plan.key])
         begin = time.perf_counter()
-        result = compute_block(task)
+        outcomes = compute_block(task)[:, 0]
         seconds.append(time.perf_counter() - begin)
-        trials += len(result.values)
-        failures.update(OUTCOMES[int(outcome)] for outcome in result.values[:, 0] if outcome)
+        trials += len(outcomes)
+        failures.update(OUTCOMES[int(outcome)] for outcome in outcomes if outcome)
         if sum(seconds) + planning > LONGEST:
             break
     blocks = study.blocks * len(study.cells)

@@ -79,23 +79,11 @@ class BlockTask:
     content: str
 
 
-@dataclass(frozen=True, eq=False)
-class BlockResult:
-    """The scores of the trials of a block.
+def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
+    """Simulate and calibrate the machines of a block, and return their scores (B, s), SI.
 
-    Attributes
-    ----------
-    key : of its task. values : (B, s), columns as `Study.columns`, SI. Column 0 is the outcome: 0
-        for a trial that converged, else the number of a code in OUTCOMES. The other numbers of a
-        failed trial are NaN as far as they do not exist.
-    """
-
-    key: str
-    values: FloatArray
-
-
-def compute_block(task: BlockTask, threads: int = 1) -> BlockResult:
-    """Simulate and calibrate the machines of a block, and return their scores.
+    Columns are `Study.columns`. Column 0 is the outcome: 0 for a trial that converged, else the
+    number of a code in OUTCOMES. Other numbers of a failed trial are NaN where they do not exist.
 
     It is a pure function of `task.content`: the same numbers to the last bit in every process, for
     every number of threads and workers.
@@ -110,10 +98,10 @@ def compute_block(task: BlockTask, threads: int = 1) -> BlockResult:
     scores: dict[str, Any] = dict.fromkeys(names, np.nan)
     scores |= score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
     columns = np.broadcast_arrays(*{**scores, **fits.scores}.values())
-    return BlockResult(task.key, np.stack(columns, axis=1))
+    return np.stack(columns, axis=1)
 
 
-def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> BlockResult | CellPoses:
+def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> FloatArray | CellPoses:
     """Compute a block, see `compute_block`, or poses."""
     if isinstance(task, PosesTask):
         return compute_poses(json.loads(task.content))
