@@ -11,16 +11,16 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.studies.files import store as file_systems
 from loopcal.studies.files.store import (
     NAME,
     StoreHeader,
-    find_type,
+    find_network_file_system,
     is_driven,
     make_store,
     open_store,
@@ -245,16 +245,6 @@ def test_full_disk_loses_only_the_block(tmp_path) -> None:
     assert done.stdout.splitlines() == ["store.disk-full True", "True", "True"], done.stderr
 
 
-MOUNTS = """\
-22 1 8:1 / / rw,relatime - ext4 /dev/sda1 rw
-23 22 0:21 / /proc rw - proc proc rw
-30 22 0:40 / /srv rw,relatime shared:1 - nfs4 server:/srv rw
-31 30 8:2 / /srv/me/local\\040disk rw - xfs /dev/sdb rw
-32 22 0:41 / /mnt/share rw - fuse.sshfs me@host:/ rw
-33 22 0:42 / /mnt/share rw - cifs //host/share rw
-"""
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -272,42 +262,58 @@ def test_header_that_was_damaged_gives_a_sentence(folder, name, value) -> None:
         assert store.header
 
 
-MACOS = """\
-/dev/disk3s1s1 on / (apfs, sealed, local, read-only, journaled)
-/dev/disk3s5 on /System/Volumes/Data (apfs, local, journaled, nobrowse)
-//me@host/share on /Volumes/my share (smbfs, nodev, nosuid, mounted by me)
-host:/export on /Volumes/nfs (nfs, nodev)
-me@host: on /Volumes/sshfs (macfuse, local, synchronous)
-/dev/disk4s1 on /Volumes/STICK (msdos, local, nodev)
-host:/x on /Volumes/other (otherfs, nodev)
-"""
+MOUNTS = {
+    "linux": [
+        *(("/", "ext4", "rw"), ("/proc", "proc", "rw"), ("/srv", "nfs4", "rw")),
+        *(("/srv/me/local disk", "xfs", "rw"), ("/mnt/share", "fuse.sshfs", "rw")),
+        ("/mnt/share", "cifs", "rw"),
+        *((f"/mnt/{k}", f"fuse.{k}", "rw") for k in ("sshfs", "rclone", "ntfs-3g", "overlayfs")),
+    ],
+    "darwin": [
+        *(("/", "apfs", "ro,local"), ("/Volumes/my share", "smbfs", "rw,nosuid")),
+        *(("/Volumes/nfs", "nfs", "rw"), ("/Volumes/sshfs", "macfuse", "rw,local")),
+        *(("/Volumes/STICK", "msdos", "rw,local"), ("/Volumes/other", "otherfs", "rw")),
+    ],
+}
+"""System -> what psutil says of its mounts: place, type, options."""
+
+
+def mount(monkeypatch, mounts: list[tuple[str, str, str]], system: str = "linux") -> None:
+    """Let psutil find these mounts."""
+    found = [SimpleNamespace(mountpoint=p, fstype=kind, opts=opts) for p, kind, opts in mounts]
+    monkeypatch.setattr("psutil.disk_partitions", lambda **_: found)
+    monkeypatch.setattr(sys, "platform", system)
 
 
 @pytest.mark.parametrize(
-    ("mounts", "path", "found"),
+    ("system", "path", "found"),
     [
-        (MOUNTS, "/var/study", ("ext4", False)),
-        (MOUNTS, "/srvwork", ("ext4", False)),
-        (MOUNTS, "/srv/me/study", ("nfs4", True)),
-        (MOUNTS, "/srv/me/local disk/study", ("xfs", False)),
-        (MOUNTS, "/mnt/share/a", ("cifs", True)),
-        (MACOS, "/opt/study", ("apfs", False)),
-        (MACOS, "/Volumes/my share/study", ("smbfs", True)),
-        (MACOS, "/Volumes/nfs", ("nfs", True)),
-        (MACOS, "/Volumes/sshfs/a", ("macfuse", True)),
-        (MACOS, "/Volumes/STICK/a", ("msdos", False)),
-        (MACOS, "/Volumes/other/a", ("otherfs", True)),
+        ("linux", "/var/study", None),
+        ("linux", "/srvwork", None),
+        ("linux", "/srv/me/study", "nfs4"),
+        ("linux", "/srv/me/local disk/study", None),
+        ("linux", "/mnt/share/a", "cifs"),
+        ("linux", "/mnt/sshfs/a", "fuse.sshfs"),
+        ("linux", "/mnt/rclone/a", "fuse.rclone"),
+        ("linux", "/mnt/ntfs-3g/a", None),
+        ("linux", "/mnt/overlayfs/a", None),
+        ("darwin", "/opt/study", None),
+        ("darwin", "/Volumes/my share/study", "smbfs"),
+        ("darwin", "/Volumes/nfs", "nfs"),
+        ("darwin", "/Volumes/sshfs/a", "macfuse"),
+        ("darwin", "/Volumes/STICK/a", None),
+        ("darwin", "/Volumes/other/a", "otherfs"),
     ],
 )
-def test_file_system_is_that_of_the_deepest_and_latest_mount(mounts, path, found) -> None:
-    assert find_type(mounts, Path(path)) == found
+def test_file_system_is_that_of_the_deepest_and_latest_mount(
+    system, path, found, monkeypatch
+) -> None:
+    mount(monkeypatch, MOUNTS[system], system)
+    assert find_network_file_system(Path(path)) == found
 
 
-def test_file_systems_of_user_programs_are_networks_unless_they_use_a_disk() -> None:
-    kinds = ("fuse.sshfs", "fuse.rclone", "fuse.s3fs", "fuse.ntfs-3g", "fuse.overlayfs", "tmpfs")
-    mounts = [f"1 0 8:1 / / rw - {kind} /dev/a rw" for kind in kinds]
-    refused = [find_type(line, Path("/study"))[1] for line in mounts]
-    assert refused == [True, True, True, False, False, False]
+def test_mounts_of_this_computer_are_found(tmp_path) -> None:
+    assert find_network_file_system(tmp_path) is None
 
 
 def test_network_file_system_is_refused_but_a_complete_copy_there_is_read(
@@ -315,9 +321,7 @@ def test_network_file_system_is_refused_but_a_complete_copy_there_is_read(
 ) -> None:
     with open_store(folder) as store:
         store.add_block("key", A, 0, make_scores(0), 0.5)
-    table = tmp_path / "mounts"
-    table.write_text(f"1 0 8:1 / / rw - ext4 /dev/a rw\n2 1 0:40 / {tmp_path} rw - nfs4 h:/ rw\n")
-    monkeypatch.setattr(file_systems, "MOUNTS", table)
+    mount(monkeypatch, [("/", "ext4", "rw"), (str(tmp_path), "nfs4", "rw")])
     with expect_refusal("store.network-file-system", FileError, kind="nfs4"), open_store(folder):
         pass
     with expect_refusal("store.network-file-system", FileError):

@@ -15,7 +15,6 @@ import json
 import os
 import re
 import sqlite3
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -30,9 +29,6 @@ from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.replacement import lock, open_folder
 from loopcal.typing import FloatArray
-
-MOUNTS = Path("/proc/self/mountinfo")
-"""Where Linux lists what is mounted."""
 
 NETWORK = (
     *("9p", "acfs", "afpfs", "afs", "beegfs", "ceph", "cephfs", "cifs", "coda", "davfs", "fhgfs"),
@@ -49,9 +45,6 @@ NETWORK_IN_USER_SPACE = re.compile(
 )
 """File systems of user programs, but for those that are known to use a local disk."""
 
-_OCTAL = re.compile(r"\\([0-7]{3})")
-_MOUNT_OF_MACOS = re.compile(r".+? on (.+) \((\w+)(.*)\)")
-
 
 def find_network_file_system(folder: Path) -> str | None:
     """Return the type of the network file system that a folder is on, such as `nfs4`.
@@ -60,44 +53,19 @@ def find_network_file_system(folder: Path) -> str | None:
     that all its users share, which network file systems do not have. Of a folder that does not
     exist, the place where it would be made counts.
     """
+    import psutil
+
     path = folder.resolve()
-    if sys.platform == "win32":  # the letter of a network drive is resolved to its server
-        return "network drive" if path.anchor.startswith("\\\\") else None
-    if sys.platform == "darwin":
-        mounts = subprocess.run(["/sbin/mount"], capture_output=True, text=True, check=False).stdout
-    elif MOUNTS.exists():
-        mounts = MOUNTS.read_text("utf-8", errors="surrogateescape")
-    else:
-        return None
-    kind, is_network = find_type(mounts, path)
-    return kind if is_network else None
-
-
-def find_type(mounts: str, path: Path) -> tuple[str, bool]:
-    """Return the type of the file system of an absolute path, and whether it is one of a network.
-
-    mounts : text of /proc/self/mountinfo, or of the command `mount` of macOS; the last one of equal
-    mounts counts.
-
-    Examples
-    --------
-    >>> disk = "1 0 8:1 / / rw - ext4 /dev/a rw"
-    >>> server = "2 1 0:40 / /srv rw shared:1 - nfs4 host:/b rw"
-    >>> mounts = chr(10).join([disk, server])
-    >>> find_type(mounts, Path("/srv/user/study")), find_type(mounts, Path("/tmp"))
-    (('nfs4', True), ('ext4', False))
-    """
-    found, depth = ("", False), -1
-    for line in mounts.splitlines():
-        if match := _MOUNT_OF_MACOS.fullmatch(line):
-            place, kind, is_local = Path(match[1]), match[2], ", local" in match[3]
-        else:
-            before, _, after = line.partition(" - ")
-            name = _OCTAL.sub(lambda octal: chr(int(octal[1], 8)), before.split(" ")[4])
-            place, kind, is_local = Path(name), after.split(" ")[0], True
+    if path.anchor.startswith("\\\\"):  # to which Windows resolves the letter of a network drive
+        return "network drive"
+    found, depth = None, -1
+    for mount in psutil.disk_partitions(all=True):  # the last one of equal mounts counts
+        place, kind = Path(mount.mountpoint), mount.fstype
         if path.is_relative_to(place) and len(place.parts) >= depth:
             is_network = kind in NETWORK or NETWORK_IN_USER_SPACE.match(kind) is not None
-            found, depth = (kind, is_network or not is_local), len(place.parts)
+            if sys.platform == "darwin":
+                is_network |= "local" not in mount.opts.split(",")
+            found, depth = kind if is_network else None, len(place.parts)
     return found
 
 
