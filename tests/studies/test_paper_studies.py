@@ -145,7 +145,7 @@ def test_sizes_of_errors_lie_between_the_smallest_and_the_largest():
     study = make_study(errors={"e": ErrorsLevel(distribution="uniform", smallest=0.5)})
     (task,) = list_tasks(study)
     cell = prepare_cell(json.loads(task.content))
-    drawn = draw_machines(cell.robot, cell.errors, 4000, 0) - cell.robot.parameters.nominal
+    drawn = draw_machines(cell.robot, cell.content.errors, 4000, 0) - cell.robot.parameters.nominal
     tolerance = cell.robot.parameters.tolerance
     free = np.flatnonzero(cell.robot.parameters.free)
     scaled = drawn[:, free] / tolerance[free]

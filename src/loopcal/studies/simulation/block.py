@@ -93,8 +93,8 @@ def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
     """
     content = json.loads(task.content)
     cell, trials, fits = calibrate_block(content, threads)
-    stream = make_stream(cell.seed, content["block"])
-    names = (column.name for column in list_columns(cell.scores))
+    stream = make_stream(cell.content.seed, content["block"])
+    names = (column.name for column in list_columns(cell.content.scores))
     scores: dict[str, Any] = dict.fromkeys(names, np.nan)
     scores |= score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
     columns = np.broadcast_arrays(*{**scores, **fits.scores}.values())
@@ -139,7 +139,7 @@ def calibrate_block(
 ) -> tuple[PreparedCell, Trials, FittedTrials]:
     """Simulate and calibrate the machines of the content of a task, by so many threads."""
     cell = prepare_cell(content)
-    trials = simulate_block(cell, make_stream(cell.seed, content["block"]))
+    trials = simulate_block(cell, make_stream(cell.content.seed, content["block"]))
     return cell, trials, fit_trials(cell, trials, threads)
 
 
@@ -157,16 +157,16 @@ def make_stream(seed: int, block: int) -> BlockStream:
 def simulate_block(cell: PreparedCell, stream: BlockStream) -> Trials:
     """Draw the true machines of a block and measure them; with a verdict, also held-out poses."""
     poses = cell.measured
-    if cell.scores.verdict:
-        poses = np.concatenate([poses, cell.validated])
-    truth = draw_machines(cell.robot, cell.errors, cell.trials, stream)
+    if cell.content.scores.verdict:
+        poses = np.concatenate([poses, np.array(cell.content.held_out)])
+    truth = draw_machines(cell.robot, cell.content.errors, cell.content.trials, stream)
     if cell.layout is not None:
         return measure_held_points(cell.layout, truth, cell.instrument, stream)
-    disturbance = make_disturbance(cell.robot, truth, poses, cell.effects, stream)
+    disturbance = make_disturbance(cell.robot, truth, poses, cell.content.effects, stream)
     trials = simulate_trials(
         cell.robot, truth, poses, cell.instrument, stream, disturbance=disturbance
     )
-    return hide_columns(trials, cell.unused)
+    return hide_columns(trials, cell.content.instrument.unused)
 
 
 def score_poses(
@@ -190,7 +190,7 @@ def score_poses(
         error = geometry.pose_difference(tools, truth.T @ robot.tool)
         if all(freedom == 3 for freedom in robot.program.freedoms):  # the platform cannot rotate
             error[..., :3] = np.nan
-        if cell.scores.frame == "both":
+        if cell.content.scores.frame == "both":
             for name, part in PARTS.items():
                 size = np.linalg.norm(error[..., part], axis=2)
                 scores[f"{name}_base{when}"] = compute_rms(size)
@@ -367,9 +367,9 @@ def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
     (task,) = list_tasks(study, [cell], blocks=[block])
     content = json.loads(task.content)
     prepared = prepare_cell(content)
-    trials = simulate_block(prepared, make_stream(prepared.seed, block))
+    trials = simulate_block(prepared, make_stream(prepared.content.seed, block))
     data = state_times(trials.trial(place))
-    if prepared.scores.verdict:
+    if prepared.content.scores.verdict:
         data = prepared.hold_out(data)
     truth = prepared.robot.with_values(trials.truth[place])
-    return ReplayedTrial(prepared.robot, truth, data, prepared.fit_options, prepared.method)
+    return ReplayedTrial(prepared.robot, truth, data, prepared.fit_options, prepared.content.method)

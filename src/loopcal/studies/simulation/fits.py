@@ -107,8 +107,8 @@ class FittedTrials:
 
 def fit_trials(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
     """Calibrate all trials; threads compute those that are one batch."""
-    options, scores = cell.fit_options, cell.scores
-    if cell.method.is_published:
+    options, scores = cell.fit_options, cell.content.scores
+    if cell.content.method.is_published:
         return fit_published(cell, trials)
     is_batch = options.loss is None and options.noise == "given" and cell.layout is None
     if is_batch and not scores.verdict and scores.intervals == "stated":
@@ -161,7 +161,7 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
 
     Raises DataError: products of points that are not held on planes and lines.
     """
-    method, robot, t = cell.method, cell.robot, len(trials)
+    method, robot, t = cell.content.method, cell.robot, len(trials)
     scores: dict[str, Any] = {}
     if method.is_of_products:
         values, outcome, iterations, scores["rank"] = _fit_products(cell, trials)
@@ -207,7 +207,7 @@ def _fit_products(
     """Return values, outcomes, iterations and ranks of fits to products of points, with the
     library's descent.
     """
-    method, robot = cell.method, cell.robot
+    method, robot = cell.content.method, cell.robot
     if cell.layout is None:
         raise DataError(
             "products of points need 'choice: plane-line' of the poses; add it, or remove "
@@ -328,20 +328,18 @@ def state_times(data: Measurements) -> Measurements:
 
 def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
     """Return the calibration of one trial, without the axis of trials."""
-    scores: dict[str, Any] = {}
-    if cell.scores.verdict:
+    asked, scores = cell.content.scores, dict[str, Any]()
+    if asked.verdict:
         options = CalibrationOptions(
-            fit=cell.fit_options,
-            limit_position=cell.scores.limit_position,
-            limit_angle=cell.scores.limit_angle,
+            fit=cell.fit_options, limit_position=asked.limit_position, limit_angle=asked.limit_angle
         )
         report = calibrate(cell.robot, cell.hold_out(data), options)
         fit, scores["verdict"] = report.identification, float(VERDICTS.index(report.verdict))
     else:
         fit = identify(cell.robot, data, options=cell.fit_options)
-        if cell.scores.intervals == "adjusted":
+        if asked.intervals == "adjusted":
             fit = adjust_uncertainty(fit, data)
-    U = pose_uncertainty(fit, forward(fit.robot, cell.held_out.q), frame=cell.scores.error_frame)
+    U = pose_uncertainty(fit, forward(fit.robot, cell.held_out.q), frame=asked.error_frame)
     state, measured = solve_cell_poses(cell, fit.robot.values[None])
     test = fit.residual_test
     return FittedTrials(

@@ -5,7 +5,6 @@ effects and method; a process prepares them once.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -13,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from msgspec import convert
 
@@ -53,10 +53,9 @@ from loopcal.studies.specification.levels import (
     MethodLevel,
     NoiseLevel,
     PosesLevel,
-    Scores,
     ThermalGrowth,
 )
-from loopcal.studies.specification.study import format_json
+from loopcal.studies.specification.study import CellContent, format_json
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, parse_quantity
 
@@ -259,10 +258,10 @@ def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
     Drawn poses depend on the machine only. Planned ones also depend on what is measured, and on the
     tolerances.
     """
-    level = convert(content["poses"], PosesLevel)
+    given = convert(content, CellContent)
     description = {key: content[key] for key in ("robot", "poses", "seed")}
-    description["held_out"] = convert(content["scores"], Scores).held_out
-    if is_planned(level):
+    description["scores"] = {"held_out": given.scores.held_out}
+    if is_planned(given.poses):
         description |= {key: content[key] for key in ("instrument", "noise")}
         stated = content["errors"]  # those settings that change the tolerances
         names = ("tolerance_factor", "tolerances")
@@ -272,9 +271,9 @@ def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     """Return the poses of a description: given ones, drawn from the workspace, or planned."""
-    level, seed = convert(description["poses"], PosesLevel), description["seed"]
-    robot = build_robot_of(description["robot"])
-    held_out = sample_workspace(robot.nominal, description["held_out"], seed + 1).coordinates
+    content = convert(description, CellContent)
+    level, seed, robot = content.poses, content.seed, build_robot_of(content.robot)
+    held_out = sample_workspace(robot.nominal, content.scores.held_out, seed + 1).coordinates
     chosen_seed = seed if level.seed is None else level.seed
     stream: int | np.random.Generator = chosen_seed
     if chosen_seed == seed + 1:  # otherwise the measured poses would be the held-out ones
@@ -286,14 +285,10 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     elif not is_planned(level):
         measured = sample_workspace(robot.nominal, level.count, stream).coordinates
     else:
-        errors = convert(description["errors"], ErrorsLevel)
-        instrument = make_instrument(
-            convert(description["instrument"], InstrumentLevel),
-            convert(description["noise"], NoiseLevel),
-        )
+        instrument = make_instrument(content.instrument, content.noise)
         options = PlanOptions(n_poses=level.count, hold_out=0, seed=chosen_seed)
-        chosen = plan(change_tolerances(robot, errors).nominal, instrument, options=options)
-        measured = chosen.poses.coordinates
+        nominal = change_tolerances(robot, content.errors).nominal
+        measured = plan(nominal, instrument, options=options).poses.coordinates
     return CellPoses(measured.tolist(), held_out.tolist())
 
 
@@ -434,34 +429,26 @@ class PreparedCell:
 
     Attributes
     ----------
-    robot : nominal, with the tolerances of the cell. instrument : with its true noise.
-    errors, effects, scores, method, fit_options : of the cell. unused : measured columns that the
-        fit does not get. layout : points that are held on planes and lines; None for other poses.
-    measured, validated : (n, c), (h, c) controlled coordinates of measured and held-out poses.
+    content : of its tasks. robot : nominal, with the tolerances of the cell.
+    instrument : with its true noise. fit_options : of the cell.
+    layout : points that are held on planes and lines; None for other poses.
+    measured : (n, c) controlled coordinates of the measured poses.
     held_out : solution of the nominal robot at the held-out poses.
     motions : (12, k) motions of the base and platform frames that are fitted before errors are
         stated: in the frame "fitted" those that the measurements do not determine.
     reference : solution of the nominal robot at the poses over which these are fitted: the measured
         ones, or none where there is no such motion.
-    seed, trials : of the study, and of a block.
     """
 
+    content: CellContent
     robot: Mechanism
     instrument: Instrument
-    errors: ErrorsLevel
-    effects: EffectsLevel
-    scores: Scores
-    method: MethodLevel
-    unused: tuple[str, ...]
     layout: Layout | None
     fit_options: FitOptions
     measured: FloatArray
-    validated: FloatArray
     held_out: Solution
     motions: FloatArray
     reference: Solution
-    seed: int
-    trials: int
 
     def hold_out(self, data: Measurements) -> Measurements:
         """Return measurements in which the poses behind the measured ones are held out."""
@@ -476,28 +463,22 @@ def prepare_cell(content: Mapping[str, Any]) -> PreparedCell:
 @lru_cache(maxsize=4)
 def _prepare(text: str) -> PreparedCell:
     """Return the cell of the common content of its blocks, as JSON."""
-    content = json.loads(text)
-    errors = convert(content["errors"], ErrorsLevel)
-    robot = change_tolerances(build_robot_of(content["robot"]), errors).nominal
-    noise = convert(content["noise"], NoiseLevel)
-    level = convert(content["instrument"], InstrumentLevel)
-    measured = np.array(content["measured"])
-    poses = convert(content["poses"], PosesLevel)
-    instrument = place_instrument(make_instrument(level, noise), robot, poses, measured)
-    method = convert(content["method"], MethodLevel)
-    effects = convert(content["effects"], EffectsLevel)
-    scores = convert(content["scores"], Scores)
+    content = msgspec.json.decode(text, type=CellContent)
+    robot = change_tolerances(build_robot_of(content.robot), content.errors).nominal
+    measured, poses = np.array(content.measured), content.poses
+    instrument = make_instrument(content.instrument, content.noise)
+    instrument = place_instrument(instrument, robot, poses, measured)
     layout = None
     if poses.is_on_surfaces:
         layout = Layout(robot, measured.reshape(poses.groups, -1, measured.shape[1]))
     motions = np.zeros((12, 0))
-    if scores.error_frame != BASE:
+    if content.scores.error_frame != BASE:
         nominal = robot.values[None]
         if layout is None:
             exact = simulate_trials(robot, nominal, measured, instrument, 0)
-            exact = hide_columns(exact, level.unused)
+            exact = hide_columns(exact, content.instrument.unused)
         else:
-            check_effects(effects)
+            check_effects(content.effects)
             exact = measure_held_points(layout, nominal, instrument, 0, is_exact=True)
             exact = replace(exact, recorded=None)
         # those that measurements of the nominal robot do not determine, if a parameter moves them
@@ -506,20 +487,13 @@ def _prepare(text: str) -> PreparedCell:
             motions = list_unfixed_motions(posterior)
     commanded = solve_commanded_poses(robot, measured)
     return PreparedCell(
+        content,
         robot,
-        alter_noise(instrument, effects),
-        errors,
-        effects,
-        scores,
-        method,
-        level.unused,
+        alter_noise(instrument, content.effects),
         layout,
-        make_fit_options(method),
+        make_fit_options(content.method),
         measured,
-        np.array(content["held_out"]),
-        inverse(robot, content["held_out"]),
+        inverse(robot, content.held_out),
         motions,
         commanded if motions.shape[1] else commanded.take(np.arange(0)),
-        content["seed"],
-        content["trials"],
     )

@@ -58,8 +58,30 @@ standard deviations, and the iterations are fewer.
 """
 
 
+@dataclass(frozen=True)
+class CellContent:
+    """What determines the numbers of all blocks of a cell, see `describe_cell`.
+
+    robot : text of its file. trials : of a block. measured, held_out : poses (n, c) [m, rad], of
+        the content of a task.
+    """
+
+    seed: int
+    robot: str
+    trials: int = 0
+    instrument: InstrumentLevel = field(default_factory=InstrumentLevel)
+    noise: NoiseLevel = field(default_factory=NoiseLevel)
+    poses: PosesLevel = field(default_factory=PosesLevel)
+    errors: ErrorsLevel = field(default_factory=ErrorsLevel)
+    method: MethodLevel = field(default_factory=MethodLevel)
+    effects: EffectsLevel = field(default_factory=EffectsLevel)
+    scores: Scores = field(default_factory=Scores)
+    measured: tuple[tuple[float, ...], ...] = ()
+    held_out: tuple[tuple[float, ...], ...] = ()
+
+
 def describe_cell(study: Study, cell: Cell) -> dict[str, Any]:
-    """Return what determines the numbers of all blocks of a cell, as plain values."""
+    """Return the content of a cell as plain values: what differs from the defaults."""
     levels: dict[str, Any] = {n: of_factor[cell.levels[n]] for n, of_factor in study.levels.items()}
     robot = levels.pop("robot")
     levels["poses"] = replace(levels["poses"], file=None)  # its poses count, not its name
