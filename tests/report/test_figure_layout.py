@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from loopcal.report.figures.notebook_figure import make_layout
+from loopcal.report.figures.notebook_figure import FigureLayout
 from loopcal.report.figures.style import add_legend, finish_figure, label_axes, label_poses
 
 
@@ -58,7 +58,7 @@ def test_axes_are_where_matplotlib_puts_them_but_are_measured_again_only_if_tick
         measured[axes] += 1
         return measure(axes, *args, **options)
 
-    figure = _draw_everything(make_layout())
+    figure = _draw_everything(FigureLayout())
     with mock.patch.object(Axes, "get_tightbbox", count):
         places = _place(figure)
     # 0.003 of 9 inches are 2 points: the box of labels moves by less when axes are resized
@@ -68,7 +68,7 @@ def test_axes_are_where_matplotlib_puts_them_but_are_measured_again_only_if_tick
 
 
 def test_a_figure_is_measured_anew_after_the_layout() -> None:
-    figure = Figure(figsize=(4.0, 3.0), layout=make_layout())
+    figure = Figure(figsize=(4.0, 3.0), layout=FigureLayout())
     axes = figure.add_subplot()
     before = _place(figure)
     axes.set_ylabel("a label\nof three\nlines")

@@ -19,10 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-# --- The arrangement of axes in a figure: that of matplotlib, which measures no axes needlessly.
-
-
-class _FigureLayout(ConstrainedLayoutEngine):
+class FigureLayout(ConstrainedLayoutEngine):
     """The constrained layout of matplotlib in half of the time.
 
     matplotlib measures all labels, places the axes, and repeats both, because axes of another size
@@ -33,11 +30,6 @@ class _FigureLayout(ConstrainedLayoutEngine):
         """Place the axes of a figure."""
         with _remembered_margins(fig.axes):
             return super().execute(fig)
-
-
-def make_layout() -> ConstrainedLayoutEngine:
-    """Return the layout of a figure."""
-    return _FigureLayout()
 
 
 @contextmanager
@@ -94,15 +86,10 @@ PIXELS = 96
 """Pixels of an inch on a page."""
 
 
-class _NotebookFigure(Figure):
+class NotebookFigure(Figure):
     """A figure that is shown as a picture where it is the result of a cell."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
         """Return the picture, and its size on the page [pixels]."""
         width, height = (round(PIXELS * float(inches)) for inches in self.get_size_inches())
         return render_figure(self, ".png"), {"width": width, "height": height}
-
-
-def make_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of this size [inch]."""
-    return _NotebookFigure(figsize=(width, height), layout=make_layout())

@@ -9,7 +9,6 @@ from `loopcal.report.scene.scene`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,18 +26,22 @@ from loopcal.report.figures.style import (
     SEQUENTIAL,
     SMALL,
     THIN,
+    add_colorbar,
     add_legend,
     finish_figure,
     label_axes,
+    make_handle,
     start_figure,
 )
-from loopcal.report.scene.scene import Part, PoseErrors, Role, Scene, is_planar, list_parts
+from loopcal.report.scene.scene import Part, Role, Scene, is_planar, list_parts
 from loopcal.results.presenters import register
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from loopcal.apply.accuracy import AccuracyMap
 
 FLAT = 0.05
 """Width of an upright plane that contains a machine, as a share of its largest extent."""
@@ -50,40 +53,42 @@ VIEWS = {(0, 1): "from above", (0, 2): "from the side", (1, 2): "from the front"
 """Directions of the second view, by the axes that it shows."""
 
 
-@dataclass(frozen=True, eq=False)
-class Stroke:
-    """A line or points (n, 3) [m] of the picture, with the arguments of matplotlib's `plot`."""
-
-    points: FloatArray
-    style: dict[str, Any]
-
-
 @register("figure", Mechanism)
 def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Figure:
     """Draw a robot at home, or at a row of a solution, in the length unit of its file."""
     state = robot.home_state if solution is None else solution.take(np.array([row])).state
-    length = find_unit(robot.units[Dimension.LENGTH])
-    strokes = [_make_stroke(part) for part in list_parts(robot, state)]
-    strokes = [Stroke(s.points / length.factor_to_si, s.style) for s in strokes]
-    everything = np.concatenate([s.points for s in strokes])
+    length, limbs = find_unit(robot.units[Dimension.LENGTH]), robot.assembly.limbs
+    strokes = [  # lines or points (n, 3), and the arguments of matplotlib's `plot`
+        (part.points[0] / length.factor_to_si, _choose_style(part))
+        for part in list_parts(robot, state)
+    ]
+    everything = np.concatenate([points for points, _ in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
-
-    is_flat, shown = is_planar(robot), choose_view(robot)
+    is_flat, shown = is_planar(robot), [*choose_view(robot)]
     figure = start_figure(7.0 if is_flat else 11.8, 6.4 if is_flat else 6.0)
     space: Any = None if is_flat else figure.add_subplot(1, 2, 1, projection="3d")
     above: Any = figure.add_subplot() if is_flat else figure.add_subplot(1, 2, 2)
-    for stroke in strokes:
-        above.plot(*stroke.points.T[[*shown]], **stroke.style)
+    for points, style in strokes:
+        above.plot(*points.T[shown], **style)
         if space is not None:
-            space.plot(*stroke.points.T, **stroke.style)
-    limbs = strokes[: len(robot.assembly.limbs)]
-    middle = np.mean([stroke.points[0] for stroke in limbs], axis=0)
-    for stroke, limb in zip(limbs, robot.assembly.limbs, strict=True):
-        _label(space, above, stroke, limb.name, middle, shown)
+            space.plot(*points.T, **style)
+    middle = np.mean([points[0] for points, _ in strokes[: len(limbs)]], axis=0)
+    for (points, style), limb in zip(strokes, limbs, strict=False):  # first the lines of limbs
+        _name_limb(above, points[:, shown], limb.name, middle[shown], style["color"])
+        if space is not None:
+            name, place = f"  {limb.name}", points[0]
+            space.text(*place, name, fontsize=SMALL, color=style["color"], zorder=9)
     _finish(space, above, low, high, length.symbol, shown)
+    add_legend(figure, _list_handles(robot))
+    counts = {
+        "limb": len(limbs),
+        "joint": sum(len(limb.joints) for limb in limbs),
+        "rod": sum(limb.ending == "distance" for limb in limbs),
+        "actuator": len(robot.actuators),
+    }
+    words = ", ".join(name_count(n, what) for what, n in counts.items() if n)
     where = "at home" if solution is None else f"at row {row}"
-    add_legend(figure, _legend(robot))
-    return finish_figure(figure, _caption(robot, where, length.symbol))
+    return finish_figure(figure, f"{robot.name} {where}: {words}; lengths in {length.symbol}")
 
 
 def choose_view(robot: Mechanism) -> tuple[int, int]:
@@ -99,8 +104,8 @@ def choose_view(robot: Mechanism) -> tuple[int, int]:
     return (0, 1)
 
 
-def _make_stroke(part: Part) -> Stroke:
-    """Return a part at its first pose, as figures draw it."""
+def _choose_style(part: Part) -> dict[str, Any]:
+    """Return how a part is drawn."""
     color = COLORS[part.index % len(COLORS)]
     face = color if part.is_driven else "white"
     styles: dict[Role, dict[str, Any]] = {
@@ -118,54 +123,42 @@ def _make_stroke(part: Part) -> Stroke:
         "frame": {"color": FRAME_COLORS[part.index % 3], "lw": 1.4},
         "tool": _dot("*", "black", "black", 8.0),
     }
-    return Stroke(part.points[0], styles[part.role])
+    return styles[part.role]
 
 
 def _dot(marker: str, edge: str, face: str, size: float = 5.0) -> dict[str, Any]:
     return {"marker": marker, "ls": "none", "ms": size, "mec": edge, "mfc": face, "mew": 1.2}
 
 
-def _label(
-    space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray, shown: tuple[int, int]
-) -> None:
-    """Write the name of a limb beside its foot: away from the center, or diagonally where the limb
-    points away from the center, too.
+def _name_limb(axes: Any, points: FloatArray, name: str, middle: FloatArray, color: str) -> None:
+    """Write the name of a limb beside its foot: away from the middle (2,), or diagonally where the
+    limb points (n, 2) away from the middle, too.
     """
-    foot, axes = limb.points[0], [*shown]
-    away = (foot - middle)[axes]
-    if (limb.points[-1] - foot)[axes] @ away > 0.0:
+    away = points[0] - middle
+    if (points[-1] - points[0]) @ away > 0.0:
         away = np.array([away[0] - away[1], away[0] + away[1]])
     distance = float(np.linalg.norm(away))
     place = tuple(np.array([20.0, 13.0]) * (away / distance if distance > 0 else [1.0, 1.0]))
-    back = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7}
-    above.annotate(
-        name,
-        tuple(foot[axes]),
-        xytext=place,
-        textcoords="offset points",
-        ha="center",
-        va="center",
-        fontsize=8,
-        color=limb.style["color"],
-        bbox=back,
-    )
-    if space is not None:
-        space.text(*foot, f"  {name}", fontsize=SMALL, color=limb.style["color"], zorder=9)
+    axes.annotate(
+        name, tuple(points[0]), place, textcoords="offset points", ha="center", va="center",
+        fontsize=8, color=color,
+        bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7},
+    )  # fmt: skip
 
 
 def _finish(
-    space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str, shown: tuple[int, int]
+    space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str, shown: list[int]
 ) -> None:
     """Set equal scales, and units on all axes."""
-    room = MARGIN * (high - low)[[*shown]].max()  # for names beside the outermost feet
-    above.update_datalim([(low - room)[[*shown]], (high + room)[[*shown]]])
+    room = MARGIN * (high - low)[shown].max()  # for names beside the outermost feet
+    above.update_datalim([(low - room)[shown], (high + room)[shown]])
     above.set_aspect("equal", adjustable="datalim")
     above.autoscale_view()
     across, up = (f"{'xyz'[axis]} [{symbol}]" for axis in shown)
     if space is None:
         label_axes(above, across, up)
         return
-    label_axes(above, across, up, VIEWS[shown])
+    label_axes(above, across, up, VIEWS[shown[0], shown[1]])
     middle, reach = (low + high) / 2, np.maximum(high - low, 0.15 * (high - low).max()) * 0.55
     for axis, m, r in zip("xyz", middle, reach, strict=True):
         getattr(space, f"set_{axis}lim")(m - r, m + r)
@@ -177,96 +170,73 @@ def _finish(
     space.set_title("perspective", fontsize=LABEL)
 
 
-def _caption(robot: Mechanism, where: str, symbol: str) -> str:
-    """Return name and counts."""
-    limbs = robot.assembly.limbs
-    counts = {
-        "limb": len(limbs),
-        "joint": sum(len(limb.joints) for limb in limbs),
-        "rod": sum(limb.ending == "distance" for limb in limbs),
-        "actuator": len(robot.actuators),
-    }
-    words = ", ".join(name_count(n, what) for what, n in counts.items() if n)
-    return f"{robot.name} {where}: {words}; lengths in {symbol}"
-
-
-def _legend(robot: Mechanism) -> list[Any]:
+def _list_handles(robot: Mechanism) -> list[Any]:
     """Return a handle for everything that the picture of a robot contains."""
-    from matplotlib.lines import Line2D
-
     limbs = robot.assembly.limbs
     kinds = {joint.kind for limb in limbs for joint in limb.joints}
     driven = {joint.kind for limb in limbs for joint in limb.joints if joint.actuator}
     marker = "s" if "P" in driven else "o" if driven else "D"
     has_rods = any(limb.ending == "distance" for limb in limbs)
     has_rods = has_rods or any(actuator.is_triangle for actuator in robot.actuators)
+    has_axes = "R" in kinds and not is_planar(robot)
+    guide = {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}
     rows: list[tuple[str, bool, dict[str, Any]]] = [
-        (
-            "axis of a revolute joint",
-            "R" in kinds and not is_planar(robot),
-            {"color": "black", "lw": 1.2},
-        ),
-        ("guide of a sliding joint", "P" in kinds, {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}),
+        ("axis of a revolute joint", has_axes, {"color": "black", "lw": 1.2}),
+        ("guide of a sliding joint", "P" in kinds, guide),
         ("rod", has_rods, {"color": "0.4", "lw": 1.6}),
         ("driven, filled", True, _dot(marker, "0.4", "0.4")),
         ("platform", True, {"color": "0.25", "lw": 2.0}),
         ("tool", True, _dot("*", "black", "black", 8.0)),
     ]
-    return [Line2D([], [], label=label, **style) for label, is_drawn, style in rows if is_drawn]
-
-
-# --- A scene as a picture: a robot at home, measured poses with errors, and the accuracy map.
+    return [make_handle(label, **style) for label, is_drawn, style in rows if is_drawn]
 
 
 def draw_scene(scene: Scene) -> Figure:
     """Draw a robot at home; with measured poses the tool points and errors there; with an accuracy
     map the uncertainty of positions over the workspace as pale points.
     """
-    robot, poses = scene.robot, scene.poses
-    figure = draw_robot(robot)
-    factor = find_unit(robot.units[Dimension.LENGTH]).factor_to_si
-    panels = figure.axes
+    robot, poses, figure = scene.robot, scene.poses, draw_robot(scene.robot)
+    factor, flat = find_unit(robot.units[Dimension.LENGTH]).factor_to_si, [*choose_view(robot)]
+    panels = [(axes, [0, 1, 2] if axes.name == "3d" else flat) for axes in figure.axes]
     if scene.accuracy is not None:
-        _draw_map(figure, panels, scene, factor)
+        _draw_map(figure, panels, scene, scene.accuracy, factor)
     if poses is None:
         return figure
-    ends, flat = _join_ends(poses) / factor, [*choose_view(robot)]
-    for axes in panels:
-        kept = [0, 1, 2] if axes.name == "3d" else flat
-        axes.plot(*ends[:, kept].T, color=ERROR, lw=1.0, zorder=8)
+    tips = poses.tool + poses.magnification * poses.error
+    gaps = np.full(poses.tool.shape, np.nan)  # between the lines from tools to tips
+    lines = np.stack([poses.tool, tips, gaps], axis=1).reshape(-1, 3) / factor
+    for axes, kept in panels:
+        axes.plot(*lines[:, kept].T, color=ERROR, lw=1.0, zorder=8)
         axes.plot(*poses.tool[:, kept].T / factor, "o", color=POSE, ms=2.5, zorder=8)
-        if axes.name == "3d" and len(ends):
-            _include(axes, ends)
-    n = len(poses.tool)
-    count = f"{n} measured {'pose' if n == 1 else 'poses'}"
+        if axes.name == "3d" and len(lines):
+            _include(axes, lines)
+    count = name_count(len(poses.tool), "measured pose")
     title = f"{robot.name} at home, {count}; errors before calibration"
     return finish_figure(figure, f"{title}, x {poses.magnification:g}")
 
 
-def _join_ends(poses: PoseErrors) -> FloatArray:
-    """Return the ends of the errors (3 n, 3) [m], with NaN behind each."""
-    ends = (poses.tool, poses.tool + poses.magnification * poses.error)
-    return np.stack([*ends, np.full(poses.tool.shape, np.nan)], axis=1).reshape(-1, 3)
-
-
-def _draw_map(figure: Figure, panels: list[Any], scene: Scene, factor: float) -> None:
+def _draw_map(
+    figure: Figure,
+    panels: list[tuple[Any, list[int]]],
+    scene: Scene,
+    accuracy: AccuracyMap,
+    factor: float,
+) -> None:
     """Draw the uncertainty of positions where it is known, with its scale of colors."""
-    assert scene.accuracy is not None
     unit = DISPLAY_UNITS[Dimension.LENGTH]
-    values = scene.accuracy.uncertainty.position / unit.factor_to_si
+    values = accuracy.uncertainty.position / unit.factor_to_si
     known = np.isfinite(values) & np.isfinite(scene.map_points).all(axis=1)
     if not known.any():
         return
-    points, drawn, flat = scene.map_points[known] / factor, [], [*choose_view(scene.robot)]
-    for axes in panels:
-        kept = [0, 1, 2] if axes.name == "3d" else flat
-        style = {"c": values[known], "cmap": SEQUENTIAL, "s": 9.0, "marker": "s", "lw": 0.0}
-        drawn.append(axes.scatter(*points[:, kept].T, alpha=0.45, zorder=0.4, **style))
+    points, drawn = scene.map_points[known] / factor, None
+    style: dict[str, Any] = {"cmap": SEQUENTIAL, "s": 9.0, "marker": "s", "lw": 0.0, "alpha": 0.45}
+    for axes, kept in panels:
+        drawn = axes.scatter(*points[:, kept].T, c=values[known], zorder=0.4, **style)
         if axes.name == "3d":
             _include(axes, points)
-    bar: Any = figure.colorbar(drawn[-1], ax=panels[-1], aspect=30, pad=0.02, shrink=0.8)
-    bar.set_label(f"position uncertainty (rms) [{unit.symbol}]", fontsize=LABEL)
-    bar.ax.tick_params(labelsize=SMALL, width=THIN)
+    label = f"position uncertainty (rms) [{unit.symbol}]"
+    bar = add_colorbar(figure, drawn, panels[-1][0], label, aspect=30, pad=0.02, shrink=0.8)
+    bar.ax.tick_params(width=THIN)
     bar.solids.set_alpha(1.0)
 
 

@@ -65,11 +65,24 @@ of ten only; a shorter one has even steps.
 """
 
 
+ZERO = {"color": REFERENCE, "lw": THIN}
+DASHED = {**ZERO, "ls": "--"}
+"""Styles of a line at zero, and of a reference that data are compared with."""
+
+
 def start_figure(width: float, height: float) -> Figure:
     """Return an empty figure of this size [inch], which notebooks show without pyplot."""
-    from loopcal.report.figures.notebook_figure import make_figure
+    from loopcal.report.figures.notebook_figure import FigureLayout, NotebookFigure
 
-    return make_figure(width, height)
+    return NotebookFigure(figsize=(width, height), layout=FigureLayout())
+
+
+def start_panels(
+    width: float, height: float, rows: int, columns: int, **how: Any
+) -> tuple[Figure, Any]:
+    """Return a figure of this size [inch], and its panels (rows, columns); how : of `subplots`."""
+    figure = start_figure(width, height)
+    return figure, figure.subplots(rows, columns, squeeze=False, **how)
 
 
 def label_axes(axes: Axes, x: str, y: str, title: str = "", grid: bool = True) -> None:
@@ -90,6 +103,20 @@ def finish_figure(figure: Figure, title: str) -> Figure:
     return show_names(figure)
 
 
+def make_handle(label: str, **style: Any) -> Any:
+    """Return a line or marker for a legend."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, **style)
+
+
+def make_patch(label: str, color: str) -> Any:
+    """Return an area for a legend."""
+    from matplotlib.patches import Patch
+
+    return Patch(color=color, label=label)
+
+
 def add_legend(figure: Figure, handles: list[Any], most: int = MOST_COLUMNS) -> None:
     """Write a legend below all axes, where no data are: as many columns as fit, at most `most`."""
     if handles:
@@ -104,10 +131,22 @@ def add_legend(figure: Figure, handles: list[Any], most: int = MOST_COLUMNS) -> 
         )
 
 
+def add_colorbar(figure: Figure, drawn: Any, axes: Any, label: str, **how: Any) -> Any:
+    """Draw and return the scale of the colors of a picture."""
+    bar = figure.colorbar(drawn, ax=axes, **how)
+    bar.set_label(label, fontsize=LABEL)
+    bar.ax.tick_params(labelsize=SMALL)
+    return bar
+
+
+def label_rows(axes: Axes, labels: Sequence[str]) -> None:
+    """Write the labels of rows, the first on top."""
+    axes.set_yticks(range(len(labels)), labels)
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+
+
 def label_poses(axes: Axes, labels: Sequence[str]) -> None:
     """Write labels of poses at x = 1, 2, ..; numbers where there are too many to read."""
-    from matplotlib.ticker import MaxNLocator
-
     axes.set_xlim(0.3, len(labels) + 0.7)
     if len(labels) <= MOST_LABELS:
         is_long = max(map(len, labels), default=0) > 3
@@ -119,7 +158,7 @@ def label_poses(axes: Axes, labels: Sequence[str]) -> None:
         )
         axes.set_xlabel("pose", fontsize=LABEL)
     else:
-        axes.xaxis.set_major_locator(MaxNLocator(12, integer=True))
+        label_sparsely(axes.xaxis, 12)
         axes.set_xlabel("number of the pose, in order of measurement [1]", fontsize=LABEL)
 
 
@@ -134,15 +173,29 @@ def shorten(name: str, length: int = LONGEST) -> str:
     return f"{name[:half]}…{name[-half:]}"
 
 
-def label_logarithmic(axis: Any, numbers: Sequence[float] = TICKS) -> None:
-    """Write plain numbers at a logarithmic axis of matplotlib: these times powers of ten."""
+def label_logarithmic(axis: Any, numbers: Sequence[float] = TICKS, decades: int = 0) -> None:
+    """Write plain numbers at a logarithmic axis of matplotlib: these times powers of ten. On a
+    long axis, and without `numbers`, there are at most so many `decades`, where these are given.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     low, high = axis.get_view_interval()
-    subs = tuple(numbers) if high < VERY_WIDE * low else (1.0,)
-    axis.set_major_locator(LogLocator(subs=subs) if high > WIDE * low else MaxNLocator(6))
+    is_short = high < VERY_WIDE * low
+    if decades and not (is_short and numbers):
+        axis.set_major_locator(LogLocator(numticks=decades))
+    elif high > WIDE * low:
+        axis.set_major_locator(LogLocator(subs=tuple(numbers) if is_short else (1.0,)))
+    else:
+        axis.set_major_locator(MaxNLocator(6))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
+
+
+def label_sparsely(axis: Any, most: int = 10, is_whole: bool = True, **how: Any) -> None:
+    """Write at most so many numbers, or whole numbers, at an axis of matplotlib."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(most, integer=is_whole, **how))
 
 
 def show_names(figure: Figure) -> Figure:
