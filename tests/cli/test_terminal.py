@@ -11,7 +11,7 @@ import pytest
 from loopcal.cli import terminal
 from loopcal.cli.commands.calibration_commands import calibrate, validate
 from loopcal.cli.commands.study_commands import study
-from loopcal.cli.hints import HINTS, find_hint, hint_for
+from loopcal.cli.hints import find_hint, hint_for, load_hints
 from loopcal.findings import IMPORTANCE, report_finding, sort_by_importance
 from loopcal.findings.catalog import load_catalog
 from loopcal.findings.catalog.phrases import MACHINE
@@ -32,7 +32,9 @@ print("end")
 
 
 def test_hints_and_importance_use_codes_of_the_catalog():
-    assert [code for code in (*HINTS, *IMPORTANCE.split()) if code not in load_catalog()] == []
+    assert [
+        code for code in (*load_hints(), *IMPORTANCE.split()) if code not in load_catalog()
+    ] == []
 
 
 def test_hint_names_the_poses_of_its_finding():
@@ -145,5 +147,5 @@ def test_copies_of_all_rows_have_no_hint_to_exclude_them():
 
 def test_every_hint_is_shown_by_some_command() -> None:
     commands = [*list_commands().values(), *study.commands.values()]
-    never = [code for code in HINTS if not any(find_hint(code, c) for c in commands)]
+    never = [code for code in load_hints() if not any(find_hint(code, c) for c in commands)]
     assert never == []

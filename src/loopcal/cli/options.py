@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments and options that several commands share."""
+"""Arguments and options of the commands, and what several commands do with them.
+
+A command is a function whose arguments have declarations as defaults: the option --max-tilt is
+`max_tilt: float | None = option("Largest tilt ...", type=ANGLE)`. What options state together, such
+as the settings of a fit, is a `Group`: one argument, which the function receives as one value.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property
+from dataclasses import dataclass
+from functools import wraps
 from importlib import import_module
-from inspect import signature
+from inspect import cleandoc, signature
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.cli import terminal
+from loopcal.errors import DataError, LoopcalError, UnitError, suggest_names
 from loopcal.registry import Registry
 from loopcal.units import Dimension, find_unit, parse_quantity
 
@@ -31,79 +39,190 @@ if TYPE_CHECKING:
     from loopcal.planning.constraints import Constraints
     from loopcal.typing import FloatArray
 
-Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
-"""Adds an option to the function of a command."""
 
-FILE = click.Path(path_type=Path)
+@dataclass(frozen=True)
+class Declared:
+    """A parameter of a command, without the name of the argument that it is the default of."""
 
+    kind: type[click.Parameter]
+    names: tuple[str, ...]
+    settings: Mapping[str, Any]
 
-def complete_robot(
-    _context: click.Context, _argument: click.Parameter, incomplete: str
-) -> list[CompletionItem]:
-    """Return the shipped robots that begin as a word; files where there is none."""
-    from click.shell_completion import CompletionItem
-
-    from loopcal.io.robot.robot_file import list_shipped_robots
-
-    names = [name for name in list_shipped_robots() if name.startswith(incomplete)]
-    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
-
-
-robot_argument = click.argument("robot", metavar="ROBOT", shell_complete=complete_robot)
-verbose_option = click.option(
-    "-v", "--verbose", is_flag=True, help="Print all findings and tables, not only the summary."
-)
+    def build(self, name: str) -> click.Parameter:
+        """Return the parameter; an option without a long name gets that of the argument."""
+        names = self.names
+        if self.kind is not click.Argument and not any(n.startswith("--") for n in names):
+            names = (*names, f"--{name.replace('_', '-')}")
+        return self.kind([name, *names], **self.settings)
 
 
-def _check_data(_context: click.Context, _argument: click.Parameter, paths: Any) -> Any:
-    """Refuse a YAML file, such as a robot file, in place of measurements."""
-    for path in paths if isinstance(paths, tuple) else () if paths is None else (paths,):
-        if path.suffix in (".yaml", ".yml"):
-            raise DataError(f"{path} is a YAML file; give a measurement file (CSV)")
-    return paths
+class Group:
+    """Parameters that a function takes as one argument: what `make` returns of their values."""
+
+    def __init__(
+        self, make: Callable[[Mapping[str, Any]], Any] = dict, /, **members: Declared
+    ) -> None:
+        self.make, self.members = make, members
 
 
-def data_argument(metavar: str, required: bool = True) -> Decorator:
-    """Return the argument of measurement files."""
-    kind = {"type": FILE, "nargs": -1, "required": required}
-    return click.argument("data", metavar=metavar, callback=_check_data, **kind)
+def command(
+    name: str | None = None, of: click.Group | None = None
+) -> Callable[[Callable[..., terminal.Output]], click.Command]:
+    """Return a decorator that makes a command of a function that declares its options; `of` is the
+    group that the command belongs to. Every command has the option --json.
+    """
+
+    def declare(function: Callable[..., terminal.Output]) -> click.Command:
+        declared = {key: entry.default for key, entry in signature(function).parameters.items()}
+        groups = {key: entry for key, entry in declared.items() if isinstance(entry, Group)}
+
+        @wraps(function)
+        def run(as_json: bool, **values: Any) -> int:
+            for key, group in groups.items():
+                values[key] = group.make({member: values.pop(member) for member in group.members})
+            return terminal.print_output(function(**values), as_json)
+
+        members: dict[str, Declared] = {}
+        for key, entry in declared.items():
+            members |= entry.members if isinstance(entry, Group) else {key: entry}
+        members["as_json"] = flag("Print one JSON document instead of text.", "--json")
+        parameters = [entry.build(key) for key, entry in members.items()]
+        text = keep_blocks(function.__doc__ or "")
+        return (of or click).command(name, params=parameters, help=text)(run)
+
+    return declare
 
 
-def data_option(name: str, help_text: str, **kind: Any) -> Decorator:
-    """Return an option that takes a measurement file."""
-    return click.option(
-        name, type=FILE, metavar="DATA", callback=_check_data, help=help_text, **kind
-    )
+def keep_blocks(text: str) -> str:
+    """Return a help text in which click does not wrap paragraphs with an indented second line."""
+    return re.sub(r"(?<=\n\n)(?=\S.*\n )", "\b\n", cleandoc(text))
 
 
-class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """A number with its unit on the command line, such as 0.02mm; its value is in SI."""
+def _import(place: str) -> Any:
+    """Return what a place such as `package.module:NAME` names."""
+    module, _, name = place.partition(":")
+    return attrgetter(name)(import_module(module))
 
-    name = "quantity"
 
-    def __init__(self, dimension: Dimension, is_positive: bool = False) -> None:
-        self.dimension, self.is_positive = dimension, is_positive
+class LibraryOption(click.Option):
+    """An option with the default of the library: of the function, or record of options, at the
+    place `of`, that has it under the same name.
+    """
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        """Return the SI value, or fail with what is allowed."""
-        if isinstance(value, float):
-            return value
+    def __init__(self, *arguments: Any, of: str, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self.of = of
+
+    def get_default(self, ctx: click.Context, call: bool = True) -> Any:
+        """Return the default; for the help (without `call`) as a text."""
+        value = signature(_import(self.of)).parameters[self.name or ""].default
+        return self.type.show(value) if not call and isinstance(self.type, Parsed) else value
+
+
+def argument(metavar: str | None = None, **settings: Any) -> Any:
+    """Declare an argument of the command line."""
+    return Declared(click.Argument, (), {"metavar": metavar, **settings})
+
+
+def option(help: str, *names: str, **settings: Any) -> Any:  # noqa: A002
+    """Declare an option, with other names than that of the argument; `of` is the place in the
+    library that states its default, see `LibraryOption`.
+    """
+    kind = LibraryOption if "of" in settings else click.Option
+    return Declared(kind, names, {"help": help, **settings})
+
+
+def path(help: str, *names: str, **settings: Any) -> Any:  # noqa: A002
+    """Declare an option that takes the path of a file or folder."""
+    return option(help, *names, type=FILE, **settings)
+
+
+def flag(help: str, *names: str) -> Any:  # noqa: A002
+    """Declare an option without a value."""
+    return option(help, *names, is_flag=True)
+
+
+def force(what: str, more: str = "") -> Any:
+    """Declare the option that lets a command replace what exists, and `more`."""
+    exists = "they exist" if what.endswith("files") else "it exists"
+    return flag(f"Replace {what} if {exists}{more}.")
+
+
+def seed(what: str) -> Any:
+    """Declare the option for the seed of something random."""
+    return option(f"Seed of {what}.", type=click.IntRange(min=0), default=1, metavar="N")
+
+
+# Types of values
+
+
+class Parsed(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
+    """Text of the command line that a function reads; it raises LoopcalError with what is allowed.
+
+    show : returns a value as text of the command line, for a default in a help text.
+    """
+
+    def __init__(
+        self, name: str, parse: Callable[[str], Any], show: Callable[[Any], str] = str
+    ) -> None:
+        self.name, self.parse, self.show = name, parse, show
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the value, or fail with what is allowed."""
         try:
-            number = parse_quantity(value, self.dimension)
-        except UnitError as error:
+            return self.parse(value) if isinstance(value, str) else value
+        except LoopcalError as error:
             self.fail(str(error), param, ctx)
-        if self.is_positive and not number > 0.0:
-            self.fail(f"{value!r} is not above 0; give a positive number", param, ctx)
+
+
+def _quantity(dimension: Dimension, is_positive: bool = False) -> Parsed:
+    """Return the type of a number with its unit, such as 0.02mm; its value is in SI."""
+
+    def parse(text: str) -> float:
+        number = parse_quantity(text, dimension)
+        if is_positive and not number > 0.0:
+            raise UnitError(f"{text!r} is not above 0; give a positive number")
         return number
 
-    def format(self, value: float) -> str:
-        """Return a number [SI] as text of the command line, in the unit that suits its size."""
+    def show(value: float) -> str:
         unit = "mm"
-        if self.dimension is Dimension.ANGLE:
+        if dimension is Dimension.ANGLE:
             unit = "deg" if value > 1e-3 else "urad"
         return f"{value / find_unit(unit).factor_to_si:g}{unit}"
+
+    return Parsed("quantity", parse, show)
+
+
+def _parse_goal(text: str) -> tuple[float, str]:
+    """Return a length or an angle in SI, and the quantity that it limits."""
+    with suppress(UnitError):
+        return parse_quantity(text, Dimension.ANGLE), "orientation"
+    try:
+        return parse_quantity(text, Dimension.LENGTH), "position"
+    except UnitError as error:
+        raise UnitError(f"{error}; or give an angle, such as 10urad") from None
+
+
+def _parse_pose_share(text: str) -> float:
+    """Return a share of the poses, from 0 to below 1; an error says what was probably meant."""
+    from loopcal.apply.calibration_options import describe_wrong_share
+
+    try:
+        share = float(text)
+    except ValueError:
+        allowed = "a share of the poses is a number from 0 to below 1, such as 0.25 for 25 %"
+        raise DataError(f"{text!r} is no number; {allowed}.") from None
+    if fault := describe_wrong_share(share):
+        raise DataError(f"it is {fault}.")
+    return share
+
+
+FILE = click.Path(path_type=Path)
+LENGTH, POSITIVE_LENGTH = (_quantity(Dimension.LENGTH, positive) for positive in (False, True))
+ANGLE, POSITIVE_ANGLE = (_quantity(Dimension.ANGLE, positive) for positive in (False, True))
+GOAL = Parsed("quantity", _parse_goal)
+POSE_SHARE = Parsed("share", _parse_pose_share)
+OPEN_SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
 
 
 class Count(click.IntRange):
@@ -124,12 +243,6 @@ class Count(click.IntRange):
         if number > limit.most:
             self.fail(f"the limit is {limit}; give a smaller number.", param, ctx)
         return int(number)
-
-
-def _import(place: str) -> Any:
-    """Return what a place such as `package.module:NAME` names."""
-    module, _, name = place.partition(":")
-    return attrgetter(name)(import_module(module))
 
 
 class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
@@ -162,179 +275,102 @@ class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # gene
         return super().convert(value, param, ctx)
 
 
-class LibraryOption(click.Option):
-    """An option with the default of the library: of the function, or record of options, at the
-    place `of`, that has it under the same name.
-    """
-
-    def __init__(self, *arguments: Any, of: str, **settings: Any) -> None:
-        super().__init__(*arguments, **settings)
-        self.of = of
-
-    def get_default(self, ctx: click.Context, call: bool = True) -> Any:
-        """Return the default; for the help (without `call`) as a text."""
-        value = signature(_import(self.of)).parameters[self.name or ""].default
-        return self.type.format(value) if not call and isinstance(self.type, Quantity) else value
+# Declarations that several commands have
 
 
-def library_option(*names: str, of: str, **settings: Any) -> Decorator:
-    """Return an option with the default of the library, see `LibraryOption`."""
-    return click.option(*names, cls=LibraryOption, of=of, **settings)
+def complete_robot(
+    _context: click.Context, _argument: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Return the shipped robots that begin as a word; files where there is none."""
+    from click.shell_completion import CompletionItem
+
+    from loopcal.io.robot.robot_file import list_shipped_robots
+
+    names = [name for name in list_shipped_robots() if name.startswith(incomplete)]
+    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
-class PoseShare(click.types.FloatParamType):
-    """A share of the poses on the command line, from 0 to below 1."""
-
-    name = "share"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the share, or fail with what is allowed and what was probably meant."""
-        from loopcal.apply.calibration_options import describe_wrong_share
-
-        try:
-            share = float(value)
-        except ValueError:
-            allowed = "a share of the poses is a number from 0 to below 1, such as 0.25 for 25 %"
-            self.fail(f"{value!r} is no number; {allowed}.", param, ctx)
-        if fault := describe_wrong_share(share):
-            self.fail(f"it is {fault}.", param, ctx)
-        return share
+def _refuse_yaml(_context: click.Context, _argument: click.Parameter, paths: Any) -> Any:
+    """Refuse a YAML file, such as a robot file, in place of measurements."""
+    for path in paths if isinstance(paths, tuple) else () if paths is None else (paths,):
+        if path.suffix in (".yaml", ".yml"):
+            raise DataError(f"{path} is a YAML file; give a measurement file (CSV)")
+    return paths
 
 
-LENGTH = Quantity(Dimension.LENGTH)
-ANGLE = Quantity(Dimension.ANGLE)
-POSITIVE_LENGTH = Quantity(Dimension.LENGTH, is_positive=True)
-POSITIVE_ANGLE = Quantity(Dimension.ANGLE, is_positive=True)
+def data(metavar: str = "DATA...", required: bool = True) -> Any:
+    """Declare the argument of measurement files."""
+    return argument(metavar, type=FILE, nargs=-1, required=required, callback=_refuse_yaml)
 
 
-class OptionGroup:
-    """Options in the order of their help; decorates a command with all of them."""
-
-    def __init__(self, *options: Decorator) -> None:
-        self.options = options
-
-    def __call__(self, command: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the command with the options."""
-        for option in reversed(self.options):
-            command = option(command)
-        return command
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of their values in the function of the command."""
-        decorated = click.command("group")(self(lambda: None))
-        return tuple(option.name or "" for option in decorated.params)
-
-    def take(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return those of the values of a command that belong to these options."""
-        return {name: values[name] for name in self.names}
+def data_option(help: str, **settings: Any) -> Any:  # noqa: A002
+    """Declare an option that takes a measurement file."""
+    return path(help, metavar="DATA", callback=_refuse_yaml, **settings)
 
 
-def file_option(*names: str, **kind: Any) -> Decorator:
-    """Return an option that takes the path of a file or folder."""
-    return click.option(*names, type=FILE, **kind)
+ROBOT: Any = argument("ROBOT", shell_complete=complete_robot)
+RUN: Any = argument("RUN", type=FILE)
+VERBOSE: Any = flag("Print all findings and tables, not only the summary.", "-v")
 
 
-def flag_option(*names: str, help: str) -> Decorator:  # noqa: A002
-    """Return an option without a value."""
-    return click.option(*names, is_flag=True, help=help)
+def frame(names: str = "fitted, base, relative, or the frame of an instrument") -> Any:
+    """Declare the option for the frame in which errors are stated."""
+    help_text = (
+        f"Frame in which errors are stated: {names}. 'fitted' is after the best rigid fit of "
+        "the base and platform frames, as far as the measurements do not determine them."
+    )
+    return option(help_text, default="fitted", metavar="NAME", show_default=True)
 
+
+def _limit(kind: Parsed, quantity: str, example: str) -> Any:
+    text = f"Largest allowed {quantity} error on poses that were not fitted, such as {example}"
+    return option(f"{text}; above it the exit code is 2.", type=kind)
+
+
+LIMIT_POSITION = _limit(POSITIVE_LENGTH, "position", "0.02mm")
+LIMIT_ANGLE = _limit(POSITIVE_ANGLE, "orientation", "0.01deg")
 
 SHIPPED_PROFILES = ("faro", "leica", "spatial-analyzer")
-"""Profiles that come with loopcal."""
+"""Profiles of exports that come with loopcal."""
 
 
-def profile_option(help_text: str, *, required: bool = False) -> Decorator:
-    """Return the option for the profile of an export: a file, or the name of a shipped one."""
+def profile(help: str, **settings: Any) -> Any:  # noqa: A002
+    """Declare the option for the profile of an export: a file, or the name of a shipped one."""
     names = ", ".join(SHIPPED_PROFILES)
-    return click.option(
-        "--profile",
-        metavar="FILE|NAME",
-        required=required,
-        help=f"{help_text} A file (docs/exports.md), or one of {names}.",
-    )
+    text = f"{help} A file (docs/exports.md), or one of {names}."
+    return option(text, metavar="FILE|NAME", **settings)
 
 
-decimal_option = click.option(
-    "--decimal",
-    type=click.Choice(("point", "comma")),
-    help="Decimal mark of the export; with comma, semicolons separate columns in place of commas.  "
+DECIMAL: Any = option(
+    "Decimal mark of the export; with comma, semicolons separate columns in place of commas.  "
     "[default: as the profile states]",
+    type=click.Choice(("point", "comma")),
 )
 
-
-def force_option(what: str, more: str = "") -> Decorator:
-    """Return the option that lets a command replace what exists, and `more`."""
-    return flag_option(
-        "--force",
-        help=f"Replace {what} if {'they exist' if what.endswith('files') else 'it exists'}{more}.",
-    )
-
-
-def seed_option(what: str) -> Decorator:
-    """Return the option for the seed of something random."""
-    kind = click.IntRange(min=0)
-    return click.option("--seed", type=kind, default=1, metavar="N", help=f"Seed of {what}.")
-
-
-def format_option(ability: str, help_text: str) -> Decorator:
-    """Return the option for the format of a file of another program that can be read or written.
-
-    ability : `read` or `write`.
-    """
-    words = Words("loopcal.io.formats:FORMATS", property=ability)
-    return click.option("--format", "format_name", type=words, help=help_text)
-
-
-def frame_option(names: str = "fitted, base, relative, or the frame of an instrument") -> Decorator:
-    """Return the option for the frame in which errors are stated."""
-    return click.option(
-        "--frame",
-        default="fitted",
-        metavar="NAME",
-        show_default=True,
-        help=f"Frame in which errors are stated: {names}. 'fitted' is after the best rigid fit of "
-        "the base and platform frames, as far as the measurements do not determine them.",
-    )
-
-
-def _limit_option(name: str, kind: Quantity, quantity: str, example: str) -> Decorator:
-    text = f"Largest allowed {quantity} error on poses that were not fitted, such as {example}"
-    return click.option(name, type=kind, help=f"{text}; above it the exit code is 2.")
-
-
-limit_options = OptionGroup(
-    _limit_option("--limit-position", POSITIVE_LENGTH, "position", "0.02mm"),
-    _limit_option("--limit-angle", POSITIVE_ANGLE, "orientation", "0.01deg"),
+ALLOWED: Any = Group(
+    allow_still=flag("Accept a target that does not move from pose to pose."),
+    allow_outside_stroke=flag("Accept readings outside the stroke of their actuator."),
+    allow_implausible=flag(
+        "Accept values that fit far better in another unit, order, sign or column."
+    ),
+    allow_duplicates=flag("Accept rows that repeat another row to the last digit."),
 )
-"""Decorator for limits on the errors."""
-
-data_options = OptionGroup(
-    flag_option("--allow-still", help="Accept a target that does not move from pose to pose."),
-    flag_option(
-        "--allow-outside-stroke", help="Accept readings outside the stroke of their actuator."
-    ),
-    flag_option(
-        "--allow-implausible",
-        help="Accept values that fit far better in another unit, order, sign or column.",
-    ),
-    flag_option(
-        "--allow-duplicates", help="Accept rows that repeat another row to the last digit."
-    ),
-)
-"""Decorator for the flags that accept suspicious measurements."""
+"""Accept suspicious measurements."""
 
 
-def name_option(name: str) -> str:
-    """Return the option of the running command that has this name in its function."""
-    parameters = click.get_current_context().command.params
-    return next(option.opts[-1] for option in parameters if option.name == name)
+# What the user stated
 
 
 def is_given(name: str) -> bool:
     """Return whether the user stated an option on the command line."""
     source = click.get_current_context().get_parameter_source(name)
     return source is click.core.ParameterSource.COMMANDLINE
+
+
+def name_option(name: str) -> str:
+    """Return the option of the running command that has this name in its function."""
+    parameters = click.get_current_context().command.params
+    return next(option.opts[-1] for option in parameters if option.name == name)
 
 
 def refuse_given(
@@ -350,6 +386,9 @@ def refuse_given(
             raise DataError(sentence.format(option=name_option(name), reason=reason))
 
 
+# Robots and measurements
+
+
 def open_robot(
     robot: str, outputs: Iterable[Path | None], inputs: Iterable[Path | None], force: bool
 ) -> Mechanism:
@@ -359,6 +398,43 @@ def open_robot(
 
     refuse_outputs(tuple(outputs), (find_robot_file(robot), *inputs), force)
     return load_robot(robot)
+
+
+def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
+    """Read measurement files as one set.
+
+    Print a note where a file names another robot, or another file by its absolute path, or contains
+    no measured value.
+    """
+    from loopcal.diagnose.conventions.convention_check import explain_outside_strokes
+    from loopcal.io.core.csv_table import read_settings
+    from loopcal.io.core.yaml_file import list_absolute_references
+    from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements
+
+    for path in paths:
+        settings = read_settings(path)
+        for finding in list_absolute_references(settings):
+            terminal.print_note(finding)
+        stated = str(settings.content.get("robot") or "").strip()
+        if stated not in ("", robot.name):
+            facts = {"file": str(path), "stated": stated, "used": robot.name}
+            terminal.print_finding("workflow.robot-of-other-name", **facts)
+    try:
+        with terminal.ProgressBar() as progress:
+            progress(0, 1, "reading the measurements")
+            data = load_measurements(paths, robot, **allowed)
+            unfilled = list_unfilled_files(paths, data)
+    except DataError as error:
+        if error.finding is not None and error.finding.code == "data.outside-stroke":
+            accepted = load_measurements(paths, robot, **{**allowed, "allow_outside_stroke": True})
+            explained = explain_outside_strokes(robot, accepted, error.finding.data)
+            if explained is not None:
+                text = f"{' and '.join(map(str, paths))}: {explained}"
+                raise DataError(text) from DataError(explained)
+        raise
+    for file in unfilled:
+        terminal.print_finding("files.no-measured-value", file=str(file))
+    return data
 
 
 def read_checked_measurements(
@@ -382,144 +458,36 @@ def read_checked_measurements(
 
 def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None:
     """Print a note where a check of these files leaves a doubt."""
-    from loopcal.cli import terminal
-
     if check.finding is not None:
         terminal.print_note(f"{' and '.join(map(str, paths))}: {check.finding}")
 
 
 def read_fitted_measurements(
-    paths: Sequence[Path], robot: Mechanism, options: Mapping[str, Any]
+    paths: Sequence[Path], robot: Mechanism, allowed: Mapping[str, bool]
 ) -> Measurements:
-    """Read the poses that a fit would use, by `data_options`; print a note where others are held
-    out.
-    """
-    from loopcal.cli import terminal
-    from loopcal.findings import report_finding
-
-    data = read_checked_measurements(paths, robot, **data_options.take(options))
+    """Read the poses that a fit would use, as `ALLOWED`; print a note where others are held out."""
+    data = read_checked_measurements(paths, robot, **allowed)
     if count := int(data.is_held_out.sum()):
-        terminal.print_note(str(report_finding("data.held-out-not-counted", count=count)))
+        terminal.print_finding("data.held-out-not-counted", count=count)
     return data.fitted
 
 
-def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
-    """Read measurement files as one set.
+# Settings of a fit
 
-    Print a note where a file names another robot, or another file by its absolute path, or contains
-    no measured value.
-    """
-    from loopcal.cli import terminal
-    from loopcal.diagnose.conventions.convention_check import explain_outside_strokes
-    from loopcal.findings import report_finding
-    from loopcal.io.core.csv_table import read_settings
-    from loopcal.io.core.yaml_file import list_absolute_references
-    from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements
+_FIT = "loopcal.estimate.options:FitOptions"
 
-    for path in paths:
-        settings = read_settings(path)
-        for finding in list_absolute_references(settings):
-            terminal.print_note(str(finding))
-        stated = str(settings.content.get("robot") or "").strip()
-        if stated not in ("", robot.name):
-            code = "workflow.robot-of-other-name"
-            note = report_finding(code, file=str(path), stated=stated, used=robot.name)
-            terminal.print_note(str(note))
-    try:
-        with terminal.ProgressBar() as progress:
-            progress(0, 1, "reading the measurements")
-            data = load_measurements(paths, robot, **allowed)
-            unfilled = list_unfilled_files(paths, data)
-    except DataError as error:
-        if error.finding is not None and error.finding.code == "data.outside-stroke":
-            accepted = load_measurements(paths, robot, **{**allowed, "allow_outside_stroke": True})
-            explained = explain_outside_strokes(robot, accepted, error.finding.data)
-            if explained is not None:
-                text = f"{' and '.join(map(str, paths))}: {explained}"
-                raise DataError(text) from DataError(explained)
-        raise
-    for file in unfilled:
-        terminal.print_note(str(report_finding("files.no-measured-value", file=str(file))))
-    return data
-
-
-FIT = "loopcal.estimate.options:FitOptions"
-
-rank_tolerance_option = library_option(
-    "--rank-tolerance",
-    of=FIT,
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+RANK_TOLERANCE: Any = option(
+    "Share of the largest singular value below which one counts as zero.",
+    of=_FIT,
+    type=OPEN_SHARE,
     metavar="SHARE",
-    help="Share of the largest singular value below which one counts as zero.",
 )
-"""Decorator of a command that decides a rank."""
-
-fit_options = OptionGroup(
-    click.option(
-        "--method",
-        type=Words("loopcal.estimate.methods:METHODS"),
-        default="auto",
-        help="map: the tolerances are a prior. auto: map, with tolerances inflated where the "
-        "data contradict them. least-squares (or ls): without tolerances. ridge, truncated-svd "
-        "(or tsvd): regularized least squares.",
-    ),
-    click.option(
-        "--inflation",
-        type=Words("loopcal.estimate.tolerance_components:By", "none"),
-        help="For auto: which tolerances may be inflated. global: all by one factor. groups: also "
-        "limbs and types of parameters, and what these have in common. heavy-tailed: also single "
-        "parameters. auto, the default: all of these. none: as stated.",
-    ),
-    click.option(
-        "--lam",
-        type=click.FloatRange(min=0),
-        metavar="WEIGHT",
-        help="For ridge: weight of the penalty; by default chosen by cross-validation.",
-    ),
-    click.option(
-        "--keep",
-        type=click.IntRange(min=0),
-        metavar="K",
-        help="For truncated-svd: number of directions; by default chosen by cross-validation.",
-    ),
-    library_option(
-        "--noise",
-        of=FIT,
-        type=Words("loopcal.estimate.options:Noise"),
-        help="Take the stated sigmas as true, or as true up to one common factor that is "
-        "estimated.",
-    ),
-    library_option(
-        "--sigma-uncertainty",
-        of=FIT,
-        type=click.FloatRange(0, 1),
-        metavar="SHARE",
-        help="Relative standard uncertainty of given sigmas, which the intervals account for; 0 "
-        "takes them as exact.",
-    ),
-    click.option(
-        "--loss",
-        type=Words("loopcal.estimate.losses:LOSSES", "none"),
-        default="none",
-        help="Reduce the weight of poses that are far from the fit.",
-    ),
-    rank_tolerance_option,
-    click.option(
-        "--drop",
-        "excluded_poses",
-        multiple=True,
-        metavar="POSE",
-        help="Exclude this pose from fit and validation. May be given several times.",
-    ),
-)
-"""Decorator of a command that fits; `make_fit_options` takes their values."""
 
 
-def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
-    """Return the options of the library from those of `fit_options`."""
+def _make_fit_options(stated: Mapping[str, Any]) -> FitOptions:
+    """Return the options of the library from those of `FIT`."""
     from loopcal.estimate.options import FitOptions, find_foreign_setting
 
-    stated = fit_options.take(options)
     if (foreign := find_foreign_setting(stated)) is not None:
         raise DataError(
             f"--{foreign[0]} belongs to --method {foreign[1]}, not to {stated['method']}; leave it "
@@ -528,87 +496,123 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     return FitOptions.from_dict(stated)
 
 
-INSTRUMENT = "loopcal.apply.simulated_measurements:InstrumentDescription"
+FIT: Any = Group(
+    _make_fit_options,
+    method=option(
+        "map: the tolerances are a prior. auto: map, with tolerances inflated where the "
+        "data contradict them. least-squares (or ls): without tolerances. ridge, truncated-svd "
+        "(or tsvd): regularized least squares.",
+        type=Words("loopcal.estimate.methods:METHODS"),
+        default="auto",
+    ),
+    inflation=option(
+        "For auto: which tolerances may be inflated. global: all by one factor. groups: also "
+        "limbs and types of parameters, and what these have in common. heavy-tailed: also single "
+        "parameters. auto, the default: all of these. none: as stated.",
+        type=Words("loopcal.estimate.tolerance_components:By", "none"),
+    ),
+    lam=option(
+        "For ridge: weight of the penalty; by default chosen by cross-validation.",
+        type=click.FloatRange(min=0),
+        metavar="WEIGHT",
+    ),
+    keep=option(
+        "For truncated-svd: number of directions; by default chosen by cross-validation.",
+        type=click.IntRange(min=0),
+        metavar="K",
+    ),
+    noise=option(
+        "Take the stated sigmas as true, or as true up to one common factor that is estimated.",
+        of=_FIT,
+        type=Words("loopcal.estimate.options:Noise"),
+    ),
+    sigma_uncertainty=option(
+        "Relative standard uncertainty of given sigmas, which the intervals account for; 0 "
+        "takes them as exact.",
+        of=_FIT,
+        type=click.FloatRange(0, 1),
+        metavar="SHARE",
+    ),
+    loss=option(
+        "Reduce the weight of poses that are far from the fit.",
+        type=Words("loopcal.estimate.losses:LOSSES", "none"),
+        default="none",
+    ),
+    rank_tolerance=RANK_TOLERANCE,
+    excluded_poses=option(
+        "Exclude this pose from fit and validation. May be given several times.",
+        "--drop",
+        multiple=True,
+        metavar="POSE",
+    ),
+)
 
-instrument_options = OptionGroup(
-    click.option(
-        "--kind",
-        default="pose",
-        help="Kind of measurement: pose, component, position, bearing, ...; or several, such "
+# Instruments
+
+_INSTRUMENT = "loopcal.apply.simulated_measurements:InstrumentDescription"
+
+INSTRUMENT: Any = Group(
+    kind=option(
+        "Kind of measurement: pose, component, position, bearing, ...; or several, such "
         "as position,inclination.",
+        default="pose",
     ),
-    click.option(
-        "--components",
-        metavar="NAMES",
-        help="Coordinates that the kind 'component' measures, such as z or x,y,z.",
+    components=option(
+        "Coordinates that the kind 'component' measures, such as z or x,y,z.", metavar="NAMES"
     ),
-    click.option(
-        "--orientation",
+    orientation=option(
+        "Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...",
         metavar="FORM",
-        help="Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...",
     ),
-    library_option(
-        "--sigma-position",
-        of=INSTRUMENT,
-        type=POSITIVE_LENGTH,
-        help="Standard deviation of each measured length.",
+    sigma_position=option(
+        "Standard deviation of each measured length.", of=_INSTRUMENT, type=POSITIVE_LENGTH
     ),
-    library_option(
-        "--sigma-angle",
-        of=INSTRUMENT,
-        type=POSITIVE_ANGLE,
-        help="Standard deviation of each measured angle.",
+    sigma_angle=option(
+        "Standard deviation of each measured angle.", of=_INSTRUMENT, type=POSITIVE_ANGLE
     ),
 )
-"""Decorator for the kind of measurement and its noise; `make_instrument` takes their values."""
+"""The kind of measurement and its noise, for `make_instrument`."""
 
-unknown_options = OptionGroup(
-    click.option(
-        "--measure",
+UNKNOWN: Any = Group(
+    measure=option(
+        "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.",
         metavar="NAMES",
-        help="Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.",
     ),
-    click.option(
-        "--frames",
+    frames=option(
+        "Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
         metavar="NAMES",
-        help="Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
     ),
-    click.option(
-        "--targets",
+    targets=option(
+        "Targets at unknown places on the platform, of a kind such as position: SMR1,SMR2,SMR3.",
         metavar="NAMES",
-        help="Targets at unknown places on the platform, of a kind such as position: "
-        "SMR1,SMR2,SMR3.",
     ),
 )
-"""Decorator for the short form of components, and for unknown frames and targets."""
+"""The short form of components, and unknown frames and targets, for `make_instrument`."""
 
-draw_option = click.option(
-    "--draw",
+DRAW: Any = option(
+    "Number of poses to draw evenly from the workspace where no poses are given.",
     type=Count("DRAWN_POSES", 1),
     default=40,
     metavar="N",
-    help="Number of poses to draw evenly from the workspace where no poses are given.",
 )
 
-distribution_option = library_option(
-    "--distribution",
-    of=INSTRUMENT,
-    type=Words("loopcal.measure.instrument:Distribution"),
-    help="Distribution of the noise of measured values. Uniform noise lies within sqrt(3) = 1.732 "
+DISTRIBUTION: Any = option(
+    "Distribution of the noise of measured values. Uniform noise lies within sqrt(3) = 1.732 "
     "standard deviations; a limit of 1 um is --sigma-position 0.57735um.",
+    of=_INSTRUMENT,
+    type=Words("loopcal.measure.instrument:Distribution"),
 )
-"""Decorator of a command that simulates noise."""
 
-sigma_reading_option = click.option(
-    "--sigma-reading",
-    metavar="QUANTITY",
-    help="Standard deviation of the recorded actuator readings, for all or each, such as "
+SIGMA_READING: Any = option(
+    "Standard deviation of the recorded actuator readings, for all or each, such as "
     "q1=5um,q2=20urad.  [default: as in the robot file]",
+    metavar="QUANTITY",
 )
 
 
-def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) -> Instrument:
-    """Return the instrument of `instrument_options`, and of `unknown_options` if there are any.
+def make_instrument(stated: Mapping[str, Any], robot: Mechanism | None = None) -> Instrument:
+    """Return the instrument of `INSTRUMENT`, and of `UNKNOWN` and the distribution where they are
+    stated.
 
     `robot` : gives targets of unknown place an assumed one; only needed where there are targets.
     """
@@ -618,8 +622,8 @@ def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) 
         place_targets,
     )
 
-    kind, components = options["kind"], options["components"]
-    orientation, measure = options["orientation"], options.get("measure")
+    kind, components = stated["kind"], stated["components"]
+    orientation, measure = stated["orientation"], stated.get("measure")
     if measure is not None:
         if components is not None or kind != "pose":
             raise DataError(
@@ -628,17 +632,17 @@ def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) 
         kind, components = "component", measure
         if orientation is None and {"phi", "theta", "psi"} & set(measure.split(",")):
             orientation = "tilt-torsion"
-    frames, targets = options.get("frames"), options.get("targets")
+    frames, targets = stated.get("frames"), stated.get("targets")
     instrument = build_instrument(
         InstrumentDescription(
             kinds=tuple(kind.split(",")),
             components=tuple(components.split(",")) if components else (),
             orientation=orientation,
-            sigma_position=options["sigma_position"],
-            sigma_angle=options["sigma_angle"],
+            sigma_position=stated["sigma_position"],
+            sigma_angle=stated["sigma_angle"],
             unknown_frames=tuple(frames.split(",")) if frames is not None else (),
             targets=tuple(targets.split(",")) if targets is not None else (),
-            distribution=options.get("distribution", "normal"),
+            distribution=stated.get("distribution", "normal"),
         )
     )
     return instrument if robot is None else place_targets(instrument, robot)
@@ -672,90 +676,32 @@ def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None
     return np.array(list(sigma.values()))
 
 
-class Goal(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """A length or an angle with its unit: of positions ("position") or of orientations."""
+# Constraints of planned poses
 
-    name = "quantity"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, str]:
-        """Return the SI value and the quantity it limits, or fail with what is allowed."""
-        if isinstance(value, tuple):
-            return value
-        with suppress(UnitError):
-            return parse_quantity(value, Dimension.ANGLE), "orientation"
-        try:
-            return parse_quantity(value, Dimension.LENGTH), "position"
-        except UnitError as error:
-            self.fail(f"{error}; or give an angle, such as 10urad", param, ctx)
+_SIGHT = "loopcal.planning.constraints:LineOfSight"
 
 
-constraint_options = OptionGroup(
-    library_option(
-        "--min-margin",
-        of="loopcal.planning.constraints:Constraints",
-        type=float,
-        help="Smallest distance from a singularity, as a share of the median of the workspace.",
-    ),
-    click.option(
-        "--stroke-margin",
-        type=Goal(),
-        help="Distance of all readings from both ends of their strokes, such as 5mm; 2deg for "
-        "actuators that turn.",
-    ),
-    click.option("--max-tilt", type=ANGLE, help="Largest tilt of the platform, such as 20deg."),
-    click.option(
-        "--seen-from",
-        metavar="X,Y,Z",
-        help="Position of the instrument in the base frame, such as 1.5m,-0.8m,1.1m.",
-    ),
-    click.option(
-        "--facing",
-        default="0,0,1",
-        metavar="X,Y,Z",
-        help="With --seen-from: direction of the target in the axes of the platform.",
-    ),
-    library_option(
-        "--cone",
-        of="loopcal.planning.constraints:LineOfSight",
-        type=ANGLE,
-        help="With --seen-from: half angle of the cone in which the target is visible.",
-    ),
-    library_option(
-        "--nearest",
-        of="loopcal.planning.constraints:LineOfSight",
-        type=LENGTH,
-        help="With --seen-from: smallest distance of the target.",
-    ),
-    click.option(
-        "--farthest", type=LENGTH, help="With --seen-from: largest distance of the target."
-    ),
-)
-"""Decorator of a command that plans; `make_constraints` takes their values."""
-
-
-def make_constraints(options: Mapping[str, Any]) -> Constraints:
-    """Return the constraints of the library from those of `constraint_options`."""
+def _make_constraints(stated: Mapping[str, Any]) -> Constraints:
+    """Return the constraints of the library from those of `CONSTRAINTS`."""
     from loopcal.planning.constraints import Constraints, LineOfSight
 
-    margin, measured = options["stroke_margin"] or (0.0, "position")
+    margin, measured = stated["stroke_margin"] or (0.0, "position")
     margins = {"stroke_margin" if measured == "position" else "stroke_margin_angle": margin}
-    if options["seen_from"] is None:
+    if stated["seen_from"] is None:
         refuse_given(
             ("facing", "cone", "nearest", "farthest"),
             "state the position of the instrument with --seen-from",
             "{option} belongs to a line of sight; {reason}",
         )
-        return Constraints(options["min_margin"], options["max_tilt"], None, **margins)
+        return Constraints(stated["min_margin"], stated["max_tilt"], None, **margins)
     sight = LineOfSight(
-        _parse_three(options["seen_from"], "--seen-from", Dimension.LENGTH),
-        _parse_three(options["facing"], "--facing", None),
-        options["cone"],
-        options["nearest"],
-        math.inf if options["farthest"] is None else options["farthest"],
+        _parse_three(stated["seen_from"], "--seen-from", Dimension.LENGTH),
+        _parse_three(stated["facing"], "--facing", None),
+        stated["cone"],
+        stated["nearest"],
+        math.inf if stated["farthest"] is None else stated["farthest"],
     )
-    return Constraints(options["min_margin"], options["max_tilt"], sight, **margins)
+    return Constraints(stated["min_margin"], stated["max_tilt"], sight, **margins)
 
 
 def _parse_three(text: str, option: str, dimension: Dimension | None) -> FloatArray:
@@ -774,3 +720,34 @@ def _parse_three(text: str, option: str, dimension: Dimension | None) -> FloatAr
         example = "0,0,1" if dimension is None else "1.5m,-0.8m,1.1m"
         raise DataError(f"{option} is {text!r}{reason}; give three numbers, such as {example}")
     return np.array(numbers)
+
+
+CONSTRAINTS: Any = Group(
+    _make_constraints,
+    min_margin=option(
+        "Smallest distance from a singularity, as a share of the median of the workspace.",
+        of="loopcal.planning.constraints:Constraints",
+        type=float,
+    ),
+    stroke_margin=option(
+        "Distance of all readings from both ends of their strokes, such as 5mm; 2deg for "
+        "actuators that turn.",
+        type=GOAL,
+    ),
+    max_tilt=option("Largest tilt of the platform, such as 20deg.", type=ANGLE),
+    seen_from=option(
+        "Position of the instrument in the base frame, such as 1.5m,-0.8m,1.1m.", metavar="X,Y,Z"
+    ),
+    facing=option(
+        "With --seen-from: direction of the target in the axes of the platform.",
+        default="0,0,1",
+        metavar="X,Y,Z",
+    ),
+    cone=option(
+        "With --seen-from: half angle of the cone in which the target is visible.",
+        of=_SIGHT,
+        type=ANGLE,
+    ),
+    nearest=option("With --seen-from: smallest distance of the target.", of=_SIGHT, type=LENGTH),
+    farthest=option("With --seen-from: largest distance of the target.", type=LENGTH),
+)

@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import wraps
 from io import TextIOWrapper
 from pathlib import Path
 from types import TracebackType
@@ -60,33 +59,24 @@ class Output:
     exit_code: int | None = None
 
 
-def shows_output(function: Callable[..., Output]) -> Callable[..., int]:
-    """Return the function of a command that prints its output, with the option --json."""
+def print_output(output: Output, as_json: bool) -> int:
+    """Print what a command has found out, and return its exit code."""
+    page = None if as_json else output.page()
+    if as_json and output.document is not None:
+        from loopcal.io.core.text_file import to_json
 
-    @click.option(
-        "--json", "as_json", is_flag=True, help="Print one JSON document instead of text."
-    )
-    @wraps(function)
-    def run(as_json: bool, **options: Any) -> int:
-        output = function(**options)
-        page = None if as_json else output.page()
-        if as_json and output.document is not None:
-            from loopcal.io.core.text_file import to_json
+        print_text(to_json(output.document))
+    elif isinstance(page, str):
+        print_text(page)
+    elif page:
+        from loopcal.results.tables import render_text
 
-            print_text(to_json(output.document))
-        elif isinstance(page, str):
-            print_text(page)
-        elif page:
-            from loopcal.results.tables import render_text
-
-            print_text(render_text(page, width()) + "\n")
-        failures = list(output.failures)
-        if as_json or not (output.shown and sys.stdout.isatty()):
-            for failure in failures:
-                print_message(f"loopcal: quality gate not met: {failure}")
-        return (2 if failures else 0) if output.exit_code is None else output.exit_code
-
-    return run
+        print_text(render_text(page, width()) + "\n")
+    failures = list(output.failures)
+    if as_json or not (output.shown and sys.stdout.isatty()):
+        for failure in failures:
+            print_message(f"loopcal: quality gate not met: {failure}")
+    return (2 if failures else 0) if output.exit_code is None else output.exit_code
 
 
 def print_text(text: str) -> None:
@@ -154,9 +144,16 @@ def print_message(text: str) -> None:
         click.echo(text, err=True)
 
 
-def print_note(text: str) -> None:
-    """Print a note on standard error."""
+def print_note(text: object) -> None:
+    """Print a text or finding as a note on standard error."""
     print_message(f"loopcal: note: {text}")
+
+
+def print_finding(code: str, **facts: Any) -> None:
+    """Print the finding of a code as a note on standard error."""
+    from loopcal.findings import report_finding
+
+    print_note(report_finding(code, **facts))
 
 
 class ProgressBar:

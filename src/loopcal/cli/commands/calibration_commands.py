@@ -6,112 +6,64 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-import click
-
+import loopcal as lc
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for, list_hints, with_hint
-from loopcal.cli.options import (
-    FILE,
-    Count,
-    PoseShare,
-    Words,
-    data_argument,
-    data_options,
-    file_option,
-    fit_options,
-    flag_option,
-    force_option,
-    frame_option,
-    library_option,
-    limit_options,
-    make_fit_options,
-    print_convention_note,
-    read_checked_measurements,
-    read_fitted_measurements,
-    read_measurements,
-    robot_argument,
-    seed_option,
-    verbose_option,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.findings import Finding
     from loopcal.results.tables import Block
 
-TAKEN_OPTIONS = (
-    "limit_position",
-    "limit_angle",
-    "choose_model",
-    "free_limb",
-    "frame",
-    "allow_still",
-)
-"""Options of the command that options of the library have by the same name."""
 
-
-@click.command()
-@robot_argument
-@data_argument("DATA...")
-@file_option("-o", "--output", help="Run folder to make.", required=True)
-@library_option(
-    "--hold-out",
-    of="loopcal.apply.calibration_options:CalibrationOptions",
-    type=PoseShare(),
-    metavar="SHARE",
-    help="Share of the poses, from 0 to below 1, to keep out of the fit for validation, such as "
-    "0.25. The poses are those of data.split(hold_out=SHARE, seed=SEED) in Python.",
-)
-@fit_options
-@flag_option(
-    "--choose-model",
-    help="Free only as many parameters as held-out predictions justify: offsets, then lengths, "
-    "ideal, complete, and what the controller stores; prints their condition numbers.",
-)
-@file_option(
-    "--prior",
-    help="Run folder of an earlier calibration of this machine, which is used as the prior.",
-    metavar="RUN",
-)
-@file_option(
-    "--compare",
-    help="Stored values to compare with the estimate, such as those of a firmware: a robot file, "
-    "or a file with the table 'identified' of some parameters.",
-)
-@click.option(
-    "--free-limb",
-    metavar="LIMB",
-    help="With --prior: a limb that was repaired, such as leg3, whose parameters return to nominal "
-    "with their tolerances.",
-)
-@frame_option()
-@limit_options
-@seed_option("the choice of held-out poses")
-@data_options
-@force_option("the run", ", and call the robot file of a failed calibration robot.yaml")
-@verbose_option
-@shows_output
+@opt.command()
 def calibrate(
-    robot: str,
-    data: tuple[Path, ...],
-    output: Path,
-    hold_out: float,
-    prior: Path | None,
-    compare: Path | None,
-    seed: int,
-    force: bool,
-    verbose: bool,
-    **options: Any,
+    robot: str = opt.ROBOT,
+    data: tuple[Path, ...] = opt.data(),
+    output: Path = opt.path("Run folder to make.", "-o", required=True),
+    hold_out: float = opt.option(
+        "Share of the poses, from 0 to below 1, to keep out of the fit for validation, such as "
+        "0.25. The poses are those of data.split(hold_out=SHARE, seed=SEED) in Python.",
+        of="loopcal.apply.calibration_options:CalibrationOptions",
+        type=opt.POSE_SHARE,
+        metavar="SHARE",
+    ),
+    fit: lc.FitOptions = opt.FIT,
+    choose_model: bool = opt.flag(
+        "Free only as many parameters as held-out predictions justify: offsets, then lengths, "
+        "ideal, complete, and what the controller stores; prints their condition numbers."
+    ),
+    prior: Path | None = opt.path(
+        "Run folder of an earlier calibration of this machine, which is used as the prior.",
+        metavar="RUN",
+    ),
+    compare: Path | None = opt.path(
+        "Stored values to compare with the estimate, such as those of a firmware: a robot file, "
+        "or a file with the table 'identified' of some parameters."
+    ),
+    free_limb: str | None = opt.option(
+        "With --prior: a limb that was repaired, such as leg3, whose parameters return to nominal "
+        "with their tolerances.",
+        metavar="LIMB",
+    ),
+    frame: str = opt.frame(),
+    limit_position: float | None = opt.LIMIT_POSITION,
+    limit_angle: float | None = opt.LIMIT_ANGLE,
+    seed: int = opt.seed("the choice of held-out poses"),
+    allowed: dict[str, bool] = opt.ALLOWED,
+    force: bool = opt.force(
+        "the run", ", and call the robot file of a failed calibration robot.yaml"
+    ),
+    verbose: bool = opt.VERBOSE,
 ) -> Output:
     """Identify the free parameters of ROBOT from DATA, validate them on held-out poses, and write a
     run folder with the corrected robot file.
 
     DATA may be several files, which are joined by the names of poses.
 
-    \b
     The verdict is one of
       calibrated                    use the result
       calibrated with reservations  usable; a warning affects its accuracy
@@ -122,7 +74,6 @@ def calibrate(
     "Not calibrated" means that the fit did not converge, the residuals contradict the stated noise,
     errors on held-out poses grew, or a limit is exceeded.
 
-    \b
     Examples:
       loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
       loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm
@@ -130,18 +81,10 @@ def calibrate(
       loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
       loopcal calibrate robot.yaml samples.csv -o run --compare published.yaml
-    """  # noqa: D301
-    from loopcal.apply.calibration import calibrate
-    from loopcal.apply.calibration_options import CalibrationOptions
+    """
     from loopcal.io.data.measurement_file import list_measurement_files
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot, load_stored_values
-    from loopcal.io.runs.run_folder import (
-        build_document,
-        load_run,
-        name_robot_file,
-        refuse_run_folder,
-        save_run,
-    )
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.io.runs.run_folder import build_document, name_robot_file, refuse_run_folder
     from loopcal.io.runs.run_result import RESULT
     from loopcal.report.calibration_view import view_calibration
 
@@ -150,25 +93,29 @@ def calibrate(
         inputs["prior"] = prior / RESULT
     if compare is not None:
         inputs["compare"] = find_robot_file(compare)
-    machine = load_robot(robot)
-    settings = CalibrationOptions(
-        make_fit_options(options),
+    machine = lc.load_robot(robot)
+    settings = lc.CalibrationOptions(
+        fit,
         hold_out,
         seed=seed,
-        prior=None if prior is None else load_run(prior).load_posterior(),
-        compare_with=None if compare is None else load_stored_values(compare, machine),
-        check_conventions=not options["allow_implausible"],
-        **{name: options[name] for name in TAKEN_OPTIONS},
+        limit_position=limit_position,
+        limit_angle=limit_angle,
+        choose_model=choose_model,
+        prior=None if prior is None else lc.load_run(prior).load_posterior(),
+        free_limb=free_limb,
+        frame=frame,
+        compare_with=None if compare is None else lc.load_stored_values(compare, machine),
+        check_conventions=not allowed.pop("allow_implausible"),
+        allow_still=allowed.pop("allow_still"),
     )
     refuse_run_folder(output, force, list(inputs.values()))
-    allowed = {name: options[name] for name in ("allow_outside_stroke", "allow_duplicates")}
-    measurements = read_measurements(data, machine, **allowed)
+    measurements = opt.read_measurements(data, machine, **allowed)
     with terminal.ProgressBar() as progress:
-        report = calibrate(machine, measurements, settings, progress)
-    print_convention_note(report.conventions, data)
+        report = lc.calibrate(machine, measurements, settings, progress)
+    opt.print_convention_note(report.conventions, data)
     with terminal.ProgressBar() as progress:
         progress(0, 1, "writing the run folder")
-        save_run(output, report, inputs, sys.argv, force)
+        lc.save_run(output, report, inputs, sys.argv, force)
     written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
     return Output(
         build_document(report, inputs, sys.argv),
@@ -179,53 +126,40 @@ def calibrate(
     )
 
 
-@click.command()
-@click.argument("run", metavar="RUN", type=FILE)
-@shows_output
-def budget(run: Path) -> Output:
+@opt.command()
+def budget(run: Path = opt.RUN) -> Output:
     """Show the uncertainty budget of RUN, a run folder: what each source of errors contributes to
     poses and parameters, and what half its sigma would gain.
 
     The frame of the pose errors is that of the calibration, see its option --frame. A run without
     intervals has no budget.
 
-    \b
     Examples:
       loopcal budget run
       loopcal budget run --json
-    """  # noqa: D301
-    from loopcal.io.runs.run_folder import load_run
+    """
     from loopcal.report.calibration_view import view_budget
 
-    calibrated = load_run(run)
+    calibrated = lc.load_run(run)
     content = calibrated.load_budget()
     return Output(content, lambda: view_budget(content, calibrated.robot))
 
 
-@click.command()
-@click.argument("run", metavar="RUN", type=FILE)
-@data_argument("DATA...")
-@limit_options
-@data_options
-@click.option(
-    "--refit",
-    multiple=True,
-    metavar="NAME",
-    help="Frame, target or surface that was moved since RUN, to be fitted to DATA again. May be "
-    "given several times.",
-)
-@flag_option("--allow-fitted-data", help="Accept measurements that the run was fitted to.")
-@verbose_option
-@shows_output
+@opt.command()
 def validate(
-    run: Path,
-    data: tuple[Path, ...],
-    limit_position: float | None,
-    limit_angle: float | None,
-    refit: tuple[str, ...],
-    allow_fitted_data: bool,
-    verbose: bool,
-    **flags: bool,
+    run: Path = opt.RUN,
+    data: tuple[Path, ...] = opt.data(),
+    limit_position: float | None = opt.LIMIT_POSITION,
+    limit_angle: float | None = opt.LIMIT_ANGLE,
+    allowed: dict[str, bool] = opt.ALLOWED,
+    refit: tuple[str, ...] = opt.option(
+        "Frame, target or surface that was moved since RUN, to be fitted to DATA again. May be "
+        "given several times.",
+        multiple=True,
+        metavar="NAME",
+    ),
+    allow_fitted_data: bool = opt.flag("Accept measurements that the run was fitted to."),
+    verbose: bool = opt.VERBOSE,
 ) -> Output:
     """Compare the robot of RUN, a run folder or a robot file, with DATA, one file or several.
 
@@ -237,28 +171,26 @@ def validate(
 
     The exit code is 2 where a limit is exceeded.
 
-    \b
     Examples:
       loopcal validate run more-measurements.csv
       loopcal validate run more.csv --limit-position 0.02mm --limit-angle 0.01deg
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
-    """  # noqa: D301
+    """
     from loopcal.apply.validation import report_reused_rows
-    from loopcal.apply.validation import validate as validate_robot
     from loopcal.io.runs.run_folder import load_run_or_robot
     from loopcal.measure.observations import check_instruments
     from loopcal.report.validation_view import view_validation
 
     calibrated = load_run_or_robot(run)
-    measurements = read_checked_measurements(data, calibrated.robot, **flags)
-    noted: list[Finding] = []
+    measurements = opt.read_checked_measurements(data, calibrated.robot, **allowed)
+    noted: list[lc.Finding] = []
     if not allow_fitted_data:
         reused = report_reused_rows(calibrated.fitted_rows, measurements)
         noted += [] if reused is None else [reused]
     noted += check_instruments(measurements.all_observations)
     for finding in noted:
-        terminal.print_note(str(finding))
-    validation = validate_robot(
+        terminal.print_note(finding)
+    validation = lc.validate(
         calibrated.robot,
         measurements,
         limit_position,
@@ -278,39 +210,27 @@ def validate(
     )
 
 
-@click.command()
-@click.argument("run", metavar="RUN", type=FILE)
-@click.argument("targets", metavar="TARGETS", type=FILE)
-@file_option("-o", "--output", help="CSV file to write; without it the CSV text is printed.")
-@library_option(
-    "--mode",
-    of="loopcal.apply.compensation:compensate",
-    type=Words("loopcal.apply.compensation:Mode"),
-    help="Actuator readings to set, or shifted commands for a controller that cannot be changed.",
-)
-@click.option(
-    "--controller",
-    metavar="ROBOT",
-    help="Robot file with the geometry of the controller; by default the nominal robot.",
-)
-@library_option(
-    "--steps",
-    of="loopcal.apply.compensation:compensate",
-    type=Count("STEPS", 1),
-    help="Iterations of the shifted commands.",
-)
-@frame_option()
-@force_option("the output file", ", and compute also from a calibration that failed")
-@shows_output
+@opt.command()
 def compensate(
-    run: Path,
-    targets: Path,
-    output: Path | None,
-    mode: Literal["readings", "commands"],
-    controller: str | None,
-    steps: int,
-    frame: str,
-    force: bool,
+    run: Path = opt.RUN,
+    targets: Path = opt.argument("TARGETS", type=opt.FILE),
+    output: Path | None = opt.path("CSV file to write; without it the CSV text is printed.", "-o"),
+    mode: Literal["readings", "commands"] = opt.option(
+        "Actuator readings to set, or shifted commands for a controller that cannot be changed.",
+        of="loopcal.apply.compensation:compensate",
+        type=opt.Words("loopcal.apply.compensation:Mode"),
+    ),
+    controller: str | None = opt.option(
+        "Robot file with the geometry of the controller; by default the nominal robot.",
+        metavar="ROBOT",
+    ),
+    steps: int = opt.option(
+        "Iterations of the shifted commands.",
+        of="loopcal.apply.compensation:compensate",
+        type=opt.Count("STEPS", 1),
+    ),
+    frame: str = opt.frame(),
+    force: bool = opt.force("the output file", ", and compute also from a calibration that failed"),
 ) -> Output:
     """Compute readings or commands with which the machine of RUN reaches TARGETS, a CSV file of
     controlled coordinates.
@@ -321,18 +241,14 @@ def compensate(
     The exit code is 2 where a target cannot be reached, or where RUN failed; then nothing is
     written without --force.
 
-    \b
     Examples:
       loopcal compensate run targets.csv -o readings.csv
       loopcal compensate run targets.csv --mode commands -o commands.csv
-    """  # noqa: D301
-    from loopcal.apply.compensation import compensate as compensate_targets
+    """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.robot.robot_file import load_robot
     from loopcal.io.runs.result_files import format_compensation, load_targets
     from loopcal.io.runs.run_folder import find_failure, load_posterior_or_robot
-    from loopcal.mechanism.model import Mechanism
     from loopcal.report.calibration_view import view_compensation
 
     inputs = (run, targets, None if controller is None else Path(controller))
@@ -341,13 +257,11 @@ def compensate(
     if failure is not None and not force:
         return Output(None, list, [with_hint(failure)])
     known = load_posterior_or_robot(run)
-    robot = known if isinstance(known, Mechanism) else known.robot
+    robot = known if isinstance(known, lc.Mechanism) else known.robot
     coordinates, labels = load_targets(targets, robot)
-    old = None if controller is None else load_robot(controller)
+    old = None if controller is None else lc.load_robot(controller)
     with terminal.ProgressBar() as progress:
-        result = compensate_targets(
-            known, coordinates, mode, old, steps, labels, progress, frame=frame
-        )
+        result = lc.compensate(known, coordinates, mode, old, steps, labels, progress, frame=frame)
     if output is not None:
         write_text(output, format_compensation(result))
     missed = [
@@ -365,22 +279,21 @@ def compensate(
     return Output(result.to_dict(), view, failures)
 
 
-@click.command()
-@click.argument("run", metavar="[RUN]", type=FILE, required=False)
-@click.argument("facts", metavar="[FACTS]", type=FILE, required=False)
-@flag_option("--new", help="Print a file FACTS to fill in.")
-@shows_output
-def certificate(run: Path | None, facts: Path | None, new: bool) -> Output:
+@opt.command()
+def certificate(
+    run: Path | None = opt.argument("[RUN]", type=opt.FILE, required=False),
+    facts: Path | None = opt.argument("[FACTS]", type=opt.FILE, required=False),
+    new: bool = opt.flag("Print a file FACTS to fill in."),
+) -> Output:
     """Print a digital calibration certificate of RUN: XML by PTB's schema DCC 3.3.0.
 
     FACTS is a YAML file with what a run does not know: laboratory, customer, dates, serial number.
     Instruments are those that the measurement files state.
 
-    \b
     Examples:
       loopcal certificate --new > facts.yaml
       loopcal certificate run facts.yaml > certificate.xml
-    """  # noqa: D301
+    """
     from loopcal.io.runs.certificate import TEMPLATE, format_certificate, load_administration
     from loopcal.io.runs.run_folder import load_run_or_robot
 
@@ -394,27 +307,22 @@ def certificate(run: Path | None, facts: Path | None, new: bool) -> Output:
     return Output({"certificate": text}, lambda: text)
 
 
-@click.command()
-@click.argument("runs", metavar="RUN...", type=FILE, nargs=-1, required=True)
-@click.option(
-    "--data",
-    "data",
-    type=FILE,
-    multiple=True,
-    metavar="DATA",
-    help="Measurements at which the errors of all runs are compared. May be given several times.",
-)
-@file_option(
-    "-o",
-    "--output",
-    help="File to write: .html (a page with figures), .json, or .csv (one row for each run and "
-    "parameter).",
-)
-@data_options
-@force_option("the output file")
-@shows_output
+@opt.command()
 def compare(
-    runs: tuple[Path, ...], data: tuple[Path, ...], output: Path | None, force: bool, **flags: Any
+    runs: tuple[Path, ...] = opt.argument("RUN...", type=opt.FILE, nargs=-1, required=True),
+    data: tuple[Path, ...] = opt.option(
+        "Measurements at which the errors of all runs are compared. May be given several times.",
+        type=opt.FILE,
+        multiple=True,
+        metavar="DATA",
+    ),
+    output: Path | None = opt.path(
+        "File to write: .html (a page with figures), .json, or .csv (one row for each run and "
+        "parameter).",
+        "-o",
+    ),
+    allowed: dict[str, bool] = opt.ALLOWED,
+    force: bool = opt.force("the output file"),
 ) -> Output:
     """Compare calibrations side by side: two or more run folders, of sessions, machines or methods.
 
@@ -426,38 +334,35 @@ def compare(
     Runs whose parameters do not mean the same are refused: other mechanisms, free parameters, or
     fixed values.
 
-    \b
     Examples:
       loopcal compare may june
       loopcal compare map ridge --data more.csv
       loopcal compare may june july -o sessions.html
       loopcal compare may june july -o sessions.csv
-    """  # noqa: D301
-    from loopcal.apply.run_comparison import compare_runs
-    from loopcal.documents import ENDINGS, check_ending, write_comparison
+    """
+    from loopcal.documents import ENDINGS, check_ending
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.runs.run_folder import load_run
     from loopcal.report.validation_view import find_error_units, view_comparison
 
     if output is not None:
         check_ending(output, "comparison", ENDINGS)
         refuse_outputs((output,), (*runs, *data), force)
-    loaded = [load_run(run) for run in runs]
-    measurements = read_checked_measurements(data, loaded[0].robot, **flags) if data else None
-    comparison = compare_runs(loaded, measurements)
+    loaded = [lc.load_run(run) for run in runs]
+    measurements = opt.read_checked_measurements(data, loaded[0].robot, **allowed) if data else None
+    comparison = lc.compare_runs(loaded, measurements)
     if output is not None:
-        write_comparison(output, comparison)
+        lc.write_comparison(output, comparison)
     written = [] if output is None else ["", f"Written to {output}"]
     units = find_error_units(comparison).__getitem__
     return Output(comparison.to_dict(), lambda: [*view_comparison(comparison, units), *written])
 
 
-@click.command()
-@click.argument("robot", metavar="ROBOT", type=FILE)
-@data_argument("DATA...")
-@data_options
-@shows_output
-def repeatability(robot: Path, data: tuple[Path, ...], **flags: bool) -> Output:
+@opt.command()
+def repeatability(
+    robot: Path = opt.argument("ROBOT", type=opt.FILE),
+    data: tuple[Path, ...] = opt.data(),
+    allowed: dict[str, bool] = opt.ALLOWED,
+) -> Output:
     """Compute pose accuracy (AP) and repeatability (RP) by ISO 9283 from DATA, in which each pose
     of ROBOT, a run folder or a robot file, was visited several times.
 
@@ -465,36 +370,33 @@ def repeatability(robot: Path, data: tuple[Path, ...], **flags: bool) -> Output:
     same commanded coordinates. The geometry of ROBOT is that of the controller. Visits from several
     directions have the direction in the column group.
 
-    \b
     Examples:
       loopcal repeatability robot.yaml visits.csv
       loopcal repeatability run visits.csv --json
-    """  # noqa: D301
-    from loopcal.apply.repeatability import assess_repeatability
+    """
     from loopcal.io.runs.run_folder import load_run_or_robot
     from loopcal.report.validation_view import view_repeatability
 
     calibrated = load_run_or_robot(robot)
-    measurements = read_checked_measurements(data, calibrated.robot, **flags)
-    result = assess_repeatability(calibrated.robot, measurements, calibrated.nuisance_values)
+    measurements = opt.read_checked_measurements(data, calibrated.robot, **allowed)
+    result = lc.assess_repeatability(calibrated.robot, measurements, calibrated.nuisance_values)
     return Output(result.to_dict(), lambda: view_repeatability(result, calibrated.robot))
 
 
-@click.command()
-@click.argument("run", metavar="RUN", type=FILE)
-@file_option(
-    "-o",
-    "--output",
-    help="HTML file to write; its name ends in .html. The same content is written as JSON beside "
-    "it. Default: report.html.",
-    default=Path("report.html"),
-)
-@flag_option(
-    "--pdf", help="Also print the report to a PDF file beside it, by an installed Chromium."
-)
-@force_option("the output files")
-@shows_output
-def report(run: Path, output: Path, pdf: bool, force: bool) -> Output:
+@opt.command()
+def report(
+    run: Path = opt.RUN,
+    output: Path = opt.path(
+        "HTML file to write; its name ends in .html. The same content is written as JSON beside "
+        "it. Default: report.html.",
+        "-o",
+        default=Path("report.html"),
+    ),
+    pdf: bool = opt.flag(
+        "Also print the report to a PDF file beside it, by an installed Chromium."
+    ),
+    force: bool = opt.force("the output files"),
+) -> Output:
     """Write the report of RUN, a run folder, as one HTML file that needs no network.
 
     It contains the verdict with its scope, what the data do not determine, errors at held-out
@@ -503,23 +405,21 @@ def report(run: Path, output: Path, pdf: bool, force: bool) -> Output:
 
     The exit code is 2 where the calibration failed; the report is written and says so.
 
-    \b
     Examples:
       loopcal report run
       loopcal report run -o hexapod.html --pdf
-    """  # noqa: D301
-    from loopcal.documents import check_browser, name_files, print_pdf, write_report
+    """
+    from loopcal.documents import check_browser, name_files, print_pdf
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.runs.run_folder import load_run
 
     files = [*name_files(output), *([output.with_suffix(".pdf")] if pdf else [])]
-    calibrated = load_run(run)
+    calibrated = lc.load_run(run)
     refuse_outputs(files, [run / name for name in calibrated.result.get("files", {})], force)
     if pdf:
         check_browser(files[-1])
     with terminal.ProgressBar() as progress:
         progress(0, 1, "writing the report")
-        write_report(output, calibrated)
+        lc.write_report(output, calibrated)
         if pdf:
             progress(0, 1, "printing the report")
             print_pdf(output, files[-1])
@@ -528,33 +428,23 @@ def report(run: Path, output: Path, pdf: bool, force: bool) -> Output:
     return Output({"output": files, "reasons": failures}, lambda: [written], failures)
 
 
-@click.command()
-@robot_argument
-@data_argument("DATA...")
-@file_option("-o", "--output", help="Folder to make, with the curves and their figure.")
-@library_option(
-    "--folds",
-    of="loopcal.diagnose.cross_validation:compute_regularization_curves",
-    type=Count("FOLDS", 2),
-    metavar="N",
-    help="Number of folds of poses where frames, targets or surfaces are unknown.",
-)
-@click.option(
-    "--drop", multiple=True, metavar="POSE", help="Exclude this pose. May be given several times."
-)
-@seed_option("the folds")
-@force_option("the folder")
-@data_options
-@shows_output
+@opt.command()
 def regularize(
-    robot: str,
-    data: tuple[Path, ...],
-    output: Path | None,
-    folds: int,
-    drop: tuple[str, ...],
-    seed: int,
-    force: bool,
-    **flags: Any,
+    robot: str = opt.ROBOT,
+    data: tuple[Path, ...] = opt.data(),
+    output: Path | None = opt.path("Folder to make, with the curves and their figure.", "-o"),
+    folds: int = opt.option(
+        "Number of folds of poses where frames, targets or surfaces are unknown.",
+        of="loopcal.diagnose.cross_validation:compute_regularization_curves",
+        type=opt.Count("FOLDS", 2),
+        metavar="N",
+    ),
+    drop: tuple[str, ...] = opt.option(
+        "Exclude this pose. May be given several times.", multiple=True, metavar="POSE"
+    ),
+    seed: int = opt.seed("the folds"),
+    force: bool = opt.force("the folder"),
+    allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
     """Show how the error at held-out poses depends on the ridge parameter lam and on the number k
     of directions of truncated SVD, for your own DATA, and which values the rules choose.
@@ -562,32 +452,29 @@ def regularize(
     Use a chosen value with loopcal calibrate --method ridge --lam, or --method truncated-svd
     --keep.
 
-    \b
     Examples:
       loopcal regularize hexapod-42 measurements.csv
       loopcal regularize robot.yaml measurements.csv -o curves
-    """  # noqa: D301
-    from loopcal.diagnose.cross_validation import compute_regularization_curves
-    from loopcal.estimate.options import FitOptions
+    """
     from loopcal.io.core.outputs import refuse_folder, write_result_folder
     from loopcal.io.data.measurement_file import list_measurement_files
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot
+    from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.io.runs.result_files import CURVES, CURVES_FORMAT, PICTURE, POINTS
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.report.figures.fit_figures import draw_regularization
     from loopcal.report.pictures import render_figure
     from loopcal.report.validation_view import tabulate_points, view_regularization
 
-    machine = load_robot(robot)
+    machine = lc.load_robot(robot)
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
     if output is not None:
         refuse_folder(output, CURVES, force, list(inputs.values()))
-    measurements = read_fitted_measurements(data, machine, flags)
+    measurements = opt.read_fitted_measurements(data, machine, allowed)
     with terminal.ProgressBar() as progress:
-        curves = compute_regularization_curves(
+        curves = lc.compute_regularization_curves(
             machine,
             measurements,
-            options=FitOptions(excluded_poses=drop),
+            options=lc.FitOptions(excluded_poses=drop),
             folds=folds,
             seed=seed,
             progress=progress,

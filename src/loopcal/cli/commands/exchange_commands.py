@@ -11,35 +11,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+import loopcal as lc
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.hints import with_hint
-from loopcal.cli.options import (
-    FILE,
-    LENGTH,
-    POSITIVE_LENGTH,
-    OptionGroup,
-    decimal_option,
-    file_option,
-    flag_option,
-    force_option,
-    format_option,
-    name_option,
-    open_robot,
-    print_convention_note,
-    profile_option,
-    read_measurements,
-    refuse_given,
-    robot_argument,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
 from loopcal.errors import DataError
 from loopcal.units import Dimension, find_unit, list_symbols
 
 if TYPE_CHECKING:
-    from loopcal.apply.calibration_report import CalibrationReport
-    from loopcal.findings import Finding
     from loopcal.io.formats.program_format import Format
-    from loopcal.mechanism.model import Mechanism
     from loopcal.results.tables import Block
 
 
@@ -47,37 +28,26 @@ SHOWN = 20
 """Lines that do not match a profile that are listed."""
 
 
-@click.command()
-@robot_argument
-@click.argument("plan", metavar="PLAN", type=FILE)
-@click.option(
-    "--feed",
-    type=float,
-    metavar="NUMBER",
-    help="Feed per minute, in the unit of the program.  [default: 300 mm, in inches as fast]",
-)
-@click.option(
-    "--pause",
-    type=float,
-    metavar="SECONDS",
-    help="Time to wait at each pose (G4).  [default: stop until the operator continues, M0]",
-)
-@click.option(
-    "--unit",
-    type=click.Choice(("mm", "in")),
-    help="Unit of lengths in the program.  [default: that of ROBOT, or mm]",
-)
-@file_option("-o", "--output", help="Program to write, such as poses.ngc.", required=True)
-@force_option("the output file")
-@shows_output
+@opt.command()
 def gcode(
-    robot: str,
-    plan: Path,
-    feed: float | None,
-    pause: float | None,
-    unit: Literal["mm", "in"] | None,
-    output: Path,
-    force: bool,
+    robot: str = opt.ROBOT,
+    plan: Path = opt.argument("PLAN", type=opt.FILE),
+    feed: float | None = opt.option(
+        "Feed per minute, in the unit of the program.  [default: 300 mm, in inches as fast]",
+        type=float,
+        metavar="NUMBER",
+    ),
+    pause: float | None = opt.option(
+        "Time to wait at each pose (G4).  [default: stop until the operator continues, M0]",
+        type=float,
+        metavar="SECONDS",
+    ),
+    unit: Literal["mm", "in"] | None = opt.option(
+        "Unit of lengths in the program.  [default: that of ROBOT, or mm]",
+        type=click.Choice(("mm", "in")),
+    ),
+    output: Path = opt.path("Program to write, such as poses.ngc.", "-o", required=True),
+    force: bool = opt.force("the output file"),
 ) -> Output:
     """Write G-code that moves ROBOT to the poses of PLAN, a folder or its plan.csv, in order.
 
@@ -85,11 +55,10 @@ def gcode(
     home. X Y Z A B C are machine coordinates (G53) of the platform. Each straight path is checked
     for strokes, joint limits and singularities.
 
-    \b
     Examples:
       loopcal gcode hexapod.yaml plan -o poses.ngc
       loopcal gcode hexapod.yaml plan -o poses.ngc --feed 600 --pause 5
-    """  # noqa: D301
+    """
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.gcode_program import (
         DEFAULT_FEED,
@@ -100,7 +69,7 @@ def gcode(
     )
     from loopcal.planning.path import check_route
 
-    machine = open_robot(robot, (output,), (plan,), force)
+    machine = opt.open_robot(robot, (output,), (plan,), force)
     is_in_inches = machine.units[Dimension.LENGTH] == "in"
     program_unit: Literal["mm", "in"] = unit or ("in" if is_in_inches else "mm")
     feed_unit = find_unit(program_unit).factor_to_si / 60.0  # [m/s]
@@ -115,45 +84,29 @@ def gcode(
     return Output({"program": output, **counts}, lambda: page)
 
 
-@click.command()
-@robot_argument
-@click.argument("sheet", metavar="SHEET", type=FILE)
-@click.argument("exports", metavar="EXPORT...", type=FILE, nargs=-1, required=True)
-@profile_option("How to read EXPORT.", required=True)
-@click.option(
-    "--unit",
-    type=click.Choice(list_symbols(Dimension.LENGTH)),
-    help="Unit of lengths in EXPORT.  [default: as the profile states]",
-)
-@decimal_option
-@flag_option(
-    "--by-order",
-    help="Ignore names: EXPORT has the points of all targets of the first pose, then those of the "
-    "second, and so on.",
-)
-@flag_option(
-    "--one-session",
-    help="Several EXPORTs: the instrument was not moved between them. Otherwise each is a session.",
-)
-@flag_option(
-    "--allow-implausible",
-    help="Accept points that are not where the robot is expected, or in another unit.",
-)
-@file_option("-o", "--output", help="Measurement file to write.", required=True)
-@force_option("the output file")
-@shows_output
+@opt.command()
 def fill(
-    robot: str,
-    sheet: Path,
-    exports: tuple[Path, ...],
-    profile: str,
-    unit: str | None,
-    decimal: str | None,
-    by_order: bool,
-    one_session: bool,
-    allow_implausible: bool,
-    output: Path,
-    force: bool,
+    robot: str = opt.ROBOT,
+    sheet: Path = opt.argument("SHEET", type=opt.FILE),
+    exports: tuple[Path, ...] = opt.argument("EXPORT...", type=opt.FILE, nargs=-1, required=True),
+    profile: str = opt.profile("How to read EXPORT.", required=True),
+    unit: str | None = opt.option(
+        "Unit of lengths in EXPORT.  [default: as the profile states]",
+        type=click.Choice(list_symbols(Dimension.LENGTH)),
+    ),
+    decimal: str | None = opt.DECIMAL,
+    by_order: bool = opt.flag(
+        "Ignore names: EXPORT has the points of all targets of the first pose, then those of the "
+        "second, and so on."
+    ),
+    one_session: bool = opt.flag(
+        "Several EXPORTs: the instrument was not moved between them. Otherwise each is a session."
+    ),
+    allow_implausible: bool = opt.flag(
+        "Accept points that are not where the robot is expected, or in another unit."
+    ),
+    output: Path = opt.path("Measurement file to write.", "-o", required=True),
+    force: bool = opt.force("the output file"),
 ) -> Output:
     """Fill in SHEET, the measurements.csv of a plan of ROBOT, with the points of an instrument's
     EXPORT.
@@ -161,7 +114,6 @@ def fill(
     Points are joined by their names: POSE_TARGET, such as 12_SMR1. Missing, unknown and repeated
     points are listed. Points that lie where others are expected are refused.
 
-    \b
     Examples:
       loopcal fill hexapod.yaml plan/measurements.csv points.txt --profile spatial-analyzer \\
           -o measured.csv
@@ -169,7 +121,7 @@ def fill(
           --decimal comma -o measured.csv
       loopcal fill hexapod.yaml plan/measurements.csv monday.txt tuesday.txt --profile faro \\
           --unit in -o measured.csv
-    """  # noqa: D301
+    """
     from loopcal.diagnose.conventions.convention_check import check_conventions
     from loopcal.diagnose.point_names import examine_points
     from loopcal.io.exports.conversion import save_converted
@@ -177,7 +129,7 @@ def fill(
     from loopcal.io.exports.sheet_filling import fill_sheet
 
     path = find_profile_file(profile)
-    machine = open_robot(robot, (output,), (sheet, *exports, path), force)
+    machine = opt.open_robot(robot, (output,), (sheet, *exports, path), force)
     filled = fill_sheet(
         machine,
         sheet,
@@ -190,7 +142,7 @@ def fill(
     conventions = check_conventions(
         machine, filled.data.fitted, allow_implausible=allow_implausible
     )
-    print_convention_note(conventions, exports)
+    opt.print_convention_note(conventions, exports)
     save_converted(filled.text, output)
     findings = (*filled.findings, *examined)
     misfits = [{"file": f, "line": n, "reason": reason} for f, n, reason in filled.misfits]
@@ -225,7 +177,7 @@ def convert_instrument_export(
 
     used = {"file", "profile", "output", "force", "as_json", "length_unit", "decimal"}
     names = (option.name or "" for option in click.get_current_context().command.params)
-    refuse_given(
+    opt.refuse_given(
         (name for name in names if name not in used),
         "with --profile, which states how the file is read",
     )
@@ -260,70 +212,62 @@ TAPED = (
 """What the option --sigma-tape is for."""
 
 
-@click.command("import")
-@click.argument("file", metavar="FILE", type=FILE)
-@format_option("read", "Format of FILE; by default chosen by the ending of its name.")
-@profile_option("Instead of --format: how to read FILE, the export of an instrument.")
-@decimal_option
-@file_option(
-    "-o",
-    "--output",
-    help="Robot file to write, which names the robot; with --profile the measurement file.",
-    required=True,
+def _sigma(what: str, default: str) -> Any:
+    return opt.option(f"Noise of {what}.  [default: {default}]", type=opt.POSITIVE_LENGTH)
+
+
+SETTINGS: Any = opt.Group(
+    sigma_height=_sigma("the probe (klipper, marlin, reprap)", "0.02mm"),
+    sigma_distance=_sigma("distances (klipper)", "0.1mm"),
+    sigma_line=_sigma("lines (hangprinter)", "1mm"),
+    sigma_position=_sigma("known positions (hangprinter)", "1mm"),
+    sigma_tape=_sigma(TAPED, "10mm for lines"),
+    sigma_anchor=_sigma("anchors that FILE states (hangprinter)", "none: they are first guesses"),
+    length_unit=opt.option(
+        "Unit of lengths (linuxcnc; with --profile, in place of the one it states).",
+        "--unit",
+        type=click.Choice(list_symbols(Dimension.LENGTH)),
+    ),
+    home_height=opt.option("Height of the home pose (linuxcnc).", "--home-z", type=opt.LENGTH),
+    closures=opt.path("Loops that a URDF closes (urdf); by default FILE with the ending .yaml."),
+    platform=opt.option(
+        "Link that is the platform (urdf); by default the one on a fixed joint.", metavar="LINK"
+    ),
 )
-@file_option("--data", help="Also write the measurements that FILE or --probes contain.")
-@file_option(
-    "--probes",
-    multiple=True,
-    metavar="REPORT",
-    help="What the firmware printed when it probed the bed (marlin: G30, G33 P3 V0, M114; reprap: "
-    "G32 with bed.g, heightmap.csv). May be given several times.",
-)
-@file_option(
-    "--corrected", help="Also calibrate with them, and write FILE with the corrected numbers."
-)
-@OptionGroup(
-    *(
-        click.option(
-            f"--sigma-{of}", type=POSITIVE_LENGTH, help=f"Noise of {what}.  [default: {default}]"
-        )
-        for of, what, default in (
-            ("height", "the probe (klipper, marlin, reprap)", "0.02mm"),
-            ("distance", "distances (klipper)", "0.1mm"),
-            ("line", "lines (hangprinter)", "1mm"),
-            ("position", "known positions (hangprinter)", "1mm"),
-            ("tape", TAPED, "10mm for lines"),
-            ("anchor", "anchors that FILE states (hangprinter)", "none: they are first guesses"),
-        )
-    )
-)
-@click.option(
-    "--unit",
-    "length_unit",
-    type=click.Choice(list_symbols(Dimension.LENGTH)),
-    help="Unit of lengths (linuxcnc; with --profile, in place of the one it states).",
-)
-@click.option("--home-z", "home_height", type=LENGTH, help="Height of the home pose (linuxcnc).")
-@file_option(
-    "--closures", help="Loops that a URDF closes (urdf); by default FILE with the ending .yaml."
-)
-@click.option(
-    "--platform",
-    metavar="LINK",
-    help="Link that is the platform (urdf); by default the one on a fixed joint.",
-)
-@force_option("an output file", ", and write --corrected even where the calibration failed")
-@shows_output
+"""How FILE is read."""
+
+
+@opt.command("import")
 def import_(
-    file: Path,
-    format_name: str | None,
-    profile: str | None,
-    decimal: str | None,
-    output: Path,
-    data: Path | None,
-    corrected: Path | None,
-    force: bool,
-    **settings: Any,
+    file: Path = opt.argument("FILE", type=opt.FILE),
+    format_name: str | None = opt.option(
+        "Format of FILE; by default chosen by the ending of its name.",
+        "--format",
+        type=opt.Words("loopcal.io.formats:FORMATS", property="read"),
+    ),
+    profile: str | None = opt.profile(
+        "Instead of --format: how to read FILE, the export of an instrument."
+    ),
+    decimal: str | None = opt.DECIMAL,
+    output: Path = opt.path(
+        "Robot file to write, which names the robot; with --profile the measurement file.",
+        "-o",
+        required=True,
+    ),
+    data: Path | None = opt.path("Also write the measurements that FILE or --probes contain."),
+    probes: Path = opt.path(
+        "What the firmware printed when it probed the bed (marlin: G30, G33 P3 V0, M114; reprap: "
+        "G32 with bed.g, heightmap.csv). May be given several times.",
+        multiple=True,
+        metavar="REPORT",
+    ),
+    corrected: Path | None = opt.path(
+        "Also calibrate with them, and write FILE with the corrected numbers."
+    ),
+    settings: dict[str, Any] = SETTINGS,
+    force: bool = opt.force(
+        "an output file", ", and write --corrected even where the calibration failed"
+    ),
 ) -> Output:
     """Read FILE, which another program wrote, as a robot file and, where it contains any,
     measurements.
@@ -334,7 +278,6 @@ def import_(
     With --corrected, the exit code is 2 where the calibration failed, as in loopcal calibrate. Then
     the corrected file is not written without --force.
 
-    \b
     Examples:
       loopcal import printer.cfg -o printer.yaml --data heights.csv
       loopcal import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg
@@ -345,17 +288,18 @@ def import_(
       loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
       loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
-    """  # noqa: D301
+    """
     from loopcal.diagnose.fit_examination import compare_stored_geometry
     from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.formats.import_export import choose_format, list_formats, save_imported
     from loopcal.io.formats.program_format import ImportOptions
 
+    settings |= {"probes": probes}
     if profile is not None:
         local = (settings["length_unit"], decimal == "comma")
         return convert_instrument_export(file, profile, local, output, force)
-    refuse_given(("decimal",), "without --profile")
+    opt.refuse_given(("decimal",), "without --profile")
     source = choose_format(file, format_name)
     if source.read is None:
         raise DataError(
@@ -366,14 +310,14 @@ def import_(
     if corrected is not None and data is None:
         raise DataError(CORRECTED_ALONE)
     beside = file.with_suffix(".yaml") if source.name == "urdf" else None
-    inputs = (file, settings["closures"] or beside, *settings["probes"])
+    inputs = (file, settings["closures"] or beside, *probes)
     refuse_outputs((output, data), inputs, force)
     refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected
     stated = {key: value for key, value in settings.items() if value not in (None, ())}
     for key in stated:
         if key not in source.read_options:
             raise DataError(
-                f"{name_option(key)} does not belong to the format {source.name}; leave it out"
+                f"{opt.name_option(key)} does not belong to the format {source.name}; leave it out"
             )
     imported = source.read(file, ImportOptions(make_name(output.stem), **stated))
     with restore_on_failure((output, data)):
@@ -411,25 +355,24 @@ class _Correction:
     `failure` : why it failed; then the file is only written where that was demanded.
     """
 
-    report: CalibrationReport
-    failure: Finding | None
+    report: lc.CalibrationReport
+    failure: lc.Finding | None
     changes: tuple[str, ...]
     is_written: bool
 
 
 def _correct_file(
-    source: Format, robot: Mechanism, file: Path, data: Path, output: Path, force: bool
+    source: Format, robot: lc.Mechanism, file: Path, data: Path, output: Path, force: bool
 ) -> _Correction:
     """Calibrate with the imported measurements, and write the corrected file."""
-    from loopcal.apply.calibration import calibrate
     from loopcal.findings import report_finding
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import export_robot
     from loopcal.io.formats.program_format import ExportSource
     from loopcal.io.runs.run_folder import list_reasons
 
-    report = calibrate(robot, read_measurements([data], robot))
-    print_convention_note(report.conventions, [data])
+    report = lc.calibrate(robot, opt.read_measurements([data], robot))
+    opt.print_convention_note(report.conventions, [data])
     failure, is_written = None, force or not report.failures
     if report.failures:
         failure = report_finding(
@@ -446,9 +389,9 @@ def _correct_file(
 
 
 def _view_import(
-    robot: Mechanism,
+    robot: lc.Mechanism,
     document: dict[str, Any],
-    noted: Sequence[Finding],
+    noted: Sequence[lc.Finding],
     correction: _Correction | None,
 ) -> list[Block]:
     """Return what was read, what was identified, and which lines were changed."""
@@ -472,23 +415,23 @@ def _view_import(
     return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
 
 
-@click.command()
-@click.argument("source", metavar="RUN|ROBOT")
-@format_option("write", "Format to write; by default chosen by the ending of -o.")
-@file_option(
-    "--into",
-    help="File of the controller to correct; everything else in it stays as it is.",
-    metavar="FILE",
-)
-@file_option(
-    "-o",
-    "--output",
-    help="File to write; without it, --format prints what to type, with sensible digits.",
-)
-@force_option("the output file", ", and write also the numbers of a calibration that failed")
-@shows_output
+@opt.command()
 def export(
-    source: str, format_name: str | None, into: Path | None, output: Path | None, force: bool
+    source: str = opt.argument("RUN|ROBOT"),
+    format_name: str | None = opt.option(
+        "Format to write; by default chosen by the ending of -o.",
+        "--format",
+        type=opt.Words("loopcal.io.formats:FORMATS", property="write"),
+    ),
+    into: Path | None = opt.path(
+        "File of the controller to correct; everything else in it stays as it is.", metavar="FILE"
+    ),
+    output: Path | None = opt.path(
+        "File to write; without it, --format prints what to type, with sensible digits.", "-o"
+    ),
+    force: bool = opt.force(
+        "the output file", ", and write also the numbers of a calibration that failed"
+    ),
 ) -> Output:
     """Write the parameters of RUN, or of a robot file, as another program reads them.
 
@@ -497,13 +440,12 @@ def export(
     what the format cannot express. The exit code is 2 where the calibration of RUN
     failed; then nothing is written without --force.
 
-    \b
     Examples:
       loopcal export run --format marlin
       loopcal export run --format klipper --into printer.cfg -o corrected.cfg
       loopcal export run --format reprap -o config-override.g
       loopcal export run -o parameters.csv
-    """  # noqa: D301
+    """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import choose_format, export_robot, load_source

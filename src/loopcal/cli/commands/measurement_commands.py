@@ -8,90 +8,48 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
+import loopcal as lc
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.hints import list_hints
-from loopcal.cli.options import (
-    POSITIVE_ANGLE,
-    POSITIVE_LENGTH,
-    data_argument,
-    data_options,
-    distribution_option,
-    draw_option,
-    file_option,
-    flag_option,
-    force_option,
-    instrument_options,
-    make_instrument,
-    open_robot,
-    parse_reading_sigma,
-    rank_tolerance_option,
-    read_fitted_measurements,
-    refuse_given,
-    robot_argument,
-    seed_option,
-    sigma_reading_option,
-    unknown_options,
-    verbose_option,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.apply.simulated_measurements import SimulatedMeasurements
-    from loopcal.mechanism.model import Mechanism
 
 
-@click.command()
-@robot_argument
-@data_argument("[DATA]...", required=False)
-@file_option("--poses", help="Instead of DATA: CSV file of poses that could be measured.")
-@draw_option
-@seed_option("the drawn poses")
-@unknown_options
-@flag_option(
-    "--reduce",
-    "reduced",
-    help="Also choose a smallest set of parameters, and show what the others are merged into.",
-)
-@file_option(
-    "-o", "--output", help="With --reduce: robot file to write, with the other parameters fixed."
-)
-@force_option("the output file")
-@instrument_options
-@sigma_reading_option
-@rank_tolerance_option
-@click.option(
-    "--useful",
-    type=POSITIVE_LENGTH,
-    metavar="QUANTITY",
-    help="Also show what the data determine to this standard deviation of lengths, such as 1um.",
-)
-@click.option(
-    "--useful-angle",
-    type=POSITIVE_ANGLE,
-    metavar="QUANTITY",
-    help="The same for angles. Default: the length over the size of ROBOT.",
-)
-@data_options
-@verbose_option
-@shows_output
+@opt.command()
 def identifiability(
-    robot: str,
-    data: tuple[Path, ...],
-    poses: Path | None,
-    draw: int,
-    seed: int,
-    reduced: bool,
-    output: Path | None,
-    force: bool,
-    sigma_reading: str | None,
-    rank_tolerance: float,
-    useful: float | None,
-    useful_angle: float | None,
-    verbose: bool,
-    **options: Any,
+    robot: str = opt.ROBOT,
+    data: tuple[Path, ...] = opt.data("[DATA]...", required=False),
+    poses: Path | None = opt.path("Instead of DATA: CSV file of poses that could be measured."),
+    draw: int = opt.DRAW,
+    seed: int = opt.seed("the drawn poses"),
+    unknown: dict[str, Any] = opt.UNKNOWN,
+    reduced: bool = opt.flag(
+        "Also choose a smallest set of parameters, and show what the others are merged into.",
+        "--reduce",
+    ),
+    output: Path | None = opt.path(
+        "With --reduce: robot file to write, with the other parameters fixed.", "-o"
+    ),
+    force: bool = opt.force("the output file"),
+    instrument: dict[str, Any] = opt.INSTRUMENT,
+    sigma_reading: str | None = opt.SIGMA_READING,
+    rank_tolerance: float = opt.RANK_TOLERANCE,
+    useful: float | None = opt.option(
+        "Also show what the data determine to this standard deviation of lengths, such as 1um.",
+        type=opt.POSITIVE_LENGTH,
+        metavar="QUANTITY",
+    ),
+    useful_angle: float | None = opt.option(
+        "The same for angles. Default: the length over the size of ROBOT.",
+        type=opt.POSITIVE_ANGLE,
+        metavar="QUANTITY",
+    ),
+    allowed: dict[str, bool] = opt.ALLOWED,
+    verbose: bool = opt.VERBOSE,
 ) -> Output:
     """Show which parameters of ROBOT the measurements DATA determine, which combinations they
     cannot determine, and which further measurement does.
@@ -100,7 +58,6 @@ def identifiability(
     of ROBOT. Its options are --measure (or --kind, --components, --orientation), --frames and the
     sigmas. With DATA they are those of the file.
 
-    \b
     Examples:
       loopcal identifiability hexapod-42 measurements.csv
       loopcal identifiability hexapod-42 poses.csv tracker.csv inclinometer.csv
@@ -108,7 +65,7 @@ def identifiability(
       loopcal identifiability hexapod-42 --frames base,tool --reduce -o reduced.yaml
       loopcal identifiability hexapod-42 --poses poses.csv --measure x,y,z --sigma-position 5um
       loopcal identifiability hexapod-42 measurements.csv --useful 1um
-    """  # noqa: D301
+    """
     from loopcal.apply.inspection import analyze_identifiability
     from loopcal.apply.simulated_measurements import predict_noise_free
     from loopcal.io.robot.robot_file import save_reduced_robot
@@ -119,23 +76,23 @@ def identifiability(
         if poses is not None:
             raise DataError("DATA and --poses exclude each other; give one of the two")
         sentence = "DATA states {reason}; leave out {option}, or DATA"
-        refuse_given(unknown_options.names, "what is measured and what is unknown", sentence)
-        refuse_given(("sigma_reading",), "the noise of its readings (reading_noise)", sentence)
+        opt.refuse_given(opt.UNKNOWN.members, "what is measured and what is unknown", sentence)
+        opt.refuse_given(("sigma_reading",), "the noise of its readings (reading_noise)", sentence)
     if output is not None and not reduced:
         raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
     if useful is None and useful_angle is not None:
         raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
-    machine, drawn = open_robot(robot, (output,), (*data, poses), force), []
+    machine, drawn = opt.open_robot(robot, (output,), (*data, poses), force), []
     if data:
-        measurements = read_fitted_measurements(data, machine, options)
+        measurements = opt.read_fitted_measurements(data, machine, allowed)
     else:
         if poses is None:
             drawn = [f"{_name_drawn_poses(machine, draw)}, seed {seed}"]
         measurements = predict_noise_free(
             machine,
-            make_instrument(options, machine),
+            opt.make_instrument(unknown | instrument, machine),
             **_read_poses(poses, draw, machine),
-            reading_sigma=parse_reading_sigma(sigma_reading, machine),
+            reading_sigma=opt.parse_reading_sigma(sigma_reading, machine),
             seed=seed,
         )
     accuracy = None if useful is None else (useful, useful_angle)
@@ -158,7 +115,7 @@ def identifiability(
     return Output(json_fields(report), lambda: page)
 
 
-def _read_poses(poses: Path | None, draw: int, robot: Mechanism) -> dict[str, Any]:
+def _read_poses(poses: Path | None, draw: int, robot: lc.Mechanism) -> dict[str, Any]:
     """Return the arguments `poses`, `labels` and `places` of a simulation: those of a file, or how
     many to draw.
     """
@@ -170,48 +127,32 @@ def _read_poses(poses: Path | None, draw: int, robot: Mechanism) -> dict[str, An
     return {"poses": load_poses(poses, robot), "labels": labels, "places": places}
 
 
-def _name_drawn_poses(robot: Mechanism, count: int) -> str:
+def _name_drawn_poses(robot: lc.Mechanism, count: int) -> str:
     """Return what the drawn poses are."""
     return f"{count} poses drawn from the workspace of {robot.name}"
 
 
-@click.command()
-@robot_argument
-@file_option(
-    "--poses", help="CSV file of commanded poses, one column per coordinate. Their names are kept."
-)
-@draw_option
-@file_option(
-    "--fill",
-    help="Instead of poses and instrument: data file of a plan, to be filled in.",
-    metavar="SHEET",
-)
-@file_option("-o", "--output", help="Measurement file to write.", required=True)
-@instrument_options
-@distribution_option
-@sigma_reading_option
-@flag_option(
-    "--draw-errors",
-    help="Draw the errors of the true machine from the tolerances of the robot file.",
-)
-@flag_option("--skip-unreachable", help="Leave out poses that the machine does not reach.")
-@file_option("--truth", help="Also write the true machine, as a robot file.")
-@seed_option("poses, errors and noise")
-@force_option("an output file")
-@shows_output
+@opt.command()
 def simulate(
-    robot: str,
-    poses: Path | None,
-    draw: int,
-    fill: Path | None,
-    output: Path,
-    sigma_reading: str | None,
-    draw_errors: bool,
-    skip_unreachable: bool,
-    truth: Path | None,
-    seed: int,
-    force: bool,
-    **options: Any,
+    robot: str = opt.ROBOT,
+    poses: Path | None = opt.path(
+        "CSV file of commanded poses, one column per coordinate. Their names are kept."
+    ),
+    draw: int = opt.DRAW,
+    fill: Path | None = opt.path(
+        "Instead of poses and instrument: data file of a plan, to be filled in.", metavar="SHEET"
+    ),
+    output: Path = opt.path("Measurement file to write.", "-o", required=True),
+    instrument: dict[str, Any] = opt.INSTRUMENT,
+    distribution: str = opt.DISTRIBUTION,
+    sigma_reading: str | None = opt.SIGMA_READING,
+    draw_errors: bool = opt.flag(
+        "Draw the errors of the true machine from the tolerances of the robot file."
+    ),
+    skip_unreachable: bool = opt.flag("Leave out poses that the machine does not reach."),
+    truth: Path | None = opt.path("Also write the true machine, as a robot file."),
+    seed: int = opt.seed("poses, errors and noise"),
+    force: bool = opt.force("an output file"),
 ) -> Output:
     """Command ROBOT to poses by its nominal geometry, and write what an instrument measures of the
     true machine.
@@ -222,7 +163,6 @@ def simulate(
     Targets that are fixed to the base (`of: base` in the settings of a file) are measured with
     --fill only: name the sheet that `loopcal plan --like` wrote from such a file.
 
-    \b
     Examples:
       loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
       loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
@@ -230,36 +170,32 @@ def simulate(
       loopcal simulate linear-delta --kind position --sigma-reading 5um -o measurements.csv
       loopcal simulate hexapod-42 --sigma-position 0.6um --distribution uniform -o measurements.csv
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
-    """  # noqa: D301
+    """
     from loopcal.apply.simulated_measurements import simulate_measurements
-    from loopcal.findings import report_finding
     from loopcal.io.core.outputs import restore_on_failure
-    from loopcal.io.data.measurement_writer import save_measurements
-    from loopcal.io.robot.robot_file import save_robot
 
-    machine = open_robot(robot, (output, truth), (poses, fill), force)
+    machine = opt.open_robot(robot, (output, truth), (poses, fill), force)
     if fill is not None:
         result = _fill_in(machine, fill, draw_errors, seed)
         source = fill.name
     else:
         result = simulate_measurements(
             machine,
-            make_instrument(options),
+            opt.make_instrument(instrument | {"distribution": distribution}),
             **_read_poses(poses, draw, machine),
             draw_errors=draw_errors,
-            reading_sigma=parse_reading_sigma(sigma_reading, machine),
+            reading_sigma=opt.parse_reading_sigma(sigma_reading, machine),
             seed=seed,
             skip_unreachable=skip_unreachable,
         )
         source = _name_drawn_poses(machine, draw) if poses is None else poses.name
     with restore_on_failure((output, truth)):
         remark = f"simulated by loopcal: {source}, seed {seed}"
-        save_measurements(result.data, output, result.truth, remark)
+        lc.save_measurements(result.data, output, result.truth, remark)
         if truth is not None:
-            save_robot(result.truth, truth)
+            lc.save_robot(result.truth, truth)
     if draw_errors and not any(p.free and p.tolerance for p in machine.parameters.entries):
-        finding = report_finding("data.no-errors-drawn", robot=machine.name)
-        terminal.print_note(str(finding))
+        terminal.print_finding("data.no-errors-drawn", robot=machine.name)
     counts = {name: getattr(result.data, name) for name in ("n_poses", "n_rows", "n_base_rows")}
     document = {"output": output, "truth": truth, **counts, "seed": seed, "skipped": result.skipped}
     n_poses, values = counts["n_poses"], f"{counts['n_rows']} measured values"
@@ -275,28 +211,28 @@ def simulate(
     return Output(document, lambda: page)
 
 
-def _fill_in(robot: Mechanism, sheet: Path, draw_errors: bool, seed: int) -> SimulatedMeasurements:
+def _fill_in(
+    robot: lc.Mechanism, sheet: Path, draw_errors: bool, seed: int
+) -> SimulatedMeasurements:
     """Return the filled-in data of a plan."""
     from loopcal.apply.simulated_measurements import fill_in_measurements
     from loopcal.io.data.measurement_file import (
         has_empty_readings,
         load_contact_sheet,
         load_instrument,
-        load_measurements,
     )
     from loopcal.io.runs.plan_folder import find_plan_sheet
-    from loopcal.measure.kinds.joints import Closure
 
     others = ("poses", "draw", "distribution", "sigma_reading", "skip_unreachable")
-    refuse_given(
-        (*others, *instrument_options.names), f"because --fill {sheet} states poses and instrument"
+    opt.refuse_given(
+        (*others, *opt.INSTRUMENT.members), f"because --fill {sheet} states poses and instrument"
     )
     instrument = load_instrument(sheet, robot)
     how = {"draw_errors": draw_errors, "seed": seed}
     if has_empty_readings(sheet, robot):
         planned = load_contact_sheet(sheet, find_plan_sheet(sheet), robot)
-        is_closure = any(isinstance(rows.kind, Closure) for rows in planned.observations)
+        is_closure = any(isinstance(rows.kind, lc.Closure) for rows in planned.observations)
         how["are_contacts"] = not is_closure
     else:
-        planned = load_measurements(sheet, robot)
+        planned = lc.load_measurements(sheet, robot)
     return fill_in_measurements(robot, planned, instrument, **how)

@@ -6,25 +6,12 @@ from __future__ import annotations
 import sys
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import click
-
+import loopcal as lc
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
-from loopcal.cli.options import (
-    Count,
-    data_argument,
-    data_options,
-    file_option,
-    flag_option,
-    force_option,
-    library_option,
-    open_robot,
-    read_fitted_measurements,
-    refuse_given,
-    robot_argument,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
 
 if TYPE_CHECKING:
     from loopcal.estimate.published_steps import PerLegEstimate
@@ -36,41 +23,34 @@ HEADING = 18
 """Characters of a line of a heading."""
 
 
-@click.command()
-@click.argument("paper", metavar="[PAPER]", required=False)
-@file_option(
-    "-o",
-    "--output",
-    help="Folder for a page, all tables (CSV, JSON) and figures (PNG).",
-    metavar="FOLDER",
-)
-@click.option("--seed", default=0, metavar="N", help="Seed of all random choices.")
-@click.option(
-    "--trials",
-    type=Count("TRIALS"),
-    metavar="N",
-    help="Number of trials behind each statistical number.  [default: 50]",
-)
-@flag_option("--force", help="Replace an earlier result in FOLDER.")
-@shows_output
+@opt.command()
 def reproduce(
-    paper: str | None, output: Path | None, seed: int, trials: int | None, force: bool
+    paper: str | None = opt.argument("[PAPER]", required=False),
+    output: Path | None = opt.path(
+        "Folder for a page, all tables (CSV, JSON) and figures (PNG).", "-o", metavar="FOLDER"
+    ),
+    seed: int = opt.option("Seed of all random choices.", default=0, metavar="N"),
+    trials: int | None = opt.option(
+        "Number of trials behind each statistical number.  [default: 50]",
+        type=opt.Count("TRIALS"),
+        metavar="N",
+    ),
+    force: bool = opt.flag("Replace an earlier result in FOLDER."),
 ) -> Output:
     """Repeat the study PAPER; without PAPER, list the studies.
 
     Every number called computed comes from this run. Statements of the paper that it does not
     confirm are listed with the reason.
 
-    \b
     Examples:
       loopcal reproduce
       loopcal reproduce hexapod-42
       loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
-    """  # noqa: D301
+    """
     from loopcal.papers.paper import PAPERS, TRIALS, find_paper
 
     if paper is None:
-        refuse_given(
+        opt.refuse_given(
             ("output", "seed", "trials", "force"), "without the name of a study, which is repeated"
         )
         rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
@@ -102,41 +82,36 @@ def reproduce(
     return Output(result.to_dict(), lambda: [*_view_reproduction(result), "", last])
 
 
-@click.command()
-@robot_argument
-@data_argument("DATA...")
-@library_option(
-    "--steps",
-    of="loopcal.estimate.published_steps:identify_per_leg",
-    type=Count("STEPS", 1),
-    metavar="N",
-    help="Gauss-Newton steps.",
-)
-@file_option("-o", "--output", help="Robot file to write, with the identified values.")
-@force_option("the output file")
-@data_options
-@shows_output
+@opt.command()
 def per_leg(
-    robot: str, data: tuple[Path, ...], steps: int, output: Path | None, force: bool, **options: Any
+    robot: str = opt.ROBOT,
+    data: tuple[Path, ...] = opt.data(),
+    steps: int = opt.option(
+        "Gauss-Newton steps.",
+        of="loopcal.estimate.published_steps:identify_per_leg",
+        type=opt.Count("STEPS", 1),
+        metavar="N",
+    ),
+    output: Path | None = opt.path("Robot file to write, with the identified values.", "-o"),
+    force: bool = opt.force("the output file"),
+    allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
     """Identify the hexapod ROBOT leg by leg from full poses DATA, as the study hexapod-42 does.
 
     All equations have weight one, and the noise that the legs share is ignored. The result has no
     uncertainties and larger errors than that of calibrate; this command is for comparisons.
 
-    \b
     Examples:
       loopcal per-leg hexapod-42 measurements.csv
       loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
-    """  # noqa: D301
+    """
     from loopcal.estimate.published_steps import identify_per_leg
-    from loopcal.io.robot.robot_file import save_robot
 
-    machine = open_robot(robot, (output,), data, force)
-    measurements = read_fitted_measurements(data, machine, options)
+    machine = opt.open_robot(robot, (output,), data, force)
+    measurements = opt.read_fitted_measurements(data, machine, allowed)
     estimate = identify_per_leg(machine, measurements, steps)
     if output is not None:
-        save_robot(estimate.robot, output)
+        lc.save_robot(estimate.robot, output)
     poses = len(measurements.readings)
     return Output(estimate.to_dict(), lambda: _view_legs(estimate, poses, output))
 

@@ -7,40 +7,16 @@ import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+import loopcal as lc
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.hints import list_hints
-from loopcal.cli.options import (
-    Count,
-    Goal,
-    constraint_options,
-    data_option,
-    file_option,
-    flag_option,
-    force_option,
-    frame_option,
-    instrument_options,
-    is_given,
-    library_option,
-    make_constraints,
-    make_instrument,
-    read_checked_measurements,
-    refuse_given,
-    robot_argument,
-    seed_option,
-    unknown_options,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
 from loopcal.errors import DataError
-
-if TYPE_CHECKING:
-    from loopcal.mechanism.model import Mechanism
-    from loopcal.planning.constraints import PlanOptions
-    from loopcal.planning.plane_line_planning import SurfacePlan
-    from loopcal.planning.result import Plan
 
 PLANE_LINE = "plane-line"
 """Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
@@ -63,82 +39,63 @@ EXCLUDED_BY_PLANE_LINE = {
 """Options that have no effect with --measure plane-line, and why."""
 
 
-@click.command()
-@robot_argument
-@file_option("-o", "--output", help="Folder to make.", required=True)
-@click.option(
-    "--poses",
-    type=Count("PLANNED_POSES"),
-    metavar="N",
-    help="Number of poses for the calibration.  [default: 40]",
-)
-@click.option(
-    "--accuracy",
-    type=Goal(),
-    help="Instead of --poses: expected error to reach, such as 20um or 10urad.",
-)
-@library_option(
-    "--criterion",
-    of=OPTIONS,
-    type=click.Choice(("I", "D")),
-    help="What the plan minimizes: the mean predicted variance of poses (I), or the uncertainty of "
-    "the parameters (D).",
-)
-@click.option(
-    "--hold-out",
-    type=Count("PLANNED_POSES"),
-    metavar="N",
-    help="Number of further poses for validation, drawn evenly.  "
-    "[default: one for four, at least 5]",
-)
-@data_option("--like", "Measurement file whose settings describe the instrument.")
-@unknown_options
-@instrument_options
-@library_option(
-    "--groups",
-    of=SURFACES,
-    type=Count("GROUPS"),
-    metavar="N",
-    help="With --measure plane-line: number of planes with a line.",
-)
-@library_option(
-    "--points",
-    of=SURFACES,
-    type=Count("POINTS"),
-    metavar="N",
-    help="With --measure plane-line: number of points on each.",
-)
-@file_option(
-    "--allowed", help="Poses to choose from; by default drawn from the workspace.", metavar="CSV"
-)
-@data_option(
-    "--measured", "Measurements that exist already. May be given several times.", multiple=True
-)
-@constraint_options
-@library_option(
-    "--candidates",
-    "n_candidates",
-    of=OPTIONS,
-    type=Count("CANDIDATES", 10),
-    metavar="N",
-    help="Number of candidate poses to draw.",
-)
-@flag_option("--curve", help="Also compute the expected errors by the number of poses.")
-@frame_option("fitted, base, or relative (to home)")
-@seed_option("all random choices")
-@force_option("the plan")
-@shows_output
+@opt.command()
 def plan(
-    robot: str,
-    output: Path,
-    like: Path | None,
-    allowed: Path | None,
-    measured: tuple[Path, ...],
-    groups: int,
-    points: int,
-    seed: int,
-    force: bool,
-    **options: Any,
+    robot: str = opt.ROBOT,
+    output: Path = opt.path("Folder to make.", "-o", required=True),
+    poses: int | None = opt.option(
+        "Number of poses for the calibration.  [default: 40]",
+        type=opt.Count("PLANNED_POSES"),
+        metavar="N",
+    ),
+    accuracy: tuple[float, str] | None = opt.option(
+        "Instead of --poses: expected error to reach, such as 20um or 10urad.", type=opt.GOAL
+    ),
+    criterion: str = opt.option(
+        "What the plan minimizes: the mean predicted variance of poses (I), or the uncertainty of "
+        "the parameters (D).",
+        of=OPTIONS,
+        type=click.Choice(("I", "D")),
+    ),
+    hold_out: int | None = opt.option(
+        "Number of further poses for validation, drawn evenly.  "
+        "[default: one for four, at least 5]",
+        type=opt.Count("PLANNED_POSES"),
+        metavar="N",
+    ),
+    like: Path | None = opt.data_option("Measurement file whose settings describe the instrument."),
+    unknown: dict[str, Any] = opt.UNKNOWN,
+    instrument: dict[str, Any] = opt.INSTRUMENT,
+    groups: int = opt.option(
+        "With --measure plane-line: number of planes with a line.",
+        of=SURFACES,
+        type=opt.Count("GROUPS"),
+        metavar="N",
+    ),
+    points: int = opt.option(
+        "With --measure plane-line: number of points on each.",
+        of=SURFACES,
+        type=opt.Count("POINTS"),
+        metavar="N",
+    ),
+    allowed: Path | None = opt.path(
+        "Poses to choose from; by default drawn from the workspace.", metavar="CSV"
+    ),
+    measured: tuple[Path, ...] = opt.data_option(
+        "Measurements that exist already. May be given several times.", multiple=True
+    ),
+    constraints: lc.Constraints = opt.CONSTRAINTS,
+    n_candidates: int = opt.option(
+        "Number of candidate poses to draw.",
+        "--candidates",
+        of=OPTIONS,
+        type=opt.Count("CANDIDATES", 10),
+        metavar="N",
+    ),
+    curve: bool = opt.flag("Also compute the expected errors by the number of poses."),
+    frame: str = opt.frame("fitted, base, or relative (to home)"),
+    seed: int = opt.seed("all random choices"),
+    force: bool = opt.force("the plan"),
 ) -> Output:
     """Plan which poses of ROBOT to measure with an instrument. Write a folder with a sheet for the
     measurement and a data file to fill in.
@@ -147,7 +104,6 @@ def plan(
     the sigmas, or by a measurement file with --like. Strokes, joint limits and cones of ROBOT are
     always respected, also on the path between poses.
 
-    \b
     Examples:
       loopcal plan hexapod-42 -o plan --poses 30 --sigma-position 5um --sigma-angle 10urad
       loopcal plan hexapod-42 -o plan --accuracy 20um --kind position
@@ -155,45 +111,64 @@ def plan(
       loopcal plan hexapod-42 -o plan --kind position --seen-from 1.5m,-0.8m,0.6m --cone 60deg
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
-    """  # noqa: D301
+    """
     from loopcal.io.core.outputs import refuse_folder
-    from loopcal.io.data.measurement_file import load_instrument_to_plan
-    from loopcal.io.robot.robot_file import find_robot_file, load_robot
+    from loopcal.io.data.measurement_file import load_instrument_to_plan, load_poses
+    from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.io.runs.plan_folder import FORMAT, PLAN
 
     files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
     files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
     inputs = {role: path for role, path in files.items() if path is not None}
     refuse_folder(output, PLAN, force, list(inputs.values()))
-    machine = load_robot(robot)
-    if options["measure"] == PLANE_LINE:
-        from loopcal.planning.plane_line_planning import SurfaceOptions, plan_surfaces
-
+    machine = lc.load_robot(robot)
+    if unknown["measure"] == PLANE_LINE:
         for name, reason in EXCLUDED_BY_PLANE_LINE.items():
             sentence = (
                 "{option} cannot be combined with --measure plane-line, {reason}; leave it out"
             )
-            refuse_given((name,), reason, sentence)
-        sigma, constraints = options["sigma_position"], make_constraints(options)
-        surface_options = SurfaceOptions(groups, points, sigma, constraints, seed)
+            opt.refuse_given((name,), reason, sentence)
+        sigma = instrument["sigma_position"]
+        surface_options = lc.SurfaceOptions(groups, points, sigma, constraints, seed)
         with terminal.ProgressBar() as progress:
-            result = plan_surfaces(machine, surface_options, progress)
+            result = lc.plan_surfaces(machine, surface_options, progress)
         document = result.to_dict()
     else:
-        if is_given("groups") or is_given("points"):
+        if opt.is_given("groups") or opt.is_given("points"):
             raise DataError("--groups and --points belong to --measure plane-line; leave them out")
         if like is None:
-            instrument = make_instrument(options, machine)
+            measuring = opt.make_instrument(unknown | instrument, machine)
         else:
-            described = (*unknown_options.names, *instrument_options.names)
+            described = (*opt.UNKNOWN.members, *opt.INSTRUMENT.members)
             sentence = "{reason} describes the instrument; leave out {option}, or --like"
-            refuse_given(described, f"--like {like}", sentence)
-            instrument = load_instrument_to_plan(like, machine)
-        plan_options = _make_plan_options(machine, allowed, measured, seed, options)
-        from loopcal.planning.pose_planning import plan as plan_poses
-
+            opt.refuse_given(described, f"--like {like}", sentence)
+            measuring = load_instrument_to_plan(like, machine)
+        if accuracy is not None and poses is not None:
+            raise DataError(
+                "--poses and --accuracy exclude each other; give the number of poses, or the error "
+                "to reach"
+            )
+        if accuracy is not None and curve:
+            raise DataError("--accuracy shows its own curve; leave out --curve")
+        goal, target = accuracy or (None, "pose")
+        earlier = _read_measured(measured, machine) if measured else None
+        plan_options = lc.PlanOptions(
+            n_poses=poses,
+            criterion=criterion,
+            target=target,
+            goal=goal,
+            hold_out=hold_out,
+            frame=frame,
+            constraints=constraints,
+            allowed_poses=None if allowed is None else load_poses(allowed, machine),
+            n_candidates=n_candidates,
+            measured=None if earlier is None else earlier.fitted,
+            used_names=() if earlier is None else earlier.labels,
+            curve=curve,
+            seed=seed,
+        )
         with terminal.ProgressBar() as progress:
-            result = plan_poses(machine, instrument, options=plan_options, progress=progress)
+            result = lc.plan(machine, measuring, options=plan_options, progress=progress)
         document = {"format": FORMAT, **result.to_dict()}
     written = _write_plan(output, result, inputs, seed, force)
     data = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
@@ -207,54 +182,25 @@ def plan(
     return Output(document, lambda: page)
 
 
-def _make_plan_options(
-    robot: Mechanism,
-    allowed: Path | None,
-    measured: tuple[Path, ...],
-    seed: int,
-    options: Mapping[str, Any],
-) -> PlanOptions:
-    """Return the options of the library."""
-    from loopcal.io.data.measurement_file import load_poses
-    from loopcal.planning.constraints import PlanOptions
-
-    accuracy = options["accuracy"]
-    if accuracy is not None and options["poses"] is not None:
+def _read_measured(paths: tuple[Path, ...], robot: lc.Mechanism) -> lc.Measurements:
+    """Return measurements that exist already; refuse those without a fitted value."""
+    earlier = opt.read_checked_measurements(paths, robot)
+    files = " ".join(map(str, paths))
+    if not earlier.n_rows:
         raise DataError(
-            "--poses and --accuracy exclude each other; give the number of poses, or the error to "
-            "reach"
+            f"--measured {files} contains no measured value; fill it in, or leave it out"
         )
-    if accuracy is not None and options["curve"]:
-        raise DataError("--accuracy shows its own curve; leave out --curve")
-    goal, target = (None, "pose") if accuracy is None else accuracy
-    earlier = read_checked_measurements(measured, robot) if measured else None
-    if earlier is not None:
-        files = " ".join(map(str, measured))
-        if not earlier.n_rows:
-            raise DataError(
-                f"--measured {files} contains no measured value; fill it in, or leave it out"
-            )
-        if earlier.is_held_out.all():
-            raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
-    return PlanOptions(
-        n_poses=options["poses"],
-        criterion=options["criterion"],
-        target=target,
-        goal=goal,
-        hold_out=options["hold_out"],
-        frame=options["frame"],
-        constraints=make_constraints(options),
-        allowed_poses=None if allowed is None else load_poses(allowed, robot),
-        n_candidates=options["n_candidates"],
-        measured=None if earlier is None else earlier.fitted,
-        used_names=() if earlier is None else earlier.labels,
-        curve=options["curve"],
-        seed=seed,
-    )
+    if earlier.is_held_out.all():
+        raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
+    return earlier
 
 
 def _write_plan(
-    output: Path, result: Plan | SurfacePlan, inputs: Mapping[str, Path], seed: int, force: bool
+    output: Path,
+    result: lc.Plan | lc.SurfacePlan,
+    inputs: Mapping[str, Path],
+    seed: int,
+    force: bool,
 ) -> str:
     """Write the folder of a plan; return its files in words."""
     from loopcal.io.core.outputs import write_result_folder
@@ -269,12 +215,12 @@ def _write_plan(
         format_surface_sheet,
     )
     from loopcal.io.runs.run_folder import collect_provenance
-    from loopcal.planning.result import Plan, list_stops
+    from loopcal.planning.result import list_stops
     from loopcal.report.figures.plan_figures import draw_curve, draw_plan
     from loopcal.report.pictures import render_figure
 
     figures = {}
-    if isinstance(result, Plan):
+    if isinstance(result, lc.Plan):
         texts = {SHEET: format_sheet(result, list_stops(result)), DATA: format_plan_data(result)}
         figures["plan.png"] = draw_plan(result)
         if result.curve is not None:

@@ -9,34 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
-from loopcal.cli.options import (
-    complete_robot,
-    file_option,
-    flag_option,
-    force_option,
-    instrument_options,
-    make_instrument,
-    open_robot,
-    robot_argument,
-    unknown_options,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
 
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
 
-@click.command()
-@click.argument("family", metavar="FAMILY")
-@file_option("-o", "--output", help="Robot file to write; the robot gets its name.", required=True)
-@file_option("--measurements", help="Also write a measurement file with columns but no rows.")
-@unknown_options
-@instrument_options
-@force_option("an output file")
-@shows_output
+@opt.command()
 def new(
-    family: str, output: Path, measurements: Path | None, force: bool, **options: Any
+    family: str = opt.argument("FAMILY"),
+    output: Path = opt.path("Robot file to write; the robot gets its name.", "-o", required=True),
+    measurements: Path | None = opt.path("Also write a measurement file with columns but no rows."),
+    unknown: dict[str, Any] = opt.UNKNOWN,
+    instrument: dict[str, Any] = opt.INSTRUMENT,
+    force: bool = opt.force("an output file"),
 ) -> Output:
     """Write a robot file of FAMILY: gough, linear-delta, 3-prs, ru-pus-prs, limbs, stages, or the
     name of a shipped robot.
@@ -44,14 +32,13 @@ def new(
     The file contains a complete robot. Replace its numbers with your own. The options of the
     instrument are for --measurements.
 
-    \b
     Examples:
       loopcal new gough -o my-hexapod.yaml --measurements tracker.csv
       loopcal new linear-delta -o printer.yaml --measurements heights.csv \\
           --kind component --components z
       loopcal new gough -o my-hexapod.yaml --measurements tracker.csv \\
           --kind position --targets SMR1,SMR2,SMR3 --frames base --sigma-position 15um
-    """  # noqa: D301
+    """
     from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
@@ -60,12 +47,12 @@ def new(
     from loopcal.io.data.measurement_writer import format_template
     from loopcal.io.robot.robot_file import build_robot, format_new_robot
 
-    make_instrument(options)  # refuses wrong options before anything is written
+    stated = unknown | instrument
+    opt.make_instrument(stated)  # refuses wrong options before anything is written
     refuse_outputs((output, measurements), (), force)
     robot_text = format_new_robot(family, make_name(output.stem))
     robot = build_robot(parse_yaml(robot_text, output, "robot file"))
-    instrument = make_instrument(options, robot)
-    template = format_template(robot, instrument)
+    template = format_template(robot, opt.make_instrument(stated, robot))
     if measurements is not None:
         refuse_settings_beside(measurements)
     with restore_on_failure((output, measurements)):
@@ -84,32 +71,31 @@ def new(
     return Output({"robot": output, "measurements": measurements}, lambda: page)
 
 
-@click.command()
-@robot_argument
-@file_option(
-    "--plot", help="Draw the robot at home into FILE (.png, .svg or .pdf).", metavar="FILE"
-)
-@force_option("the picture")
-@flag_option("--expand", help="Also show links, joints, transmissions, and how parameters enter.")
-@shows_output
-def check(robot: str, plot: Path | None, force: bool, expand: bool) -> Output:
+@opt.command()
+def check(
+    robot: str = opt.ROBOT,
+    plot: Path | None = opt.path(
+        "Draw the robot at home into FILE (.png, .svg or .pdf).", metavar="FILE"
+    ),
+    force: bool = opt.force("the picture"),
+    expand: bool = opt.flag("Also show links, joints, transmissions, and how parameters enter."),
+) -> Output:
     """Read ROBOT, a robot file or the name of a shipped robot, and show its actuators and
     parameters.
 
     An error in the file is reported with its line: units, joints, dimensions, mobility.
 
-    \b
     Examples:
       loopcal check hexapod-42
       loopcal check my-robot.yaml --json
       loopcal check linear-delta --expand
       loopcal check 3-prs --plot 3-prs.png
-    """  # noqa: D301
+    """
     from loopcal.apply.inspection import inspect_robot
     from loopcal.io.core.text_file import write_bytes
     from loopcal.results.serialization import json_fields
 
-    inspection = inspect_robot(open_robot(robot, (plot,), (), force))
+    inspection = inspect_robot(opt.open_robot(robot, (plot,), (), force))
     if plot is not None:
         from loopcal.report.figures.robot_figure import draw_robot
         from loopcal.report.pictures import save_figure
@@ -127,15 +113,15 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool) -> Output:
     return Output(json_fields(inspection) | assembly, view)
 
 
-@click.command()
-@click.argument("source", metavar="RUN|ROBOT", shell_complete=complete_robot)
-@file_option(
-    "-o", "--output", default="view.html", help="HTML file to write; its name ends in .html."
-)
-@flag_option("--no-browser", help="Do not open the view in the browser.")
-@force_option("the output file")
-@shows_output
-def view(source: str, output: Path, no_browser: bool, force: bool) -> Output:
+@opt.command()
+def view(
+    source: str = opt.argument("RUN|ROBOT", shell_complete=opt.complete_robot),
+    output: Path = opt.path(
+        "HTML file to write; its name ends in .html.", "-o", default="view.html"
+    ),
+    no_browser: bool = opt.flag("Do not open the view in the browser."),
+    force: bool = opt.force("the output file"),
+) -> Output:
     """Show RUN, a run folder, or a robot file as an interactive 3-D view in the browser.
 
     The view is one HTML file that needs no network. It shows the robot at home; of a run also at
@@ -144,11 +130,10 @@ def view(source: str, output: Path, no_browser: bool, force: bool) -> Output:
 
     The exit code is 2 where the calibration of RUN failed; the view is written and says so.
 
-    \b
     Examples:
       loopcal view hexapod-42
       loopcal view run -o hexapod.html --no-browser
-    """  # noqa: D301
+    """
     from loopcal.documents import check_ending, open_page, write_view
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.runs.run_folder import load_run_or_robot
@@ -167,19 +152,20 @@ def view(source: str, output: Path, no_browser: bool, force: bool) -> Output:
     return Output(document, lambda: [f"Written to {output}{unopened}"], failures)
 
 
-@click.command()
-@click.argument("name", metavar="[NAME]", required=False)
-@file_option("-o", "--output", help="Folder to make; by default one with the name of the example.")
-@shows_output
-def example(name: str | None, output: Path | None) -> Output:
+@opt.command()
+def example(
+    name: str | None = opt.argument("[NAME]", required=False),
+    output: Path | None = opt.path(
+        "Folder to make; by default one with the name of the example.", "-o"
+    ),
+) -> Output:
     """Write the files of an example into a new folder; without NAME, list the examples.
 
-    \b
     Examples:
       loopcal example
       loopcal example hexapod-42
       loopcal example delta-printer -o printer
-    """  # noqa: D301
+    """
     from loopcal.io.example_folders import describe_example, list_examples, write_example
     from loopcal.results.tables import Table, word_column
 
@@ -194,22 +180,18 @@ def example(name: str | None, output: Path | None) -> Output:
     return Output(document, lambda: [f"Written to {folder}: {', '.join(files)}"])
 
 
-@click.command()
-@click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
-@shows_output
-def completion(shell: str) -> Output:
+@opt.command()
+def completion(shell: str = opt.argument(type=click.Choice(("bash", "zsh", "fish")))) -> Output:
     """Print the script with which SHELL completes commands, options, names of robots and files.
 
-    \b
     Add to the start-up file of your shell:
       bash  ~/.bashrc                        eval "$(loopcal completion bash)"
       zsh   ~/.zshrc                         eval "$(loopcal completion zsh)"
       fish  ~/.config/fish/config.fish       loopcal completion fish | source
 
-    \b
     Examples:
       loopcal completion bash
-    """  # noqa: D301
+    """
     from click.shell_completion import get_completion_class
 
     from loopcal.cli.entry_point import command_line

@@ -7,34 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
+import loopcal as lc
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
-from loopcal.cli.options import (
-    Count,
-    OptionGroup,
-    Words,
-    data_argument,
-    data_options,
-    file_option,
-    fit_options,
-    flag_option,
-    force_option,
-    library_option,
-    make_fit_options,
-    read_fitted_measurements,
-    refuse_given,
-    seed_option,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
 from loopcal.errors import LoopcalError
 
 if TYPE_CHECKING:
-    from loopcal.diagnose.bootstrap import Bootstrap
-    from loopcal.diagnose.intervals import Intervals
-    from loopcal.diagnose.posterior_sample import PosteriorSample
-    from loopcal.estimate.result import Identification
-    from loopcal.measure.measurements import Measurements
     from loopcal.results.tables import Block
 
 MOST_DIGITS = 10
@@ -42,101 +21,77 @@ MOST_DIGITS = 10
 
 BOOTSTRAP = "loopcal.diagnose.bootstrap"
 
-source_options = OptionGroup(
-    click.argument("source", metavar="RUN|ROBOT"), data_argument("[DATA...]", required=False)
+SOURCE: Any = opt.argument("RUN|ROBOT")
+LEVEL: Any = opt.option(
+    "Coverage of the intervals.",
+    of=f"{BOOTSTRAP}:Bootstrap.intervals",
+    type=opt.OPEN_SHARE,
+    metavar="SHARE",
 )
-"""Decorator of a command that takes a run folder, or a robot and its measurements."""
-
-draw_options = OptionGroup(
-    library_option(
-        "--level",
-        of=f"{BOOTSTRAP}:Bootstrap.intervals",
-        type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-        metavar="SHARE",
-        help="Coverage of the intervals.",
-    ),
-    seed_option("the random draws"),
-    file_option("-o", "--output", help="CSV file for the draws, one row each.", metavar="CSV"),
-    force_option("the output file"),
-)
-"""Decorator of a command that draws."""
+FIT_NAMES = (*opt.FIT.members, *opt.ALLOWED.members)
+DRAWS: Any = opt.path("CSV file for the draws, one row each.", "-o", metavar="CSV")
 
 
 def load_fit(
-    source: str, data: tuple[Path, ...], options: Mapping[str, Any]
-) -> tuple[Identification, Measurements]:
+    source: str, data: tuple[Path, ...], options: lc.FitOptions, allowed: Mapping[str, bool]
+) -> tuple[lc.Identification, lc.Measurements]:
     """Return a fit with its measurements, and with the uncertainty that `calibrate` states: that of
     a run folder, repeated, or of a robot file and data by `fit_options` and `data_options`.
     """
     from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
-    from loopcal.estimate.identification import identify
-    from loopcal.io.robot.robot_file import load_robot
-    from loopcal.io.runs.run_folder import load_run, repeat_fit
+    from loopcal.io.runs.run_folder import repeat_fit
 
     if data:
-        robot = load_robot(source)
-        measurements = read_fitted_measurements(data, robot, options)
-        chosen = make_fit_options(options)
+        robot = lc.load_robot(source)
+        measurements = opt.read_fitted_measurements(data, robot, allowed)
         with terminal.ProgressBar() as progress:
-            fit = identify(robot, measurements, options=chosen, progress=progress)
+            fit = lc.identify(robot, measurements, options=options, progress=progress)
     else:
         if Path(source).is_file():
             raise LoopcalError(
                 f"{source}: this is a file; give a run folder, or the files of measurements after "
                 "that of the robot"
             )
-        refuse_given(options, "with a run folder")
-        run = load_run(source)
+        opt.refuse_given(FIT_NAMES, "with a run folder")
+        run = lc.load_run(source)
         with terminal.ProgressBar() as progress:
             fit, measurements = repeat_fit(run, progress)
     return adjust_uncertainty(fit, measurements), measurements
 
 
-@click.command()
-@source_options
-@library_option(
-    "--count",
-    of=f"{BOOTSTRAP}:bootstrap",
-    type=Count("RESAMPLES", 2),
-    metavar="N",
-    help="Number of resamples.",
-)
-@library_option(
-    "--scheme",
-    of=f"{BOOTSTRAP}:bootstrap",
-    type=Words(f"{BOOTSTRAP}:Scheme"),
-    help="wild: errors of each block times a random factor. pairs: blocks drawn with replacement. "
-    "normal: normal errors of the stated sigma.",
-)
-@click.option(
-    "--unit",
-    metavar="UNIT",
-    help="What is resampled together: pose, block, session, day, or a number of consecutive "
-    "poses.  [default: the largest unit with at least 12 blocks]",
-)
-@library_option(
-    "--interval",
-    "kind",
-    of=f"{BOOTSTRAP}:Bootstrap.intervals",
-    type=Words(f"{BOOTSTRAP}:IntervalKind"),
-    help="How intervals are read from the resamples.",
-)
-@draw_options
-@fit_options
-@data_options
-@shows_output
+@opt.command()
 def bootstrap(
-    source: str,
-    data: tuple[Path, ...],
-    count: int,
-    scheme: Any,
-    unit: str | None,
-    kind: Any,
-    level: float,
-    seed: int,
-    output: Path | None,
-    force: bool,
-    **options: Any,
+    source: str = SOURCE,
+    data: tuple[Path, ...] = opt.data("[DATA...]", required=False),
+    count: int = opt.option(
+        "Number of resamples.",
+        of=f"{BOOTSTRAP}:bootstrap",
+        type=opt.Count("RESAMPLES", 2),
+        metavar="N",
+    ),
+    scheme: Any = opt.option(
+        "wild: errors of each block times a random factor. pairs: blocks drawn with replacement. "
+        "normal: normal errors of the stated sigma.",
+        of=f"{BOOTSTRAP}:bootstrap",
+        type=opt.Words(f"{BOOTSTRAP}:Scheme"),
+    ),
+    unit: str | None = opt.option(
+        "What is resampled together: pose, block, session, day, or a number of consecutive "
+        "poses.  [default: the largest unit with at least 12 blocks]",
+        metavar="UNIT",
+    ),
+    kind: Any = opt.option(
+        "How intervals are read from the resamples.",
+        "--interval",
+        of=f"{BOOTSTRAP}:Bootstrap.intervals",
+        type=opt.Words(f"{BOOTSTRAP}:IntervalKind"),
+    ),
+    level: float = LEVEL,
+    seed: int = opt.seed("the random draws"),
+    output: Path | None = DRAWS,
+    force: bool = opt.force("the output file"),
+    fit_options: lc.FitOptions = opt.FIT,
+    allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
     """Resample a calibration by blocks of poses, fit every resample, and compare the scatter with
     the stated intervals.
@@ -144,73 +99,59 @@ def bootstrap(
     RUN is a run folder, whose fit is repeated from its files. Or give a ROBOT and DATA, and the
     options of the fit.
 
-    \b
     Examples:
       loopcal bootstrap run
       loopcal bootstrap run --unit session --count 2000 -o draws.csv
       loopcal bootstrap hexapod-42 measurements.csv --method least-squares
-    """  # noqa: D301
-    from loopcal.diagnose.bootstrap import bootstrap as resample
+    """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.report.validation_view import view_bootstrap
 
     refuse_outputs((output,), (Path(source), *data), force)
-    fit, measurements = load_fit(source, data, options)
+    fit, measurements = load_fit(source, data, fit_options, allowed)
     is_number = unit is not None and unit.isdecimal() and len(unit) < MOST_DIGITS
     chosen = int(unit) if unit is not None and is_number else unit
     with terminal.ProgressBar() as progress:
-        result = resample(
+        result = lc.bootstrap(
             fit, measurements, count, scheme=scheme, unit=chosen, seed=seed, progress=progress
         )
     intervals = result.intervals(level, kind)
     return _finish(result, intervals, view_bootstrap(result, intervals), output)
 
 
-@click.command()
-@source_options
-@library_option(
-    "--count",
-    of="loopcal.diagnose.posterior_sample:sample_posterior",
-    type=Count("DRAWS", 100),
-    metavar="N",
-    help="Number of draws.",
-)
-@flag_option(
-    "--region",
-    help="Instead of drawing, show linear intervals that hold for several parameters at once; "
-    "of parameters that -p selects, also their joint region.",
-)
-@click.option(
-    "-p",
-    "--parameter",
-    "names",
-    multiple=True,
-    metavar="NAME",
-    help="Parameter for --region, or a pattern such as 'leg1.*'. May be given several times.  "
-    "[default: all]",
-)
-@library_option(
-    "--rule",
-    of="loopcal.diagnose.intervals:compute_simultaneous_intervals",
-    type=Words("loopcal.diagnose.intervals:Rule"),
-    help="How --region makes intervals that hold together; maximum gives the narrowest.",
-)
-@draw_options
-@fit_options
-@data_options
-@shows_output
+@opt.command()
 def sample(
-    source: str,
-    data: tuple[Path, ...],
-    count: int,
-    region: bool,
-    names: tuple[str, ...],
-    rule: Any,
-    level: float,
-    seed: int,
-    output: Path | None,
-    force: bool,
-    **options: Any,
+    source: str = SOURCE,
+    data: tuple[Path, ...] = opt.data("[DATA...]", required=False),
+    count: int = opt.option(
+        "Number of draws.",
+        of="loopcal.diagnose.posterior_sample:sample_posterior",
+        type=opt.Count("DRAWS", 100),
+        metavar="N",
+    ),
+    region: bool = opt.flag(
+        "Instead of drawing, show linear intervals that hold for several parameters at once; "
+        "of parameters that -p selects, also their joint region."
+    ),
+    names: tuple[str, ...] = opt.option(
+        "Parameter for --region, or a pattern such as 'leg1.*'. May be given several times.  "
+        "[default: all]",
+        "-p",
+        "--parameter",
+        multiple=True,
+        metavar="NAME",
+    ),
+    rule: Any = opt.option(
+        "How --region makes intervals that hold together; maximum gives the narrowest.",
+        of="loopcal.diagnose.intervals:compute_simultaneous_intervals",
+        type=opt.Words("loopcal.diagnose.intervals:Rule"),
+    ),
+    level: float = LEVEL,
+    seed: int = opt.seed("the random draws"),
+    output: Path | None = DRAWS,
+    force: bool = opt.force("the output file"),
+    fit_options: lc.FitOptions = opt.FIT,
+    allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
     """Draw parameters from the exact posterior of a calibration, and compare its intervals with the
     linear ones. With --region, show intervals that hold for all selected parameters at once.
@@ -218,44 +159,40 @@ def sample(
     RUN is a run folder, whose fit is repeated from its files. Or give a ROBOT and DATA, and the
     options of the fit.
 
-    \b
     Examples:
       loopcal sample run
       loopcal sample run --count 20000 -o draws.csv
       loopcal sample linear-delta measurements.csv --method map
       loopcal sample run --region -p radius -p 'tower*.angle'
-    """  # noqa: D301
-    from loopcal.diagnose.intervals import compute_joint_region, compute_simultaneous_intervals
-    from loopcal.diagnose.posterior_sample import sample_posterior
+    """
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.runs.run_folder import load_run
     from loopcal.report.validation_view import view_posterior, view_region
 
     if region:
-        refuse_given(("count", "seed", "output", "force"), "with --region")
+        opt.refuse_given(("count", "seed", "output", "force"), "with --region")
         if data:
-            posterior = load_fit(source, data, options)[0].posterior
+            posterior = load_fit(source, data, fit_options, allowed)[0].posterior
         else:
-            refuse_given(options, "with a run folder")
-            posterior = load_run(source).load_posterior()
-        together = compute_simultaneous_intervals(posterior, names or None, level, rule)
-        joint = compute_joint_region(posterior, names, level) if names else None
+            opt.refuse_given(FIT_NAMES, "with a run folder")
+            posterior = lc.load_run(source).load_posterior()
+        together = lc.compute_simultaneous_intervals(posterior, names or None, level, rule)
+        joint = lc.compute_joint_region(posterior, names, level) if names else None
         return Output(
             {"intervals": together.to_dict(), "region": None if joint is None else joint.to_dict()},
             lambda: view_region(joint, together, posterior.robot),
         )
-    refuse_given(("names", "rule"), "without --region")
+    opt.refuse_given(("names", "rule"), "without --region")
     refuse_outputs((output,), (Path(source), *data), force)
-    fit, measurements = load_fit(source, data, options)
+    fit, measurements = load_fit(source, data, fit_options, allowed)
     with terminal.ProgressBar() as progress:
-        result = sample_posterior(fit, measurements, count, seed=seed, progress=progress)
+        result = lc.sample_posterior(fit, measurements, count, seed=seed, progress=progress)
     intervals = result.intervals(level)
     return _finish(result, intervals, view_posterior(result, intervals), output)
 
 
 def _finish(
-    result: Bootstrap | PosteriorSample,
-    intervals: Intervals,
+    result: lc.Bootstrap | lc.PosteriorSample,
+    intervals: lc.Intervals,
     page: list[Block],
     output: Path | None,
 ) -> Output:

@@ -6,23 +6,18 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+import loopcal as lc
+from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.entry_point import CommandGroup
-from loopcal.cli.options import (
-    FILE,
-    Count,
-    OptionGroup,
-    file_option,
-    flag_option,
-    force_option,
-    refuse_given,
-)
-from loopcal.cli.terminal import Output, shows_output
+from loopcal.cli.terminal import Output
+from loopcal.errors import StudyError
 
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
@@ -36,63 +31,51 @@ STOPPED, INCOMPLETE = 1, 2
 """Exit codes of a study that was stopped, and of one with blocks that could not be computed."""
 
 
-class ShareType(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """A share such as 3/10: the third of ten parts."""
+def _parse_share(text: str) -> Share:
+    """Return a share such as 3/10: the third of ten parts."""
+    from loopcal.studies.driver import Share
 
-    name = "share"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the share, or fail with what is allowed."""
-        from loopcal.studies.driver import Share
-
-        match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", str(value))
-        if match is None or int(match[1]) > int(match[2]):
-            sentence = f"{value!r} is not a share; write 3/10 for the third of ten parts"
-            self.fail(sentence, param, ctx)
-        return Share(int(match[1]), int(match[2]))
+    match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
+    if match is None or int(match[1]) > int(match[2]):
+        raise StudyError(f"{text!r} is not a share; write 3/10 for the third of ten parts")
+    return Share(int(match[1]), int(match[2]))
 
 
-worker_options = OptionGroup(
-    click.option(
-        "--workers",
-        type=Count("WORKERS", 1),
-        metavar="N",
-        help="Processes that compute.  [default: the number of processors]",
-    ),
-    click.option(
-        "--dask", metavar="ADDRESS", help="Use a dask cluster, by the address of its scheduler."
-    ),
-    flag_option(
-        "--ray",
-        help="Use the ray cluster of the variable RAY_ADDRESS, or one that is started here.",
-    ),
-    click.option(
-        "--cells",
-        "share",
-        type=ShareType(),
-        metavar="PART/PARTS",
-        help="Compute a share only, such as 3/10 for the third of ten jobs; join their folders "
-        "with merge.",
-    ),
-)
-
-
-def choose_work(
-    share: Share | None, workers: int | None, dask: str | None, ray: bool
-) -> tuple[Executor, Share]:
-    """Return who computes a study, and which share of it, from the values of `worker_options`."""
+def _choose_work(stated: Mapping[str, Any]) -> tuple[Executor, Share]:
+    """Return who computes a study, and which share of it, from the values of `WORK`."""
     from loopcal.studies.driver import WHOLE
-    from loopcal.studies.execution.executors import Dask, Ray
     from loopcal.studies.running import make_local
 
-    share = share or WHOLE
-    if dask is not None:
-        refuse_given(("workers", "ray"), "with --dask")
-        return Dask(dask), share
-    if ray:
-        refuse_given(("workers",), "with --ray")
-        return Ray(), share
+    share, workers = stated["share"] or WHOLE, stated["workers"]
+    if stated["dask"] is not None:
+        opt.refuse_given(("workers", "ray"), "with --dask")
+        return lc.Dask(stated["dask"]), share
+    if stated["ray"]:
+        opt.refuse_given(("workers",), "with --ray")
+        return lc.Ray(), share
     return make_local(count_processors() if workers is None else workers), share
+
+
+STUDY: Any = opt.argument("STUDY", type=opt.FILE)
+FOLDER: Any = opt.argument("FOLDER", type=opt.FILE)
+QUICK: Any = opt.flag("Use the quick tier of STUDY, which takes seconds.")
+WORK: Any = opt.Group(
+    _choose_work,
+    workers=opt.option(
+        "Processes that compute.  [default: the number of processors]",
+        type=opt.Count("WORKERS", 1),
+        metavar="N",
+    ),
+    dask=opt.option("Use a dask cluster, by the address of its scheduler.", metavar="ADDRESS"),
+    ray=opt.flag("Use the ray cluster of the variable RAY_ADDRESS, or one that is started here."),
+    share=opt.option(
+        "Compute a share only, such as 3/10 for the third of ten jobs; join their folders "
+        "with merge.",
+        "--cells",
+        type=opt.Parsed("part", _parse_share),
+        metavar="PART/PARTS",
+    ),
+)
 
 
 def run_and_report(
@@ -135,11 +118,6 @@ def count_processors() -> int:
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
-study_argument = click.argument("study_file", metavar="STUDY", type=FILE)
-folder_argument = click.argument("folder", metavar="FOLDER", type=FILE)
-quick_option = flag_option("--quick", help="Use the quick tier of STUDY, which takes seconds.")
-
-
 @click.group(cls=CommandGroup)
 def study() -> None:
     """Simulate thousands of calibrations to answer questions before anything is measured: which
@@ -151,31 +129,30 @@ def study() -> None:
       loopcal study check study.yaml
       loopcal study run study.yaml -o results
       loopcal study summary results
-    """  # noqa: D301
+    """
 
 
-@study.command()
-@study_argument
-@click.option(
-    "--robot",
-    metavar="ROBOT",
-    help="A robot, or its file.  [default: linear-delta, or that of PAPER]",
-)
-@click.option("--paper", metavar="PAPER", help="Write the study of a paper that reproduce repeats.")
-@force_option("STUDY")
-@shows_output
-def new(study_file: Path, robot: str | None, paper: str | None, force: bool) -> Output:
+@opt.command(of=study)
+def new(
+    study_file: Path = STUDY,
+    robot: str | None = opt.option(
+        "A robot, or its file.  [default: linear-delta, or that of PAPER]", metavar="ROBOT"
+    ),
+    paper: str | None = opt.option(
+        "Write the study of a paper that reproduce repeats.", metavar="PAPER"
+    ),
+    force: bool = opt.force("STUDY"),
+) -> Output:
     """Write a study file to fill in, with a comment for each setting.
 
     With --paper, write the study of a paper: its errors, noises and methods. --robot replaces its
     robot.
 
-    \b
     Examples:
       loopcal study new study.yaml
       loopcal study new study.yaml --robot hexapod-42
       loopcal study new study.yaml --paper cmm-constraint-2011 --robot hexapod-42
-    """  # noqa: D301
+    """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.studies.files.study_file import write_template
 
@@ -202,18 +179,14 @@ def new(study_file: Path, robot: str | None, paper: str | None, force: bool) -> 
     return Output({"written": str(study_file), "robot": robot}, lambda: page)
 
 
-@study.command()
-@study_argument
-@quick_option
-@shows_output
-def check(study_file: Path, quick: bool) -> Output:
+@opt.command(of=study)
+def check(study_file: Path = STUDY, quick: bool = QUICK) -> Output:
     """Read STUDY, show its cells, and estimate the time that it takes from one block of each robot.
 
-    \b
     Examples:
       loopcal study check study.yaml
       loopcal study check study.yaml --quick
-    """  # noqa: D301
+    """
     from loopcal.studies.driver import estimate_time, view_estimate
     from loopcal.studies.running import read_source
 
@@ -224,100 +197,88 @@ def check(study_file: Path, quick: bool) -> Output:
     return Output(estimate, lambda: [*view_estimate(chosen, estimate, round_duration), following])
 
 
-@study.command()
-@study_argument
-@file_option("-o", "--output", "folder", required=True, metavar="FOLDER", help="Folder to make.")
-@worker_options
-@flag_option(
-    "--resume",
-    help="Continue FOLDER where it exists. STUDY may have more replicates or levels than before.",
-)
-@quick_option
-@shows_output
-def run(study_file: Path, folder: Path, resume: bool, quick: bool, **options: Any) -> Output:
+@opt.command(of=study)
+def run(
+    study_file: Path = STUDY,
+    folder: Path = opt.path("Folder to make.", "-o", "--output", required=True, metavar="FOLDER"),
+    work: tuple[Executor, Share] = WORK,
+    resume: bool = opt.flag(
+        "Continue FOLDER where it exists. STUDY may have more replicates or levels than before."
+    ),
+    quick: bool = QUICK,
+) -> Output:
     """Compute STUDY, and store its trials in FOLDER.
 
     Every block of trials is stored when it is finished. A study that is stopped, by Ctrl-C or in
     any other way, loses only the blocks in work; --resume continues it.
 
-    \b
     Examples:
       loopcal study run study.yaml -o results
       loopcal study run study.yaml -o results --resume --workers 4
       loopcal study run study.yaml -o results --dask tcp://scheduler:8786
       loopcal study run study.yaml -o part-3 --cells 3/10
-    """  # noqa: D301
+    """
     from loopcal.studies.files.study_folder import open_study
     from loopcal.studies.running import read_source
 
-    source, work = read_source(study_file, quick), choose_work(**options)
+    source = read_source(study_file, quick)
     with open_study(folder, source, resume) as store:
         return run_and_report(source.study, store, folder, work)
 
 
-@study.command()
-@folder_argument
-@click.option(
-    "--replicates",
-    type=Count("REPLICATES", 1),
-    required=True,
-    metavar="N",
-    help="Trials of a cell.",
-)
-@worker_options
-@shows_output
-def extend(folder: Path, replicates: int, **options: Any) -> Output:
+@opt.command(of=study)
+def extend(
+    folder: Path = FOLDER,
+    replicates: int = opt.option(
+        "Trials of a cell.", type=opt.Count("REPLICATES", 1), required=True, metavar="N"
+    ),
+    work: tuple[Executor, Share] = WORK,
+) -> Output:
     """Compute further trials of each cell of a study, until there are N; finished ones are kept.
 
-    \b
     Examples:
       loopcal study extend results --replicates 5000
-    """  # noqa: D301
+    """
     from loopcal.studies.files.study_folder import extend_study, load_specification
 
-    work = choose_work(**options)
     with extend_study(folder, replicates) as store:
         return run_and_report(load_specification(store), store, folder, work)
 
 
-@study.command()
-@folder_argument
-@shows_output
-def status(folder: Path) -> Output:
+@opt.command(of=study)
+def status(folder: Path = FOLDER) -> Output:
     """Show how much of a study is stored, also while it runs.
 
-    \b
     Examples:
       loopcal study status results
-    """  # noqa: D301
+    """
     from loopcal.studies.results.study_result import read_status, view_status
 
     state = read_status(folder)
     return Output(state, lambda: view_status(state, round_duration))
 
 
-@study.command()
-@folder_argument
-@click.option(
-    "--score", "scores", multiple=True, metavar="NAME", help="Score to show; may be repeated."
-)
-@click.option(
-    "--against", metavar="FACTOR", help="Factor along the axis of figures, such as poses."
-)
-@shows_output
-def summary(folder: Path, scores: tuple[str, ...], against: str | None) -> Output:
+@opt.command(of=study)
+def summary(
+    folder: Path = FOLDER,
+    scores: tuple[str, ...] = opt.option(
+        "Score to show; may be repeated.", "--score", multiple=True, metavar="NAME"
+    ),
+    against: str | None = opt.option(
+        "Factor along the axis of figures, such as poses.", metavar="FACTOR"
+    ),
+) -> Output:
     """Show medians and coverage of each cell, with intervals, the failed trials by reason, and the
     answers to the questions of the study file.
 
     It also writes summary.json and summary.csv, with all scores, and a figure of each shown score
     into FOLDER.
 
-    \b
     Examples:
       loopcal study summary results
       loopcal study summary results --score position_max --score condition
       loopcal study summary results --score position --against instrument
-    """  # noqa: D301
+    """
     from loopcal.studies.results.questions import (
         build_document,
         list_shown,
@@ -342,37 +303,35 @@ def summary(folder: Path, scores: tuple[str, ...], against: str | None) -> Outpu
     )
 
 
-@study.command()
-@folder_argument
-@click.option("--smallest", metavar="FACTOR", help="Ask for its smallest level, such as poses.")
-@click.option("--largest", metavar="FACTOR", help="Ask for its largest level, such as noise.")
-@click.option(
-    "--score", default="position", metavar="NAME", help="Score that stays within the limit."
-)
-@click.option(
-    "--limit", required=True, metavar="LIMIT", help="Of the score, with its unit, such as 10um."
-)
-@click.option(
-    "--share",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
-    default=0.95,
-    metavar="SHARE",
-    help="Share of the machines that stay within the limit.",
-)
-@shows_output
+@opt.command(of=study)
 def ask(
-    folder: Path, smallest: str | None, largest: str | None, score: str, limit: str, share: float
+    folder: Path = FOLDER,
+    smallest: str | None = opt.option(
+        "Ask for its smallest level, such as poses.", metavar="FACTOR"
+    ),
+    largest: str | None = opt.option("Ask for its largest level, such as noise.", metavar="FACTOR"),
+    score: str = opt.option(
+        "Score that stays within the limit.", default="position", metavar="NAME"
+    ),
+    limit: str = opt.option(
+        "Of the score, with its unit, such as 10um.", required=True, metavar="LIMIT"
+    ),
+    share: float = opt.option(
+        "Share of the machines that stay within the limit.",
+        type=click.FloatRange(0, 1, min_open=True, max_open=True),
+        default=0.95,
+        metavar="SHARE",
+    ),
 ) -> Output:
     """Find the smallest or largest level of a factor that reaches a limit on a share of machines.
 
     The answer says which levels reach it for certain, and which may. Run more replicates where it
     is not certain, see loopcal study extend.
 
-    \b
     Examples:
       loopcal study ask results --smallest poses --limit 10um
       loopcal study ask results --largest noise --score position_max --limit 0.05mm --share 0.9
-    """  # noqa: D301
+    """
     from loopcal.studies.results.questions import view_answers
     from loopcal.studies.results.study_result import StudyResult
 
@@ -387,19 +346,18 @@ def ask(
     return Output(answered, lambda: view_answers([answered]))
 
 
-@study.command()
-@folder_argument
-@file_option("-o", "--output", required=True, metavar="FILE", help="Table: .csv or .parquet.")
-@force_option("FILE")
-@shows_output
-def export(folder: Path, output: Path, force: bool) -> Output:
+@opt.command(of=study)
+def export(
+    folder: Path = FOLDER,
+    output: Path = opt.path("Table: .csv or .parquet.", "-o", required=True, metavar="FILE"),
+    force: bool = opt.force("FILE"),
+) -> Output:
     """Write all trials of a study as one table, with all factors as columns and numbers in SI.
 
-    \b
     Examples:
       loopcal study export results -o trials.csv
       loopcal study export results -o trials.parquet
-    """  # noqa: D301
+    """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.studies.files.store import read_store
     from loopcal.studies.files.study_folder import load_specification
@@ -412,17 +370,18 @@ def export(folder: Path, output: Path, force: bool) -> Output:
     return Output(document, lambda: [f"Written: {output} ({count} trials)"])
 
 
-@study.command()
-@click.argument("part_folders", metavar="PART...", nargs=-1, required=True, type=FILE)
-@file_option("-o", "--output", required=True, metavar="FOLDER", help="Folder to make or to add to.")
-@shows_output
-def merge(part_folders: tuple[Path, ...], output: Path) -> Output:
+@opt.command(of=study)
+def merge(
+    part_folders: tuple[Path, ...] = opt.argument(
+        "PART...", nargs=-1, required=True, type=opt.FILE
+    ),
+    output: Path = opt.path("Folder to make or to add to.", "-o", required=True, metavar="FOLDER"),
+) -> Output:
     """Join folders of jobs that each computed a share of one study (see run --cells).
 
-    \b
     Examples:
       loopcal study merge part-1 part-2 part-3 -o results
-    """  # noqa: D301
+    """
     from loopcal.studies.files.study_folder import merge_studies
     from loopcal.studies.results.study_result import read_status, view_status
 
@@ -436,22 +395,21 @@ def merge(part_folders: tuple[Path, ...], output: Path) -> Output:
     )
 
 
-@study.command()
-@folder_argument
-@click.argument("trial", metavar="CELL/TRIAL")
-@file_option("-o", "--output", required=True, metavar="RUN", help="Run folder to make.")
-@force_option("RUN")
-@shows_output
-def replay(folder: Path, trial: str, output: Path, force: bool) -> Output:
+@opt.command(of=study)
+def replay(
+    folder: Path = FOLDER,
+    trial: str = opt.argument("CELL/TRIAL"),
+    output: Path = opt.path("Run folder to make.", "-o", required=True, metavar="RUN"),
+    force: bool = opt.force("RUN"),
+) -> Output:
     """Repeat one trial of a study as a normal calibration, with all its checks and a run folder.
 
     Cells and trials count from 0; status lists the cells. A second folder beside the run folder,
     RUN-input, gets the robot file, the measurements and the true machine.
 
-    \b
     Examples:
       loopcal study replay results 3/17 -o trial
-    """  # noqa: D301
+    """
     from loopcal.studies.running import calibrate_trial
 
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", trial)
@@ -467,7 +425,7 @@ def replay(folder: Path, trial: str, output: Path, force: bool) -> Output:
 
     def view() -> list[Block]:
         for finding in done.findings:
-            terminal.print_note(str(finding))
+            terminal.print_note(finding)
         written = f"Written to {output}, and its inputs to {done.inputs}"
         return [*view_calibration(done.report, False, hint_for), "", written]
 
