@@ -32,9 +32,8 @@ print("end")
 
 
 def test_hints_and_importance_use_codes_of_the_catalog():
-    assert [
-        code for code in (*load_hints(), *IMPORTANCE.split()) if code not in load_catalog()
-    ] == []
+    codes = (*load_hints(), *IMPORTANCE.split())
+    assert [code for code in codes if code not in load_catalog()] == []
 
 
 def test_hint_names_the_poses_of_its_finding():

@@ -255,7 +255,7 @@ def import_(
         required=True,
     ),
     data: Path | None = opt.path("Also write the measurements that FILE or --probes contain."),
-    probes: Path = opt.path(
+    probes: tuple[Path, ...] = opt.path(
         "What the firmware printed when it probed the bed (marlin: G30, G33 P3 V0, M114; reprap: "
         "G32 with bed.g, heightmap.csv). May be given several times.",
         multiple=True,

@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -48,7 +48,7 @@ def plan(
         type=opt.Count("PLANNED_POSES"),
         metavar="N",
     ),
-    accuracy: tuple[float, str] | None = opt.option(
+    accuracy: tuple[float, Literal["position", "orientation"]] | None = opt.option(
         "Instead of --poses: expected error to reach, such as 20um or 10urad.", type=opt.GOAL
     ),
     criterion: str = opt.option(
