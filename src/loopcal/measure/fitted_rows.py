@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.measure.kinds import READINGS
 from loopcal.measure.measurements import Measurements
 from loopcal.typing import BoolArray, FloatArray
 
@@ -27,6 +26,7 @@ CHANCE, LARGEST = 1e-6, 1e-2
 ENOUGH = 3  # equal values by which rows of different kinds are the same
 # Steps [SI] of lengths and of angles of which the rounding of values is a multiple.
 SMALLEST_STEPS = (1e-9, np.deg2rad(1e-7))
+ALONE = "readings"  # stands for the kind of rows that have readings alone
 PREFIX = "fitted"  # first word of the names of the stored arrays
 
 
@@ -232,7 +232,7 @@ class FittedRows:
         """
         count = 0
         for kind, content in self.groups:
-            width = 0 if kind == READINGS else readings
+            width = 0 if kind == ALONE else readings
             sd = np.zeros(content.shape[1])
             if kind in noise and len(noise[kind]) == len(sd) - width:
                 sd[width:] = noise[kind]
@@ -254,7 +254,7 @@ class FittedRows:
         labels: list[str] = []
         total, kinds = 0, {kind for kind, _ in self.groups}
         for rows in _list_rows(data):
-            if rows.kind == READINGS and rows.kind not in kinds:
+            if rows.kind == ALONE and rows.kind not in kinds:
                 continue
             reused = self.find_copies(rows)
             labels += ["/".join(data.labels[j] for j in poses) for poses in rows.poses[reused]]
@@ -267,7 +267,7 @@ def collect_fitted_rows(data: Measurements, are_readings_fitted: bool = False) -
     if these are fitted, as where actuators are redundant.
     """
     rows = _list_rows(data) if are_readings_fitted else _list_rows(data)[:-1]
-    kept = (o for o in rows if are_readings_fitted or o.kind != READINGS)
+    kept = (o for o in rows if are_readings_fitted or o.kind != ALONE)
     return FittedRows(tuple((o.kind, o.content) for o in kept))
 
 
@@ -299,4 +299,4 @@ def _list_rows(data: Measurements) -> list[ComparedRows]:
     if data.reading_sigma is not None:
         is_alone &= np.isfinite(data.reading_sigma).any(axis=1)
     alone, poses = data.readings[is_alone], np.flatnonzero(is_alone)[:, None]
-    return [*result, ComparedRows(READINGS, 0, alone, np.zeros(alone.shape), poses)]
+    return [*result, ComparedRows(ALONE, 0, alone, np.zeros(alone.shape), poses)]

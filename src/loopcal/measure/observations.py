@@ -132,11 +132,6 @@ class InstrumentRecord:
         number = f"serial number {self.serial_number}" if self.serial_number else ""
         return ", ".join(part for part in (name, number) if part) or "without a name"
 
-    @property
-    def is_traceable(self) -> bool:
-        """Whether a certificate and the date of calibration are stated."""
-        return bool(self.certificate and self.calibrated)
-
     def to_dict(self) -> dict[str, str]:
         """Return the stated facts by name."""
         return {name: value for name, value in asdict(self).items() if value}

@@ -428,8 +428,8 @@ def load_measurements(
     FileError : a value that does not fit, at its line.
     DataError : a check fails, noise is not a covariance, or a commanded pose cannot be reached.
     """
-    tables = _read_tables(path)
-    return _join_tables(tables, robot, allow_outside_stroke, allow_duplicates)
+    tables = read_tables(path)
+    return join_tables(tables, robot, allow_outside_stroke, allow_duplicates)
 
 
 def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) -> Measurements:
@@ -447,10 +447,10 @@ def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) ->
         units={name: planned.units[name] for name in kept},
         columns={name: planned.columns[name] for name in kept},
     )
-    return _join_tables((table, planned), robot, allow_outside_stroke=True, allow_duplicates=True)
+    return join_tables((table, planned), robot, allow_outside_stroke=True, allow_duplicates=True)
 
 
-def _join_tables(
+def join_tables(
     tables: Sequence[Table], robot: Mechanism, allow_outside_stroke: bool, allow_duplicates: bool
 ) -> Measurements:
     """Return the measurements of some tables; arguments as of `load_measurements`."""
@@ -559,7 +559,7 @@ def _collect_pose_context(files: Sequence[_File], n: int) -> dict[str, FloatArra
 def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
     """Return the files that state a kind, but only hold poses and readings."""
     sources = {rows.source for rows in data.all_observations}
-    tables = (table for table in _read_tables(path) if has_measured_values(table))
+    tables = (table for table in read_tables(path) if has_measured_values(table))
     return tuple(table.path for table in tables if str(table.path) not in sources)
 
 
@@ -568,7 +568,7 @@ def list_measurement_files(path: Paths) -> dict[str, Path]:
     with measured values, `poses` with readings alone. FileError : one is given twice, or
     unreadable.
     """
-    tables = _read_tables(path)
+    tables = read_tables(path)
     files: dict[str, Path] = {}
     for table in tables:
         role = "data" if len(tables) == 1 or has_measured_values(table) else "poses"
@@ -601,7 +601,7 @@ def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]
     return names, tuple(map(table.place, range(len(names))))
 
 
-def _read_tables(path: Paths) -> tuple[Table, ...]:
+def read_tables(path: Paths) -> tuple[Table, ...]:
     """Read the files, and those that they name under `poses`."""
     given = path if isinstance(path, list | tuple) else [path]
     paths = [as_path(file, WHAT) for file in given]

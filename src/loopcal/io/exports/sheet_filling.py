@@ -13,21 +13,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import Table, format_header, format_row, read_table
 from loopcal.io.core.text_file import read_text
 from loopcal.io.data.kind_settings import KindRows, read_kinds
-from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_file import join_tables, read_tables
 from loopcal.io.exports.conversion import convert_export, list_headers
 from loopcal.io.exports.profile import Profile, check_columns
 from loopcal.measure.kinds.position import name_point
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.units import find_unit
 
 Row = dict[str, str]
 """Column -> cell."""
@@ -112,12 +108,12 @@ def fill_sheet(
         if names:
             findings.append(report_finding(f"sheet.{code}", names=tuple(dict.fromkeys(names))))
     body = list(_merge(table, filled, units, columns))
-    data = _build_measurements(robot, table, entry, body, units)
-    source = " and ".join(map(str, exports))  # the file whose values a check doubts
-    data = replace(data, observations=tuple(replace(o, source=source) for o in data.observations))
     # columns of the sheet, measured ones with the unit of the export, then further ones
     header = {n: units.get(n, u) if n in columns else u for n, u in table.units.items()}
     header |= {name: unit for name, unit in units.items() if name not in header}
+    data = _read_measurements(robot, table, body, header)
+    source = " and ".join(map(str, exports))  # the file whose values a check doubts
+    data = replace(data, observations=tuple(replace(o, source=source) for o in data.observations))
     above = read_text(table.path, "sheet").lstrip("\ufeff").splitlines()[: table.header_line - 1]
     lines = [line for line in above if line.strip()]
     cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
@@ -254,37 +250,15 @@ def _merge(
             yield {**dict.fromkeys(units, ""), **kept, **{n: c for n, c in points.items() if c}}
 
 
-def _build_measurements(
-    robot: Mechanism,
-    table: Table,
-    entry: KindRows,
-    body: Sequence[Row],
-    units: Mapping[str, str | None],
+def _read_measurements(
+    robot: Mechanism, table: Table, body: Sequence[Row], header: dict[str, str | None]
 ) -> Measurements:
-    """Return the measurements of a filled sheet, with the noise that its settings state."""
-    planned = load_measurements(table.path, robot, allow_outside_stroke=True, allow_duplicates=True)
-    place = {name: i for i, name in enumerate(planned.labels)}
-    columns = entry.kind.columns
-    symbols = [units.get(column.name) for column in columns]
-    factors = [
-        1.0 if symbol is None else find_unit(symbol, column.dimension).factor_to_si
-        for symbol, column in zip(symbols, columns, strict=True)
-    ]
-    measured = np.array(
-        [
-            [float(row.get(c.name) or "nan") * f for c, f in zip(columns, factors, strict=True)]
-            for row in body
-        ]
-    )
-    present = ~np.isnan(measured).all(axis=1)
-    sigma = np.array([entry.noise.get(c.name, np.nan) for c in entry.kind.noise_columns])
-    if np.isnan(sigma).any():
-        raise table.settings.error("the settings state no noise; add 'noise: {\"*\": 15 um}'", ())
-    observations = Observations.from_sigma(
-        entry.kind,
-        np.array([place[row["pose"]] for row in body])[present],
-        measured[present],
-        sigma,
-        np.array([row.get("session", "") for row in body])[present],
-    )
-    return replace(planned, observations=(observations,))
+    """Return the measurements of a filled sheet, without the poses that have no measured value."""
+    lines = dict(zip(table.pose_names(), table.lines, strict=True))
+    columns = {name: tuple(row.get(name, "") for row in body) for name in header}
+    of_rows = tuple(lines[pose] for pose in columns["pose"])
+    filled = replace(table, units=header, columns=columns, lines=of_rows)
+    others = read_tables(table.path)[1:]
+    data = join_tables((filled, *others), robot, allow_outside_stroke=True, allow_duplicates=True)
+    measured = tuple(rows.take(rows.is_measured) for rows in data.observations)
+    return replace(data, observations=measured)

@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 K = TypeVar("K")
 
-# Names of the kinds that contain actuator readings alone: uncertain ones, and those of poses
-# without a measured value.
-READINGS, CLOSURE = "readings", "closure"
+CLOSURE = "closure"  # name of the kind that contains actuator readings alone
 
 KINDS: Registry[type[Kind]] = Registry(
     "kind of measurement",

@@ -24,7 +24,9 @@ from loopcal.measure.kinds.kind import (
     Kind,
     checked,
     is_incomplete,
+    list_not_unit,
     list_rows,
+    make_angles,
 )
 from loopcal.measure.kinds.position import convert_camera_angles, predict_camera_angles
 from loopcal.measure.kinds.setup_parameters import make_perpendicular_basis
@@ -172,6 +174,8 @@ class Direction(AxisKind):
     axis_name: str = "axis"
 
     name: ClassVar[str] = "direction"
+    # the three components, as measuring machines write them
+    per_target: ClassVar[tuple[Column, ...]] = tuple(Column(n, Dimension.RATIO) for n in "ijk")
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "axis")
 
     @classmethod
@@ -181,14 +185,9 @@ class Direction(AxisKind):
         return (cls(), cls(axis=face, unknown=("axis", "frame"), frame="cmm", axis_name="face"))
 
     @property
-    def columns(self) -> tuple[Column, ...]:
-        """The three components, as measuring machines write them."""
-        return tuple(Column(name, Dimension.RATIO) for name in ("i", "j", "k"))
-
-    @property
     def noise_columns(self) -> tuple[Column, ...]:
         """Two angles perpendicular to the direction."""
-        return (Column("across_a", Dimension.ANGLE), Column("across_b", Dimension.ANGLE))
+        return make_angles("across_a", "across_b")
 
     @property
     def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
@@ -206,14 +205,9 @@ class Direction(AxisKind):
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows with an incomplete direction, or one whose length is not 1."""
-        length = np.linalg.norm(measured, axis=-1)
-        return list_rows(
-            is_incomplete(measured),
-            lambda _: "has an incomplete direction; give i, j and k, or none of them",
-        ) + list_rows(
-            np.abs(length - 1.0) > 1e-3,
-            lambda i: f"has a direction of length {length[i]:.6g}; the length must be 1 to 1e-3",
-        )
+        incomplete = "has an incomplete direction; give i, j and k, or none of them"
+        invalid = list_rows(is_incomplete(measured), lambda _: incomplete)
+        return invalid + list_not_unit(measured, "direction")
 
     def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the direction itself."""
@@ -276,6 +270,7 @@ class Inclination(DirectionKind):
     sensor: str = "inclinometer"
 
     name: ClassVar[str] = "inclination"
+    per_target: ClassVar[tuple[Column, ...]] = make_angles("tilt_x", "tilt_y")
     allowed_unknown: ClassVar[tuple[str, ...]] = ("mounting", "gravity")
     inward: ClassVar[bool] = True
 
@@ -284,11 +279,6 @@ class Inclination(DirectionKind):
         """Return a level base, an unknown vertical, and an unknown mounting too."""
         both = cls(unknown=("mounting", "gravity"), sensor="level")
         return (cls(), cls(unknown=("gravity",)), both)
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """Two angles."""
-        return (Column("tilt_x", Dimension.ANGLE), Column("tilt_y", Dimension.ANGLE))
 
     @property
     def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
@@ -356,17 +346,13 @@ class Autocollimation(AxisKind):
     mirror: str = "mirror"
 
     name: ClassVar[str] = "autocollimation"
+    per_target: ClassVar[tuple[Column, ...]] = make_angles("angle_x", "angle_y")
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "mirror")
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """Return a mirror along z, and an unknown mirror in an unknown frame."""
         return (cls(), cls(unknown=("frame", "mirror"), frame="collimator", mirror="face"))
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """Two angles."""
-        return (Column("angle_x", Dimension.ANGLE), Column("angle_y", Dimension.ANGLE))
 
     @property
     def stated(self) -> tuple[str, FloatArray, str, FloatArray]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_names, set_fields
-from loopcal.measure.kinds import CLOSURE, READINGS
+from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Column, Evaluation, Kind
 from loopcal.typing import FloatArray
@@ -139,7 +139,7 @@ class ActuatorReadings(Kind):
     because a full turn too much is an error of a full turn.
     """
 
-    name: ClassVar[str] = READINGS
+    name: ClassVar[str] = "readings"
     description: ClassVar[str] = "the readings of the actuators"
     wraps_angles: ClassVar[bool] = False
     actuators: Mapping[str, Dimension]  # name -> dimension, in the order of the readings
@@ -182,11 +182,6 @@ class Closure(Kind):
     def examples(cls) -> tuple[Self, ...]:
         """Return the only one: it has no settings."""
         return (cls(),)
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """None."""
-        return ()
 
     def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         shape = (max(len(T), len(values)), T.shape[1], 0)

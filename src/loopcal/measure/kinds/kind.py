@@ -55,6 +55,11 @@ class Column:
     dimension: Dimension
 
 
+def make_angles(*names: str) -> tuple[Column, ...]:
+    """Return columns of angles."""
+    return tuple(Column(name, Dimension.ANGLE) for name in names)
+
+
 POSITION_COLUMNS = tuple(Column(name, Dimension.LENGTH) for name in ("x", "y", "z"))
 
 
@@ -101,6 +106,15 @@ def checked(check: Callable[[Any, str], FloatArray], what: str, default: Any = N
 def list_rows(wrong: BoolArray, describe: Callable[[int], str]) -> InvalidRows:
     """Return the rows of a mask (r,), each with its description."""
     return tuple((int(i), describe(int(i))) for i in np.flatnonzero(wrong))
+
+
+def list_not_unit(vectors: FloatArray, what: str, more: str = "") -> InvalidRows:
+    """Return the rows of vectors (r, k) whose length is not 1."""
+    length = np.linalg.norm(vectors, axis=-1)
+    rule = f"the length must be 1 to 1e-3{more}"
+    return list_rows(
+        np.abs(length - 1.0) > 1e-3, lambda i: f"has a {what} of length {length[i]:.6g}; {rule}"
+    )
 
 
 def is_incomplete(columns: FloatArray) -> BoolArray:
@@ -181,7 +195,8 @@ class Kind(ABC):
 
     Attributes
     ----------
-    name : in files and in `KINDS`. poses_per_row : number of poses that one row compares.
+    name : in files and in `KINDS`. per_target : columns of a row, or of each of its targets, where
+        no setting changes them. poses_per_row : number of poses that one row compares.
     changes_with_pose : whether columns that stay constant while the robot moves indicate a mistake.
         It is False for touched surfaces and for locked joints, whose columns stay at 0.
     mixes_components : whether a motion of base and setup mixes the components of a residual, so
@@ -199,6 +214,7 @@ class Kind(ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # every kind is a dataclass
     name: ClassVar[str]
+    per_target: ClassVar[tuple[Column, ...]] = ()
     poses_per_row: ClassVar[int] = 1
     changes_with_pose: ClassVar[bool] = True
     mixes_components: ClassVar[bool] = False
@@ -251,9 +267,9 @@ class Kind(ABC):
         return f"{type(self).__name__}({', '.join(changed)})"
 
     @property
-    @abstractmethod
     def columns(self) -> tuple[Column, ...]:
         """The c columns of a row, as in files."""
+        return self.per_target
 
     @property
     def noise_columns(self) -> tuple[Column, ...]:

@@ -23,6 +23,7 @@ from loopcal.measure.kinds.kind import (
     Kind,
     checked,
     is_incomplete,
+    list_not_unit,
     list_rows,
 )
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES
@@ -212,14 +213,7 @@ class Pose(ToolKind):
         invalid = list_rows(is_incomplete(orientation), lambda _: incomplete)
         if self.orientation != "quaternion":
             return invalid
-        length, rule = (
-            np.linalg.norm(orientation, axis=-1),
-            "must be 1 to 1e-3, with the scalar first",
-        )
-        return invalid + list_rows(
-            np.abs(length - 1.0) > 1e-3,
-            lambda i: f"has a quaternion of length {length[i]:.6g}; the length {rule}",
-        )
+        return invalid + list_not_unit(orientation, "quaternion", ", with the scalar first")
 
     @property
     def placeholder(self) -> FloatArray:

@@ -26,9 +26,15 @@ from loopcal.geometry import (
 )
 from loopcal.measure.array_checks import check_array, check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import POSITION_COLUMNS, Column, Evaluation, Kind, checked
+from loopcal.measure.kinds.kind import (
+    POSITION_COLUMNS,
+    Column,
+    Evaluation,
+    Kind,
+    checked,
+    make_angles,
+)
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
 
 # The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in the
 # frame, and (.., k, g, w) by the setup items that only this kind has.
@@ -75,7 +81,6 @@ class TargetKind(Kind):
 
     measures_points: ClassVar[bool] = True
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "targets")
-    per_target: ClassVar[tuple[Column, ...]]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -298,10 +303,7 @@ class Bearing(TargetKind):
     form: str = "theodolite"
 
     name: ClassVar[str] = "bearing"
-    per_target: ClassVar[tuple[Column, ...]] = (
-        Column("azimuth", Dimension.ANGLE),
-        Column("elevation", Dimension.ANGLE),
-    )
+    per_target: ClassVar[tuple[Column, ...]] = make_angles("azimuth", "elevation")
 
     def __post_init__(self) -> None:
         super().__post_init__()
