@@ -2,6 +2,7 @@
 """Kinematics agree with a published table and with closed forms."""
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
@@ -72,115 +73,147 @@ def test_largest_pose_error_is_the_published_one():
     assert round(integrated.max(), 6) == FIRST_ERROR
 
 
-def test_hexapod_leg_lengths_are_distances_between_joint_centers():
-    poses = commanded_poses()
-    legs = (
-        poses[:, None, :3, 3]
-        + zoo.HEXAPOD_PLATFORM * zoo.MM @ poses[:, :3, :3].swapaxes(1, 2)
-        - zoo.HEXAPOD_BASE * zoo.MM
+def readings_of_hexapod(T):
+    """Distances between joint centers."""
+    platform = zoo.HEXAPOD_PLATFORM * zoo.MM @ T[:, :3, :3].swapaxes(1, 2)
+    legs = T[:, None, :3, 3] + platform - zoo.HEXAPOD_BASE * zoo.MM
+    return np.linalg.norm(legs, axis=-1) - zoo.HEXAPOD_LENGTH * zoo.MM
+
+
+def list_arms(T, radius, base):
+    """Vectors (n, 3, 3) from points on the base to the platform at three equal angles."""
+    angles = 2 * np.pi * np.arange(3) / 3
+    out = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    return T[:, None, :3, 3] + radius * out @ T[:, :3, :3].swapaxes(1, 2) - base * out
+
+
+def readings_of_3_prs(T):
+    """The right triangle of rod and carriage."""
+    c = list_arms(T, zoo.PRS_A, zoo.PRS_B)
+    return c[..., 2] - np.sqrt(zoo.PRS_L**2 - c[..., 0] ** 2 - c[..., 1] ** 2)
+
+
+def readings_of_3_rps(T):
+    return np.linalg.norm(list_arms(T, 0.15, 0.25), axis=2)
+
+
+def readings_of_delta(T):
+    record = zoo.delta().record
+    towers = record.radius * np.column_stack([np.cos(record.angles), np.sin(record.angles)])
+    arms = np.array(record.arms)
+    across = ((T[:, None, :2, 3] - towers) ** 2).sum(-1)
+    height = np.sqrt(arms**2 - across) + T[:, None, 2, 3]
+    return np.array(record.stops) + np.sqrt(arms**2 - record.radius**2) - height
+
+
+def readings_of_five_bar(T):
+    """Two triangles."""
+    q = []
+    for pivot, crank, rod, side in [(-0.07, 0.1, 0.22, 1), (0.07, 0.15, 0.2, -1)]:
+        x, y = T[:, 0, 3] - pivot, T[:, 1, 3]
+        d = np.hypot(x, y)
+        inner = np.arccos((crank**2 + d**2 - rod**2) / (2 * crank * d))
+        q.append(np.arctan2(y, x) + side * inner)
+    return np.stack(q, axis=1)
+
+
+def readings_of_6_rus(T):
+    """The intersection of the circle of a crank and the sphere of its rod."""
+    servo, crank, rod = np.array([0.1, 0.04, 0.0]), 0.025, 0.16
+    ball, q = np.array([0.045886, 0.065532, 0.0]), []
+    for k in range(6):
+        turn, side = geometry.rotation_about_axis(2 * np.pi / 3 * (k % 3), 2), 1 if k < 3 else -1
+        mirror = np.array([1, side, 1])
+        to_ball = T[:, :3, 3] + T[:, :3, :3] @ turn @ (mirror * ball) - turn @ (mirror * servo)
+        a, b = to_ball @ turn @ [0, side, 0], to_ball[:, 2]  # at zero and at 90 degrees
+        c = ((to_ball**2).sum(axis=1) + crank**2 - rod**2) / (2 * crank)
+        q.append(np.arctan2(b, a) - np.arccos(c / np.hypot(a, b)))
+    return np.stack(q, axis=1)
+
+
+def readings_of_agile_eye(T):
+    """The elbow axis of limb 1 is (0, -sin q1, cos q1), normal to its pin axis -R (0, 1, 0); the
+    other limbs are this one with the axes permuted.
+    """
+    return np.stack(
+        [
+            np.arctan2(T[:, (k + 2) % 3, (k + 1) % 3], T[:, (k + 1) % 3, (k + 1) % 3])
+            for k in range(3)
+        ],
+        axis=1,
     )
-    lengths = np.linalg.norm(legs, axis=-1) - zoo.HEXAPOD_LENGTH * zoo.MM
-    assert_allclose(inverse(zoo.hexapod(), poses).q, lengths, rtol=0, atol=1e-15)
 
 
-def test_3_prs_poses_agree_with_the_closed_form_of_the_parasitic_motion():
-    # N = (a/2)(1 - cos theta)(-cos 2 phi, sin 2 phi), zero torsion; q from the right triangle of
-    # rod and carriage
-    rng = np.random.default_rng(2)
-    z, phi, theta = rng.uniform([0.65, -np.pi, 0.0], [0.75, np.pi, np.deg2rad(35)], (60, 3)).T
-    sol = inverse(zoo.three_prs(), np.stack([z, phi, theta], axis=1))
+def draw(low, high, n, seed):
+    """Draw coordinates (n, c) evenly."""
+    return np.random.default_rng(seed).uniform(low, high, (n, len(low)))
+
+
+def sample(name, seed):
+    return sample_workspace(zoo.load_cached_robot(name), 60, seed=seed).coordinates
+
+
+PRS_RANGE = [0.65, -np.pi, 0.0], [0.75, np.pi, np.deg2rad(35)]
+RPS_RANGE = [0.43, -np.pi, 0.0], [0.57, np.pi, np.deg2rad(20)]
+CLOSED_FORMS = {
+    "hexapod": (zoo.hexapod, commanded_poses, readings_of_hexapod, 1e-15),
+    "3-prs": (zoo.three_prs, lambda: draw(*PRS_RANGE, 60, 2), readings_of_3_prs, 1e-13),
+    "linear delta": (
+        zoo.delta,
+        lambda: draw([-0.08, -0.08, 0.0], [0.08, 0.08, 0.2], 50, 3),
+        readings_of_delta,
+        1e-14,
+    ),
+    "five-bar": (
+        zoo.five_bar,
+        lambda: draw([-0.05, 0.2], [0.05, 0.28], 20, 4),
+        readings_of_five_bar,
+        1e-13,
+    ),
+    "3-rps": (
+        lambda: zoo.load_cached_robot("3-rps"),
+        lambda: draw(*RPS_RANGE, 60, 5),
+        readings_of_3_rps,
+        1e-13,
+    ),
+    "6-rus": (
+        lambda: zoo.load_cached_robot("6-rus"),
+        lambda: sample("6-rus", 6),
+        readings_of_6_rus,
+        1e-12,
+    ),
+    "agile-eye": (
+        lambda: zoo.load_cached_robot("agile-eye"),
+        lambda: sample("agile-eye", 7),
+        readings_of_agile_eye,
+        1e-13,
+    ),
+}
+"""Robot, its poses, readings (n, a) of platform poses in closed form, and tolerance [m, rad]."""
+
+
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+def test_readings_and_poses_agree_with_closed_forms(name):
+    make, list_poses, compute, atol = CLOSED_FORMS[name]
+    robot, poses = make(), list_poses()
+    sol = inverse(robot, poses)
     assert_array_equal(sol.status, Status.CONVERGED)
-    half = zoo.PRS_A / 2 * (1 - np.cos(theta))
-    N = np.stack([-half * np.cos(2 * phi), half * np.sin(2 * phi), z], axis=1)
-    R = geometry.tilt_torsion_to_matrix(phi, theta, 0.0 * phi)
-    assert_allclose(sol.T[:, :3, 3], N, atol=1e-13)
-    assert_allclose(sol.T[:, :3, :3], R, atol=1e-13)
-    for i, angle in enumerate(2 * np.pi * np.arange(3) / 3):
-        out = np.array([np.cos(angle), np.sin(angle), 0.0])
-        c = N + zoo.PRS_A * R @ out - zoo.PRS_B * out
-        carriage = c[:, 2] - np.sqrt(zoo.PRS_L**2 - c[:, 0] ** 2 - c[:, 1] ** 2)
-        assert_allclose(sol.q[:, i], carriage, atol=1e-13)
-    assert_allclose(
-        geometry.pose_difference(forward(zoo.three_prs(), sol.q).T, sol.T), 0.0, atol=1e-12
-    )
+    assert_allclose(sol.q, compute(sol.T), rtol=0, atol=atol)
+    back = forward(robot, sol.q)
+    assert_allclose(geometry.pose_difference(back.T, sol.T), 0.0, atol=1e-12)
+    if name in ("3-prs", "3-rps"):
+        # N = (a/2)(1 - cos theta)(-cos 2 phi, sin 2 phi), zero torsion
+        z, phi, theta = poses.T
+        half = {"3-prs": zoo.PRS_A, "3-rps": 0.15}[name] / 2 * (1 - np.cos(theta))
+        N = np.stack([-half * np.cos(2 * phi), half * np.sin(2 * phi), z], axis=1)
+        assert_allclose(sol.T[:, :3, 3], N, atol=1e-13)
+        R = geometry.tilt_torsion_to_matrix(phi, theta, 0.0 * phi)
+        assert_allclose(sol.T[:, :3, :3], R, atol=1e-13)
+    if name == "agile-eye":
+        assert_allclose(sol.T[:, :3, 3], 0.0, atol=1e-15)
 
 
 def test_passive_joints_of_a_3_prs_are_the_rod_angles():
     sol = inverse(zoo.three_prs(), np.array([[0.7, 0.0, 0.0]]))
     assert sol.passive_names == ("limb1.pin", "limb2.pin", "limb3.pin")
     assert_allclose(np.cos(sol.passive), (zoo.PRS_A - zoo.PRS_B) / zoo.PRS_L, atol=1e-14)
-
-
-def test_linear_delta_readings_agree_with_the_closed_form():
-    robot = zoo.delta()
-    points = np.random.default_rng(3).uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.2], (50, 3))
-    record = robot.record
-    towers = record.radius * np.column_stack([np.cos(record.angles), np.sin(record.angles)])
-    height = (
-        np.sqrt(np.array(record.arms) ** 2 - ((points[:, None, :2] - towers) ** 2).sum(-1))
-        + points[:, 2:]
-    )
-    drop = np.array(record.stops) + np.sqrt(np.array(record.arms) ** 2 - record.radius**2) - height
-    assert_allclose(inverse(robot, points).q, drop, rtol=0, atol=1e-14)
-
-
-def test_five_bar_readings_agree_with_two_triangles():
-    points = np.random.default_rng(4).uniform([-0.05, 0.2], [0.05, 0.28], (20, 2))
-    sol = inverse(zoo.five_bar(), points)
-    for k, (pivot, crank, rod, side) in enumerate([(-0.07, 0.1, 0.22, 1), (0.07, 0.15, 0.2, -1)]):
-        d = np.hypot(points[:, 0] - pivot, points[:, 1])
-        inner = np.arccos((crank**2 + d**2 - rod**2) / (2 * crank * d))
-        assert_allclose(
-            sol.q[:, k], np.arctan2(points[:, 1], points[:, 0] - pivot) + side * inner, atol=1e-13
-        )
-
-
-def test_3_rps_leg_lengths_agree_with_the_closed_form_of_the_parasitic_motion():
-    robot, radius = zoo.load_cached_robot("3-rps"), 0.15
-    rng = np.random.default_rng(5)
-    z, phi, theta = rng.uniform([0.43, -np.pi, 0.0], [0.57, np.pi, np.deg2rad(20)], (60, 3)).T
-    sol = inverse(robot, np.stack([z, phi, theta], axis=1))
-    assert_array_equal(sol.status, Status.CONVERGED)
-    # the planes of the legs are those of a 3-PRS, and so is the motion of the platform
-    half = radius / 2 * (1 - np.cos(theta))
-    center = np.stack([-half * np.cos(2 * phi), half * np.sin(2 * phi), z], axis=1)
-    R = geometry.tilt_torsion_to_matrix(phi, theta, 0.0 * phi)
-    assert_allclose(sol.T[:, :3, 3], center, atol=1e-13)
-    assert_allclose(sol.T[:, :3, :3], R, atol=1e-13)
-    for i, angle in enumerate(2 * np.pi * np.arange(3) / 3):
-        out = np.array([np.cos(angle), np.sin(angle), 0.0])
-        leg = center + radius * R @ out - 0.25 * out
-        assert_allclose(sol.q[:, i], np.linalg.norm(leg, axis=1), atol=1e-13)
-
-
-def test_6_rus_readings_agree_with_the_intersection_of_crank_circle_and_rod_sphere():
-    robot = zoo.load_cached_robot("6-rus")
-    sol = inverse(robot, sample_workspace(robot, 60, seed=6).coordinates)
-    assert_array_equal(sol.status, Status.CONVERGED)
-    servo, crank, rod = np.array([0.1, 0.04, 0.0]), 0.025, 0.16
-    ball = np.array([0.045886, 0.065532, 0.0])
-    for k in range(6):
-        turn, side = geometry.rotation_about_axis(2 * np.pi / 3 * (k % 3), 2), 1 if k < 3 else -1
-        mirror = np.array([1, side, 1])
-        out, up = turn @ [0, side, 0], np.array([0.0, 0.0, 1.0])  # at zero and at 90 degrees
-        to_ball = (
-            sol.T[:, :3, 3] + sol.T[:, :3, :3] @ turn @ (mirror * ball) - turn @ (mirror * servo)
-        )
-        a, b = to_ball @ out, to_ball @ up
-        c = ((to_ball**2).sum(axis=1) + crank**2 - rod**2) / (2 * crank)
-        assert_allclose(
-            sol.q[:, k], np.arctan2(b, a) - np.arccos(c / np.hypot(a, b)), rtol=0, atol=1e-12
-        )
-
-
-def test_agile_eye_readings_are_arc_tangents_of_the_rotation_matrix():
-    # the elbow axis of limb 1 is (0, -sin q1, cos q1), normal to its pin axis -R (0, 1, 0); the
-    # other limbs are this one with the axes permuted
-    robot = zoo.load_cached_robot("agile-eye")
-    sol = inverse(robot, sample_workspace(robot, 60, seed=7).coordinates)
-    assert_array_equal(sol.status, Status.CONVERGED)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        expected = np.arctan2(sol.T[:, j, i], sol.T[:, i, i])
-        assert_allclose(sol.q[:, k], expected, rtol=0, atol=1e-13)
-    assert_allclose(sol.T[:, :3, 3], 0.0, atol=1e-15)
