@@ -11,9 +11,8 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.harness import Metric
-from loopcal.studies.driver import RunReport
-from loopcal.studies.execution.executors import Answer, Executor, Processes, Serial
-from loopcal.studies.running import read_source, run_study
+from loopcal.studies.executors import Answer, Executor, Processes, Serial
+from loopcal.studies.running import RunReport, read_source, run_study
 from loopcal.studies.simulation.block import BlockTask, PosesTask, compute_task
 from loopcal.studies.simulation.machines import CellPoses
 from loopcal.typing import FloatArray

@@ -24,11 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from loopcal.studies.driver import count_blocks
-from loopcal.studies.execution.executors import Executor, Processes
-from loopcal.studies.files.store import NAME, read_store
-from loopcal.studies.files.study_folder import load_specification
-from loopcal.studies.running import read_source, run_study
+from loopcal.studies.executors import Executor, Processes
+from loopcal.studies.files.store import NAME, load_specification, read_store
+from loopcal.studies.running import count_blocks, read_source, run_study
 
 REPLICATES, BLOCK = 12_500, 50
 KILLS = 20

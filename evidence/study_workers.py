@@ -18,11 +18,10 @@ from typing import Any
 
 from evidence.questions.empty_blocks import EmptyBlocks, leave_empty
 from evidence.questions.example_studies import STUDIES
-from loopcal.studies.driver import run_blocks
-from loopcal.studies.execution.executors import QUEUED, Dask, Executor, Serial
-from loopcal.studies.files.store import NAME
+from loopcal.studies.executors import QUEUED, Dask, Executor, Serial
+from loopcal.studies.files.store import NAME, StudySource, open_study
 from loopcal.studies.files.study_file import load_study
-from loopcal.studies.files.study_folder import StudySource, open_study
+from loopcal.studies.running import run_blocks
 from loopcal.studies.simulation.block import compute_block, list_tasks
 from loopcal.studies.specification.study import Study
 

@@ -28,7 +28,7 @@ from loopcal.mechanism.families import FAMILIES
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.studies.files.study_file import LEVELS, StudySettings
 from loopcal.studies.specification.levels import Question, Scores
-from loopcal.studies.specification.scores import list_columns
+from loopcal.studies.specification.study import list_columns
 from loopcal.units import DISPLAY_UNITS, Dimension
 from tools.markdown import fill_blocks, format_table
 

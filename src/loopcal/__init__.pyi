@@ -156,10 +156,10 @@ from .planning.plane_line_planning import plan_surfaces as plan_surfaces
 from .planning.pose_planning import plan as plan
 from .planning.result import Plan as Plan
 from .progress_bar import ProgressBar as ProgressBar
-from .studies.execution.executors import Dask as Dask
-from .studies.execution.executors import Processes as Processes
-from .studies.execution.executors import Ray as Ray
-from .studies.execution.executors import Serial as Serial
+from .studies.executors import Dask as Dask
+from .studies.executors import Processes as Processes
+from .studies.executors import Ray as Ray
+from .studies.executors import Serial as Serial
 from .studies.files.study_file import load_study as load_study
 from .studies.results.study_result import StudyResult as StudyResult
 from .studies.running import study as study

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.studies.files.store import read_store
-from loopcal.studies.files.study_folder import StudySource, load_specification, open_study
+from loopcal.studies.files.store import StudySource, load_specification, open_study, read_store
 from loopcal.studies.results.study_result import StudyResult, find_columns
 from loopcal.studies.specification.levels import (
     InstrumentLevel,

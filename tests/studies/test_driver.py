@@ -16,18 +16,25 @@ import pytest
 import loopcal
 from evidence.study_interruption import BLOCK, Disturbance, examine, read_contents
 from loopcal.errors import EstimationError, FileError, StudyError
-from loopcal.studies.driver import Share, count_blocks, count_stored, run_blocks
-from loopcal.studies.execution.executors import Answer, Dask, Processes, Serial
-from loopcal.studies.files.store import NAME, open_store
-from loopcal.studies.files.study_folder import (
+from loopcal.studies.executors import Answer, Dask, Processes, Serial
+from loopcal.studies.files.store import (
+    NAME,
     StudySource,
     extend_study,
     merge_studies,
+    open_store,
     open_study,
     read_study,
 )
 from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.running import read_source, run_study
+from loopcal.studies.running import (
+    Share,
+    count_blocks,
+    count_stored,
+    read_source,
+    run_blocks,
+    run_study,
+)
 from loopcal.studies.simulation.block import BlockTask, PosesTask
 from tests.findings.expectations import expect_refusal, list_codes
 from tests.studies.small_study import CELLS, write_study

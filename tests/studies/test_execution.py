@@ -22,15 +22,7 @@ import pytest
 
 from evidence.study_interruption import Contents, read_contents
 from loopcal.errors import FileError, StudyError
-from loopcal.studies.execution.executors import (
-    MOST_LOSSES,
-    Answer,
-    Dask,
-    Executor,
-    Processes,
-    Ray,
-    Serial,
-)
+from loopcal.studies.executors import MOST_LOSSES, Answer, Dask, Executor, Processes, Ray, Serial
 from loopcal.studies.running import read_source, run_study
 from tests.findings.expectations import expect_refusal
 from tests.studies.block_functions import (
@@ -153,7 +145,7 @@ def test_closed_iteration_leaves_no_process() -> None:
 
 
 UNGUARDED = """
-from loopcal.studies.execution.executors import Processes
+from loopcal.studies.executors import Processes
 from tests.studies.block_functions import draw_numbers, list_tasks
 print(len(list(Processes(1).map_blocks(draw_numbers, list_tasks(2)))))
 """
@@ -171,7 +163,7 @@ def test_script_without_guard_computes_once(tmp_path) -> None:
 
 
 ORPHAN = """
-from loopcal.studies.execution.executors import Processes
+from loopcal.studies.executors import Processes
 from tests.studies.block_functions import count_threads, list_tasks
 if __name__ == "__main__":
     for answer in Processes(2).map_blocks(count_threads, list_tasks(10_000)):

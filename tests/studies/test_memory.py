@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.studies.driver import run_blocks
-from loopcal.studies.execution.executors import Answer, Serial
-from loopcal.studies.files.study_folder import StudySource, open_study
+from loopcal.studies.executors import Answer, Serial
+from loopcal.studies.files.store import StudySource, open_study
+from loopcal.studies.running import run_blocks
 from loopcal.studies.simulation.block import PosesTask
 from loopcal.studies.simulation.machines import CellPoses
 from loopcal.typing import FloatArray

@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 from loopcal.errors import DataError
 from loopcal.results.tables import render_text
-from loopcal.studies.files.study_folder import StudySource, open_study
+from loopcal.studies.files.store import StudySource, open_study
 from loopcal.studies.results.questions import AnsweredQuestion, decide, say_answer, view_answers
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.specification.levels import (

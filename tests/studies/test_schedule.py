@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from loopcal.studies.driver import (
+from loopcal.studies.running import (
     KEPT_POSES,
     MOST_WAITING,
     MissingBlock,

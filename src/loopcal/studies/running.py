@@ -1,12 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run a study in Python: what `loopcal study run` does."""
+"""Run a study: what `loopcal study run` does. A driver gives blocks to workers and stores what
+they return; a single trial is calibrated again with all checks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
@@ -14,21 +23,372 @@ from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.estimate.published_steps import identify_per_leg
 from loopcal.estimate.trial_identification import check_threads
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import name_count
 from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.core.text_file import as_path
 from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.robot.robot_file import format_robot
 from loopcal.io.runs.run_folder import build_document, refuse_run_folder, save_run
-from loopcal.studies.driver import WHOLE, RunReport, Share, run_blocks
-from loopcal.studies.execution.executors import Executor, Processes, Serial
+from loopcal.results.tables import Block
+from loopcal.studies.executors import MOST_LOSSES, Executor, Processes, Serial
+from loopcal.studies.files.store import StudySource, StudyStore, open_study, read_study
 from loopcal.studies.files.study_file import load_study
-from loopcal.studies.files.study_folder import StudySource, open_study, read_study
+from loopcal.studies.results.questions import explain_failures
 from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.simulation.block import replay_trial
-from loopcal.studies.simulation.fits import choose_rule
+from loopcal.studies.simulation.block import (
+    BlockTask,
+    PosesTask,
+    compute_block,
+    compute_task,
+    make_block_task,
+    make_poses_task,
+    replay_trial,
+)
+from loopcal.studies.simulation.fits import OUTCOMES, choose_rule
+from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
 from loopcal.studies.specification.levels import FACTORS, PER_LEG
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import Cell, Study, compute_key, describe_cell
 from loopcal.typing import Progress, report_no_progress
+
+KEPT_POSES = 256
+"""Poses that are kept, because later cells have the same ones, such as those of other methods."""
+
+MOST_WAITING = 64
+"""Cells that may wait for poses which they have in common."""
+
+
+class MissingBlock(NamedTuple):
+    """A block to compute, the number of its cell, and what determines its numbers."""
+
+    key: str
+    cell: int
+    content: dict[str, Any]
+
+
+Blocks = Iterator[MissingBlock]
+"""The missing blocks of one cell."""
+
+
+class Schedule(Iterator["BlockTask | PosesTask | None"]):
+    """Tasks, one by one: the poses of a cell, then its blocks; None while all that is left needs
+    poses that a worker computes.
+
+    cells : missing blocks of each cell. Few of them are taken ahead, so that memory does not grow
+    with the number of cells or blocks.
+    """
+
+    def __init__(self, cells: Iterable[Blocks]) -> None:
+        self._cells = iter(cells)
+        self._current: tuple[Blocks, CellPoses] | None = None
+        self._next: deque[tuple[Blocks, CellPoses]] = deque()  # not begun, poses are known
+        self._waiting: dict[str, list[tuple[int, Blocks]]] = {}  # by the task of their poses
+        self._poses: dict[str, CellPoses] = {}  # the latest ones, by their task
+
+    def __next__(self) -> BlockTask | PosesTask | None:
+        """Return the next task."""
+        if not self._next and not self._waiting and (task := self._look_ahead()) is not None:
+            return task
+        while True:
+            if self._current is not None:
+                blocks, poses = self._current
+                if (block := next(blocks, None)) is not None:
+                    return make_block_task(*block, poses)
+            self._current = None
+            if not self._next and (task := self._look_ahead()) is not None:
+                return task
+            if self._next:
+                self._current = self._next.popleft()
+            elif self._waiting:
+                return None
+            else:
+                raise StopIteration
+
+    def add_poses(self, task: PosesTask, poses: CellPoses) -> None:
+        """Accept the poses of a task; the blocks that wait for them come next."""
+        self._next.extend((blocks, poses) for _, blocks in self._waiting.pop(task.key))
+        self._poses[task.key] = poses
+        if len(self._poses) > KEPT_POSES:
+            del self._poses[next(iter(self._poses))]
+
+    def give_up(self, task: PosesTask) -> list[int]:
+        """Leave out the cells that wait for poses, and return their numbers."""
+        return [cell for cell, _ in self._waiting.pop(task.key)]
+
+    def _look_ahead(self) -> PosesTask | None:
+        """Take cells until one can begin, or needs poses that no worker has; return their task."""
+        while sum(map(len, self._waiting.values())) < MOST_WAITING:
+            blocks = next(self._cells, None)
+            if blocks is None:
+                return None
+            first = next(blocks, None)
+            if first is None:
+                continue
+            blocks, task = chain((first,), blocks), make_poses_task(first.content)
+            if (poses := self._poses.get(task.key)) is not None:
+                self._next.append((blocks, poses))
+                return None
+            waiting = self._waiting.setdefault(task.key, [])
+            waiting.append((first.cell, blocks))
+            if len(waiting) == 1:
+                return task
+        return None
+
+
+MOST_NAMED = 5
+"""Blocks that were given up and are named in a finding."""
+
+LISTED = 200
+"""Blocks whose keys are read at once, so that memory does not grow with the number of blocks."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """One of several equal parts of the blocks of a study, for jobs that run at once.
+
+    A study with at least as many cells as jobs is divided by cells, others by the blocks of each
+    cell.
+
+    Parameters
+    ----------
+    part : from 1. of : their number.
+    """
+
+    part: int = 1
+    of: int = 1
+
+    def select_cells(self, study: Study) -> Sequence[Cell]:
+        """Return the cells of this part."""
+        return study.cells[self.part - 1 :: self.of] if self._by_cells(study) else study.cells
+
+    def select_blocks(self, study: Study) -> range:
+        """Return the blocks of this part in each of its cells."""
+        step = 1 if self._by_cells(study) else self.of
+        return range(0 if step == 1 else self.part - 1, study.blocks, step)
+
+    def _by_cells(self, study: Study) -> bool:
+        return len(study.cells) >= self.of
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """What a driver did.
+
+    Attributes
+    ----------
+    total : blocks that were asked for. before : of these, stored when it began. computed, trials :
+        stored by it. given_up : blocks that stopped every worker, and cells whose poses did.
+    losses : workers that were lost, as far as is known. worker_seconds : sum over all workers.
+    """
+
+    total: int
+    before: int
+    computed: int
+    trials: int
+    given_up: tuple[str, ...]
+    losses: int
+    seconds: float
+    worker_seconds: float
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether all blocks are stored."""
+        return self.before + self.computed == self.total
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What happened to workers."""
+        findings = []
+        if self.losses:
+            findings.append(report_finding("workers.lost", losses=self.losses))
+        if self.given_up:
+            named = self.given_up[:MOST_NAMED]
+            code, count = "workers.blocks-given-up", len(self.given_up)
+            findings.append(report_finding(code, count=count, losses=MOST_LOSSES, blocks=named))
+        return tuple(findings)
+
+
+WHOLE = Share()
+"""All blocks."""
+
+
+def run_blocks(
+    study: Study,
+    store: StudyStore,
+    executor: Executor,
+    share: Share = WHOLE,
+    progress: Progress = report_no_progress,
+    threads: int = 1,
+) -> RunReport:
+    """Compute and store the blocks of a study that are missing in its store, each as soon as it is
+    there; `threads` compute a block, in each worker.
+
+    Raises FileError: a block cannot be stored. StudyError, LoopcalError: see `Executor.map_blocks`
+    and `compute_block`.
+    """
+    begin = time.perf_counter()
+    total, before = count_blocks(study, share), count_stored(study, store, share)
+    computed = trials = losses = 0
+    seconds, given_up = 0.0, []
+    progress(before, total, "computing blocks")
+    schedule = Schedule(_list_missing(study, store, share))
+    compute = compute_task if threads == 1 else partial(compute_task, threads=threads)
+    with closing(executor.map_blocks(compute, schedule)) as answers:
+        for answer in answers:
+            task, result = answer.task, answer.result
+            losses, seconds = losses + answer.losses, seconds + answer.seconds
+            if isinstance(task, PosesTask):
+                if isinstance(result, CellPoses):
+                    schedule.add_poses(task, result)
+                else:
+                    given_up += [f"cell {cell}, poses" for cell in schedule.give_up(task)]
+                continue
+            if result is None:
+                given_up.append(f"cell {task.cell}, block {task.block}")
+                continue
+            assert not isinstance(result, CellPoses)
+            levels = study.cells[task.cell].levels
+            if store.add_block(task.key, levels, task.block, result, answer.seconds):
+                computed, trials = computed + 1, trials + len(result)
+            progress(before + computed, total, "computing blocks")
+    wall = time.perf_counter() - begin
+    return RunReport(total, before, computed, trials, tuple(given_up), losses, wall, seconds)
+
+
+def count_blocks(study: Study, share: Share = WHOLE) -> int:
+    """Return the number of blocks of a study, or of a part of it."""
+    return len(share.select_cells(study)) * len(share.select_blocks(study))
+
+
+def count_stored(study: Study, store: StudyStore, share: Share = WHOLE) -> int:
+    """Return how many of these blocks are stored."""
+    blocks = share.select_blocks(study)
+    return sum(store.count_blocks(cell.levels, blocks) for cell in share.select_cells(study))
+
+
+def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blocks]:
+    """Yield, for one cell after the other, its blocks that are not stored."""
+    blocks = share.select_blocks(study)
+
+    def list_blocks(cell: Cell) -> Blocks:
+        of_cell = describe_cell(study, cell)
+        for first in range(0, len(blocks), LISTED):
+            listed = blocks[first : first + LISTED]
+            stored = store.list_keys(cell.levels, listed)
+            contents = (of_cell | {"block": block} for block in listed)
+            for key, content in ((compute_key(content), content) for content in contents):
+                if key not in stored:
+                    yield MissingBlock(key, cell.number, content)
+
+    for cell in share.select_cells(study):
+        if store.count_blocks(cell.levels, blocks) < len(blocks):
+            yield list_blocks(cell)
+
+
+MOST_BLOCKS = 4
+"""Cells of which a block is computed at most; further cells are estimated from them."""
+
+LONGEST = 30.0
+"""Seconds after which no further block is begun."""
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """How long a study takes, by a block of some of its cells.
+
+    Attributes
+    ----------
+    measured : cells of which a block was computed. plans : sets of poses to draw or to plan, which
+        cells have in common. worker_seconds, seconds : by one worker, and by as many `workers`.
+    bytes : of the store. failed : share of the computed trials that failed, and by their code.
+    """
+
+    cells: int
+    trials: int
+    blocks: int
+    measured: int
+    seconds_per_block: float
+    plans: int
+    seconds_per_plan: float
+    worker_seconds: float
+    workers: int
+    seconds: float
+    bytes: int
+    failed: float
+    computed: int
+    failures: Mapping[str, int]
+
+
+def estimate_time(
+    study: Study, workers: int, progress: Progress = report_no_progress
+) -> TimeEstimate:
+    """Compute a block of some cells, evenly spread over the study, and estimate the whole.
+
+    Raises LoopcalError: one of these cells cannot be computed; the text names it.
+    """
+    last = len(study.cells) - 1
+    chosen = range(last + 1)
+    if last >= MOST_BLOCKS:
+        chosen = [round(i * last / (MOST_BLOCKS - 1)) for i in range(MOST_BLOCKS)]
+    seconds, trials, planning = [], 0, 0.0
+    failures: Counter[str] = Counter()
+    poses: dict[str, CellPoses] = {}
+    for i, number in enumerate(chosen):
+        progress(i, len(chosen), "computing a block")
+        content = describe_cell(study, study.cells[number]) | {"block": 0}
+        plan = make_poses_task(content)
+        if plan.key not in poses:
+            begin = time.perf_counter()
+            poses[plan.key] = compute_poses(json.loads(plan.content))
+            planning += time.perf_counter() - begin
+        task = make_block_task(compute_key(content), number, content, poses[plan.key])
+        begin = time.perf_counter()
+        outcomes = compute_block(task)[:, 0]
+        seconds.append(time.perf_counter() - begin)
+        trials += len(outcomes)
+        failures.update(OUTCOMES[int(outcome)] for outcome in outcomes if outcome)
+        if sum(seconds) + planning > LONGEST:
+            break
+    blocks = study.blocks * len(study.cells)
+    plans = len({make_poses_task(describe_cell(study, cell)).key for cell in study.cells})
+    each, each_plan = sum(seconds) / len(seconds), planning / len(poses)
+    return TimeEstimate(
+        cells=len(study.cells),
+        trials=study.replicates * len(study.cells),
+        blocks=blocks,
+        measured=len(seconds),
+        seconds_per_block=each,
+        plans=plans,
+        seconds_per_plan=each_plan,
+        worker_seconds=each * blocks + each_plan * plans,
+        workers=workers,
+        seconds=each * math.ceil(blocks / workers) + each_plan * math.ceil(plans / workers),
+        bytes=blocks * study.block * len(study.columns) * 8,
+        failed=sum(failures.values()) / trials,
+        computed=trials,
+        failures=failures,
+    )
+
+
+def view_estimate(
+    study: Study, estimate: TimeEstimate, format_duration: Callable[[float], str]
+) -> list[Block]:
+    """Return the page of an estimate."""
+    cells = name_count(estimate.cells, "cell")
+    lines: list[Block] = [f"{study.title}: {cells}, {estimate.trials} trials"]
+    for name, levels in study.levels.items():
+        separator = "; " if any("," in level for level in levels) else ", "
+        lines.append(f"  {name:<12}{separator.join(levels)}")
+    total = format_duration(estimate.seconds)
+    plural = "es" if estimate.workers > 1 else ""
+    lines.append(
+        f"A block of {study.block} trials takes {estimate.seconds_per_block:.2g} s; the study "
+        f"takes about {total} with {estimate.workers} process{plural}, and "
+        f"{max(estimate.bytes / 1e6, 0.1):.1f} MB"
+    )
+    if any(is_planned(level) for level in study.poses.values()):
+        times = "once" if estimate.plans == 1 else f"{estimate.plans} times"
+        lines.append(f"This includes planning poses, {estimate.seconds_per_plan:.2g} s {times}")
+    return [*lines, *explain_failures(estimate.failures, estimate.computed)]
 
 
 def study(

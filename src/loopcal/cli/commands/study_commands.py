@@ -21,9 +21,9 @@ from loopcal.errors import StudyError
 
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
-    from loopcal.studies.driver import Share
-    from loopcal.studies.execution.executors import Executor
+    from loopcal.studies.executors import Executor
     from loopcal.studies.files.store import StudyStore
+    from loopcal.studies.running import Share
     from loopcal.studies.specification.study import Study
 
 
@@ -33,7 +33,7 @@ STOPPED, INCOMPLETE = 1, 2
 
 def _parse_share(text: str) -> Share:
     """Return a share such as 3/10: the third of ten parts."""
-    from loopcal.studies.driver import Share
+    from loopcal.studies.running import Share
 
     match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
     if match is None or int(match[1]) > int(match[2]):
@@ -43,8 +43,7 @@ def _parse_share(text: str) -> Share:
 
 def _choose_work(stated: Mapping[str, Any]) -> tuple[Executor, Share]:
     """Return who computes a study, and which share of it, from the values of `WORK`."""
-    from loopcal.studies.driver import WHOLE
-    from loopcal.studies.running import make_local
+    from loopcal.studies.running import WHOLE, make_local
 
     share, workers = stated["share"] or WHOLE, stated["workers"]
     if stated["dask"] is not None:
@@ -84,7 +83,7 @@ def run_and_report(
     """Compute what is missing in an open store; Ctrl-C ends it with what is kept."""
     from loopcal.findings import report_finding
     from loopcal.results.serialization import to_json
-    from loopcal.studies.driver import count_blocks, count_stored, run_blocks
+    from loopcal.studies.running import count_blocks, count_stored, run_blocks
 
     executor, share = work
     try:
@@ -187,8 +186,7 @@ def check(study_file: Path = STUDY, quick: bool = QUICK) -> Output:
       loopcal study check study.yaml
       loopcal study check study.yaml --quick
     """
-    from loopcal.studies.driver import estimate_time, view_estimate
-    from loopcal.studies.running import read_source
+    from loopcal.studies.running import estimate_time, read_source, view_estimate
 
     chosen = read_source(study_file, quick).study
     with terminal.ProgressBar() as progress:
@@ -218,7 +216,7 @@ def run(
       loopcal study run study.yaml -o results --dask tcp://scheduler:8786
       loopcal study run study.yaml -o part-3 --cells 3/10
     """
-    from loopcal.studies.files.study_folder import open_study
+    from loopcal.studies.files.store import open_study
     from loopcal.studies.running import read_source
 
     source = read_source(study_file, quick)
@@ -239,7 +237,7 @@ def extend(
     Examples:
       loopcal study extend results --replicates 5000
     """
-    from loopcal.studies.files.study_folder import extend_study, load_specification
+    from loopcal.studies.files.store import extend_study, load_specification
 
     with extend_study(folder, replicates) as store:
         return run_and_report(load_specification(store), store, folder, work)
@@ -359,9 +357,8 @@ def export(
       loopcal study export results -o trials.parquet
     """
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.studies.files.store import read_store
-    from loopcal.studies.files.study_folder import load_specification
-    from loopcal.studies.results.export import export_trials
+    from loopcal.studies.files.store import load_specification, read_store
+    from loopcal.studies.results.study_result import export_trials
 
     refuse_outputs((output,), (), force)
     with read_store(folder) as store, terminal.ProgressBar() as progress:
@@ -382,7 +379,7 @@ def merge(
     Examples:
       loopcal study merge part-1 part-2 part-3 -o results
     """
-    from loopcal.studies.files.study_folder import merge_studies
+    from loopcal.studies.files.store import merge_studies
     from loopcal.studies.results.study_result import read_status, view_status
 
     with terminal.ProgressBar() as progress:

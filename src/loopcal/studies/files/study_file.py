@@ -53,8 +53,7 @@ from loopcal.studies.specification.levels import (
     Scores,
     whole_numbers,
 )
-from loopcal.studies.specification.scores import check_question
-from loopcal.studies.specification.study import BLOCK, REPLICATES, Study
+from loopcal.studies.specification.study import BLOCK, REPLICATES, Study, check_question
 
 LEVELS: Mapping[str, type] = {
     "instruments": InstrumentLevel,

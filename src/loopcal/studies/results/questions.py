@@ -37,8 +37,7 @@ from loopcal.studies.results.study_result import (
     iterate_trials,
 )
 from loopcal.studies.specification.levels import Question, list_chains
-from loopcal.studies.specification.scores import check_question
-from loopcal.studies.specification.study import Cell, Study
+from loopcal.studies.specification.study import Cell, Study, check_question
 from loopcal.units import Unit, find_unit
 
 Certainty = Literal["certain", "between", "none", "unknown"]

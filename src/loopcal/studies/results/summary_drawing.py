@@ -27,8 +27,7 @@ from loopcal.report.pictures import render_figure
 from loopcal.studies.results.questions import FRAMES, UNITS
 from loopcal.studies.results.study_result import CellSummary, Interval, StudySummary, find_columns
 from loopcal.studies.specification.levels import list_chains
-from loopcal.studies.specification.scores import BASE_COLUMNS, ScoreColumn, check_question
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import BASE_COLUMNS, ScoreColumn, Study, check_question
 from loopcal.units import Unit
 
 if TYPE_CHECKING:

@@ -43,8 +43,13 @@ from loopcal.studies.simulation.machines import (
     prepare_cell,
 )
 from loopcal.studies.specification.levels import MethodLevel
-from loopcal.studies.specification.scores import list_columns
-from loopcal.studies.specification.study import Study, compute_key, describe_cell, format_json
+from loopcal.studies.specification.study import (
+    Study,
+    compute_key,
+    describe_cell,
+    format_json,
+    list_columns,
+)
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
