@@ -29,7 +29,7 @@ from loopcal.numerics.decomposition import (
     empty_factor,
     solve_regular,
 )
-from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, Model, minimize
+from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
@@ -231,6 +231,31 @@ FIRST_DAMPING = 1e-6
 """Damping after the first rejected step, in units of the largest squared singular value."""
 
 
+PATIENCE = 20
+"""Evaluations without progress after which a trial ends. One whose result is not finite, such as
+that of poses out of reach, counts `NOT_FINITE` times: it takes the longest and says the least."""
+
+NOT_FINITE = 5
+
+LESS_COST, LESS_LENGTH, LESS_DAMPING = 0.99, 0.95, 0.1
+"""Progress is a decrease of the sum of squares, of the length of the full step, or of the damping
+to this share of its value at the last progress."""
+
+
+CHAIN_CONTRACTION = 0.9
+"""Largest ratio of the lengths of two full steps of a chain."""
+
+LEAST_GAIN = 0.25
+"""Share of the predicted decrease that a chain must bring. With less, full steps may lead into the
+basin of another, higher minimum."""
+
+LONGEST_CHAIN = 10
+"""Steps of a chain, at most."""
+
+FIRST_WAIT = 2
+"""Damped steps before a chain is tried; twice as many after every one that led nowhere."""
+
+
 class LeastSquaresProblem(Protocol):
     """A least-squares problem of t trials: whitened rows, columns scaled by tolerance."""
 
@@ -412,33 +437,31 @@ def descend(
         They become shorter at least by the ratio of the last two.
     """
     control = control or StepControl()
-    fixed = fix_penalty(method, problem.parameters)
-    model = _FilteredDescent(problem, method, tolerance, control, fixed, sufficient)
+    run = _Run(problem, method, tolerance, control, sufficient)
     z = np.array(deviation, dtype=np.float64)
     progress(0, 1, "fitting")
-    with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
-        begin = problem.start(z) if start is None else start
-        first = _clear_failed(problem.linearize(z, begin))
-    arrival = np.full(len(z), np.inf) if arrival is None else arrival
-    point = model.locate(replace(first, deviation=z), arrival)
-    linear_model = point.linear_model
-    deviations, costs = [z.copy()], [point.cost.copy()]
+    run.begin(z, start, arrival)
+    deviations, costs = [z.copy()], [run.point.cost.copy()]
 
-    def observe(moved: _Point) -> None:
-        deviations.append(moved.z.copy())
-        costs.append(moved.cost.copy())
-        progress(0, 1, f"fitting, step {len(costs) - 1}: sum of squares {moved.cost[0]:.4g}")
+    def observe() -> None:
+        deviations.append(run.point.z.copy())
+        costs.append(run.point.cost.copy())
+        progress(0, 1, f"fitting, step {len(costs) - 1}: sum of squares {costs[-1][0]:.4g}")
 
-    def measure_curvature(trials: IntArray) -> FloatArray:
-        decomposition = linear_model.take(trials).decomposition
-        return decomposition.singular_values.max(axis=1, initial=0.0) ** 2
-
-    first_damping = np.zeros(len(z))
-    if control.damping:
-        first_damping = control.damping * measure_curvature(np.arange(len(z)))
-    damping = Damping(first_damping, lambda trials: FIRST_DAMPING * measure_curvature(trials))
-    minimum = minimize(model, point, damping, control.iterations, observe)
-    last: _Point = minimum.point
+    for i in range(control.iterations + 1):
+        if run.accept_chains():
+            observe()
+        active = np.flatnonzero(run.status == DescentStatus.RUNNING.value)
+        if not active.size:
+            break
+        active, current, step = run.propose(active)
+        if not active.size or i == control.iterations:
+            break
+        if run.evaluate(active, current, step, i):
+            observe()
+    running = run.status == DescentStatus.RUNNING.value
+    run.status[running] = DescentStatus.OUT_OF_ITERATIONS
+    last = run.point
     if (last.z != deviations[-1]).any():
         deviations.append(last.z)
         costs.append(last.cost)
@@ -446,21 +469,12 @@ def descend(
         deviation=last.z,
         linear_model=last.linear_model,
         cost=last.cost,
-        status=minimum.status,
-        iterations=minimum.iterations,
+        status=run.status,
+        iterations=run.taken,
         start=last.start,
         deviation_history=np.stack(deviations),
         cost_history=np.stack(costs),
     )
-
-
-def _clear_failed(linearized: Linearization) -> Linearization:
-    """Return a linearization with infinite cost and no rows where one of them is not finite."""
-    is_finite = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
-    if is_finite.all():
-        return linearized
-    factor = np.where(is_finite[:, None, None], linearized.factor, 0.0)
-    return replace(linearized, factor=factor, cost=np.where(is_finite, linearized.cost, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,6 +491,15 @@ class _Point(TrialBatch):
     start: Start
     arrival: FloatArray
 
+    def propose(self, damping: FloatArray) -> FilteredStep:
+        """Return the steps, damped by `damping` (a,)."""
+        return self.linear_model.propose(self.z, damping)
+
+    @property
+    def objective(self) -> FloatArray:
+        """(a,) sum of squares plus penalty."""
+        return self.cost + self.linear_model.penalize(self.z)
+
     @property
     def spread(self) -> FloatArray:
         """(a,) 1 + |z|, with which lengths of steps are compared."""
@@ -486,31 +509,46 @@ class _Point(TrialBatch):
 class _Candidate(NamedTuple):
     """The linearization at proposed deviations; its linear model is made where it is needed."""
 
-    model: _FilteredDescent
+    run: _Run
     linearized: Linearization
     arrival: FloatArray
 
-    @property
-    def cost(self) -> FloatArray:
-        """(a,) sums of squares, infinite where the rows are not finite."""
-        return self.linearized.cost
-
-    def take(self, trials: IntArray) -> _Point:
+    def take(self, trials: np.ndarray) -> _Point:
         """Return the points of some trials."""
         needed = replace(self.linearized, nuisance=None, poses=None)  # the rest is not copied
-        return self.model.locate(needed.take(trials), self.arrival[trials])
+        return self.run.locate(needed.take(trials), self.arrival[trials])
 
 
-@dataclass(frozen=True, eq=False)
-class _FilteredDescent(Model):
-    """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
+class _Run:
+    """One descent of t trials: its working memory."""
 
-    problem: LeastSquaresProblem
-    method: Method
-    tolerance: float
-    control: StepControl
-    fixed: FixedPenalty | None
-    sufficient: float
+    def __init__(
+        self,
+        problem: LeastSquaresProblem,
+        method: Method,
+        tolerance: float,
+        control: StepControl,
+        sufficient: float,
+    ) -> None:
+        self.problem, self.method, self.tolerance = problem, method, tolerance
+        self.control, self.sufficient = control, sufficient
+        self.fixed = fix_penalty(method, problem.parameters)
+
+    def begin(self, z: FloatArray, start: Start | None, arrival: FloatArray | None) -> None:
+        """Linearize at the deviations z (t, p) from which the trials start."""
+        t, problem = len(z), self.problem
+        with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
+            begin = problem.start(z) if start is None else start
+            first = _clear_failed(problem.linearize(z, begin))
+        arrival = np.full(t, np.inf) if arrival is None else arrival
+        self.point = self.locate(replace(first, deviation=z), arrival)
+        running, bad = DescentStatus.RUNNING.value, DescentStatus.BAD_START.value
+        self.status = np.where(np.isfinite(self.point.cost), running, bad).astype(int)
+        self.taken = np.zeros(t, dtype=np.int64)
+        self.chains = _FullSteps(self.point)
+        self.damping = _Damping(t, self.control.damping, self.point.linear_model)
+        self.marks = np.full((t, 3), np.inf)  # of the last progress, and evaluations since then
+        self.age = np.zeros(t, dtype=np.int64)
 
     def locate(self, linearized: Linearization, arrival: FloatArray) -> _Point:
         """Return the points of a linearization."""
@@ -518,9 +556,43 @@ class _FilteredDescent(Model):
         z, start = linearized.deviation, linearized.next_start
         return _Point(z, linearized.cost, linear_model, start, arrival)
 
-    def propose(self, point: _Point, damping: FloatArray) -> FilteredStep:
-        """Return the damped steps."""
-        return point.linear_model.propose(point.z, damping)
+    def accept_chains(self) -> bool:
+        """Move trials to the lower points that chains of full steps reached; return whether any."""
+        if not self.chains.is_ahead.any():
+            return False
+        arrived, lower = self.chains.find_arrived()
+        if not arrived.size:
+            return False
+        self.point = self.point.put(arrived, lower)
+        self.damping.release(arrived)
+        self.taken[arrived] += 1
+        return True
+
+    def propose(self, active: IntArray) -> tuple[IntArray, _Point, FilteredStep]:
+        """Return the trials (a,) that go on, their points and steps; end those that converged,
+        after their full step and with the linear model before it.
+        """
+        damping, current = self.damping.value[active], self.point.take(active)
+        self.chains.start_due(self.point, active, damping)
+        if self.chains.is_ahead.any():
+            current = self.chains.replace_points(current, active)
+            damping = np.where(self.chains.is_ahead[active], 0.0, damping)
+        step = current.propose(damping)
+        is_last = self.is_negligible(current, step)
+        if self.chains.is_ahead.any():
+            is_last &= ~self.chains.is_away(active)
+        if is_last.any():
+            last, going = active[is_last], np.flatnonzero(~is_last)
+            self.chains.is_ahead[last] = False
+            self.status[last] = DescentStatus.CONVERGED
+            self.taken[last] += 1
+            z = self.point.z.copy()
+            z[last] = step.target[is_last]
+            self.point = replace(self.point, z=z)
+            active = active[going]
+            if active.size:
+                current, step = current.take(going), step.take(going)
+        return active, current, step
 
     def is_negligible(self, point: _Point, step: FilteredStep) -> BoolArray:
         """Return which steps are the last."""
@@ -533,43 +605,228 @@ class _FilteredDescent(Model):
         remaining = change * ratio / np.maximum(1.0 - ratio, 1.0 - CONTRACTION)
         return is_last | ((ratio <= CONTRACTION) & (remaining <= self.sufficient))
 
-    def finish(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Point:
-        """Return the points, some after their full step, without copies of the linear model."""
-        z = point.z.copy()
-        z[trials] = step.target
-        return replace(point, z=z)
-
-    def evaluate(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Candidate:
-        """Linearize at the deviations of the steps."""
-        linearized = self.problem.take(trials).linearize(step.deviation, point.start)
+    def evaluate(
+        self, active: IntArray, current: _Point, step: FilteredStep, round_number: int
+    ) -> bool:
+        """Evaluate steps of trials (a,) and take those that are accepted; return whether any."""
+        linearized = self.problem.take(active).linearize(step.deviation, current.start)
         is_full = step.length >= step.full_length
         arrival = np.where(is_full, np.sqrt(step.change), np.inf)
-        return _Candidate(self, _clear_failed(linearized), arrival)
+        candidate = _Candidate(self, _clear_failed(linearized), arrival)
+        cost, chains, reference = candidate.linearized.cost, self.chains, current
+        ahead = chains.is_ahead[active]
+        if has_chains := ahead.any():
+            reference, step = self.point.take(active), chains.expect(step, active)
+        accepted, ratio = _judge(reference, step, cost)
+        status = _find_ending(reference, step, cost, accepted)
+        single, was_full = np.flatnonzero(~ahead), self.damping.value[active] == 0.0
+        if has_chains:
+            self.damping.adapt(active[single], accepted[single], ratio[single])
+            status = np.where(ahead, DescentStatus.RUNNING.value, status)
+        else:
+            self.damping.adapt(active, accepted, ratio)
+        self.status[active] = status
+        chains.record(step, candidate, active, accepted, ratio, was_full)
+        if round_number >= PATIENCE:  # most trials have converged before
+            finite = np.isfinite(cost)[single]
+            self._end_stalled(active[single], finite, reference.take(single), step.take(single))
+        is_taken = accepted & ~ahead
+        if not is_taken.any():
+            return False
+        moved = active[is_taken]
+        self.taken[moved] += 1
+        self.point = self.point.put(moved, candidate.take(np.flatnonzero(is_taken)))
+        return True
 
-    def judge(
-        self, point: _Point, step: FilteredStep, candidate: _Candidate
-    ) -> tuple[BoolArray, FloatArray]:
-        """Accept steps that bring a share of the decrease that was predicted."""
-        before = self.objective(point)
-        after = candidate.cost + point.linear_model.penalize(step.deviation)
-        gained = before - after + ROUNDING * before
-        # a truncated direction on its way back to nominal may cost something: up to twice what was
-        # predicted
-        needed = np.where(step.predicted > 0.0, ACCEPTED_SHARE, 2.0) * step.predicted
-        smallest = np.finfo(np.float64).tiny
-        return gained >= needed, gained / np.maximum(np.abs(step.predicted), smallest)
+    def _end_stalled(
+        self, trials: IntArray, is_finite: BoolArray, point: _Point, step: FilteredStep
+    ) -> None:
+        """End trials (a,) that made no progress within `PATIENCE` evaluations."""
+        values = np.stack([point.objective, step.full_length, self.damping.value[trials]], axis=1)
+        progress = values < np.array([LESS_COST, LESS_LENGTH, LESS_DAMPING]) * self.marks[trials]
+        self.marks[trials] = np.where(progress, values, self.marks[trials])
+        age = np.where(progress.any(axis=1), 0, self.age[trials])
+        self.age[trials] = age + np.where(is_finite, 1, NOT_FINITE)
+        running = self.status[trials] == DescentStatus.RUNNING.value
+        stalled = self.age[trials] >= PATIENCE
+        self.status[trials[stalled & running]] = DescentStatus.NO_PROGRESS
 
-    def objective(self, point: _Point) -> FloatArray:
-        """Return the sum of squares plus penalty."""
-        return point.cost + point.linear_model.penalize(point.z)
 
-    def ending(
-        self, point: _Point, step: FilteredStep, candidate: _Candidate, accepted: BoolArray
-    ) -> IntArray:
-        """End trials that met rounding, or whose steps became too short."""
-        spread, good = point.spread, np.isfinite(candidate.cost)
-        met_rounding = good & (step.full_length <= ROUNDING_STEP * spread)
-        is_stuck = ~accepted & (met_rounding | (step.length <= SHORTEST_STEP * spread))
-        converged = good & (step.full_length <= SMALL_STEP * spread)
-        ending = np.where(converged, DescentStatus.CONVERGED.value, DescentStatus.NO_DESCENT.value)
-        return np.where(is_stuck, ending, DescentStatus.RUNNING.value)
+class _Damping:
+    """Levenberg-Marquardt damping of t trials by Nielsen's rule: working memory of one iteration.
+
+    Parameters
+    ----------
+    first : damping of the first step, in units of these squares.
+    model : at the start; its largest squared singular values scale the damping.
+    """
+
+    def __init__(self, trials: int, first: float, model: LinearModel) -> None:
+        self._model = model
+        self.value: FloatArray = np.zeros(trials)
+        if first:
+            self.value = first * self._measure_curvature(np.arange(trials))
+        self.growth: FloatArray = np.full(trials, 2.0)
+        self._floor = np.full(trials, np.nan)
+
+    def _measure_curvature(self, trials: IntArray) -> FloatArray:
+        """Return the largest squared singular values (a,) of some trials."""
+        s = self._model.take(trials).decomposition.singular_values
+        return s.max(axis=1, initial=0.0) ** 2
+
+    def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
+        """Lower the damping after a good step; raise it ever faster after rejected ones.
+
+        `ratio` (a,) is the decrease over the predicted one.
+        """
+        if accepted.all() and not self.value[trials].any():
+            self.growth[trials] = 2.0
+            return
+        unknown = trials[~accepted & np.isnan(self._floor[trials])]
+        if unknown.size:
+            self._floor[unknown] = FIRST_DAMPING * self._measure_curvature(unknown)
+        less = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
+        more = np.fmax(self.value[trials] * self.growth[trials], self._floor[trials])
+        self.value[trials] = np.where(accepted, self.value[trials] * less, more)
+        self.growth[trials] = np.where(accepted, 2.0, 2.0 * self.growth[trials])
+
+    def release(self, trials: IntArray) -> None:
+        """Remove the damping of some trials."""
+        self.value[trials], self.growth[trials] = 0.0, 2.0
+
+
+class _FullSteps:
+    """Chains of full steps of t trials: working memory of one iteration.
+
+    `is_ahead` (t,) are the trials with a chain.
+    """
+
+    def __init__(self, point: _Point) -> None:
+        self._point, trials = point, len(point.z)
+        self.is_ahead: BoolArray = np.zeros(trials, dtype=bool)
+        self._is_low = np.zeros(trials, dtype=bool)
+        self._count, self._taken = np.zeros(trials, dtype=np.int64), np.zeros(trials, dtype=int)
+        self._wait = np.full(trials, FIRST_WAIT)
+        self._length, self._promised = np.zeros(trials), np.zeros(trials)
+
+    def find_arrived(self) -> tuple[IntArray, _Point]:
+        """End the chains that reached a lower point or led nowhere.
+
+        Return the trials (a,) that reached a lower point, and these points.
+        """
+        ahead = np.flatnonzero(self.is_ahead)
+        points_ahead = self._point.take(ahead)
+        length = points_ahead.propose(np.zeros(len(ahead))).full_length
+        contracts = length <= CHAIN_CONTRACTION * self._length[ahead]
+        is_lower = contracts & self._is_low[ahead]
+        goes_on = contracts & ~is_lower & (self._count[ahead] < LONGEST_CHAIN)
+        self._end(ahead[~goes_on & ~is_lower])
+        arrived = ahead[is_lower]
+        self.is_ahead[arrived], self._wait[arrived], self._taken[arrived] = False, FIRST_WAIT, 0
+        return arrived, points_ahead.take(np.flatnonzero(is_lower))
+
+    def start_due(self, point: _Point, active: IntArray, damping: FloatArray) -> None:
+        """Begin chains at the points of trials (a,) that took enough damped steps."""
+        if not damping.any():
+            return
+        due = (damping > 0.0) & (self._taken[active] >= self._wait[active])
+        due &= ~self.is_ahead[active]
+        if due.any():
+            trials = active[due]
+            self._begin(trials, point.take(trials), 0)
+
+    def is_away(self, active: IntArray) -> BoolArray:
+        """Return which trials (a,) are at a point of a chain that is not accepted."""
+        return self.is_ahead[active] & (self._count[active] > 0)
+
+    def replace_points(self, current: _Point, active: IntArray) -> _Point:
+        """Return the points of trials (a,), those of chains where a chain goes on."""
+        ahead = np.flatnonzero(self.is_ahead[active])
+        return current if not ahead.size else current.put(ahead, self._point.take(active[ahead]))
+
+    def expect(self, step: FilteredStep, active: IntArray) -> FilteredStep:
+        """Return steps (a,) with the decrease that the first full step of their chain predicted."""
+        is_first = self.is_ahead[active] & (self._count[active] == 0)
+        self._promised[active[is_first]] = step.predicted[is_first]
+        self._length[active] = step.full_length
+        promised = np.where(self.is_ahead[active], self._promised[active], step.predicted)
+        return replace(step, predicted=promised)
+
+    def record(
+        self,
+        step: FilteredStep,
+        candidate: _Candidate,
+        active: IntArray,
+        accepted: BoolArray,
+        ratio: FloatArray,
+        is_full: BoolArray,
+    ) -> None:
+        """Record what was evaluated at the ends of steps (a,).
+
+        Chains begin where a full step was refused; `is_full` (a,) are the undamped steps, `ratio`
+        (a,) the decrease over the predicted one.
+        """
+        if accepted.all() and not self.is_ahead.any():
+            self._taken[active] += 1
+            return
+        ahead, finite = self.is_ahead[active], np.isfinite(candidate.linearized.cost)
+        self._taken[active[accepted & ~ahead]] += 1
+        begun = ~ahead & ~accepted & is_full & finite
+        if begun.any():
+            trials = active[begun]
+            self._promised[trials] = step.predicted[begun]
+            self._length[trials] = step.full_length[begun]
+            self._begin(trials, candidate.take(np.flatnonzero(begun)), 1)
+        moved = ahead & finite
+        if moved.any():
+            trials = active[moved]
+            self._point = self._point.put(trials, candidate.take(np.flatnonzero(moved)))
+            self._is_low[trials] = accepted[moved] & (ratio[moved] >= LEAST_GAIN)
+            self._count[trials] += 1
+        self._end(active[ahead & ~finite])
+
+    def _begin(self, trials: IntArray, first: _Point, count: int) -> None:
+        """Begin chains at the points `first`."""
+        self._point = self._point.put(trials, first)
+        self.is_ahead[trials], self._is_low[trials], self._count[trials] = True, False, count
+
+    def _end(self, trials: IntArray) -> None:
+        """End chains that led nowhere."""
+        again = trials[self._taken[trials] >= self._wait[trials]]
+        self._wait[again] *= 2
+        self.is_ahead[trials], self._taken[trials] = False, 0
+
+
+def _judge(point: _Point, step: FilteredStep, cost: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Return which steps bring a share of the decrease that was predicted, and the ratio of both;
+    `cost` (a,) is the sum of squares after the steps.
+    """
+    before = point.objective
+    after = cost + point.linear_model.penalize(step.deviation)
+    gained = before - after + ROUNDING * before
+    # a truncated direction on its way back to nominal may cost something: up to twice what was
+    # predicted
+    needed = np.where(step.predicted > 0.0, ACCEPTED_SHARE, 2.0) * step.predicted
+    smallest = np.finfo(np.float64).tiny
+    return gained >= needed, gained / np.maximum(np.abs(step.predicted), smallest)
+
+
+def _find_ending(
+    point: _Point, step: FilteredStep, cost: FloatArray, accepted: BoolArray
+) -> IntArray:
+    """Return the status (a,): trials end that met rounding, or whose steps became too short."""
+    spread, good = point.spread, np.isfinite(cost)
+    met_rounding = good & (step.full_length <= ROUNDING_STEP * spread)
+    is_stuck = ~accepted & (met_rounding | (step.length <= SHORTEST_STEP * spread))
+    converged = good & (step.full_length <= SMALL_STEP * spread)
+    ending = np.where(converged, DescentStatus.CONVERGED.value, DescentStatus.NO_DESCENT.value)
+    return np.where(is_stuck, ending, DescentStatus.RUNNING.value)
+
+
+def _clear_failed(linearized: Linearization) -> Linearization:
+    """Return a linearization with infinite cost and no rows where one of them is not finite."""
+    is_finite = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
+    if is_finite.all():
+        return linearized
+    factor = np.where(is_finite[:, None, None], linearized.factor, 0.0)
+    return replace(linearized, factor=factor, cost=np.where(is_finite, linearized.cost, np.inf))

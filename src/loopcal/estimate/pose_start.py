@@ -9,7 +9,7 @@ list, that of home, or one of a few values across the stroke, whichever fits the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import differentiate_by_coordinates, inverse
 from loopcal.mechanism.states import Status
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, Model, minimize
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -51,14 +50,44 @@ def measure_poses(
 
     Rows that use nuisance parameters, compare poses, or look at joints are passed over.
     """
-    usable = _usable_rows(rows, pose)
-    T = np.tile(robot.home, (len(pose), 1, 1))
-    if not usable:
-        return T, np.zeros(len(pose), dtype=bool)
-    model = _MeasuredPoses(robot, usable)
-    start = _Point(T, trial, np.arange(len(pose)), np.zeros(len(pose)), None)
-    minimum = minimize(model, start, FixedFactors(np.ones(len(pose))), STEPS)
-    return minimum.point.T, minimum.status == DescentStatus.CONVERGED
+    usable, is_found = _usable_rows(rows, pose), np.zeros(len(pose), dtype=bool)
+    T, active, state = np.tile(robot.home, (len(pose), 1, 1)), np.arange(len(pose)), None
+    for _ in range(STEPS + 1 if usable else 0):
+        if not active.size:
+            break
+        parts = [
+            _whitened_rows(r, places[active], trial[active], T[active]) for r, places in usable
+        ]
+        residual, by_twist = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
+        closed, slope, is_closed, state = _linearize_freedoms(robot, T[active], state)
+        step, is_full = _least_squares_step(by_twist @ slope, residual)
+        length, longest = np.linalg.norm(step, axis=1), LONGEST_STEP * robot.size
+        step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
+        twist = np.matmul(slope, step[..., None])[..., 0]
+        T[active] = geometry.apply_twist(closed, twist)
+        is_last = is_full & is_closed & (length < NEGLIGIBLE_STEP * robot.size)
+        is_found[active] = is_last
+        goes_on = is_full & ~is_last
+        state = state if goes_on.all() and len(active) == len(pose) else None
+        active = active[goes_on]
+    return T, is_found
+
+
+def _linearize_freedoms(
+    robot: Mechanism, T: FloatArray, state: engine.State | None
+) -> tuple[FloatArray, FloatArray, BoolArray, engine.State | None]:
+    """Return closed poses (k, 4, 4) next to T, the twists (6, f) or (k, 6, f) by what the platform
+    can do there, which poses are closed, and their states.
+    """
+    is_closed = np.ones(len(T), dtype=bool)
+    if set(robot.controlled) == set(robot.freedoms) or len(robot.controlled) == 6:
+        slope = np.diag([1.0 / robot.size] * 3 + [1.0] * 3)[:, robot.program.freedoms]
+        return T, slope, is_closed, None
+    target = read_coordinates(T[None], robot.controlled)
+    state = inverse_trials(robot, robot.values[None], target, state)
+    slope = differentiate_by_coordinates(robot, robot.values[None], state)[0]
+    is_closed = np.asarray(state.status[0] == Status.CONVERGED)
+    return np.where(is_closed[:, None, None], state.T[0], T), slope, is_closed, state
 
 
 def sum_squares_at(
@@ -67,124 +96,6 @@ def sum_squares_at(
     """Return the sum of whitened squares (k,) of the rows of k poses, platform at T (k, 4, 4)."""
     residuals = [_whitened_rows(r, places, trial, T)[0] for r, places in _usable_rows(rows, pose)]
     return sum(((residual**2).sum(axis=1) for residual in residuals), start=np.zeros(len(pose)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """Poses T (k, 4, 4) with their trials and numbers (k,); `cost` is not looked at."""
-
-    T: FloatArray
-    trial: IntArray
-    number: IntArray
-    cost: FloatArray
-    state: engine.State | None
-
-    def take(self, chosen: IntArray) -> _Point:
-        """Return some poses."""
-        state = self.state and map_arrays(lambda array: array[:, chosen], self.state)
-        return _Point(
-            self.T[chosen], self.trial[chosen], self.number[chosen], self.cost[chosen], state
-        )
-
-    def put(self, chosen: IntArray, other: _Point) -> _Point:
-        """Return these poses with some taken from another value."""
-        T = self.T.copy()
-        T[chosen] = other.T
-        state = other.state if len(chosen) == len(T) else None
-        return replace(self, T=T, state=state)
-
-
-@dataclass(frozen=True, eq=False)
-class _FullStep:
-    """Twists (k, 6) from closed poses T, their lengths (k,), and whether rows are sufficient."""
-
-    T: FloatArray
-    twist: FloatArray
-    length: FloatArray
-    is_full: BoolArray
-    is_closed: BoolArray
-    state: engine.State | None
-
-    def take(self, chosen: np.ndarray) -> _FullStep:
-        """Return some poses."""
-        state = self.state and map_arrays(lambda array: array[:, chosen], self.state)
-        return _FullStep(
-            self.T[chosen],
-            self.twist[chosen],
-            self.length[chosen],
-            self.is_full[chosen],
-            self.is_closed[chosen],
-            state,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _MeasuredPoses(Model):
-    """Gauss-Newton by full steps over what the platform can do: every step is accepted."""
-
-    robot: Mechanism
-    rows: list[tuple[ObservationRows, IntArray]]
-
-    def propose(self, point: _Point, damping: FloatArray) -> _FullStep:
-        """Return the full steps, limited in length."""
-        del damping
-        robot, k = self.robot, len(point.T)
-        rows_of_kinds = [
-            _whitened_rows(rows, places[point.number], point.trial, point.T)
-            for rows, places in self.rows
-        ]
-        residual, by_twist = (
-            np.concatenate([part[i] for part in rows_of_kinds], axis=1) for i in (0, 1)
-        )
-        state, T, closed = None, point.T, np.ones(k, dtype=bool)
-        if self.moves_freely:
-            slope = np.diag([1.0 / robot.size] * 3 + [1.0] * 3)[:, robot.program.freedoms]
-        else:
-            target = read_coordinates(T[None], robot.controlled)
-            state = inverse_trials(robot, robot.values[None], target, point.state)
-            slope = differentiate_by_coordinates(robot, robot.values[None], state)[0]
-            closed = np.asarray(state.status[0] == Status.CONVERGED)
-            T = np.where(closed[:, None, None], state.T[0], T)
-        step, is_full = _least_squares_step(by_twist @ slope, residual)
-        length = np.linalg.norm(step, axis=1)
-        longest = LONGEST_STEP * robot.size
-        step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
-        twist = np.matmul(slope, step[..., None])[..., 0]
-        return _FullStep(T, twist, length, is_full, closed, state)
-
-    @property
-    def moves_freely(self) -> bool:
-        """Whether every motion of the platform is one of its freedoms."""
-        robot = self.robot
-        return set(robot.controlled) == set(robot.freedoms) or len(robot.controlled) == 6
-
-    def is_negligible(self, point: _Point, step: _FullStep) -> BoolArray:
-        """Return which poses (k,) are found."""
-        del point
-        return step.is_full & step.is_closed & (step.length < NEGLIGIBLE_STEP * self.robot.size)
-
-    def finish(self, point: _Point, step: _FullStep, trials: IntArray) -> _Point:
-        """Return the poses, some after their step."""
-        return point.put(trials, self.evaluate(point.take(trials), step, trials))
-
-    def evaluate(self, point: _Point, step: _FullStep, trials: IntArray) -> _Point:
-        """Return the poses after their step."""
-        del trials
-        return replace(point, T=geometry.apply_twist(step.T, step.twist), state=step.state)
-
-    def judge(
-        self, point: _Point, step: _FullStep, candidate: _Point
-    ) -> tuple[BoolArray, FloatArray]:
-        """Accept every step."""
-        del point, candidate
-        return np.ones(len(step.T), dtype=bool), np.ones(len(step.T))
-
-    def ending(
-        self, point: _Point, step: _FullStep, candidate: _Point, accepted: BoolArray
-    ) -> IntArray:
-        """End where rows do not determine all freedoms."""
-        del point, candidate, accepted
-        return np.where(step.is_full, DescentStatus.RUNNING, DescentStatus.NO_DESCENT)
 
 
 def _usable_rows(
