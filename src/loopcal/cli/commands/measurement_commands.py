@@ -68,7 +68,8 @@ def identifiability(
     """
     from loopcal.apply.inspection import analyze_identifiability
     from loopcal.apply.simulated_measurements import predict_noise_free
-    from loopcal.io.robot.robot_file import save_reduced_robot
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.robot.robot_file import format_reduced_robot
     from loopcal.report.calibration_view import view_identifiability
     from loopcal.results.serialization import json_fields
 
@@ -100,7 +101,7 @@ def identifiability(
     if report.subset is not None and output is not None:
         subset = report.subset
         words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
-        save_reduced_robot(subset.robot, words, output)
+        write_text(output, format_reduced_robot(subset.robot, words))
     written = []
     if output is not None:
         written = ["", f"Written to {output}: the robot with the other parameters fixed"]

@@ -62,59 +62,28 @@ NOT_CALIBRATED = "# NOT CALIBRATED"
 EXAMPLE = "'{name: .., value: .., unit: ..}'"
 
 
-def format_table(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
-    """Return the table as YAML: free parameters, and others that differ from their nominal value.
-
-    Parameters
-    ----------
-    robot : its values and the units of its file.
-    plus_minus : (p,) uncertainty of each value [SI]; what is not finite is written as null.
-
-    Returns
-    -------
-    Lines with a final break; nothing where all values are nominal and no uncertainty is given.
-    """
-    return _format_rows(_list_rows(robot, plus_minus))
-
-
-def _list_rows(robot: Mechanism, plus_minus: FloatArray | None) -> list[dict[str, str]]:
-    """Return the rows of the table with the keys KEYS; numbers as their texts."""
-    if plus_minus is None and (robot.values == robot.parameters.nominal).all():
-        return []
-    rows = []
-    for i, parameter in enumerate(robot.parameters.entries):
-        if parameter.free or robot.values[i] != parameter.nominal:
-            shown = find_unit(robot.units[parameter.dimension])
-            value = format_scaled(float(robot.values[i]), shown.factor_to_si)
-            half = math.nan if plus_minus is None else float(plus_minus[i]) / shown.factor_to_si
-            text = f"{half:.2g}" if math.isfinite(half) else "null"
-            cells = (parameter.name, value, text, shown.symbol)
-            rows.append(dict(zip(KEYS, cells, strict=True)))
-    return rows
-
-
-def _format_rows(rows: Sequence[Mapping[str, str]]) -> str:
-    """Return rows as YAML; nothing without rows."""
-    lines = [f"{TABLE}:  # delete this table to restore the nominal robot\n"] if rows else []
-    for row in rows:
-        name, unit = quote_scalar(row["name"]), quote_scalar(row["unit"])
-        numbers = f"value: {row['value']}, {PLUS_MINUS}: {row[PLUS_MINUS]}"
-        lines.append(f"  - {{name: {name}, {numbers}, unit: {unit}}}\n")
-    return "".join(lines)
-
-
 def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = None) -> YamlFile:
-    """Return a robot file without a table with that of `format_table`."""
-    rows = _list_rows(robot, plus_minus)
-    if not rows:
+    """Return a robot file without a table with one of its free parameters, and of others that
+    differ from their nominal value; unchanged where all are nominal and none has an uncertainty.
+
+    `plus_minus` : (p,) uncertainty of each value [SI]; what is not finite is written as null.
+    """
+    if plus_minus is None and (robot.values == robot.parameters.nominal).all():
         return file
-    # JSON reads the texts of the numbers, and `null`, as YAML does
-    numbers = ("value", PLUS_MINUS)
-    content = [
-        {key: json.loads(text) if key in numbers else text for key, text in row.items()}
-        for row in rows
-    ]
-    return add_key(file, _format_rows(rows), {TABLE: content})
+    text, content = f"{TABLE}:  # delete this table to restore the nominal robot\n", []
+    for i, parameter in enumerate(robot.parameters.entries):
+        if not parameter.free and robot.values[i] == parameter.nominal:
+            continue
+        unit = find_unit(robot.units[parameter.dimension])
+        value = format_scaled(float(robot.values[i]), unit.factor_to_si)
+        half = math.nan if plus_minus is None else float(plus_minus[i]) / unit.factor_to_si
+        shown = f"{half:.2g}" if math.isfinite(half) else "null"
+        # JSON reads these numbers, and `null`, as YAML does
+        cells = (parameter.name, json.loads(value), json.loads(shown), unit.symbol)
+        content.append(dict(zip(KEYS, cells, strict=True)))
+        name, symbol = quote_scalar(parameter.name), quote_scalar(unit.symbol)
+        text += f"  - {{name: {name}, value: {value}, {PLUS_MINUS}: {shown}, unit: {symbol}}}\n"
+    return add_key(file, text, {TABLE: content}) if content else file
 
 
 def remove_mark(text: str) -> str:
@@ -463,10 +432,6 @@ def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] |
 
 SECTION = re.compile(r"^(Attributes|Examples|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
 SHORT = re.compile(r"(?:^ *|(?<=[.;] ))((?:\w+, )*\w+) :\s", re.MULTILINE)
-LONG = re.compile(
-    r"^(?P<names>(?:\w+, )*\w+)(?: : [^\n]{0,48})?\n(?P<phrase>(?: {4}[^\n]*(?:\n|$))+)",
-    re.MULTILINE,
-)
 SI = re.compile(r" \[(?:m|rad|m per turn|m, rad|m or rad)\]")
 ELSEWHERE = re.compile(r"(?:Others: )?[Ss]ee (?:`\w+`|the module)(?:, |; |\. ?|$)")
 
@@ -490,15 +455,13 @@ class Key:
 
 def list_keys(record: type) -> tuple[Key, ...]:
     """Return the keys that a record takes, its own before inherited ones."""
-    meanings = collect_meanings(record)
-    hints = get_field_types(record)
-    fields = {f.name.removesuffix("_"): f for f in dataclasses.fields(record) if f.init}
+    meanings, hints = collect_meanings(record), get_field_types(record)
+    own = {f.name.removesuffix("_"): f for f in fields(record) if f.init}
     bases = [base for base in record.__mro__[1:] if dataclasses.is_dataclass(base)]
     inherited = {name for base in bases for name in get_field_types(base)}
-    order = sorted(fields, key=lambda name: name in inherited)
     return tuple(
-        Key(n, describe_type(hints[n]), _describe_default(fields[n]), meanings.get(n, ""))
-        for n in order
+        Key(n, describe_type(hints[n]), _describe_default(own[n]), meanings.get(n, ""))
+        for n in sorted(own, key=lambda name: name in inherited)
     )
 
 
@@ -542,29 +505,18 @@ def describe_type(annotation: Any) -> str:
 
 
 def _parse_entries(doc: str) -> dict[str, str]:
-    """Return name -> phrase of the Attributes and Parameters sections of a docstring.
-
-    An entry is `name : type` with an indented phrase below it, or `name : phrase`, of which
-    several may share a line.
+    """Return name -> phrase of the Attributes and Parameters sections of a docstring, from entries
+    `name : phrase`, of which several may share a line. Phrases that only point elsewhere are empty.
     """
     titles_and_bodies = SECTION.split(doc)
     sections = zip(titles_and_bodies[1::2], titles_and_bodies[2::2], strict=True)
     text = "".join(body for title, body in sections if title in ("Attributes", "Parameters"))
+    _, *names_and_phrases = SHORT.split(text)
     entries: dict[str, str] = {}
-    for match in LONG.finditer(text):
-        entries |= _clean_phrase(match["names"], match["phrase"])
-    text = LONG.sub("", text)
-    matches = list(SHORT.finditer(text))
-    ends = [*(match.start() for match in matches), len(text)][1:]
-    for match, end in zip(matches, ends, strict=True):
-        entries |= _clean_phrase(match[1], text[match.end() : end])
+    for names, written in zip(names_and_phrases[::2], names_and_phrases[1::2], strict=True):
+        phrase = ELSEWHERE.sub("", SI.sub("", " ".join(written.split()))).rstrip(". ")
+        entries |= dict.fromkeys(names.split(", "), phrase) if phrase else {}
     return entries
-
-
-def _clean_phrase(names: str, text: str) -> dict[str, str]:
-    """Return name -> phrase of one entry; nothing for one that only points elsewhere."""
-    phrase = ELSEWHERE.sub("", SI.sub("", " ".join(text.split()))).rstrip(". ")
-    return dict.fromkeys(names.split(", "), phrase) if phrase else {}
 
 
 def _describe_default(field: dataclasses.Field[Any]) -> str:
@@ -627,16 +579,6 @@ def format_new_robot(family: str, name: str) -> str:
     body = text.split("\n")
     first = next(i for i, line in enumerate(body) if not line.startswith("#"))
     return "\n".join([*lines, "", *body[first:]])
-
-
-def save_reduced_robot(robot: Mechanism, dropped: Mapping[str, str], path: str | Path) -> None:
-    """Write a robot's file with further parameters fixed; arguments as `format_reduced_robot`.
-
-    Raises
-    ------
-    FileError : the file cannot be written. MechanismError : as `format_reduced_robot`.
-    """
-    write_text(path, format_reduced_robot(robot, dropped))
 
 
 def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:
