@@ -60,37 +60,6 @@ def test_marlin_stops_are_the_height_less_the_adjustments_and_the_probe(tmp_path
     )
 
 
-@pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
-def test_file_with_the_same_numbers_is_unchanged(tmp_path, name, text) -> None:
-    robot = import_robot(tmp_path, name, text)
-    assert export_robot(robot, name, tmp_path / f"{name}.g") == text
-
-
-@pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
-def test_corrected_words_are_read_as_written_and_other_lines_are_kept(tmp_path, name, text) -> None:
-    robot = import_robot(tmp_path, name, text)
-    shift = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
-    shift[robot.parameters.index("tower3.angle")] = 0.0
-    robot = robot.with_values(robot.values + shift)
-    for into in (tmp_path / f"{name}.g", None):
-        written = export_robot(robot, name, into)
-        again = import_robot(tmp_path, name, written)
-        # six decimals are written; two such numbers make a stop [mm, deg]
-        np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=9e-9)
-        if into is not None:
-            changed = [
-                (a, b)
-                for a, b in zip(text.splitlines(), written.splitlines(), strict=True)
-                if a != b
-            ]
-            assert [a for a, _ in changed] == [
-                line for line in text.splitlines() if "M665" in line or "M666" in line
-            ]
-            assert ("B140.0" in written) == ("B140.0" in text)
-        if into is not None:
-            into.write_text(text)
-
-
 def test_marlin_and_reprap_state_adjustments_with_opposite_signs(tmp_path) -> None:
     robot = import_robot(tmp_path, "reprap", REPRAP)
     marlin = export_robot(robot, "marlin")
@@ -114,61 +83,6 @@ def test_missing_word_is_added_before_the_comment(tmp_path) -> None:
         export_robot(moved, "reprap", tmp_path / "reprap.g")
         == "M665 L250 R130 H300 X0.057296 ; ours\r\n"
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "sentence"),
-    [
-        ("reprap", "G28\n", "no M665"),
-        ("reprap", "M665 R1 H2\n", "M665 has no L"),
-        ("reprap", "G20\nM665 L2 R1 H2\n", r":1: G20 selects inches"),
-        ("reprap", "G28\nM665 L2:2:2:2 R1 H2\n", r":2: L of M665 has 4 lengths"),
-        (
-            "reprap",
-            "M665 L250 R130 H2-3\n",
-            r":1: H of M665 is '2-3', but a finite number is needed",
-        ),
-        ("reprap", "M665 L250 R130 H200\nM666 A0.3\n", r":2: M666 A tilts the bed"),
-        (
-            "reprap",
-            "M665 L100 R130 H200\n",
-            "the delta radius is 130 mm and the shortest arm 100 mm",
-        ),
-        ("marlin", "M665 L250 R130 H200 B80\n", r":1: M665 B without A and C"),
-        (
-            "reprap",
-            "G28\nM665 L269 R130,25 H250\n",
-            r":2: R of M665 is '130,25', but a finite number is needed",
-        ),
-        (
-            "reprap",
-            "M665 L269 R130 ,25 H250\n",
-            r":1: M665 has ',25 H250', but a letter and its number are needed",
-        ),
-        ("reprap", "M665 269 R130 H250\n", r":1: M665 has '269 R130 H250', but a letter"),
-        ("reprap", "M665 L269 R130 H250\nM666 X - 0.5\n", r":2: M666 has '0.5', but a letter"),
-        (
-            "reprap",
-            "M665 L{var.rod} R130 H250\n",
-            r":1: L of M665 is '{var.rod}', but a finite number",
-        ),
-        ("reprap", "M665 L269 R130 R131 H250\n", r":1: M665 has R twice"),
-        ("reprap", "G28 G20\nM665 L269 R130 H250\n", r":1: G20 selects inches"),
-        (
-            "marlin",
-            "M665 L269 R130 H250 M666 X-0.5\n",
-            r":1: M666 is not the first command of this line",
-        ),
-        (
-            "marlin",
-            "M665 L250 R130 H200\nM666 X0.1\n",
-            r":2: M666 X is 0.1, but is never positive in Marlin",
-        ),
-    ],
-)
-def test_invalid_gcode_is_refused_with_its_line(tmp_path, name, text, sentence) -> None:
-    with pytest.raises(FileError, match=sentence):
-        import_robot(tmp_path, name, text)
 
 
 @pytest.mark.parametrize(

@@ -49,84 +49,12 @@ def test_options_are_read_from_main_part_saved_block_and_defaults(tmp_path) -> N
     assert found.stops == (300.0, 300.0, 300.0)
 
 
-@pytest.mark.parametrize("text", [SHORT, SHORT + SAVED, SHORT.rstrip("\n"), SHORT + "\n\n"])
-def test_missing_options_are_added_to_the_saved_block(tmp_path, text) -> None:
-    robot = read(tmp_path, text)
-    moved = robot.with_values(
-        robot.values
-        + 1e-3 * np.arange(1, 11) * (np.array(robot.parameters.names) != "tower3.angle")
-    )
-    written = klipper.write(ExportSource(moved), tmp_path / "printer.cfg").text
-    again = read(tmp_path, written)
-    np.testing.assert_allclose(
-        again.values, moved.values, rtol=0, atol=1e-8
-    )  # six decimals [mm, deg]
-    # without the new lines the old ones are left, but for the numbers that were changed
-    assert written.startswith(
-        "[printer]\nkinematics: delta\ndelta_radius: 131.000000\n[stepper_a]\narm_length = "
-    )
-    assert "rotation_distance: 40\nmicrosteps: 16\n[stepper_b]\n[stepper_c]\n" in written
-    assert written.count("SAVE_CONFIG") == 1
-    assert written.count("[stepper_b]") == 2
-
-
 def test_unchanged_arm_is_written_if_its_default_changed(tmp_path) -> None:
     robot = read(tmp_path, SHORT)
     values = robot.values.copy()
     values[robot.parameters.index("arm1.length")] += 1e-3
     written = klipper.write(ExportSource(robot.with_values(values)), tmp_path / "printer.cfg").text
     np.testing.assert_allclose(read(tmp_path, written).values, values, rtol=0, atol=1e-9)
-
-
-def test_export_without_a_file_gives_a_block_to_paste(tmp_path) -> None:
-    robot = read(tmp_path, SHORT)
-    block = klipper.write(ExportSource(robot), None).text
-    assert block.startswith("#*# <------")
-    assert all(line.startswith("#*#") for line in block.splitlines())
-    pasted = (
-        SHORT.replace("delta_radius: 130\n", "").replace("position_endstop: 300\n", "")
-        + "\n"
-        + block
-    )
-    np.testing.assert_array_equal(read(tmp_path, pasted).values, robot.values)
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (("kinematics: delta", "kinematics: corexy"), ":2: .*its kinematics is 'corexy'"),
-        (
-            ("delta_radius: 130", ""),
-            r"option 'delta_radius' of \[printer\] is missing, and has no default|is missing",
-        ),
-        (("delta_radius: 130", "[include geometry.cfg]"), "if geometry.cfg contains it"),
-        (
-            ("position_endstop: 300", "position_endstop: high"),
-            ":6: 'position_endstop' of .* is 'high', but a finite number",
-        ),
-        (("position_endstop: 300", "position_endstop: inf"), ":6: "),
-        (
-            ("arm_length = 250", "arm_length = 120"),
-            "the delta radius is 130 mm and the shortest arm 120 mm",
-        ),
-        (
-            ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2\n"),
-            ":12: 'height0_pos' .* has 2 numbers",
-        ),
-        (
-            ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\n"),
-            ":11: 'height0' .* without 'height0_pos'",
-        ),
-        (
-            ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2,3\n"),
-            r"'rotation_distance' of \[stepper_b\] is missing",
-        ),
-        (("[stepper_c]\n", SAVED + "[tmc]\n"), ":19: this line below SAVE_CONFIG"),
-    ],
-)
-def test_invalid_printer_cfg_is_refused_in_one_sentence(tmp_path, change, sentence) -> None:
-    with pytest.raises(FileError, match=sentence):
-        read(tmp_path, SHORT.replace(*change))
 
 
 @pytest.mark.parametrize("ratio", ["80", "80:0", "a:b", "1:2:3"])

@@ -99,43 +99,6 @@ def test_strut_lengths_agree_with_linuxcnc(
     assert off.max() < 1e-12  # [m]
 
 
-def test_corrected_pins_are_read_as_written_and_other_lines_are_kept(tmp_path, geometry) -> None:
-    text = format_hal(geometry, 4.0, 7.5)
-    robot = read(tmp_path, text)
-    names = robot.parameters.names
-    shift = 1e-4 * np.random.default_rng(1).uniform(-1, 1, len(names))
-    moved = robot.with_values(robot.values + shift)
-    written = hal_file.write(ExportSource(moved), tmp_path / "hexapod.hal")
-    again = read(tmp_path, written.text)
-    centres = [i for i, name in enumerate(names) if not name.endswith("length")]
-    np.testing.assert_allclose(
-        again.values[centres], moved.values[centres], rtol=0, atol=1e-15
-    )  # [m]
-    changed = [
-        a for a, b in zip(text.splitlines(), written.text.splitlines(), strict=True) if a != b
-    ]
-    assert len(changed) == 36
-    assert all(
-        line.startswith(("setp genhexkins.base.", "setp genhexkins.platform.")) for line in changed
-    )
-    assert written.text.count("# as built") == text.count("# as built")
-    # lengths have no pin, and that is said
-    said = [str(f) for f in written.findings if f.code == "files.strut-length"]
-    assert len(said) == 6
-    assert "HOME_OFFSET of [JOINT_0]" in said[0]
-
-
-def test_unchanged_hexapod_keeps_the_file_and_new_lines_are_read_as_written(
-    tmp_path, geometry
-) -> None:
-    text = format_hal(geometry).rstrip("\n")
-    robot = read(tmp_path, text)
-    assert hal_file.write(ExportSource(robot), tmp_path / "hexapod.hal").text == text
-    np.testing.assert_array_equal(
-        read(tmp_path, hal_file.write(ExportSource(robot), None).text).values, robot.values
-    )
-
-
 def test_missing_pin_is_added(tmp_path, geometry) -> None:
     text = "".join(
         line for line in format_hal(geometry).splitlines(keepends=True) if ".base.0.z" not in line
@@ -149,7 +112,10 @@ def test_missing_pin_is_added(tmp_path, geometry) -> None:
 
 def test_export_reports_strut_lengths_without_a_pin() -> None:
     found = hal_file.write(ExportSource(load_robot("hexapod-42")), None)
-    assert "strut 0 is 233.238076 mm long at reading zero" in "\n".join(map(str, found.findings))
+    sentences = [str(f) for f in found.findings if f.code == "files.strut-length"]
+    assert len(sentences) == 6
+    assert "strut 0 is 233.238076 mm long at reading zero" in sentences[0]
+    assert "HOME_OFFSET of [JOINT_0]" in sentences[0]
 
 
 def test_screws_with_different_leads_are_refused(tmp_path, geometry) -> None:
@@ -161,27 +127,3 @@ def test_screws_with_different_leads_are_refused(tmp_path, geometry) -> None:
     )
     with pytest.raises((DataError, FileError), match="screws of different lead"):
         hal_file.write(ExportSource(load_robot(tmp_path / "two.yaml")), None)
-
-
-@pytest.mark.parametrize(
-    ("change", "options", "sentence"),
-    [
-        (("genhexkins.", "hexkins."), {}, "this file has no 'setp genhexkins...'"),
-        (("setp genhexkins.base.0.x", "# setp"), {}, "'setp genhexkins.base.0.x ..' is missing"),
-        (
-            ("base.0.y 13.25", "base.0.y [HEX]B0Y"),
-            {},
-            r":5: genhexkins.base.0.y is '\[HEX\]B0Y', but a finite number",
-        ),
-        (("", ""), {"length_unit": None}, "a HAL file states no unit of length"),
-    ],
-)
-def test_invalid_hal_file_is_refused_in_one_sentence(
-    tmp_path, geometry, change, options, sentence
-) -> None:
-    with pytest.raises(FileError, match=sentence):
-        read(
-            tmp_path,
-            format_hal(geometry).replace(*change) if change[0] else format_hal(geometry),
-            **options,
-        )
