@@ -331,6 +331,11 @@ class Mechanism(DrawnResult):
         """Return the unit in which values are shown: that of the robot file, or the usual one."""
         return find_unit(self.units[dimension])
 
+    @property
+    def shown_units(self) -> dict[Dimension, Unit]:
+        """The units in which values are shown, by dimension."""
+        return {dimension: find_unit(symbol) for dimension, symbol in self.units.items()}
+
     def to_quantity(self, value: float, dimension: Dimension) -> Quantity:
         """Return a value [SI] in the unit in which it is shown."""
         unit = self.get_unit(dimension)

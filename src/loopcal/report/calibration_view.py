@@ -34,7 +34,6 @@ from loopcal.results.tables import (
     format_number,
     format_uncertainty,
     format_with_uncertainty,
-    units_of,
     word_column,
 )
 from loopcal.units import Dimension, find_unit
@@ -306,7 +305,7 @@ def build_reading_table(robot: Mechanism, errors: Sequence[ReadingError]) -> Tab
         Field("largest", digits=3, units="joint_dimension"),
         Field("joint_dimension", title="unit"),
         Field("pose", title="at pose"),
-        units=units_of(robot),
+        units=robot.shown_units,
     )
 
 
@@ -350,7 +349,7 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     """Return one line for each source of errors, and their sum; without orientation where the
     platform does not rotate.
     """
-    length, angle = (units_of(robot)[d] for d in (Dimension.LENGTH, Dimension.ANGLE))
+    length, angle = (robot.shown_units[d] for d in (Dimension.LENGTH, Dimension.ANGLE))
     worst = budget["worst_parameter"]
     table = robot.parameters
     dimension = table.entries[table.index(worst)].dimension if worst else Dimension.LENGTH
@@ -454,7 +453,7 @@ def view_compensation(result: Compensation) -> list[Block]:
     """Return the table of targets, the convergence of shifted commands, and the frame."""
     from loopcal.apply.compensation import ROUNDING
 
-    units = units_of(result.robot)
+    units = result.robot.shown_units
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     columns = [word_column("target"), word_column("status")]
     values = []

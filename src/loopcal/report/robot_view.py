@@ -21,7 +21,6 @@ from loopcal.results.tables import (
     format_list,
     format_number,
     format_with_uncertainty,
-    units_of,
     word_column,
 )
 from loopcal.units import Dimension, Unit
@@ -61,7 +60,7 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
 
 def _build_actuator_table(inspection: RobotInspection) -> Table:
     """Return strokes and readings at home."""
-    units = units_of(inspection.robot)
+    units = inspection.robot.shown_units
     rows = []
     pairs = zip(inspection.robot.actuators, inspection.home_readings, strict=True)
     for actuator, reading in pairs:
@@ -77,7 +76,7 @@ def _build_actuator_table(inspection: RobotInspection) -> Table:
 
 def _build_triangle_table(robot: Mechanism) -> Table:
     """Return the lengths of triangle drives at their dead points, and the angles there."""
-    units = units_of(robot)
+    units = robot.shown_units
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     rows = []
     for actuator in robot.actuators:
@@ -123,7 +122,7 @@ def format_sum(weights: Mapping[str, float]) -> str:
 
 def _build_parameter_table(robot: Mechanism) -> Table:
     """Return nominal and present values with tolerances."""
-    units = units_of(robot)
+    units = robot.shown_units
     return build_table(
         "Parameters",
         zip(robot.parameters.entries, robot.values, strict=True),
@@ -145,7 +144,7 @@ def _build_parameter_table(robot: Mechanism) -> Table:
 
 def _build_common_error_table(robot: Mechanism) -> Table:
     """Return the errors that several parameters share in addition to their own."""
-    units, table = units_of(robot), robot.parameters
+    units, table = robot.shown_units, robot.parameters
     rows = []
     for error in table.common:
         unit = units[table.entries[table.index(error.parameters[0])].dimension]
@@ -166,7 +165,7 @@ PLACE = ("x", "y", "z", "roll", "pitch", "yaw")
 
 def view_assembly(robot: Mechanism) -> list[Table]:
     """Return the tables of an assembly."""
-    units = units_of(robot)
+    units = robot.shown_units
     return [
         *([_build_stage_table(robot, units)] if robot.stages else []),
         _build_link_table(robot, units),

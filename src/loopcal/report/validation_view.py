@@ -28,7 +28,6 @@ from loopcal.results.tables import (
     format_uncertainty,
     format_with_uncertainty,
     make_table,
-    units_of,
     word_column,
 )
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
@@ -249,7 +248,7 @@ def _compare(change: ErrorChange) -> str:
 
 def view_repeatability(result: Repeatability, robot: Mechanism | None = None) -> list[Block]:
     """Return the page of pose accuracy and repeatability, in the units of a robot's file."""
-    units = DISPLAY_UNITS if robot is None else units_of(robot)
+    units = DISPLAY_UNITS if robot is None else robot.shown_units
     blocks: list[Block] = []
     for quantity, poses in result.poses.items():
         unit, rows = units[DIMENSIONS[quantity]], []

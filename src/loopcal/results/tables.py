@@ -10,15 +10,12 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from loopcal.findings.wording import count_decimals
 from loopcal.plain_text import escape
 from loopcal.results.description import Field, look_up
-from loopcal.units import Dimension, Unit, find_unit
-
-if TYPE_CHECKING:
-    from loopcal.mechanism.model import Mechanism
+from loopcal.units import Dimension, Unit
 
 GAP = 2
 """Blanks between two columns of text."""
@@ -228,7 +225,7 @@ def _total(widths: Sequence[int]) -> int:
     return sum(widths) + GAP * (len(widths) - 1)
 
 
-# Numbers for people: digits that the uncertainty leaves, and the units of a robot's file.
+# Numbers for people: digits that the uncertainty leaves.
 
 ROUNDING = 1e-12
 """A number smaller than this, in whatever unit is shown, is rounding and printed as 0."""
@@ -238,11 +235,6 @@ INSIGNIFICANT = 0.01
 
 ABSENT = "-"
 """Stands for a number that does not exist."""
-
-
-def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
-    """Return the units in which the numbers of a robot are shown: those of its file."""
-    return {dimension: find_unit(symbol) for dimension, symbol in robot.units.items()}
 
 
 def format_number(value: float, digits: int = 6) -> str:

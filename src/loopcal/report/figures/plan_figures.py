@@ -36,7 +36,6 @@ from loopcal.report.figures.style import (
     start_panels,
 )
 from loopcal.results.presenters import register
-from loopcal.results.tables import units_of
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -62,7 +61,7 @@ def draw_plan(plan: Plan) -> Figure:
     The path is straight in the coordinates and begins at home; where it goes via home before a
     pose, it is dashed.
     """
-    names, poses, units = plan.robot.controlled, plan.poses, units_of(plan.robot)
+    names, poses, units = plan.robot.controlled, plan.poses, plan.robot.shown_units
     of_name = [units[d] for d in list_dimensions(names)]
     labels = [f"{name} [{unit.symbol}]" for name, unit in zip(names, of_name, strict=True)]
     scale = np.array([unit.factor_to_si for unit in of_name])
@@ -198,7 +197,7 @@ def draw_surface_plan(plan: SurfacePlan) -> Figure:
     """Draw where the tool is at the points of each group: the first two are on the line, and the
     first and all others in the plane. A number is that of a group at its first point.
     """
-    unit = units_of(plan.robot)[Dimension.LENGTH]
+    unit = plan.robot.shown_units[Dimension.LENGTH]
     places = plan.positions / unit.factor_to_si
     styles = [
         (COLORS[i % len(COLORS)], MARKERS[i // len(COLORS) % len(MARKERS)])
