@@ -41,8 +41,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.planning.constraints import PlanOptions
-from loopcal.planning.pose_planning import plan
-from loopcal.planning.result import Plan
+from loopcal.planning.pose_planning import Plan, plan
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]

@@ -153,8 +153,8 @@ from .planning.constraints import PlanOptions as PlanOptions
 from .planning.plane_line_planning import SurfaceOptions as SurfaceOptions
 from .planning.plane_line_planning import SurfacePlan as SurfacePlan
 from .planning.plane_line_planning import plan_surfaces as plan_surfaces
+from .planning.pose_planning import Plan as Plan
 from .planning.pose_planning import plan as plan
-from .planning.result import Plan as Plan
 from .progress_bar import ProgressBar as ProgressBar
 from .studies.executors import Dask as Dask
 from .studies.executors import Processes as Processes

@@ -14,8 +14,8 @@ from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.kinds import KINDS
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.pose_planning import round_shortfall
 from loopcal.planning.problem import find_sample_size, prepare_problem
-from loopcal.planning.result import round_shortfall
 from tests.findings.expectations import expect_refusal
 
 UM, URAD = 1e-6, 1e-6

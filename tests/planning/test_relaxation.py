@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.planning.design_space import Criterion, DesignProblem
-from loopcal.planning.relaxation import relax_design
+from loopcal.planning.exchange import relax_design
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import (
     CASES,

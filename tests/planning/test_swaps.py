@@ -12,7 +12,7 @@ from loopcal.planning.design_space import (
     score_additions,
     score_swaps,
 )
-from loopcal.planning.relaxation import differentiate_score
+from loopcal.planning.exchange import differentiate_score
 from tests.planning.design_problems import CASES, Array, L, draw_rows, make_problem
 
 every_case = pytest.mark.parametrize(("criterion", "nuisance", "prior"), CASES.values(), ids=CASES)

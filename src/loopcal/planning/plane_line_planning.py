@@ -37,7 +37,7 @@ from loopcal.planning.design_space import (
 )
 from loopcal.planning.exchange import MovedDesign, coordinate_exchange
 from loopcal.planning.path import check_paths, locate_home
-from loopcal.planning.result import POSE_FIELDS, Plan, PlannedPoses
+from loopcal.planning.pose_planning import POSE_FIELDS, Plan, PlannedPoses
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress

@@ -215,7 +215,7 @@ def _write_plan(
         format_surface_sheet,
     )
     from loopcal.io.runs.run_folder import collect_provenance
-    from loopcal.planning.result import list_stops
+    from loopcal.planning.pose_planning import list_stops
     from loopcal.report.figures.plan_figures import draw_curve, draw_plan
     from loopcal.report.pictures import render_figure
 

@@ -33,7 +33,7 @@ from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from loopcal.planning.plane_line_planning import SurfacePlan
-    from loopcal.planning.result import Plan, Stop
+    from loopcal.planning.pose_planning import Plan, Stop
 
 FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
@@ -63,7 +63,7 @@ INSTRUCTIONS = """\
 def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
     """Return the operator's sheet: the stops in order, with home where a straight path is blocked.
 
-    `stops` are those of `loopcal.planning.result.list_stops`.
+    `stops` are those of `loopcal.planning.pose_planning.list_stops`.
     """
     robot = plan.robot
     headers, factors = _list_columns(robot)

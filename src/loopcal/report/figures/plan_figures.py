@@ -14,8 +14,8 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, list_dimensions
 from loopcal.planning.path import locate_home
 from loopcal.planning.plane_line_planning import SurfacePlan
+from loopcal.planning.pose_planning import Plan, PlannedPoses
 from loopcal.planning.problem import DIMENSIONS, ErrorCurve
-from loopcal.planning.result import Plan, PlannedPoses
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
