@@ -11,7 +11,7 @@ import pytest
 import loopcal as lc
 from loopcal.apply.verdict import Verdict, recommend_values
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
-from loopcal.diagnose.row_errors import compute_kind_errors
+from loopcal.diagnose.row_errors import sum_kinds, summarize_kinds
 from loopcal.estimate.identification import identify
 from loopcal.findings import Quantity, report_finding
 from loopcal.measure.kinds.poses import Component
@@ -199,12 +199,12 @@ def test_p_value_of_a_gain_is_uniform_where_the_values_before_are_right(printer)
     change = SIGMA * rng.standard_normal((6, 1))
     p_values = []
     for noise in 7.0 * SIGMA * rng.standard_normal((2000, 6, 1)):  # sigma is wrong by a factor of 7
-        errors = compute_kind_errors([observed], [noise], [noise - change])[-1]
+        errors = summarize_kinds(sum_kinds([observed], [noise], [noise - change]))[-1]
         p_values.append(errors.compute_gain_p_value(6))
     for level in (0.05, 0.5):
         share = np.mean(np.array(p_values) < level)
         assert share == pytest.approx(level, abs=4.0 * np.sqrt(level * (1.0 - level) / 2000))
-    nothing = compute_kind_errors([observed], [change], [change])[-1]
+    nothing = summarize_kinds(sum_kinds([observed], [change], [change]))[-1]
     assert np.isnan(nothing.compute_gain_p_value(1))
 
 
@@ -233,17 +233,17 @@ def test_gain_is_standard_normal_where_the_values_before_are_right(printer) -> N
     change = SIGMA * rng.standard_normal((8, 1))
     gains = []
     for noise in SIGMA * rng.standard_normal((2000, 8, 1)):
-        kinds = compute_kind_errors([observed], [noise], [noise - change])
+        kinds = summarize_kinds(sum_kinds([observed], [noise], [noise - change]))
         gains.append(kinds[-1].gain)
     assert np.mean(gains) == pytest.approx(0.0, abs=4.0 / np.sqrt(2000))
     assert np.std(gains) == pytest.approx(1.0, abs=4.0 / np.sqrt(4000))
     size = float(np.linalg.norm(change)) / SIGMA
     right_after = [
-        compute_kind_errors([observed], [noise + change], [noise])[-1].gain
+        summarize_kinds(sum_kinds([observed], [noise + change], [noise]))[-1].gain
         for noise in SIGMA * rng.standard_normal((2000, 8, 1))
     ]
     assert np.mean(right_after) == pytest.approx(size, abs=4.0 / np.sqrt(2000))
-    assert compute_kind_errors([observed], [change], [change])[-1].gain == 0.0
+    assert summarize_kinds(sum_kinds([observed], [change], [change]))[-1].gain == 0.0
 
 
 def test_values_that_held_out_poses_do_not_confirm_are_kept(printer) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopcal.apply.validation import validate
-from loopcal.diagnose.row_errors import compute_kind_errors
+from loopcal.diagnose.row_errors import sum_kinds, summarize_kinds
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.poses import Component
@@ -39,7 +39,7 @@ def test_kind_errors_are_in_units_of_sigma_for_each_kind_and_for_all():
     positions = replace(positions, measured=measured)
     before = [np.full((4, 1), 80 * UM), np.full((2, 3), 300 * UM)]
     after = [np.full((4, 1), 20 * UM), np.full((2, 3), 600 * UM)]
-    one, two, every = compute_kind_errors([heights, positions], before, after)
+    one, two, every = summarize_kinds(sum_kinds([heights, positions], before, after))
     assert [(k.kind, k.count) for k in (one, two, every)] == [
         ("component", 4),
         ("position", 5),

@@ -30,12 +30,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from loopcal.diagnose.row_errors import PoseErrors, invert_increasing
+from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.observations import Observations
-from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
+from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct, invert_increasing
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray

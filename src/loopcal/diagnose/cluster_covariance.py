@@ -272,8 +272,17 @@ def compute_robust_spread(
     total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
     sd = np.sqrt(linear.variance[used])
     sigma = fit.residual_test.sigma_scale
-    rows = _fold_clusters(linear, clusters)
-    rows = rows / np.r_[np.ones(rows.shape[-1] - 1), sigma]
+    setup = 0 if linear.problem.nuisance is None else len(linear.problem.nuisance)
+    width = setup + linear.problem.parameters + 1
+    folded = np.zeros((1, clusters.count, 0, width))  # the rows of each cluster
+    for rows_of_block in linear.problem.leverage_rows(linear.linearization, linear.solution):
+        for part in rows_of_block:
+            member = clusters.member[part.poses]
+            rows, m = part.rows[member >= 0], part.rows.shape[1]
+            if rows.size:
+                places = np.repeat(member[member >= 0], m)
+                folded = fold_at(folded, rows.reshape(1, -1, width), places)
+    rows = folded[0] / np.r_[np.ones(width - 1), sigma]
     nuisance, A, r = rows[..., : -p - 1], rows[..., -p - 1 : -1], rows[..., -1]
     half = np.concatenate([nuisance, (A @ V) / np.sqrt(total)], axis=2)
     P = (A @ V) * (sigma / (total * sd))
@@ -299,22 +308,6 @@ def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:
     number[chosen] = np.arange(MOST_CLUSTERS)
     times = clusters.count / MOST_CLUSTERS
     return replace(clusters, member=number[clusters.member], count=MOST_CLUSTERS), times
-
-
-def _fold_clusters(linear: FitLinearization, clusters: Clusters) -> FloatArray:
-    """Return the rows (G, h, U + p + 1) of each cluster, folded."""
-    problem = linear.problem
-    setup = 0 if problem.nuisance is None else len(problem.nuisance)
-    width = setup + problem.parameters + 1
-    factor = np.zeros((1, clusters.count, 0, width))
-    for rows_of_block in problem.leverage_rows(linear.linearization, linear.solution):
-        for part in rows_of_block:
-            member = clusters.member[part.poses]
-            rows, m = part.rows[member >= 0], part.rows.shape[1]
-            if rows.size:
-                places = np.repeat(member[member >= 0], m)
-                factor = fold_at(factor, rows.reshape(1, -1, width), places)
-    return factor[0]
 
 
 def _compare(

@@ -16,14 +16,13 @@ covariance of u.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.estimate.posterior import DataInformation, Posterior, combine_degrees
+from loopcal.estimate.posterior import Posterior, combine_degrees
 from loopcal.numerics.decomposition import NULL_COMPONENT, are_nonzero
 from loopcal.numerics.statistics import (
     compute_averaged_tail,
@@ -153,8 +152,27 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     left = u[:, rank:].T
     count = len(scaled[0])
     slope, value = left[:, count:] @ scaled[1] / unit, left @ np.concatenate(values)
-    combinations = (left[:, :count], left[:, count:])
-    return _whiten(first, second, slope, value, combinations, (before, after))
+    # rows are divided by the root of their covariance, which errors beside the noise increase
+    errors = [ErrorPart(left[:, :count], before.degrees), ErrorPart(left[:, count:], after.degrees)]
+    for posterior, combined, own in zip((first, second), errors[:2], (before, after), strict=True):
+        changed = combined.root @ own.rows / np.sqrt(own.variance)
+        errors += [
+            ErrorPart(changed @ added.root, added.degrees)
+            for added in posterior.parts
+            if added.is_added and np.isfinite(added.root).all()
+        ]
+    root = np.linalg.cholesky(np.sum([error.root @ error.root.T for error in errors], axis=0))
+
+    def divide(values: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.solve(root, values), dtype=np.float64)
+
+    return ParameterChanges(
+        first.names,
+        first.unit,
+        divide(slope),
+        divide(value[:, None])[:, 0],
+        tuple(ErrorPart(divide(error.root), error.degrees) for error in errors),
+    )
 
 
 def _remove_common_null(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -175,40 +193,6 @@ def _remove_common_null(first: FloatArray, second: FloatArray) -> tuple[FloatArr
     return first - (first @ common) @ common.T, second - (second @ common) @ common.T
 
 
-def _whiten(
-    first: Posterior,
-    second: Posterior,
-    slope: FloatArray,
-    value: FloatArray,
-    combinations: tuple[FloatArray, FloatArray],
-    information: tuple[DataInformation, DataInformation],
-) -> ParameterChanges:
-    """Divide rows by the root of their covariance, which errors beside the noise increase."""
-    errors = [
-        ErrorPart(part, own.degrees) for part, own in zip(combinations, information, strict=True)
-    ]
-    for posterior, part, own in zip((first, second), combinations, information, strict=True):
-        rows = part @ own.rows / np.sqrt(own.variance)
-        errors += [
-            ErrorPart(rows @ added.root, added.degrees)
-            for added in posterior.parts
-            if added.is_added and np.isfinite(added.root).all()
-        ]
-    covariance = np.sum([error.root @ error.root.T for error in errors], axis=0)
-    root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-
-    def divide(values: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.solve(root, values), dtype=np.float64)
-
-    return ParameterChanges(
-        first.names,
-        first.unit,
-        divide(slope),
-        divide(value[:, None])[:, 0],
-        tuple(ErrorPart(divide(error.root), error.degrees) for error in errors),
-    )
-
-
 DISTINGUISHED = 0.05  # probability of distinguishing the true cause from a better one by chance
 
 
@@ -226,9 +210,8 @@ class ChangeCause:
 
 
 def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
-    """Return the simplest cause of a change.
-
-    level : probability with which the true cause is rejected.
+    """Return the simplest cause of a change; `level` is the probability with which the true cause
+    is rejected.
     """
     limbs: dict[str, list[int]] = {}  # places of its parameters, named before the first point
     for i, name in enumerate(changes.names):
@@ -243,40 +226,26 @@ def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
         ],
     }
     for kind, causes in kinds.items():
-        cause = _choose(changes, kind, causes, level)
-        if cause is not None:
-            return cause
+        results = [changes.project_out(places) for _, places in causes]
+        p_values = [
+            changes.compute_p_value(left, degrees) if degrees else 1.0 for left, degrees in results
+        ]
+        # a cause that leaves nothing to test explains any change
+        tested = [i for i, (_, degrees) in enumerate(results) if degrees < changes.degrees]
+        best = max(tested, key=lambda i: (p_values[i], -results[i][0]), default=-1)
+        if best < 0 or p_values[best] < level or results[best][1] == 0:
+            continue
+        left, degrees = results[best]
+        near = left + float(compute_chi_square_quantile(1.0, DISTINGUISHED))
+        others = [
+            causes[i][0]
+            for i in sorted(tested, key=lambda i: results[i][0])
+            if i != best and results[i][0] <= near
+        ]
+        names, places = causes[best]
+        parameters = tuple(changes.names[i] for i in places)
+        return ChangeCause(kind, names, parameters, tuple(others), left, degrees)
     return ChangeCause("none")
-
-
-def _choose(
-    changes: ParameterChanges,
-    kind: str,
-    causes: Sequence[tuple[tuple[str, ...], list[int]]],
-    level: float,
-) -> ChangeCause | None:
-    """Return the best of some causes; None where none of them explains the change."""
-    results = [changes.project_out(places) for _, places in causes]
-    p_values = [
-        changes.compute_p_value(left, degrees) if degrees else 1.0 for left, degrees in results
-    ]
-    # a cause that leaves nothing to test explains any change
-    open_causes = [i for i, (_, degrees) in enumerate(results) if degrees < changes.degrees]
-    if not open_causes:
-        return None
-    best = max(open_causes, key=lambda i: (p_values[i], -results[i][0]))
-    left, degrees = results[best]
-    if p_values[best] < level or degrees == 0:
-        return None
-    near = left + float(compute_chi_square_quantile(1.0, DISTINGUISHED))
-    others = [
-        causes[i][0]
-        for i in sorted(open_causes, key=lambda i: results[i][0])
-        if i != best and results[i][0] <= near
-    ]
-    names, places = causes[best]
-    parameters = tuple(changes.names[i] for i in places)
-    return ChangeCause(kind, names, parameters, tuple(others), left, degrees)
 
 
 def estimate_cause(changes: ParameterChanges, cause: ChangeCause) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.estimate.pose_estimate import PoseFit, fit_poses, predict_from_readings
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import report_finding
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
@@ -40,7 +40,7 @@ from loopcal.measure.readings import list_sensed_joints, select_joint_values
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
-from loopcal.numerics.statistics import NEAR_ONE, compute_chi_square_tail
+from loopcal.numerics.statistics import NEAR_ONE, compute_chi_square_tail, invert_increasing
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -75,17 +75,6 @@ def _median_of_largest(variances: FloatArray) -> float:
 
     highest = 1e3 * float(mean.max())
     return float(np.sqrt(invert_increasing(compute_log_probability, np.log(0.5), highest, 60)))
-
-
-def invert_increasing(
-    function: Callable[[float], float], value: float, highest: float, bisections: int
-) -> float:
-    """Return where an increasing function has a value, by bisection from 0 to `highest`."""
-    low, high = 0.0, highest
-    for _ in range(bisections):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if function(middle) < value else (low, middle)
-    return high
 
 
 # All numbers that results, JSON and tables state of errors, by their names there.
@@ -343,10 +332,10 @@ def join_errors(errors: Sequence[PoseErrors]) -> PoseErrors:
     )
 
 
-def compute_kind_errors(
+def sum_kinds(
     observations: Sequence[Observations], before: list[FloatArray], after: list[FloatArray]
-) -> tuple[KindErrors, ...]:
-    """Return the whitened errors of each kind and, last, of all kinds, from residuals (r, m)."""
+) -> dict[str, FloatArray]:
+    """Return the totals of each kind from residuals (r, m), see `summarize_kinds`."""
     totals: dict[str, FloatArray] = {}
     for o, *residuals in zip(observations, before, after, strict=True):
         squares = [
@@ -355,7 +344,7 @@ def compute_kind_errors(
         ]
         total = totals.setdefault(o.kind.name, np.zeros(4))
         total += [o.present.sum(), *squares]
-    return summarize_kinds(totals)
+    return totals
 
 
 def summarize_kinds(totals: Mapping[str, FloatArray]) -> tuple[KindErrors, ...]:
@@ -491,28 +480,25 @@ class PredictionComparison:
     @property
     def readings(self) -> KindErrors | None:
         """Errors of the readings of redundant actuators; None where there are none."""
+        totals = self._sum_readings()
+        return None if totals is None else summarize_kinds({READINGS: totals})[0]
+
+    def kind_errors(self) -> tuple[KindErrors, ...]:
+        """Return the errors of each kind, readings among them, and last of all kinds."""
+        rows, readings = self.data.observations, self._sum_readings()
+        totals = sum_kinds(rows, self.before.residuals(rows), self.after.residuals(rows))
+        if readings is not None:
+            totals = {k: t for k, t in {**totals, READINGS: readings}.items() if t[0]}
+        return summarize_kinds(totals)
+
+    def _sum_readings(self) -> FloatArray | None:
+        """Return the totals of redundant readings, see `summarize_kinds`."""
         first, last = self.reading_fits
         if first is None or last is None:
             return None
         residuals = [fit.reading_residuals[self.usable] for fit in (first, last)]
         squares = [(r**2).sum() for r in (*residuals, residuals[0] - residuals[1])]
-        count = int(last.left[self.usable].sum())
-        return summarize_kinds({READINGS: np.array([count, *squares])})[0]
-
-    def kind_errors(self) -> tuple[KindErrors, ...]:
-        """Return the errors of each kind, readings among them, and last of all kinds."""
-        rows = self.data.observations
-        kinds = compute_kind_errors(rows, self.before.residuals(rows), self.after.residuals(rows))
-        if self.readings is None:
-            return kinds
-        errors = (*kinds[:-1], self.readings)
-        return summarize_kinds(
-            {
-                k.kind: np.array([1.0, k.before**2, k.after**2, k.change**2]) * k.count
-                for k in errors
-                if k.count
-            }
-        )
+        return np.array([int(last.left[self.usable].sum()), *squares])
 
 
 def compare_predictions(
@@ -541,8 +527,17 @@ def compare_predictions(
     reached = first.solution.converged & last.solution.converged & commanded.converged
     usable = reached & predictable
     if not usable.any():
-        solutions = (first.solution.converged, last.solution.converged)
-        raise DataError(_explain_unreached(after, predictable, *solutions))
+        reaching = [int(each.solution.converged.sum()) for each in (first, last)]
+        numbers: dict[str, Any] = {"robot": after.name, "poses": len(predictable)}
+        if not predictable.any():
+            raise DataError(report_finding("residuals.readings-missing", **numbers))
+        if not any(reaching):
+            raise DataError(report_finding("residuals.poses-out-of-reach", **numbers))
+        if not reaching[0]:
+            numbers = {"poses": len(predictable), "after": reaching[1]}
+            raise DataError(report_finding("residuals.before-out-of-reach", **numbers))
+        numbers |= {"before": reaching[0], "after": reaching[1]}
+        raise DataError(report_finding("residuals.calibrated-out-of-reach", **numbers))
     data = _take_rows(data, usable)
     return PredictionComparison(
         data,
@@ -642,23 +637,3 @@ def _fix_nuisance(nuisance: NuisanceParameters, kept: Mapping[str, float]) -> Nu
         for p in nuisance.table.entries
     )
     return replace(nuisance, table=ParameterTable(entries))
-
-
-def _explain_unreached(
-    robot: Mechanism, predictable: BoolArray, before: BoolArray, after: BoolArray
-) -> Finding:
-    """Return why no pose is left: readings are missing, or a geometry does not reach it."""
-    poses, reached, calibrated = len(predictable), int(before.sum()), int(after.sum())
-    if not predictable.any():
-        return report_finding("residuals.readings-missing", robot=robot.name, poses=poses)
-    if not reached and calibrated:
-        return report_finding("residuals.before-out-of-reach", poses=poses, after=calibrated)
-    if not reached:
-        return report_finding("residuals.poses-out-of-reach", robot=robot.name, poses=poses)
-    return report_finding(
-        "residuals.calibrated-out-of-reach",
-        robot=robot.name,
-        poses=poses,
-        before=reached,
-        after=calibrated,
-    )

@@ -42,7 +42,7 @@ from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT
-from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail
+from loopcal.numerics.statistics import compute_f_tail
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray, IntArray
@@ -361,11 +361,20 @@ def _compare(fit: Identification, indices: IntArray, given: FloatArray) -> Value
         left = float(posterior.count_degrees(whitening))
     chi_square = float(np.sum(whitened**2))
     names = tuple(fit.names[i] for i in indices)
-    sigma, direction = _name_largest(names, tested @ u, whitened)
+    sigma, direction = float("nan"), ()
+    if np.isfinite(whitened).all() and len(whitened):  # the parameters of the largest difference
+        worst = int(np.argmax(np.abs(whitened)))
+        part = np.abs((tested @ u)[:, worst])
+        order = [i for i in np.argsort(-part).tolist() if part[i] > LEAST_PART * part.max()]
+        sigma = float(abs(whitened[worst]))
+        direction = tuple(names[i] for i in order[:MOST_NAMED])
     is_cut = comparable.shape[1] < len(names)
+    roots = np.sqrt(chi_square) + np.array([0.0, -1.0, 1.0]) * np.sqrt(second_order)
     p_value, *bounds = (
-        _compute_p_value(left, len(y), max(root, 0.0) ** 2)
-        for root in np.sqrt(chi_square) + np.array([0.0, -1.0, 1.0]) * np.sqrt(second_order)
+        float(compute_f_tail(len(y), left, max(root, 0.0) ** 2 / len(y)))
+        if len(y) and np.isfinite(root)
+        else float("nan")
+        for root in roots
     )
     return ValueComparison(
         names=names,
@@ -389,26 +398,3 @@ def _find_complement(columns: FloatArray) -> FloatArray:
     """Return an orthonormal basis (k, d) of the vectors that are orthogonal to columns (k, c)."""
     u, s, _ = np.linalg.svd(columns)
     return u[:, int((s > NULL_COMPONENT).sum()) :]
-
-
-def _compute_p_value(left: float, degrees: int, chi_square: float) -> float:
-    """Return the probability of a larger chi-square; of F, where the size of the posterior has
-    `left` effective degrees of freedom.
-    """
-    if degrees == 0 or not np.isfinite(chi_square):
-        return float("nan")
-    if np.isinf(left):
-        return float(compute_chi_square_tail(degrees, chi_square))
-    return float(compute_f_tail(degrees, left, chi_square / degrees))
-
-
-def _name_largest(
-    names: tuple[str, ...], directions: FloatArray, whitened: FloatArray
-) -> tuple[float, tuple[str, ...]]:
-    """Return the largest whitened difference, and the parameters that its direction consists of."""
-    if not np.isfinite(whitened).all() or not len(whitened):
-        return float("nan"), ()
-    worst = int(np.argmax(np.abs(whitened)))
-    part = np.abs(directions[:, worst])
-    order = [int(i) for i in np.argsort(-part) if part[i] > LEAST_PART * part.max()]
-    return float(abs(whitened[worst])), tuple(names[i] for i in order[:MOST_NAMED])

@@ -7,7 +7,7 @@ pay for them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -206,6 +206,17 @@ def _tail(values: FloatArray) -> float:
         third = 8.0 * float(((values / (1.0 - 2.0 * t * values)) ** 3).sum())
         return float(0.5 - third / (6.0 * np.sqrt(2.0 * np.pi) * curvature**1.5))
     return float(ndtr(-(w + np.log(v / w) / w)))
+
+
+def invert_increasing(
+    function: Callable[[float], float], value: float, highest: float, bisections: int
+) -> float:
+    """Return where an increasing function has a value, by bisection from 0 to `highest`."""
+    low, high = 0.0, highest
+    for _ in range(bisections):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if function(middle) < value else (low, middle)
+    return high
 
 
 # Distinct values and medians without masked arrays.
