@@ -51,6 +51,21 @@ def scale_first(factor):
 
 
 READINGS = {
+    "actuators swapped": (
+        "hexapod-42",
+        lambda q: q[:, [1, 0, 2, 3, 4, 5]],
+        {"slip": "swapped-readings", "actuators": ("q1", "q2")},
+    ),
+    "drop for rise": (
+        "linear-delta",
+        lambda q: -q,
+        {"slip": "reading-sign", "actuators": ("q1", "q2", "q3")},
+    ),
+    "rows moved by one": (
+        "linear-delta",
+        lambda q: np.roll(q, 1, axis=0),
+        {"slip": "shifted-readings", "neighbor": "below"},
+    ),
     "half the microsteps": (
         "linear-delta",
         lambda q: 2.0 * q,

@@ -219,35 +219,6 @@ def test_wrong_convention_is_refused_and_the_right_one_is_named(slip) -> None:
     assert result.finding.data["is_consistent"]
 
 
-READINGS = {
-    "actuators swapped": (
-        "hexapod-42",
-        lambda q: q[:, [1, 0, 2, 3, 4, 5]],
-        {"slip": "swapped-readings", "actuators": ("q1", "q2")},
-    ),
-    "drop for rise": (
-        "linear-delta",
-        lambda q: -q,
-        {"slip": "reading-sign", "actuators": ("q1", "q2", "q3")},
-    ),
-    "rows moved by one": (
-        "linear-delta",
-        lambda q: np.roll(q, 1, axis=0),
-        {"slip": "shifted-readings", "neighbor": "below"},
-    ),
-}
-
-
-@pytest.mark.parametrize("slip", READINGS)
-def test_wrong_reading_convention_is_refused_and_the_right_one_is_named(slip) -> None:
-    name, change, expected = READINGS[slip]
-    data = simulate_data(name, Position())
-    result = compare_conventions(
-        load_cached_robot(name), replace(data, readings=change(data.readings))
-    )
-    assert expected.items() <= list_slips(result)[0].items(), result
-
-
 def test_published_table_has_no_false_refusal_and_names_three_of_four_slips(root: Path) -> None:
     """Undetected slips change what the robot cannot do, such as the orientation of a delta."""
     tables = json.loads((root / "docs" / "evidence" / "conventions.json").read_text("utf-8"))[
@@ -267,24 +238,20 @@ def test_published_table_has_no_false_refusal_and_names_three_of_four_slips(root
     )
 
 
-def test_wrong_unit_is_named_although_two_rows_are_outliers() -> None:
-    """Two of twenty rows are 0.1 m off, and all lengths are in the wrong unit."""
-    data = change_values(
-        simulate_data("hexapod-42", Position(unknown=("frame",)), n=20), scaled(slice(None), 0.1)
-    )
+@pytest.mark.parametrize(
+    ("name", "factor", "far"), [("hexapod-42", 0.1, 0.01), ("linear-delta", 1e3, 0.0)]
+)
+def test_wrong_unit_is_named_although_two_rows_are_far_off_in_an_unknown_frame(
+    name, factor, far
+) -> None:
+    """All lengths are in the wrong unit; two of twenty rows are 0.1 m off, or none."""
+    data = simulate_data(name, Position(unknown=("frame",)), n=20)
+    data = change_values(data, scaled(slice(None), factor))
     bad = change_values(
-        data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.01)
+        data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + far)
     )
-    result = compare_conventions(load_cached_robot("hexapod-42"), bad)
-    assert has_slip(result, **unit_slip("lengths", 10.0)), result
-
-
-def test_wrong_unit_is_named_although_the_frame_is_unknown() -> None:
-    data = change_values(
-        simulate_data("linear-delta", Position(unknown=("frame",)), n=20), scaled(slice(None), 1e3)
-    )
-    result = compare_conventions(load_cached_robot("linear-delta"), data)
-    assert has_slip(result, **unit_slip("lengths", 1e-3)), result
+    result = compare_conventions(load_cached_robot(name), bad)
+    assert has_slip(result, **unit_slip("lengths", 1.0 / factor)), result
 
 
 def test_outliers_alone_are_reported_but_not_refused() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from loopcal.diagnose.machine_changes import (
+from loopcal.diagnose.value_comparison import (
     ParameterChanges,
     compare_information,
     estimate_cause,

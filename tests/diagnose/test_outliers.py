@@ -287,29 +287,22 @@ def test_one_degree_of_freedom_names_no_outlier_and_no_conflict(wrong):
     assert [code for code in codes if code.startswith("outliers.")] == ["outliers.one-degree"]
 
 
-def test_one_degree_of_freedom_with_unknown_noise_is_reported_as_untestable():
-    robot, data = probe_delta(7, {3: 1e-3})
-    result = find_outliers(
-        identify(robot, data, LeastSquares(), options=FitOptions(noise="estimated")), data
-    )
-    assert result.outliers == result.ambiguous == ()
-    assert [f.code for f in result.summary] == ["outliers.unknown-noise"]
-
-
-def test_wrong_height_is_named_with_enough_degrees_of_freedom():
-    robot, data = probe_delta(12, {4: 1e-3})
-    result = find_outliers(identify(robot, data, LeastSquares()), data)
-    assert result.names == ("5",)
-    assert result.ambiguous == ()
-
-
-def test_two_wrong_heights_of_eight_are_ambiguous():
-    robot, data = probe_delta(
-        8, {0: 1e-3, 1: -1e-3}
-    )  # no single height explains both, and any two do
-    result = find_outliers(identify(robot, data, LeastSquares()), data)
-    assert result.names == ()
-    assert [f.code for f in result.summary] == ["outliers.ambiguous"]
+@pytest.mark.parametrize(
+    ("points", "off", "noise", "names", "codes"),
+    [
+        (7, {3: 1e-3}, "estimated", (), ["outliers.unknown-noise"]),
+        (12, {4: 1e-3}, "given", ("5",), ["outliers.some"]),
+        # no single height explains both, and any two do
+        (8, {0: 1e-3, 1: -1e-3}, "given", (), ["outliers.ambiguous"]),
+    ],
+)
+def test_wrong_heights_are_named_with_enough_degrees_of_freedom(points, off, noise, names, codes):
+    robot, data = probe_delta(points, off)
+    fit = identify(robot, data, LeastSquares(), options=FitOptions(noise=noise))
+    result = find_outliers(fit, data)
+    assert result.names == names
+    assert bool(result.ambiguous) == (codes == ["outliers.ambiguous"])
+    assert [f.code for f in result.summary] == codes
 
 
 def test_misfit_of_all_rows_is_reported_although_no_outlier_is_named():

@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from loopcal.apply.validation import report_reused_rows, validate
-from loopcal.diagnose.machine_changes import (
+from loopcal.diagnose.row_errors import Statistics, compute_statistics
+from loopcal.diagnose.value_comparison import (
+    EQUAL,
     ChangeCause,
     ParameterChanges,
     compare_information,
     estimate_cause,
     explain_change,
+    refuse_other_dimensions,
 )
-from loopcal.diagnose.row_errors import Statistics, compute_statistics
-from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
 from loopcal.errors import DataError
 from loopcal.estimate.posterior import Posterior
 from loopcal.findings import Finding, report_finding

@@ -59,12 +59,7 @@ class HeldOutBlocks(NamedTuple):
 
     def fit_without(self, excluded: BoolArray) -> PartialFit:
         """Return the prediction by all blocks that are not excluded (u,)."""
-        triangle, y = self.combine(excluded)
-        u = len(excluded)
-        influence = make_empty_influence(u)
-        for numbers, H, residual, present in self.groups:
-            tested = compare_blocks(H, residual, present, triangle, y, ~excluded[numbers])
-            influence.fill(numbers, tested)
+        influence = self.compare(*self.combine(excluded), ~excluded)
         inside, scale = (influence.degrees > 0) & ~excluded, 1.0
         if inside.any():
             distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
@@ -73,6 +68,21 @@ class HeldOutBlocks(NamedTuple):
             middle = order[[(len(order) - 1) // 2]]
             scale = max(1.0, estimate_scale_of(distance[middle], degrees[middle].astype(float)))
         return PartialFit(excluded, influence, scale, 0)
+
+    def compare(self, triangle: FloatArray, y: FloatArray, inside: BoolArray) -> Influence:
+        """Return the influence of every block for the factor (k, k) and solution (k,) of the blocks
+        that are `inside` (u,), and of others.
+        """
+        influence = make_empty_influence(len(self.poses))
+        for numbers, H, residual, present in self.groups:
+            half = H
+            if H.size:  # one system for all blocks
+                stacked = H.reshape(-1, H.shape[2]).T
+                half = substitute_transposed(triangle, stacked).T.reshape(H.shape)
+            weight = inside[numbers].astype(np.float64)
+            tested = compute_block_influence(half, residual + H @ y, present, weight)
+            influence.fill(numbers, tested)
+        return influence
 
     def combine(self, excluded: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return the factor R (k, k) and solution y (k,) of the blocks that are not excluded."""
@@ -109,17 +119,14 @@ class HeldOutCheck:
         """Return the probability of a larger distance, of each block (b,) of other values of some
         of these poses: against the prediction by all blocks that do fit.
         """
-        end = self.search.end
-        triangle, y = self.prediction
         other = self.predictor.make_blocks(data)
-        p_value = np.ones(len(other.poses))
-        for numbers, H, residual, present in other.groups:
-            outside = np.zeros(len(numbers), dtype=bool)
-            tested = compare_blocks(H, residual, present, triangle, y, outside)
-            statistic = tested.distance / end.scale**2
-            p_value[numbers] = compute_chi_square_tail(tested.degrees, statistic)
-            p_value[numbers[tested.degrees < 1]] = np.nan
-        return p_value
+        outside = np.zeros(len(other.poses), dtype=bool)
+        tested = other.compare(*self.prediction, outside)
+        tail = compute_chi_square_tail(tested.degrees, tested.distance / self.search.end.scale**2)
+        has_rows = np.zeros(len(other.poses), dtype=bool)
+        for numbers, *_ in other.groups:
+            has_rows[numbers] = True
+        return np.where(has_rows & (tested.degrees < 1), np.nan, tail)
 
 
 class Predictor(NamedTuple):
@@ -210,24 +217,6 @@ def check_held_out_rows(
     always = np.all([fit.excluded for fit in search.fits], axis=0)
     order = np.argsort(-search.end.ratio, kind="stable")
     return HeldOutCheck(predictor, blocks, search, order[always[order]])
-
-
-def compare_blocks(
-    H: FloatArray,
-    residual: FloatArray,
-    present: BoolArray,
-    triangle: FloatArray,
-    y: FloatArray,
-    inside: BoolArray,
-) -> Influence:
-    """Return the influence of blocks H (b, m, k) for the factor and solution of `inside` (b,) and
-    other blocks.
-    """
-    b, m, k = H.shape
-    half = H
-    if H.size:  # one system for all blocks
-        half = substitute_transposed(triangle, H.reshape(b * m, k).T).T.reshape(H.shape)
-    return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 
 MOST_EXPLAINED = 10  # poses for which explanations are tried, the farthest first

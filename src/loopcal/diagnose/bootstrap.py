@@ -171,6 +171,7 @@ def compute_block_errors(
     for g in range(clusters.count):
         mine = np.flatnonzero(values.block == g)
         by_parameters = values.by_parameters[mine]
+        # half half' is the leverage of the block by setup and machine
         half = np.concatenate([values.by_nuisance[mine], by_parameters @ V], axis=1)
         poses = np.unique(values.poses[mine])
         k = values.by_coordinates.shape[2]
@@ -179,32 +180,21 @@ def compute_block_errors(
             place = np.searchsorted(poses, values.poses[mine, link])
             by_poses[np.arange(len(mine)), place] += values.by_coordinates[mine, link]
         by_poses = by_poses.reshape(len(mine), len(poses) * k)
-        error[mine], lost = _correct(residual[mine], half, by_poses)
+        Q = by_poses  # its range has leverage 1
+        if Q.shape[1]:
+            length = np.linalg.norm(Q, axis=0)
+            u, s, _ = np.linalg.svd(Q / np.where(length > 0.0, length, 1.0), full_matrices=False)
+            Q = u[:, are_nonzero(s, NUISANCE_TOLERANCE)]
+        left, half = residual[mine] - Q @ (Q.T @ residual[mine]), half - Q @ (Q.T @ half)
+        L, s, _ = np.linalg.svd(half, full_matrices=False)
+        remaining = 1.0 - s**2
+        is_tested = remaining > TESTABLE
+        gain = np.where(is_tested, 1.0 / np.sqrt(np.where(is_tested, remaining, 1.0)), 0.0)
+        error[mine] = left + L @ ((gain - 1.0) * (L.T @ left))
         residual[mine] += by_parameters @ shift
-        untested.append(lost)
+        untested.append(np.concatenate([Q, L[:, ~is_tested]], axis=1))
     shapes = tuple(rows.whitener.shape[1:3] for rows in linear.problem.rows)
     return BlockErrors(values, residual, error, tuple(untested), shapes)
-
-
-def _correct(
-    residual: FloatArray, half: FloatArray, poses: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the corrected errors (M,) of a block, and a basis (M, d) of its untested directions.
-    half : (M, w) with half half' the leverage of the block by setup and machine. poses : (M, K)
-        columns of the coordinates of its poses, whose range has leverage 1.
-    """
-    Q = poses
-    if Q.shape[1]:
-        length = np.linalg.norm(poses, axis=0)
-        u, s, _ = np.linalg.svd(poses / np.where(length > 0.0, length, 1.0), full_matrices=False)
-        Q = u[:, are_nonzero(s, NUISANCE_TOLERANCE)]
-    residual, half = residual - Q @ (Q.T @ residual), half - Q @ (Q.T @ half)
-    L, s, _ = np.linalg.svd(half, full_matrices=False)
-    remaining = 1.0 - s**2
-    is_tested = remaining > TESTABLE
-    gain = np.where(is_tested, 1.0 / np.sqrt(np.where(is_tested, remaining, 1.0)), 0.0)
-    error = residual + L @ ((gain - 1.0) * (L.T @ residual))
-    return error, np.concatenate([Q, L[:, ~is_tested]], axis=1)
 
 
 # Probability that any parameter is reported where errors are independent and as stated.

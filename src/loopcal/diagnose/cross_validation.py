@@ -54,7 +54,7 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.decomposition import Decomposition, are_nonzero, decompose
+from loopcal.numerics.decomposition import are_nonzero, decompose
 from loopcal.results.description import Field, each, fields, label_axes, pick
 from loopcal.results.result import DrawnResult, TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
@@ -644,11 +644,18 @@ def compute_regularization_curves(
         ChosenValue("marginal likelihood", float(MarginalLikelihood()(d)[0])),
     ]
     rules_k = [ChosenValue("GCV", float(TruncationGCV()(d)[0]))]
-    lam, k = list_lam(d, [rule.value for rule in rules_lam]), np.arange(len(free) + 1)
+    # from hardly any effect on the weakest determined direction to hardly any use of the data, with
+    # 1 (the tolerances as a prior) and about what rules choose
+    square, by_rules = d.singular_values[0] ** 2, [rule.value for rule in rules_lam]
+    lowest = min(1e-2 * square[d.used[0]].min(), 10.0**-FEWEST_DECADES)
+    low = np.log10(min(max(lowest, LOWEST * square[0]), *by_rules))
+    high = np.log10(max(HIGHEST * square[0], 10.0, *by_rules))
+    steps = np.arange(np.floor(low * PER_DECADE), np.ceil(high * PER_DECADE) + 1)
+    lam, k = 10.0 ** (steps / PER_DECADE), np.arange(len(free) + 1)
     if problem.nuisance is not None:
         lam, k = lam[_spread(len(lam), MOST_FITTED)], k[_spread(len(k), MOST_FITTED)]
     # what the rules choose has its own score
-    lam = np.union1d(lam, [rule.value for rule in rules_lam])
+    lam = np.union1d(lam, by_rules)
     k = np.union1d(k, [int(rule.value) for rule in rules_k])
     methods = (*map(Ridge, lam.tolist()), *(TruncatedSVD(int(i)) for i in k))
     if problem.nuisance is None:
@@ -679,18 +686,6 @@ def compute_regularization_curves(
         truncation,
         truncation.score_at(0.0),
     )
-
-
-def list_lam(d: Decomposition, chosen: Sequence[float]) -> FloatArray:
-    """Return values of lam: from hardly any effect on the weakest determined direction to hardly
-    any use of the data, with 1 (the tolerances as a prior) and about those chosen by rules.
-    """
-    square = d.singular_values[0] ** 2
-    lowest = min(1e-2 * square[d.used[0]].min(), 10.0**-FEWEST_DECADES)
-    low = np.log10(min(max(lowest, LOWEST * square[0]), *chosen))
-    high = np.log10(max(HIGHEST * square[0], 10.0, *chosen))
-    steps = np.arange(np.floor(low * PER_DECADE), np.ceil(high * PER_DECADE) + 1)
-    return np.asarray(10.0 ** (steps / PER_DECADE))
 
 
 def _mark(

@@ -26,7 +26,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms, probe_readings, twist_weights
+from loopcal.diagnose.gauge_freedoms import (
+    find_gauge_freedoms,
+    find_moving_frames,
+    probe_readings,
+    twist_weights,
+)
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
@@ -214,11 +219,8 @@ def refer_errors(
         determine; those that `followed` leaves are fitted, unless the frame is "base".
     """
     T, twists, over = reference
-    p = twists.shape[2]
-    nothing = FollowedMotion(
-        np.zeros((MOTIONS, MOTIONS)), np.zeros((MOTIONS, p)), np.zeros((MOTIONS, 0))
-    )
-    begin = followed or nothing
+    still, unmoved, exact = (np.zeros((MOTIONS, n)) for n in (MOTIONS, twists.shape[2], 0))
+    begin = followed or FollowedMotion(still, unmoved, exact)
     M = frame_twists(T, robot.size)
     fit = fit_frames(robot, T, motions - begin.by_frames @ motions)
     extra = fit(twists - M @ begin.by_parameters)
@@ -308,16 +310,13 @@ def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tupl
     """Return which frames a motion (12, p) that fits twists (m, 6, p) moves: the fewest."""
     M = frame_twists(fit.poses, fit.size)
     weight = np.array([fit.size] * 3 + [1.0] * 3)[:, None]
-    moved = (weight * (M @ motion)).reshape(6 * len(M), motion.shape[-1])
-    length = np.linalg.norm(moved)
+    moved, base, platform = (
+        (weight * D).reshape(6 * len(M), -1) for D in (M @ motion, M[:, :, :6], M[:, :, 6:])
+    )
+    length = float(np.linalg.norm(moved))
     if not length > FIT_TOLERANCE * np.linalg.norm(weight * twists):
         return ()
-    for name, columns in (("base", slice(0, 6)), ("platform", slice(6, 12))):
-        of_frame = (weight * M[:, :, columns]).reshape(6 * len(M), -1)
-        left = moved - of_frame @ np.linalg.lstsq(of_frame, moved, rcond=FIT_TOLERANCE)[0]
-        if np.linalg.norm(left) <= FIT_TOLERANCE * length:
-            return (name,)
-    return ("base", "platform")
+    return find_moving_frames(moved, base, platform, FIT_TOLERANCE * length)
 
 
 def _as_base_motion(by_base: FloatArray, twists: FloatArray) -> FloatArray:

@@ -80,11 +80,7 @@ def find_gauge_freedoms(posterior: Posterior) -> GaugeFreedoms:
     _, s, combine = np.linalg.svd(moving, full_matrices=False)
     moving = moving @ combine[s > NO_MOTION * total].T
     count = moving.shape[1]
-    frames: tuple[str, ...] = ("base", "platform") if count else ()
-    for name, frame in (("base", base), ("platform", platform)):
-        rest = float(np.linalg.norm(_without_span([frame], moving)))
-        if len(frames) == 2 and rest <= SAME_MOTION * total:
-            frames = (name,)  # only one where it suffices
+    frames = find_moving_frames(moving, base, platform, SAME_MOTION * total) if count else ()
     infinite = np.isinf(posterior.variance[~posterior.determined])
     kept = null @ _gauge_projector(gauge, infinite)
     unit = np.array([1.0 / robot.size] * 3 + [1.0] * 3)
@@ -216,6 +212,18 @@ def _weigh_motions(
         (weight * D).reshape(-1, D.shape[-1]) for D in (twists, M[:, :, :6], M[:, :, 6:])
     )
     return motions, base, platform
+
+
+def find_moving_frames(
+    moved: FloatArray, base: FloatArray, platform: FloatArray, limit: float
+) -> tuple[str, ...]:
+    """Return the frames whose motions (6 n, 6) explain motions (6 n, k) up to a limit: only one
+    where it suffices.
+    """
+    for name, frame in (("base", base), ("platform", platform)):
+        if np.linalg.norm(_without_span([frame], moved)) <= limit:
+            return (name,)
+    return ("base", "platform")
 
 
 def _without_span(frames: Sequence[FloatArray], moved: FloatArray) -> FloatArray:

@@ -410,7 +410,15 @@ def compute_simultaneous_intervals(
     degrees = chosen.posterior.count_degrees(chosen.effect[:, None, :])
     least = float(degrees.min())
     if rule == "maximum":
-        factor = np.full(q, _simulate_maximum(chosen.correlation, level, least, seed))
+        value, vectors = np.linalg.eigh(chosen.correlation)
+        root = vectors * np.sqrt(np.maximum(value, 0.0))
+        rng, largest = np.random.default_rng(np.random.SeedSequence(seed)), []
+        for _ in range(DRAWS // BATCH):  # of max |t_j| for these correlations
+            drawn = np.abs(rng.standard_normal((BATCH, len(root))) @ root.T).max(axis=1)
+            if np.isfinite(least):
+                drawn = drawn / np.sqrt(rng.chisquare(least, BATCH) / least)
+            largest.append(drawn)
+        factor = np.full(q, float(np.quantile(np.concatenate(largest), level)))
     elif rule == "scheffe":
         rank = int((np.linalg.eigvalsh(chosen.correlation) > SMALLEST).sum())
         factor = np.full(q, np.sqrt(_find_square(rank, least, level)))
@@ -513,17 +521,3 @@ def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntA
 def _find_square(count: int, degrees: float, level: float) -> float:
     """Return the largest squared distance of `count` quantities within a region."""
     return count * float(compute_f_quantile(count, degrees, 1.0 - level))
-
-
-def _simulate_maximum(correlation: FloatArray, level: float, degrees: float, seed: int) -> float:
-    """Return the quantile of max |t_j| for these correlations, from `DRAWS` simulated values."""
-    value, vectors = np.linalg.eigh(correlation)
-    root = vectors * np.sqrt(np.maximum(value, 0.0))
-    rng = np.random.default_rng(np.random.SeedSequence(seed))
-    largest = []
-    for _ in range(DRAWS // BATCH):
-        drawn = np.abs(rng.standard_normal((BATCH, len(root))) @ root.T).max(axis=1)
-        if np.isfinite(degrees):
-            drawn = drawn / np.sqrt(rng.chisquare(degrees, BATCH) / degrees)
-        largest.append(drawn)
-    return float(np.quantile(np.concatenate(largest), level))

@@ -157,9 +157,20 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
         degrees[part] = component.degrees
     errors = rows.errors.scaled(amplitude)
     root = rows.slope * np.repeat(amplitude, rows.errors.count // 6)
-    for part, (component, _) in slow.components.items():
+    for part, (component, p_value) in slow.components.items():
+        dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
+        finding = report_finding(
+            DISCREPANCY,
+            quantity=("orientation", "position")[part],
+            amplitude=fit.robot.to_quantity(float(np.sqrt(component.variance)), dimension),
+            degrees=component.degrees,
+            p_value=p_value,
+            is_slow=slow.is_slow,
+            level=LEVEL if slow.is_slow else REPEATS_LEVEL,
+            severity=choose_severity(p_value),  # a warning where they are beyond doubt
+        )
         own = root[:, _columns(rows.errors, part)]
-        fit = add_covariance(fit, own, component.degrees, _report(fit, slow, part))
+        fit = add_covariance(fit, own, component.degrees, finding)
     discrepancy = ModelDiscrepancy(errors, root, degrees, first.directions, first.variance)
     return replace(fit, posterior=replace(fit.posterior, discrepancy=discrepancy))
 
@@ -245,24 +256,6 @@ def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     axes = np.zeros((len(rows), inner.shape[1]))
     axes[filled] = inner if basis is None else basis @ inner
     return axes, variances[kept]
-
-
-def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:
-    """Return the size of the errors of rotation or of place, and that they are in the uncertainty;
-    a warning where they are beyond doubt.
-    """
-    component, p_value = slow.components[part]
-    dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
-    return report_finding(
-        DISCREPANCY,
-        quantity=("orientation", "position")[part],
-        amplitude=fit.robot.to_quantity(float(np.sqrt(component.variance)), dimension),
-        degrees=component.degrees,
-        p_value=p_value,
-        is_slow=slow.is_slow,
-        level=LEVEL if slow.is_slow else REPEATS_LEVEL,
-        severity=choose_severity(p_value),
-    )
 
 
 def _is_seen(rows: SlowErrorRows, part: int) -> bool:

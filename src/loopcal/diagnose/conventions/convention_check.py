@@ -38,7 +38,6 @@ from loopcal.diagnose.conventions.misfit import (
 from loopcal.diagnose.conventions.selection import (
     GROSS,
     UNDECLARED,
-    Selection,
     report_equals,
     search_interpretations,
     shares_poses,
@@ -350,7 +349,20 @@ def _compare_interpretations(
         "poses": n_tried,
     }
     if chosen is not None and has_enough:
-        return _refuse(description, misfit, chosen)
+        interpretation, alternatives = chosen.interpretation, chosen.alternatives
+        # a robot far beyond its tolerances looks the same as an undeclared setup item
+        is_doubtful = interpretation.slip == UNDECLARED and not misfit > GROSS
+        finding = report_finding(
+            "conventions.other-interpretation",
+            Severity.WARNING if is_doubtful else Severity.REFUSAL,
+            **description,
+            interpretation=interpretation.describe(),
+            alternatives=tuple(other.describe() for other in alternatives),
+            other_misfit=chosen.misfit,
+            other_residuals=list_rms_residuals(chosen.comparison),
+            is_consistent=chosen.misfit <= ALLOWED,
+        )
+        return ConventionCheck(misfit, interpretation, chosen.misfit, alternatives, finding)
     if against is not None:
         return _contradict(misfit, against)
     if not misfit > IMPLAUSIBLE or has_errors:
@@ -378,25 +390,6 @@ def _thin_out(data: Measurements) -> Measurements:
         return data
     first = np.linspace(0, n - MOST_POSES // RUNS, RUNS).astype(np.intp)
     return data.take(find_distinct(first[:, None] + np.arange(MOST_POSES // RUNS)))
-
-
-def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> ConventionCheck:
-    """Refuse data that fit far better in another interpretation; warn where a robot far beyond its
-    tolerances looks the same as a setup item that is not declared unknown.
-    """
-    interpretation, alternatives = chosen.interpretation, chosen.alternatives
-    is_setup = interpretation.slip == UNDECLARED
-    finding = report_finding(
-        "conventions.other-interpretation",
-        Severity.WARNING if is_setup and not misfit > GROSS else Severity.REFUSAL,
-        **description,
-        interpretation=interpretation.describe(),
-        alternatives=tuple(other.describe() for other in alternatives),
-        other_misfit=chosen.misfit,
-        other_residuals=list_rms_residuals(chosen.comparison),
-        is_consistent=chosen.misfit <= ALLOWED,
-    )
-    return ConventionCheck(misfit, interpretation, chosen.misfit, alternatives, finding)
 
 
 def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:

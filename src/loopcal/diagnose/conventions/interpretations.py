@@ -321,8 +321,8 @@ def list_reading_interpretations(
             chosen = poses[:, None] & np.array([a.dimension is dimension for a in actuators])
             for factor in FACTORS.get(dimension, ()):
                 details = _describe_unit("readings", dimension, factor)
-                scale = partial(_scale_chosen, chosen=chosen, factor=factor)
-                yield interpret_readings("unit", details, scale, source)
+                times = np.where(chosen, factor, 1.0)
+                yield interpret_readings("unit", details, partial(np.multiply, times), source)
     for slip, details, change in chain(
         _list_reading_slips(actuators), _list_gears(actuators, home)
     ):
@@ -330,10 +330,6 @@ def list_reading_interpretations(
     for shift, neighbor in ((1, "above"), (-1, "below")):
         change = partial(np.roll, shift=shift, axis=0)
         yield interpret_readings("shifted-readings", {"neighbor": neighbor}, change)
-
-
-def _scale_chosen(values: FloatArray, chosen: BoolArray, factor: float) -> FloatArray:
-    return np.where(chosen, factor * values, values)
 
 
 def _group_actuators(count: int) -> list[tuple[int, ...]]:

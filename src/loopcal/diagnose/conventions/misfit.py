@@ -267,32 +267,26 @@ def _linearize(
     begin = problem.start(z, seek=False)
     try:
         if start is None and problem.nuisance is not None:
-            start = _guess_start(problem, data, effort)
+            robot, t, observations = problem.free.robot, len(problem), list(data.observations)
+            measured = [np.broadcast_to(o.measured, (t, *o.measured.shape)) for o in observations]
+            used = [i for i, o in enumerate(observations) if len(o)]
+            for i, rows in zip(used, problem.rows, strict=False):  # readings may follow
+                measured[i] = np.broadcast_to(rows.measured, measured[i].shape)
+                if t == 1:  # absent rows do not count
+                    present = np.any(rows.whitener[0] != 0.0, axis=(1, 2))
+                    weighted = observations[i].with_weights(present * observations[i].weight)
+                    observations[i] = weighted
+            start = guess_nuisance_values_batch(
+                replace(data, observations=tuple(observations)),
+                measured,
+                forward_trials(robot, robot.values[None], data.readings[None]).T,
+                data.nuisance_parameters,
+                most=effort.candidates,
+                steps=effort.guess_steps,
+            )
         return problem.linearize(z, begin if start is None else begin.with_nuisance(start))
     except DataError:
         return None
-
-
-def _guess_start(problem: Problem, data: Measurements, effort: Effort) -> FloatArray:
-    """Guess nuisance parameters (t, U) for every interpretation; absent rows do not count where
-    there is one interpretation.
-    """
-    robot, t, observations = problem.free.robot, len(problem), list(data.observations)
-    measured = [np.broadcast_to(o.measured, (t, *o.measured.shape)) for o in observations]
-    used = [i for i, o in enumerate(observations) if len(o)]
-    for i, rows in zip(used, problem.rows, strict=False):  # readings may follow
-        measured[i] = np.broadcast_to(rows.measured, measured[i].shape)
-        if t == 1:
-            present = np.any(rows.whitener[0] != 0.0, axis=(1, 2))
-            observations[i] = observations[i].with_weights(present * observations[i].weight)
-    return guess_nuisance_values_batch(
-        replace(data, observations=tuple(observations)),
-        measured,
-        forward_trials(robot, robot.values[None], data.readings[None]).T,
-        data.nuisance_parameters,
-        most=effort.candidates,
-        steps=effort.guess_steps,
-    )
 
 
 def _expected_sd(problem: Problem, linearization: Linearization) -> list[FloatArray]:

@@ -471,14 +471,19 @@ def report_equals(free: FreeParameters, data: Measurements, misfit: float) -> Fi
     """Report other orders of a redundant robot's actuators, or the other sign of heights, that
     explain data as well as they are written; None without any.
     """
-    opposite = _compute_opposite_misfit(free, data)
-    if opposite <= max(EQUALLY * misfit, 1.0):
-        return report_finding(
-            "conventions.height-sign-undecided",
-            robot=free.robot.name,
-            misfit=misfit,
-            other_misfit=opposite,
-        )
+    heights = [o for o in data.observations if o.kind.columns == HEIGHT]
+    sizes = [np.nan_to_num(o.whitener[:, 0, 0] * o.measured[:, 0]) for o in heights]
+    is_significant = any(np.abs(size).max(initial=0.0) > SIGNIFICANT for size in sizes)
+    if len(heights) == len(data.observations) and is_significant:
+        mirrored = tuple(replace(o, measured=-o.measured) for o in heights)
+        opposite = compute_quick_misfit(free, replace(data, observations=mirrored))
+        if opposite <= max(EQUALLY * misfit, 1.0):
+            return report_finding(
+                "conventions.height-sign-undecided",
+                robot=free.robot.name,
+                misfit=misfit,
+                other_misfit=opposite,
+            )
     if not is_redundant(free) or sum(o.n_residuals for o in data.observations) >= MEASURED:
         return None
     few = data.take(select_measured(data))
@@ -502,16 +507,3 @@ def select_measured(data: Measurements) -> IntArray:
     missing = max(FEWEST_POSES - len(measured), 0) if len(others) else 0
     spread = np.linspace(0, len(others) - 1, missing)
     return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)
-
-
-def _compute_opposite_misfit(free: FreeParameters, data: Measurements) -> float:
-    """Return the misfit of data that consist of heights alone with the opposite sign of these; NaN
-    for other data, and for heights within the noise.
-    """
-    if not data.observations or any(o.kind.columns != HEIGHT for o in data.observations):
-        return float("nan")
-    sizes = [np.nan_to_num(o.whitener[:, 0, 0] * o.measured[:, 0]) for o in data.observations]
-    if not np.abs(np.concatenate(sizes)).max(initial=0.0) > SIGNIFICANT:
-        return float("nan")
-    opposite = tuple(replace(o, measured=-o.measured) for o in data.observations)
-    return compute_quick_misfit(free, replace(data, observations=opposite))
