@@ -15,8 +15,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
-from fractions import Fraction
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -36,94 +35,28 @@ from loopcal.io.core.limits import (
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import FloatArray
 from loopcal.units import LARGEST, Dimension, find_unit
 
-# Many numbers as text at once, to the same doubles as one after the other by `parse_exact`.
 
-MOST_DIGITS = 18
-"""Digits of a plain decimal, so that its whole number is below 2^63."""
-
-WIDTH = MOST_DIGITS + 2
-"""Characters of the longest plain decimal: with its sign and its point."""
-
-COLUMN_CHUNK = 1 << 16
-"""Cells that are converted at once."""
-
-UNDECIDED = 1e-9
-"""Distance from the middle between two doubles, as a share of half their distance, below which the
-rounded product is not certain: twice 10^-25 of the number, far beyond all rounding.
-"""
-
-SPLITTER = 2.0**27 + 1.0
-"""Splits a double into two halves of 26 bits (Dekker)."""
-
-
-def parse_decimals(cells: Sequence[str], factor: float) -> tuple[FloatArray, BoolArray]:
-    """Return products of plain decimals (n,) with a factor, each rounded once as by `parse_exact`,
-    and which cells are plain decimals with a certain product; others are zero.
+def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
+    """Return products of finite numbers (n,) with a factor, each rounded once as by `parse_exact`;
+    NaN for other cells.
     """
-    values, is_plain = np.zeros(len(cells)), np.zeros(len(cells), dtype=bool)
-    # factor / 10^k as sums of two doubles
-    exact = [Fraction(repr(factor)) / 10**k for k in range(MOST_DIGITS + 1)]
-    doubles = [float(value) for value in exact]
-    rests = [float(value - Fraction(h)) for value, h in zip(exact, doubles, strict=True)]
-    high, low = np.array(doubles), np.array(rests)
-    for begin in range(0, len(cells), COLUMN_CHUNK):
-        part = slice(begin, begin + COLUMN_CHUNK)
-        whole, decimals, is_negative, is_decimal = _read_digits(cells[part])
-        product, is_certain = _multiply(whole, high[decimals], low[decimals])
-        is_plain[part] = is_decimal & is_certain
-        signed = np.where(is_negative, -product, product)
-        values[part] = np.where(is_plain[part], signed, 0.0)
-    return values, is_plain
+    exact = Decimal(repr(factor)).normalize()
+    _, digits, exponent = exact.as_tuple()
 
+    def parse(cell: str) -> float:
+        try:
+            if digits == (1,):  # a power of ten, such as of mm: three times as fast
+                product = float(f"{cell}e{exponent}")
+            else:
+                product = float(Decimal(cell) * exact)
+        except (ValueError, InvalidOperation):
+            return math.nan
+        return product if math.isfinite(product) and "_" not in cell else math.nan
 
-def _read_digits(cells: Sequence[str]) -> tuple[IntArray, IntArray, BoolArray, BoolArray]:
-    """Return the whole numbers (n,), their decimals (n,), whether they are negative, and whether
-    the texts are plain decimals; numbers of others mean nothing.
-    """
-    n, size = len(cells), WIDTH + 1  # one more, so that a longer text is noticed
-    try:
-        texts = np.array(cells, dtype=f"S{size}")
-    except UnicodeEncodeError:
-        texts = np.array([cell.encode("ascii", "replace") for cell in cells], dtype=f"S{size}")
-    characters = np.ascontiguousarray(texts.view(np.uint8).reshape(n, size).T)
-    whole, digits, decimals = (np.zeros(n, dtype=np.int64) for _ in range(3))
-    is_negative = characters[0] == ord("-")
-    is_decimal = characters[-1] == 0
-    has_point = np.zeros(n, dtype=bool)
-    for place, column in enumerate(characters):
-        if not column.any():
-            break
-        digit = column - np.uint8(ord("0"))  # wraps around below "0"
-        is_digit, is_point = digit <= 9, column == ord(".")
-        whole = np.where(is_digit & (digits < MOST_DIGITS), 10 * whole + digit, whole)
-        digits += is_digit
-        decimals += is_digit & has_point
-        is_allowed = is_digit | (is_point & ~has_point) | (column == 0)
-        if place == 0:
-            is_allowed |= is_negative | (column == ord("+"))
-        is_decimal &= is_allowed
-        has_point |= is_point
-    is_decimal &= (digits > 0) & (digits <= MOST_DIGITS)
-    return whole, np.minimum(decimals, MOST_DIGITS), is_negative, is_decimal
-
-
-def _multiply(whole: IntArray, high: FloatArray, low: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the doubles nearest to whole * (high + low), and where they are certain."""
-    m = whole.astype(np.float64)
-    rest = (whole - m.astype(np.int64)).astype(np.float64)
-    product = m * high
-    # the rounding error of the product, exactly (Dekker)
-    (m_high, f_high) = (x * SPLITTER - (x * SPLITTER - x) for x in (m, high))
-    m_low, f_low = m - m_high, high - f_high
-    error = m_high * f_high - product + m_high * f_low + m_low * f_high
-    left = (error + m_low * f_low) + (m * low + rest * high)
-    nearest = product + left
-    left -= nearest - product
-    half = 0.5 * np.abs(np.nextafter(nearest, np.where(left < 0.0, -np.inf, np.inf)) - nearest)
-    return nearest, half - np.abs(left) >= UNDECIDED * half
+    return np.array([parse(cell) for cell in cells])
 
 
 # Numbers as text: the fewest digits that read back as the same double.
@@ -237,8 +170,8 @@ class Table:
         `inf`, where `infinite` cells are allowed), or is empty where it must not be.
         """
         factor, cells = self.factor(name, dimension), self.text(name)
-        values, is_plain = parse_decimals(cells, factor)
-        for row in np.flatnonzero(~is_plain).tolist():
+        values = parse_decimals(cells, factor)
+        for row in np.flatnonzero(np.isnan(values)).tolist():
             cell, value = cells[row], math.inf
             if not infinite or cell != "inf":
                 value = self.number(name, row, cell, empty)

@@ -150,8 +150,8 @@ class ProductColumn(Column):
             for symbol, dimension in zip(symbols, self.dimensions, strict=True)
         )
         cells = table.text(self.name)
-        numbers, is_plain = parse_decimals(cells, 1.0)
-        for row in np.flatnonzero(~is_plain).tolist():
+        numbers = parse_decimals(cells, 1.0)
+        for row in np.flatnonzero(np.isnan(numbers)).tolist():
             numbers[row] = table.number(self.name, row, cells[row], empty=False)
         return numbers * (a * b)
 
@@ -189,10 +189,9 @@ class ContextColumn(Column):
             allowed = ", ".join(f"[{s}]" for s in self.units)
             raise table.header_error(f"column {self.name!r} has {stated}; write one of {allowed}")
         factor, offset = self.units[symbol]
-        values, is_plain = parse_decimals(cells, factor)
-        values += offset
+        values = parse_decimals(cells, factor) + offset
         lowest = -math.inf if self.name == TIME else ABSOLUTE_ZERO - ROUNDING
-        for row in np.flatnonzero(~is_plain | (values < lowest)).tolist():
+        for row in np.flatnonzero(~(values >= lowest)).tolist():
             is_empty = math.isnan(table.number(self.name, row, cells[row]))
             values[row] = math.nan if is_empty else parse_exact(cells[row], factor) + offset
             if values[row] < lowest:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 import typing
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache
@@ -145,17 +145,33 @@ def read_noise(
         example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in dimensions.items())
         sentence = "'noise' must state a standard deviation for each column"
         raise file.error(f"{sentence}; write 'noise: {{{example}}}'", place)
-    noise: dict[str, float] = {}
-    for name, text in stated.items():
-        matching = [c for c in dimensions if c == name or fnmatchcase(c, name)]
-        matching = [name] if name in dimensions else matching
+    return {
+        column: _read_sd(file, text, dimensions[column], at, f"the noise of {at[-1]!r}")
+        for text, names, at in _match_names(file, stated, list(dimensions), place)
+        for column in names
+    }
+
+
+def _match_names(
+    file: YamlFile, stated: Mapping[str, Any], names: list[str], place: Location
+) -> Iterator[tuple[Any, list[str], Location]]:
+    """Yield what is stated by names or patterns, the names that each denotes, and its place."""
+    for pattern, node in stated.items():
+        matching = [name for name in names if fnmatchcase(name, pattern)]
+        matching = [pattern] if pattern in names else matching
         if not matching:
-            refuse_unknown_keys(file, [name], list(dimensions), place)
-        for column in matching:
-            noise[column] = file.quantity(text, dimensions[column], (*place, name))
-            if fault := find_sd_fault(noise[column]):
-                raise file.error(f"the noise of {name!r} is {text}; {fault}", (*place, name))
-    return noise
+            refuse_unknown_keys(file, [pattern], names, place)
+        yield node, matching, (*place, pattern)
+
+
+def _read_sd(
+    file: YamlFile, text: Any, dimension: Dimension, place: Location, what: str, act: str = ""
+) -> float:
+    """Return a standard deviation [SI]; FileError where it cannot be one."""
+    sd = file.quantity(text, dimension, place)
+    if fault := find_sd_fault(sd):
+        raise file.error(f"{what} is {text}; {fault}{act}", place)
+    return sd
 
 
 def format_kind(
@@ -420,28 +436,22 @@ def read_shared_errors(
         if key not in node:
             continue
         place, stated = (*location, key), node[key]
-        components = dict(list_components(kind))
+        components = dict(list_components(kind).keys())
         if stated != UNKNOWN and not (isinstance(stated, dict) and stated):
-            example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in components)
+            example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in components.items())
             sentence = f"{key!r} is {stated!r}; write '{key}: {UNKNOWN}', or standard deviations"
             raise file.error(f"{sentence}, as '{key}: {{{example}}}'", place)
         kind = replace(cast(Any, kind), unknown=tuple(dict.fromkeys((*kind.unknown, item))))
         if stated == UNKNOWN:
             continue
-        priors |= {name_shared_error(kind, item, name): 0.0 for name, _ in components}
-        for pattern, text in stated.items():
-            matching = [(n, d) for n, d in components if fnmatchcase(n, str(pattern))]
-            if not matching:
-                refuse_unknown_keys(file, [pattern], [name for name, _ in components], place)
-            for name, dimension in matching:
+        priors |= {name_shared_error(kind, item, name): 0.0 for name in components}
+        for text, names, at in _match_names(file, stated, list(components), place):
+            for name in names:
                 parameter = name_shared_error(kind, item, name)
                 priors.pop(parameter, None)
-                if text == UNKNOWN:
-                    continue
-                priors[parameter] = file.quantity(text, dimension, (*place, pattern))
-                if fault := find_sd_fault(priors[parameter]):
-                    sentence = f"the standard deviation is {text}; {fault}, or {UNKNOWN}"
-                    raise file.error(sentence, (*place, pattern))
+                if text != UNKNOWN:
+                    what, act = "the standard deviation", f", or {UNKNOWN}"
+                    priors[parameter] = _read_sd(file, text, components[name], at, what, act)
     return kind, priors
 
 
@@ -503,11 +513,32 @@ def read_kinds(table: Table, robot: Mechanism, several: bool = False) -> tuple[K
     One of `several` files may have none, and then only holds readings of poses. FileError :
     settings or columns without a meaning.
     """
+    file, content = table.settings, table.settings.content
+    labeled = content.get("kinds")
     if several and not has_measured_values(table):
-        refuse_unknown_keys(table.settings, list(table.settings.content), POSE_SETTINGS)
+        refuse_unknown_keys(file, list(content), POSE_SETTINGS)
         kinds: tuple[KindRows, ...] = ()
+    elif labeled is None:
+        kinds = (_read_entry(file, content, robot, (), np.arange(len(table))),)
     else:
-        kinds = _read_kinds(table, robot)
+        of_kind = {"kind", *KIND_SETTINGS} - {"instrument"}
+        refuse_unknown_keys(file, list(content), [key for key in SETTINGS if key not in of_kind])
+        if not isinstance(labeled, dict) or not all(isinstance(n, dict) for n in labeled.values()):
+            sentence = (
+                "'kinds' must map labels to kinds, as 'kinds: {height: {kind: component, ..}}'"
+            )
+            example = "'kinds: {height: {kind: component, ..}}'"
+            raise file.error(f"{sentence}, as {example}", ("kinds",))
+        require_columns(table, ["kind"], "which assigns each row to one of the kinds")
+        cells = np.array(table.text("kind"))
+        for row, cell in enumerate(cells):
+            if cell and cell not in labeled:  # without a kind, a row only holds readings
+                sentence = f"column 'kind' is {cell!r}; allowed: {', '.join(labeled)}"
+                raise table.row_error(row, sentence)
+        kinds = tuple(
+            _read_entry(file, node, robot, ("kinds", label), np.flatnonzero(cells == label))
+            for label, node in labeled.items()
+        )
     refuse_unknown_columns(table, robot, [entry.kind for entry in kinds])
     return kinds
 
@@ -559,39 +590,8 @@ def read_observations(
     return observations, table.places(rows.tolist())
 
 
-def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
-    """Read the settings `kind` or `kinds`, and the column `kind`."""
-    file, content = table.settings, table.settings.content
-    several = content.get("kinds")
-    instrument = read_instrument(file, content, ())
-    if several is None:
-        return (_read_entry(file, content, robot, (), np.arange(len(table)), instrument),)
-    allowed = [
-        key for key in SETTINGS if key == "instrument" or key not in ("kind", *KIND_SETTINGS)
-    ]
-    refuse_unknown_keys(file, list(content), allowed)
-    if not isinstance(several, dict) or not all(isinstance(n, dict) for n in several.values()):
-        sentence = "'kinds' must map labels to kinds, as 'kinds: {height: {kind: component, ..}}'"
-        raise file.error(sentence, ("kinds",))
-    require_columns(table, ["kind"], "which assigns each row to one of the kinds")
-    cells = np.array(table.text("kind"))
-    for row, cell in enumerate(cells):
-        if cell and cell not in several:  # without a kind, a row only holds readings
-            sentence = f"column 'kind' is {cell!r}; allowed: {', '.join(several)}"
-            raise table.row_error(row, sentence)
-    return tuple(
-        _read_entry(file, node, robot, ("kinds", label), np.flatnonzero(cells == label), instrument)
-        for label, node in several.items()
-    )
-
-
 def _read_entry(
-    file: YamlFile,
-    node: Mapping[str, Any],
-    robot: Mechanism,
-    place: Location,
-    rows: IntArray,
-    instrument: InstrumentRecord | None,
+    file: YamlFile, node: Mapping[str, Any], robot: Mechanism, place: Location, rows: IntArray
 ) -> KindRows:
     """Return the kind of some rows, from the settings at a place of the file."""
     kind = _read_robot_kind(file, node, robot, place)
@@ -603,7 +603,9 @@ def _read_entry(
         sentence = f"noise_source is {source!r}; write {ASSUMED} where nobody stated the noise"
         raise file.error(f"{sentence}, or stated", (*place, "noise_source"))
     kind, shared = read_shared_errors(file, node, kind, place)
-    instrument = (read_instrument(file, node, place) if place else None) or instrument
+    instrument = read_instrument(file, node, place)
+    if instrument is None and place:
+        instrument = read_instrument(file, file.content, ())
     return KindRows(kind, noise, rows, place, bool(source == ASSUMED), shared, instrument)
 
 
