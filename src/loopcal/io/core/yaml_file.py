@@ -23,9 +23,6 @@ from loopcal.units import Dimension, parse_quantity
 
 Location = tuple[str | int, ...]
 
-LONGEST_PROBLEM = 100
-"""Characters of a parser's sentence that a message repeats."""
-
 KEPT_TEXTS, KEPT_LENGTH = 32, 100_000
 """Texts whose trees are kept, and their largest length. A command reads the same text several times
 (it is looked at before it is used, and read back after it was written), which takes as long as a
@@ -104,10 +101,7 @@ def parse_yaml(
         raise FileError(sentence, path)
     file = YamlFile(path, text, tree, {}, first_line)
     with _hide_content(path, what) if not is_ours else nullcontext():
-        content = _to_plain(tree, file, ())
-        if has_names:
-            _refuse_names(content, file, ())
-    return replace(file, content=content)
+        return replace(file, content=_to_plain(tree, file, (), has_names))
 
 
 @contextmanager
@@ -195,9 +189,9 @@ def name_location(location: Location) -> str:
 
 
 def _shorten(problem: object) -> str:
-    """Return a parser's sentence in one line, which may quote the file, without its end."""
+    """Return a parser's sentence, which may quote the file, in one line of 100 characters."""
     text = " ".join(str(problem).split())
-    return escape(text if len(text) <= LONGEST_PROBLEM else f"{text[:LONGEST_PROBLEM]}…")
+    return escape(text if len(text) <= 100 else f"{text[:100]}…")
 
 
 def _inside(location: Location) -> str:
@@ -205,17 +199,26 @@ def _inside(location: Location) -> str:
     return f" in {name_location(location)!r}" if location else ""
 
 
-def _to_plain(node: Any, file: YamlFile, location: Location) -> Any:
-    """Return `node` as plain Python values; see `YamlFile.content`."""
+def _to_plain(node: Any, file: YamlFile, location: Location, has_names: bool) -> Any:
+    """Return `node` as plain Python values, see `YamlFile.content`; FileError for the first value
+    that is none, or, where the file `has_names`, a key or text that is not a name.
+    """
     if isinstance(node, Mapping):
-        for key in node:
+        plain: dict[str, Any] = {}
+        for key, value in node.items():
+            place = (*location, key)
             if not isinstance(key, str):
                 sentence = f"key {quote(key)}{_inside(location)} is not text; put it in quotes"
-                raise file.error(sentence, (*location, key))
-        return {str(key): _to_plain(value, file, (*location, key)) for key, value in node.items()}
+                raise file.error(sentence, place)
+            if has_names and (fault := find_fault_below(location, key)) is not None:
+                raise file.error(fault, place)
+            plain[str(key)] = _to_plain(value, file, place, has_names)
+        return plain
     if isinstance(node, bool) or node is None:
         return node
     if isinstance(node, str):
+        if has_names and (fault := find_fault_below(location, node)) is not None:
+            raise file.error(fault, location)
         return str(node)
     if isinstance(node, int | float):
         value = int(node) if isinstance(node, int) else float(node)
@@ -225,25 +228,11 @@ def _to_plain(node: Any, file: YamlFile, location: Location) -> Any:
         shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
         raise file.error(f"{name_location(location)!r} is {shown}; write a finite number", location)
     if isinstance(node, Sequence):
-        return [_to_plain(value, file, (*location, i)) for i, value in enumerate(node)]
+        return [_to_plain(item, file, (*location, i), has_names) for i, item in enumerate(node)]
     if isinstance(node, datetime.date):
         return node.isoformat()
     sentence = f"{name_location(location)!r} has a YAML tag, which is not allowed here; remove it"
     raise file.error(sentence, location)
-
-
-def _refuse_names(node: Any, file: YamlFile, location: Location) -> None:
-    """Raise FileError for the first key or text that is not a name, or no text where one may be."""
-    if isinstance(node, dict):
-        for key, value in node.items():
-            if (fault := find_fault_below(location, key)) is not None:
-                raise file.error(fault, (*location, key))
-            _refuse_names(value, file, (*location, key))
-    elif isinstance(node, list):
-        for i, value in enumerate(node):
-            _refuse_names(value, file, (*location, i))
-    elif isinstance(node, str) and (fault := find_fault_below(location, node)) is not None:
-        raise file.error(fault, location)
 
 
 # A composer of YAML that refuses deep documents, those whose aliases stand for too much, and
