@@ -223,16 +223,15 @@ class _ProcessPool:
 
 
 def _begin_worker(driver: int) -> None:
-    """Leave Ctrl-C to the driver, and end with it, however it ends."""
+    """Leave Ctrl-C to the driver, and end when it is no longer the parent, however it ends."""
+
+    def end_with_driver() -> None:
+        while os.getppid() == driver:
+            time.sleep(PERIOD)
+        os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(driver,), daemon=True).start()
-
-
-def _end_with(driver: int) -> None:
-    """End this process when its parent is no longer the driver."""
-    while os.getppid() == driver:
-        time.sleep(PERIOD)
-    os._exit(1)
+    threading.Thread(target=end_with_driver, daemon=True).start()
 
 
 @contextmanager

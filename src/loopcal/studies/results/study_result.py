@@ -535,24 +535,18 @@ def _write_parquet(study: Study, store: StudyStore, path: Path, progress: Progre
     with parquet.ParquetWriter(path, schema) as writer:
         for cell in study.cells:
             progress(cell.number, len(study.cells), "writing trials")
-            tables = [
-                _make_table(arrow, schema, [cell.levels[name] for name in names], first, scores)
-                for first, scores in iterate_trials(study, store, cell)
-            ]
+            tables = []
+            for first, scores in iterate_trials(study, store, cell):
+                rows = len(scores)
+                places = arrow.array([0] * rows, arrow.int32())
+                columns = [
+                    arrow.DictionaryArray.from_arrays(places, [cell.levels[name]]) for name in names
+                ]
+                columns.append(arrow.array(range(first, first + rows), arrow.int64()))
+                columns += [arrow.array(column) for column in scores.T.copy()]
+                tables.append(arrow.table(columns, schema=schema))
             if tables:
                 table = arrow.concat_tables(tables).combine_chunks()
                 writer.write_table(table)
                 count += table.num_rows
     return count
-
-
-def _make_table(arrow: Any, schema: Any, levels: list[str], first: int, scores: FloatArray) -> Any:
-    """Return the table of one block."""
-    rows = len(scores)
-    words = [
-        arrow.DictionaryArray.from_arrays(arrow.array([0] * rows, arrow.int32()), [level])
-        for level in levels
-    ]
-    numbers = [arrow.array(range(first, first + rows), arrow.int64())]
-    columns = [arrow.array(column) for column in scores.T.copy()]
-    return arrow.table([*words, *numbers, *columns], schema=schema)

@@ -29,6 +29,7 @@ from loopcal.studies.simulation.fits import (
     FittedTrials,
     fit_trials,
     is_reached,
+    solve_cell_poses,
     state_times,
 )
 from loopcal.studies.simulation.machines import (
@@ -187,10 +188,13 @@ def score_poses(
         drawn = np.stack([s.standard_normal(readings.shape[1:]) for s in streams])
         readings = readings + drawn * sigma
     truth = forward_trials(robot, trials.truth, readings, held_out.state)
+    state, reference = fits.states or solve_cell_poses(cell, fits.values)
+    is_lost = (fits.outcome == 0) & ~(is_reached(truth) & is_reached(state))
+    is_known = np.isfinite(fits.values).all(axis=1)[:, None, None, None]
     nominal = held_out.T[None], cell.reference.T[None]
-    is_lost = (fits.outcome == 0) & ~(is_reached(truth) & fits.reached)
+    fitted = (np.where(is_known, s.T, np.nan) for s in (state, reference))
     scores: dict[str, FloatArray] = {"outcome": np.where(is_lost, NOT_REACHED, fits.outcome)}
-    for when, (T, measured) in {"_before": nominal, "": (fits.T, fits.T_measured)}.items():
+    for when, (T, measured) in {"_before": nominal, "": tuple(fitted)}.items():
         tools = np.broadcast_to(T, truth.T.shape) @ robot.tool
         error = geometry.pose_difference(tools, truth.T @ robot.tool)
         if all(freedom == 3 for freedom in robot.program.freedoms):  # the platform cannot rotate

@@ -87,22 +87,19 @@ class FittedTrials:
     Attributes
     ----------
     values : (t, p of the robot) [SI]. outcome : (t,) numbers of OUTCOMES.
-    T, reached : (t, h, 4, 4), (t,) calibrated machines at the readings of the held-out poses.
-    T_measured : (t, n, 4, 4) at those of the measured poses; n = 0 where no frame is fitted.
     half_width : (t, p free) of 95 % intervals [SI]. expanded : (t, h, 2) position and rotation
         errors that 95 % of the errors of held-out poses do not exceed [m], [rad].
     scores : name -> (t,) of further scores that the method has: rank, condition, iterations,
         residuals over the stated noise, numbers of VERDICTS.
+    states : of the calibrated machines, see `solve_cell_poses`; None where they are not known yet.
     """
 
     values: FloatArray
     outcome: IntArray
-    T: FloatArray
-    reached: BoolArray
-    T_measured: FloatArray
     half_width: FloatArray
     expanded: FloatArray
     scores: Mapping[str, Any]
+    states: tuple[State, State] | None = None
 
 
 def fit_trials(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
@@ -129,9 +126,6 @@ def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> Fitted
     return FittedTrials(
         values=fits.values,
         outcome=np.array([_OF_STATUS[DescentStatus(int(status))] for status in fits.status]),
-        T=state.T,
-        reached=is_reached(state),
-        T_measured=measured.T,
         half_width=LEVEL_95 * fits.standard_deviations(),
         expanded=_expand_errors(cell, fits, state, measured),
         scores={
@@ -140,6 +134,7 @@ def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> Fitted
             "iterations": fits.iterations.astype(float),
             "noise_scale": compute_noise(plain.unexplained, plain.rows - plain.rank),
         },
+        states=(state, measured),
     )
 
 
@@ -186,17 +181,11 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
         outcome = np.where(steps.is_converged | is_counted, 0, EXHAUSTED)
         outcome = np.where(steps.is_diverged, DIVERGED, outcome)
         values, iterations = steps.values, steps.count
-    is_known = np.asarray(np.isfinite(values).all(axis=1))
-    state, measured = solve_cell_poses(cell, np.where(is_known[:, None], values, robot.values))
-    lost = ~is_known[:, None, None, None]
     return FittedTrials(
         values=values,
         outcome=outcome,
-        T=np.where(lost, np.nan, state.T),
-        reached=is_reached(state),
-        T_measured=np.where(lost, np.nan, measured.T),
         half_width=np.full((t, len(select_free_parameters(robot))), np.nan),
-        expanded=np.full((*state.T.shape[:2], 2), np.nan),
+        expanded=np.full((t, len(cell.held_out.q), 2), np.nan),
         scores=scores | {"iterations": iterations.astype(float)},
     )
 
@@ -235,8 +224,10 @@ def compute_noise(chi_square: ArrayLike, degrees: ArrayLike) -> FloatArray:
 
 def solve_cell_poses(cell: PreparedCell, values: FloatArray) -> tuple[State, State]:
     """Return the states of machines (t, p) at the readings of the held-out poses, and at those of
-    the measured poses, see `PreparedCell.reference`.
+    the measured poses, see `PreparedCell.reference`; those of lost trials do not count.
     """
+    is_known = np.isfinite(values).all(axis=1, keepdims=True)
+    values = np.where(is_known, values, cell.robot.values)
     held_out, commanded = cell.held_out, cell.reference
     return (
         forward_trials(cell.robot, values, held_out.q[None], held_out.state),
@@ -291,15 +282,12 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
 
     A trial that is refused does not stop the others.
     """
-    free, h, n = select_free_parameters(cell.robot), len(cell.held_out.q), len(cell.reference.q)
+    free = select_free_parameters(cell.robot)
     nothing = FittedTrials(
         values=np.full(len(cell.robot.parameters), np.nan),
         outcome=np.array(REFUSED),
-        T=np.full((h, 4, 4), np.nan),
-        reached=np.array(False),
-        T_measured=np.full((n, 4, 4), np.nan),
         half_width=np.full(len(free), np.nan),
-        expanded=np.full((h, 2), np.nan),
+        expanded=np.full((len(cell.held_out.q), 2), np.nan),
         scores={},
     )
     single = []
@@ -308,9 +296,10 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
             single.append(_fit_one(cell, state_times(trials.trial(i))))
         except (EstimationError, DataError):
             single.append(nothing)
-    arrays = {n: np.stack([getattr(f, n) for f in single]) for n in vars(nothing) if n != "scores"}
-    names = dict.fromkeys(name for fit in single for name in fit.scores)
-    scores = {name: np.array([f.scores.get(name, np.nan) for f in single]) for name in names}
+    names = ("values", "outcome", "half_width", "expanded")
+    arrays = {name: np.stack([getattr(fit, name) for fit in single]) for name in names}
+    known = dict.fromkeys(name for fit in single for name in fit.scores)
+    scores = {name: np.array([f.scores.get(name, np.nan) for f in single]) for name in known}
     return FittedTrials(**arrays, scores=scores)
 
 
@@ -340,14 +329,10 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
         if asked.intervals == "adjusted":
             fit = adjust_uncertainty(fit, data)
     U = pose_uncertainty(fit, forward(fit.robot, cell.held_out.q), frame=asked.error_frame)
-    state, measured = solve_cell_poses(cell, fit.robot.values[None])
     test = fit.residual_test
     return FittedTrials(
         values=fit.robot.values,
         outcome=np.array(_OF_STATUS[fit.status]),
-        T=state.T[0],
-        reached=is_reached(state)[0],
-        T_measured=measured.T[0],
         half_width=fit.interval(),
         expanded=np.stack([U.expanded_position, U.expanded_orientation], axis=-1),
         scores=scores
