@@ -22,9 +22,8 @@ from benchmarks.bench_start import import_numpy, read_processor_time, run_python
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.engine import get_current_engine
 from loopcal.engine.selection import VARIABLE
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component

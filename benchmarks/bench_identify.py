@@ -12,10 +12,9 @@ import numpy as np
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.diagnose.cross_validation import score_leave_one_out
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
 from loopcal.estimate.problem import problem_of
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

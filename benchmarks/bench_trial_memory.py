@@ -14,8 +14,8 @@ import numpy as np
 
 from benchmarks.bench_engine import ENGINES, ROOT, simulate_hexapods, use_engine
 from benchmarks.harness import Metric
+from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 
 FEW, MANY = 1_000, 10_000

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.estimate.descent import penalize
+from loopcal.estimate.identification import IdentifiedTrials, identify_trials
 from loopcal.estimate.penalties import MAP, LeastSquares, Method
-from loopcal.estimate.trial_identification import IdentifiedTrials, identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component, Pose

@@ -22,13 +22,13 @@ from loopcal.apply.error_budget import compute_error_budget
 from loopcal.apply.validation import validate
 from loopcal.diagnose.error_frames import fit_frames, fit_unfixed_frames
 from loopcal.diagnose.fit_examination import estimate_calibration_gain
-from loopcal.estimate.identification import identify
-from loopcal.estimate.posterior import FrameKnowledge, Posterior, compute_posterior
-from loopcal.estimate.trial_identification import (
+from loopcal.estimate.identification import (
     IdentifiedTrials,
     compute_trial_posterior,
+    identify,
     identify_trials,
 )
+from loopcal.estimate.posterior import FrameKnowledge, Posterior, compute_posterior
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.distance import Distance

@@ -20,13 +20,11 @@ from loopcal.apply.validation import validate
 from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms
 from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import LoopcalError
-from loopcal.estimate.identification import identify
-from loopcal.estimate.nuisance_estimate import estimate_nuisance
+from loopcal.estimate.identification import IdentifiedTrials, identify, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.problem import problem_of, problem_of_trials
-from loopcal.estimate.result import Identification
-from loopcal.estimate.trial_identification import IdentifiedTrials, identify_trials
+from loopcal.estimate.result import Identification, estimate_nuisance
 from loopcal.geometry import align_point_sets, solve_hand_eye
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.diagnose.cross_validation import choose_model
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.penalties import (
     GCV,
     MAP,
@@ -23,7 +23,6 @@ from loopcal.estimate.penalties import (
     TruncationGCV,
 )
 from loopcal.estimate.tolerance_components import InflatedTolerances
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component, Pose

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from evidence.known_truth import Array, make_instrument, position_errors
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.penalties import MAP, LeastSquares, Method
 from loopcal.estimate.result import Identification
 from loopcal.estimate.tolerance_components import InflatedTolerances
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
 from loopcal.mechanism.model import Mechanism

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.estimate.trial_identification import identify_trials
+from loopcal.estimate.identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component, Pose

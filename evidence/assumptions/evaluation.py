@@ -23,10 +23,9 @@ from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty, check_heav
 from loopcal.diagnose.cluster_covariance import check_clusters
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.findings import Severity
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.kinematics import forward_trials

@@ -69,7 +69,9 @@ from .errors import StudyError as StudyError
 from .errors import UnitError as UnitError
 from .estimate.descent import DescentStatus as DescentStatus
 from .estimate.descent import StepControl as StepControl
+from .estimate.identification import IdentifiedTrials as IdentifiedTrials
 from .estimate.identification import identify as identify
+from .estimate.identification import identify_trials as identify_trials
 from .estimate.losses import Huber as Huber
 from .estimate.losses import Tukey as Tukey
 from .estimate.losses import register_loss as register_loss
@@ -87,8 +89,6 @@ from .estimate.prior import prior_from as prior_from
 from .estimate.recalibration import recalibrate as recalibrate
 from .estimate.result import Identification as Identification
 from .estimate.tolerance_components import InflatedTolerances as InflatedTolerances
-from .estimate.trial_identification import IdentifiedTrials as IdentifiedTrials
-from .estimate.trial_identification import identify_trials as identify_trials
 from .findings import Finding as Finding
 from .findings import Quantity as Quantity
 from .findings import Severity as Severity

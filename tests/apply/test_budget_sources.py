@@ -260,7 +260,7 @@ def test_fits_with_one_source_switched_off_lack_its_part():
     second = Sensor(Distance(), noise(6 * UM))
     silent = Sensor(Component(("x", "y", "z")), noise(*[1e-9] * 3))
     truth = sample_truth(robot, 300, 5)
-    from loopcal.estimate.trial_identification import identify_trials
+    from loopcal.estimate.identification import identify_trials
     from loopcal.measure.simulation import simulate_trials
 
     trials = simulate_trials(robot, truth, coordinates, Instrument((first, second)), 5)

@@ -19,7 +19,7 @@ from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.penalties import MAP
-from loopcal.estimate.pose_blocks import BLOCK, EXACT_BLOCK
+from loopcal.estimate.pose_rows import BLOCK, EXACT_BLOCK
 from loopcal.findings import Quantity, Severity, report_finding
 from loopcal.io.core.text_file import to_json
 from loopcal.io.runs.run_folder import load_run, save_run

@@ -12,11 +12,10 @@ from loopcal import geometry
 from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.apply.error_budget import ErrorBudget, compute_error_budget
 from loopcal.diagnose.error_frames import solve_home
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.result import Identification
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.kinds.position import Position

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

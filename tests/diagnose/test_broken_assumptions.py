@@ -15,7 +15,7 @@ from evidence.assumptions.simulation import describe_noise, simulate_case
 from loopcal import load_robot
 from loopcal.diagnose import residual_patterns
 from loopcal.diagnose.outliers import find_outliers
-from loopcal.estimate import prior_conflict, residual_test
+from loopcal.estimate import prior_inflation, residual_test
 from loopcal.measure.instrument import Gaussian
 from loopcal.studies.simulation.machines import AlteredNoise
 
@@ -132,7 +132,7 @@ def test_levels_of_the_study_are_those_of_the_code():
     assert STATED_LEVELS["noise.residuals-too-large"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["noise.residuals-too-small"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["residuals.perhaps-correlated"] == residual_test.SIGNIFICANCE
-    assert STATED_LEVELS["prior.tolerances"] == prior_conflict.LEVEL
+    assert STATED_LEVELS["prior.tolerances"] == prior_inflation.LEVEL
     assert STATED_LEVELS["residuals.heavy-tailed"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["residuals.model-discrepancy"] == residual_patterns.LEVEL
     assert STATED_LEVELS["residuals.patterns"] == residual_patterns.LEVEL

@@ -13,7 +13,7 @@ from loopcal.diagnose.value_comparison import (
     estimate_cause,
     explain_change,
 )
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge
 from loopcal.estimate.posterior import (
     CovariancePart,
@@ -22,7 +22,6 @@ from loopcal.estimate.posterior import (
     fold_information,
     posterior_from_arrays,
 )
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.position import Position

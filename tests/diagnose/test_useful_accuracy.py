@@ -13,9 +13,9 @@ from loopcal.cli.entry_point import main
 from loopcal.diagnose.gauge_freedoms import interpret_combinations
 from loopcal.diagnose.identifiable_parameters import identifiability, judge_useful_accuracy
 from loopcal.errors import EstimationError
+from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate_trials

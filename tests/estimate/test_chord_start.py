@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from loopcal.errors import EstimationError
+from loopcal.estimate import identification as module
 from loopcal.estimate import problem as problem_module
-from loopcal.estimate import trial_identification as module
+from loopcal.estimate.identification import ACCEPTED_STEP, IdentifiedTrials, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import GCV, MAP, LeastSquares, Ridge
 from loopcal.estimate.tolerance_components import InflatedTolerances
-from loopcal.estimate.trial_identification import ACCEPTED_STEP, IdentifiedTrials, identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

@@ -11,12 +11,12 @@ from scipy.stats import chi2, multivariate_normal, norm
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.losses import Huber
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.prior_conflict import LEVEL
 from loopcal.estimate.prior_inflation import (
+    LEVEL,
     VARIANCES,
     ComponentSearch,
     compute_evidence,
@@ -29,7 +29,6 @@ from loopcal.estimate.tolerance_components import (
     ToleranceComponent,
     list_components,
 )
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import loopcal.estimate.pose_blocks as blocks_module
+import loopcal.estimate.pose_rows as blocks_module
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.information import observe_poses, observe_rows

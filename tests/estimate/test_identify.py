@@ -10,10 +10,9 @@ import pytest
 import loopcal.estimate.problem as problem_module
 from loopcal.errors import EstimationError
 from loopcal.estimate.descent import StepControl
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.core.text_file import to_json
 from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.solutions import forward

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
+from loopcal.estimate.fit_descent import compute_loss_variance
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber, Tukey
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.robust_descent import compute_loss_variance
 from tests.estimate.test_machine_change import DELTA, measure
 from tests.findings.expectations import list_codes
 

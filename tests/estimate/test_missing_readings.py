@@ -12,10 +12,10 @@ from numpy.testing import assert_allclose
 import loopcal.mechanism.kinematics as trials_module
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
+from loopcal.estimate.linearization import PoseStates
+from loopcal.estimate.pose_coordinates import measure_poses
 from loopcal.estimate.pose_estimate import report_doubtful_readings
-from loopcal.estimate.pose_linearization import PoseStates
 from loopcal.estimate.pose_rows import PoseRows
-from loopcal.estimate.pose_start import measure_poses
 from loopcal.estimate.problem import problem_of
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor

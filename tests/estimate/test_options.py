@@ -8,12 +8,11 @@ import pytest
 
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.descent import StepControl
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.losses import Huber
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, TruncatedSVD
 from loopcal.estimate.recalibration import recalibrate
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.measure.simulation import sample_truth, simulate_trials
 from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses, tracker
 from tests.findings.expectations import expect_refusal, get_finding

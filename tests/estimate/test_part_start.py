@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import loopcal.estimate.pose_blocks as blocks_module
+import loopcal.estimate.pose_rows as blocks_module
 from loopcal.diagnose.fit_examination import check_start_values
 from loopcal.errors import EstimationError
 from loopcal.estimate import fit_descent as module
@@ -18,7 +18,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, TruncatedSVD
-from loopcal.estimate.pose_blocks import BLOCK
+from loopcal.estimate.pose_rows import BLOCK
 from loopcal.estimate.prior import prior_from
 from loopcal.estimate.problem import problem_of, problem_of_trials
 from loopcal.estimate.result import Identification

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.prior_conflict import assess_prior_conflict, compute_prior_statistic
+from loopcal.estimate.prior_inflation import assess_prior_conflict, compute_prior_statistic
 from loopcal.estimate.tolerance_components import InflatedTolerances, estimate_excess_noise
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.measure.simulation import sample_truth, simulate_trials
 from loopcal.numerics.decomposition import decompose
 from loopcal.parameters import ParameterTable

@@ -9,19 +9,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
-import loopcal.estimate.pose_blocks as blocks_module
+import loopcal.estimate.pose_rows as blocks_module
 from loopcal import geometry
 from loopcal.apply.validation import validate
 from loopcal.cli.entry_point import main
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.estimate.elimination import NuisanceElimination
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.information import observe_poses, observe_rows
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.problem import problem_of
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.distance import Separation
 from loopcal.measure.kinds.joints import JointSensor

@@ -10,12 +10,12 @@ import pytest
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import problem as problem_module
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import divide_trials, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.pose_blocks import BLOCK
+from loopcal.estimate.pose_rows import BLOCK
 from loopcal.estimate.problem import problem_of_trials
 from loopcal.estimate.tolerance_components import InflatedTolerances
-from loopcal.estimate.trial_identification import divide_trials, identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

@@ -11,18 +11,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 from scipy.stats import binom, chi2
 
-import loopcal.estimate.pose_blocks as blocks_module
+import loopcal.estimate.pose_rows as blocks_module
 from loopcal.apply.validation import validate
 from loopcal.diagnose.cross_validation import cross_validate
 from loopcal.diagnose.fit_examination import examine_fit
 from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.identification import exclude_poses, identify
+from loopcal.estimate.identification import exclude_poses, identify, identify_trials
 from loopcal.estimate.losses import Huber, Tukey
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.distance import Separation

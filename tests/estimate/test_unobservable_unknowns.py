@@ -12,8 +12,7 @@ from scipy.stats import chi2
 
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.pose_linearization import coordinate_derivative
+from loopcal.estimate.linearization import Linearization, coordinate_derivative
 from loopcal.estimate.problem import problem_of
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.instrument import Instrument, Sensor

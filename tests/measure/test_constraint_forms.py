@@ -16,7 +16,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.plane_line_products import (
+from loopcal.estimate.published_steps import (
     Layout,
     PaperRows,
     identify_from_rows,

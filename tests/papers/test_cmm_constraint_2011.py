@@ -16,7 +16,7 @@ from scipy.stats import beta
 
 from loopcal import geometry
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.plane_line_products import (
+from loopcal.estimate.published_steps import (
     PaperRows,
     identify_from_rows,
     linearize_products,

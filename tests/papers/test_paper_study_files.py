@@ -11,8 +11,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.cli.entry_point import main
-from loopcal.estimate.plane_line_products import Layout, PaperRows, identify_from_rows
-from loopcal.estimate.published_steps import penalize_ridge, penalize_truncated
+from loopcal.estimate.published_steps import (
+    Layout,
+    PaperRows,
+    identify_from_rows,
+    penalize_ridge,
+    penalize_truncated,
+)
 from loopcal.measure.instrument import make_random_stream
 from loopcal.papers.cmm_constraint_2011 import steps as cmm
 from loopcal.papers.hexapod_42 import steps as hexapod

@@ -36,15 +36,15 @@ from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.gauge_freedoms import NO_MOTION, twist_weights
 from loopcal.engine import State
 from loopcal.errors import EstimationError
-from loopcal.estimate.penalties import LeastSquares, Method
-from loopcal.estimate.posterior import NOISE, Posterior, combine_degrees
-from loopcal.estimate.residual_test import coverage_factor
-from loopcal.estimate.result import Identification
-from loopcal.estimate.trial_identification import (
+from loopcal.estimate.identification import (
     IdentifiedTrials,
     compute_trial_posterior,
     identify_trials,
 )
+from loopcal.estimate.penalties import LeastSquares, Method
+from loopcal.estimate.posterior import NOISE, Posterior, combine_degrees
+from loopcal.estimate.residual_test import coverage_factor
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument

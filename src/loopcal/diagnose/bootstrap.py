@@ -43,9 +43,9 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import prepare_fitted_data
+from loopcal.estimate.linearization import linearize_rows
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.pose_linearization import linearize_rows
 from loopcal.estimate.resampling import ResampleFits, Resamples, draw_centers, fit_resamples
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification

@@ -17,8 +17,8 @@ import numpy as np
 from loopcal import geometry
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.information import ObservedPoses, observe_poses
+from loopcal.estimate.linearization import spread_states
 from loopcal.estimate.null_space import Combination
-from loopcal.estimate.pose_linearization import spread_states
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding

@@ -37,16 +37,15 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.errors import LoopcalError
+from loopcal.estimate.fit_descent import estimate_scale_of, measure_block_distances
 from loopcal.estimate.identification import identify, prepare_fitted_data
-from loopcal.estimate.linearization import LeverageRows, Linearization, Start
+from loopcal.estimate.linearization import LeverageRows, Linearization, PoseSolution, Start
 from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.penalties import decompose_for
-from loopcal.estimate.pose_linearization import PoseSolution
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
-from loopcal.estimate.robust_descent import estimate_scale_of, measure_block_distances
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import Decomposition

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import engine
+from loopcal.estimate.linearization import KindRows
 from loopcal.estimate.observation_rows import ObservationRows
-from loopcal.estimate.pose_linearization import KindRows
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters

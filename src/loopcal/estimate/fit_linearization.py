@@ -21,11 +21,9 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.elimination import NodeRows, divide_among_nodes
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.linearization import KindRows, Linearization, PoseSolution, Start
 from loopcal.estimate.penalties import decompose_for
-from loopcal.estimate.pose_blocks import PoseBlock, stack_rows
-from loopcal.estimate.pose_linearization import KindRows, PoseSolution
-from loopcal.estimate.pose_rows import PoseRows
+from loopcal.estimate.pose_rows import PoseBlock, PoseRows, stack_rows
 from loopcal.estimate.posterior import (
     Posterior,
     VarianceSources,

@@ -1,25 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify the free parameters of a robot from measurements, with all diagnostics."""
+"""Identify the free parameters of a robot from measurements, with all diagnostics, and those of
+many simulated machines at once.
+
+Trials are fitted in parts of limited size, so that what a part computes with fits the cache and
+memory holds little more than the results, however many trials there are. Parts are independent of
+each other: threads compute them in any order, with the same numbers to the last bit.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from numbers import Integral
+from typing import Any, ClassVar
 
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError, suggest_names
-from loopcal.estimate.descent import Descent
-from loopcal.estimate.fit_descent import fit_with_tolerances, get_method, report_closure_start
+from loopcal.estimate.descent import Descent, LinearModel, descend
+from loopcal.estimate.fit_descent import (
+    add_loss_uncertainty,
+    fit_rows,
+    fit_with_tolerances,
+    get_method,
+    repeat_trials,
+    report_closure_start,
+)
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.linearization import (
+    Linearization,
+    PoseEstimates,
+    PoseSolution,
+    Start,
+    linearize_rows,
+)
 from loopcal.estimate.losses import Loss
-from loopcal.estimate.nuisance_estimate import NuisanceEstimate, add_followers, estimate_nuisance
 from loopcal.estimate.null_space import describe_null_space
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.penalties import LeastSquares, Method, adapt_method, describe_regularization
+from loopcal.estimate.penalties import (
+    MAP,
+    LeastSquares,
+    Method,
+    adapt_method,
+    describe_regularization,
+    fix_penalty,
+)
 from loopcal.estimate.pose_estimate import (
     estimate_poses,
     find_unclosed_poses,
@@ -27,8 +55,9 @@ from loopcal.estimate.pose_estimate import (
     report_doubtful_readings,
     report_uneven_sigmas,
 )
-from loopcal.estimate.pose_linearization import PoseEstimates
 from loopcal.estimate.posterior import (
+    Posterior,
+    VarianceSources,
     collect_information,
     compute_posterior,
     find_shown_noise,
@@ -36,20 +65,22 @@ from loopcal.estimate.posterior import (
 )
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
-from loopcal.estimate.problem import Problem, problem_of
+from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
 from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest, run_residual_test
 from loopcal.estimate.result import (
     History,
     Identification,
+    NuisanceEstimate,
     Spectrum,
+    add_followers,
+    estimate_nuisance,
     label_residuals,
     report_divergence,
     report_equations,
     report_unknown_bias,
     report_used_poses,
 )
-from loopcal.estimate.robust_descent import add_loss_uncertainty
-from loopcal.estimate.unfixed_motions import FrameRows, describe_frames
+from loopcal.estimate.unfixed_motions import FrameRows, describe_frames, find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators
@@ -58,11 +89,15 @@ from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.readings import fill_in_reading_sigma, weight_reading_sigma
+from loopcal.measure.simulation import Trials
 from loopcal.mechanism.compilation import find_impossible_values
 from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.decomposition import Decomposition, solve_regular
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.parameters import ParameterTable
-from loopcal.typing import FloatArray, Progress, report_no_progress
+from loopcal.results.description import Field, label_axes
+from loopcal.results.result import TableResult
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 HUGE = 1e150
 """Residuals, in units of sigma, whose squares cannot be summed."""
@@ -447,4 +482,346 @@ def _assemble(
         nuisance=nuisance,
         poses=poses,
         findings=tuple(findings),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedTrials(TableResult):
+    """t machines identified at once; arrays are (t, ...), SI.
+
+    Attributes
+    ----------
+    values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
+    cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
+    linear_models : of the last rows of consecutive trials. method : with what `adapt_method`
+        entered.
+    """
+
+    values: FloatArray
+    status: IntArray
+    iterations: IntArray
+    cost: FloatArray
+    free_parameters: FreeParameters
+    linear_models: tuple[LinearModel, ...]
+    method: Method
+
+    FIELDS: ClassVar[tuple[Field, ...]] = (
+        Field("converged", axes="trial"),
+        Field("iterations", axes="trial", unit="1"),
+        Field("sum_of_squares", "cost", "trial", "1"),
+        Field(
+            "estimate",
+            lambda trials: trials.values[:, trials.free_parameters.places],
+            "trial parameter",
+            units="free_parameters.dimensions",
+        ),
+    )
+    LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="free_parameters.names")
+
+    def __repr__(self) -> str:
+        """Return the number of trials and how many converged."""
+        return (
+            f"<IdentifiedTrials of {self.free_parameters.robot.name}: {len(self.values)} trials of "
+            f"{len(self.free_parameters)} parameters, {int(self.converged.sum())} converged>"
+        )
+
+    @cached_property
+    def decomposition(self) -> Decomposition:
+        """The decompositions of the rows: variances and leverages are read from them."""
+        decompositions = [model.decomposition for model in self.linear_models]
+        if any(part.dual is not None for part in decompositions):
+            decompositions = [part.with_dual() for part in decompositions]
+        return Decomposition.join(decompositions)
+
+    @cached_property
+    def penalty(self) -> FloatArray:
+        """(t, p free) of the directions of the decompositions."""
+        return np.concatenate([model.penalty for model in self.linear_models])
+
+    @cached_property
+    def prior_variance(self) -> FloatArray | None:
+        """(t, p free) see `Method.prior_variance`."""
+        return self.method.prior_variance(self.decomposition, self.penalty, self.free_parameters)
+
+    @property
+    def converged(self) -> BoolArray:
+        """(t,) which trials converged."""
+        return self.status == DescentStatus.CONVERGED
+
+    def standard_deviations(self, noise_variance: FloatArray | float = 1.0) -> FloatArray:
+        """Return standard deviations (t, p free) [SI]; infinite where the data do not determine a
+        parameter. They do not contain the uncertainty of factors on the tolerances.
+        """
+        scaled = self.decomposition.standard_deviations(
+            self.penalty, noise_variance, self.prior_variance
+        )
+        return scaled * self.free_parameters.tolerance
+
+
+ACCEPTED_STEP = 1e-3
+"""A trial that began with a chord has converged where all further steps together would change the
+whitened residuals by less than this: no estimate then moves by more than this share of its standard
+deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class SharedFactor:
+    """The factor of the rows of one trial at the start of all.
+
+    Attributes
+    ----------
+    solution : of this trial at the start. start : there, for the linearizations nearby.
+    triangle : (p, p) R. by_residuals : (p, m) R^-1 Q' of the rows. by_deviation : (p, p) R^-1 Q' P.
+    """
+
+    solution: PoseSolution
+    start: Start
+    triangle: FloatArray
+    by_residuals: FloatArray
+    by_deviation: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ChordStart:
+    """Where chords lead.
+
+    Attributes
+    ----------
+    deviation : (t, p). length : (t,) by which the chords changed the whitened residuals, to first
+        order; infinite in trials that begin where they were. start : for the linearization there.
+    """
+
+    deviation: FloatArray
+    length: FloatArray
+    start: Start
+
+
+def share_factor(
+    problem: Problem, deviation: FloatArray, method: Method, tolerance: float
+) -> SharedFactor | None:
+    """Return the factor of the first trial at deviation (1, p).
+
+    None where chords cannot be used: poses or nuisance parameters are eliminated from the rows, the
+    penalty depends on them, or a direction might not count.
+    """
+    poses, p = problem.poses, problem.parameters
+    if isinstance(method, MAP) and callable(method.inflation):
+        method = replace(method, inflation=1.0)  # which only chooses where the exact descent begins
+    fixed = fix_penalty(method, p)
+    is_plain = problem.nuisance is None and problem.consistent is None
+    if fixed is None or not (is_plain and poses.coordinates.are_shared and poses.is_kept):
+        return None
+    first = problem.take(np.array([0]))
+    begin = first.start(deviation)
+    solution = first.poses.solve(deviation, first.trials, begin, first.control)
+    assert solution.linearized is not None
+    if solution.linearized.is_lost(poses.blocks[0].is_needed).any():
+        return None
+    kinds = [
+        linearize_rows(rows, solution.linearized, first.trials, None)
+        for rows in poses.blocks[0].rows
+    ]
+    A = np.concatenate([kind.by_parameters.reshape(-1, p) for kind in kinds])
+    q, r = np.linalg.qr(np.concatenate([A, fixed.matrix]))
+    if len(r) < p:  # fewer rows than parameters
+        return None
+    _, is_regular = solve_regular(r[None], np.zeros((1, p)), tolerance)
+    if not is_regular[0]:
+        return None
+    inverse = np.linalg.solve(r, q.T)
+    states, is_near = poses.next_start(solution, begin)
+    start = replace(begin, deviation=deviation, poses=states, is_near=is_near)
+    by_residuals = np.ascontiguousarray(inverse[:, : len(A)])
+    return SharedFactor(
+        solution, start, np.array(r), by_residuals, inverse[:, len(A) :] @ fixed.matrix
+    )
+
+
+def take_chords(problem: Problem, shared: SharedFactor, deviation: FloatArray) -> ChordStart:
+    """Return where one chord leads from deviations (t, p), which are equal in all trials."""
+    t = len(deviation)
+    kinds = problem.residuals(deviation, shared.solution)
+    residual = np.concatenate([kind.whitened.reshape(t, -1) for kind in kinds], axis=1)
+    # one product for each trial: a product of all of them would round by their number
+    step = np.matmul(shared.by_residuals, residual[:, :, None])
+    step = -(step + np.matmul(shared.by_deviation, deviation[:, :, None]))[:, :, 0]
+    length = np.linalg.norm(np.matmul(shared.triangle, step[:, :, None])[:, :, 0], axis=1)
+    good = np.isfinite(length)
+    return ChordStart(
+        np.where(good[:, None], deviation + step, deviation),
+        np.where(good, length, np.inf),
+        shared.start.take(np.zeros(t, dtype=np.int64)),
+    )
+
+
+def identify_trials(
+    robot: Mechanism,
+    trials: Trials,
+    method: Method | None = None,
+    *,
+    options: FitOptions | None = None,
+    threads: int = 1,
+    chord_start: bool = False,
+) -> IdentifiedTrials:
+    """Identify t simulated machines at once.
+
+    Each trial equals its own `identify`, and no trial stops another.
+
+    Parameters
+    ----------
+    robot : as for `identify`. trials : their measurements.
+    method : in place of that of `options`.
+    options : see `FitOptions`; `start` may be (t, p of the robot). A loss, a prior, excluded poses
+        and nuisance parameters are not supported.
+    threads : that compute, 1 or more; results do not depend on it. Let linear algebra have one
+        thread for each of them (OPENBLAS_NUM_THREADS=1).
+    chord_start : whether the first step of all trials uses one factor, and a trial has converged
+        where further steps would move no estimate by more than 1e-3 standard deviations. For
+        studies: it takes about half of the time. Trials equal their own `identify` within 1e-3
+        standard deviations. It has no effect where poses or setup parameters are estimated, where
+        trials begin at different values, or with `begin="closure"`.
+
+    Raises
+    ------
+    EstimationError : an option that is not supported, or no thread.
+    """
+    check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
+    check_type(trials, Trials, "trials", "as from simulate_trials(...)")
+    check_threads(threads)
+    if not len(trials):
+        raise EstimationError("there are no trials; simulate at least one machine")
+    options = merge_options(options, method)
+    for name in ("loss", "prior", "nuisance", "excluded_poses"):
+        value = getattr(options, name)
+        if value is not None and value != ():
+            raise EstimationError(
+                f"identify_trials does not support the option {name}; remove it, or call identify "
+                "for every trial"
+            )
+    free = select_free_parameters(robot)
+    problem = problem_of_trials(free, trials)
+    values = np.atleast_2d(robot.values if options.start is None else np.asarray(options.start))
+    z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
+    method = adapt_method(options.method, free.assumed, options.noise, free.correlation)
+    options = replace(options, method=method)
+    shared = None
+    if chord_start and options.begin == "kinematics" and len(values) == 1:
+        shared = share_factor(problem, z[:1], method, options.rank_tolerance)
+    fits = _fit_parts(problem, z, options, free, threads, shared)
+    *arrays, models = zip(*fits, strict=True)
+    deviation, status, iterations, cost = map(np.concatenate, arrays)
+    return IdentifiedTrials(
+        free.values(deviation), status, iterations, cost, free, tuple(models), method
+    )
+
+
+def check_threads(threads: int) -> None:
+    """Raise EstimationError unless `threads` is a whole number of at least 1."""
+    check_type(threads, Integral, "threads", "a whole number, 1 or more")
+    if threads < 1:
+        raise EstimationError(f"threads is {threads}; give 1 or more")
+
+
+def _fit_parts(
+    problem: Problem,
+    z: FloatArray,
+    options: FitOptions,
+    free: FreeParameters,
+    threads: int,
+    shared: SharedFactor | None,
+) -> list[tuple[FloatArray, IntArray, IntArray, FloatArray, LinearModel]]:
+    """Return deviation, status, iterations, cost and linear model (see `Descent`) of all parts of
+    the trials, which begin at deviations z (t, p), with chords where a factor is shared.
+    """
+    # all trials begin with the nuisance parameters of the first one that reaches its poses
+    start = None if problem.nuisance is None else problem.start(z)
+
+    def fit(part: IntArray) -> tuple[FloatArray, IntArray, IntArray, FloatArray, LinearModel]:
+        own, begin = _cut_problem(problem, part), None if start is None else start.take(part)
+        if shared is None:
+            first = fit_rows(own, z[part], begin, options)
+        else:
+            first = _descend_from_chords(own, z[part], options, shared)
+        fit = repeat_trials(own, first, options, free)
+        return (fit.deviation, fit.status, fit.iterations, fit.cost, fit.linear_model)
+
+    batches = divide_trials(problem, threads)
+    if threads == 1 or len(batches) == 1:
+        return [fit(batch) for batch in batches]
+    with ThreadPoolExecutor(min(threads, len(batches))) as pool:
+        return list(pool.map(fit, batches))
+
+
+def _descend_from_chords(
+    problem: Problem, z: FloatArray, options: FitOptions, shared: SharedFactor
+) -> Descent:
+    """Return the descents that begin with chords; without them in trials that do not converge."""
+    begin, method = take_chords(problem, shared, z), get_method(options)
+    fit = descend(
+        problem,
+        begin.deviation,
+        method,
+        options.control,
+        options.rank_tolerance,
+        begin.start,
+        arrival=begin.length,
+        sufficient=ACCEPTED_STEP,
+    )
+    fit = replace(fit, iterations=fit.iterations + np.isfinite(begin.length))
+    again = np.flatnonzero(fit.status != DescentStatus.CONVERGED)
+    if not again.size:
+        return fit
+    usual = fit_rows(problem.take(again), z[again], None, options)
+    return usual if len(again) == len(z) else fit.put(again, usual)
+
+
+def divide_trials(problem: Problem, threads: int) -> list[IntArray]:
+    """Return the numbers of the trials of each part: equal parts, and equally many for each thread
+    unless they were too small.
+    """
+    least = -(-len(problem) // problem.part_size)
+    count = -(-least // threads) * threads
+    if 2 * count > 3 * least:  # a part takes milliseconds of Python, which runs in one thread
+        count = least
+    return np.array_split(np.arange(len(problem)), count)
+
+
+def _cut_problem(problem: Problem, trials: IntArray) -> Problem:
+    """Return the problem of some trials, where rows are plain with arrays of their own.
+
+    The measured columns are then prepared once for all steps of a fit.
+    """
+    if not problem.folds_plain_rows:
+        return problem.take(trials)
+    numbers, data, own = problem.trials[trials], problem.data, np.arange(len(trials))
+    rows = (r.cut_trials(numbers) for r in problem.rows)
+    cut = problem.with_rows(rows)
+    return replace(cut, trials=own, data=lambda i: data(int(numbers[i])))
+
+
+def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) -> Posterior:
+    """Return the posterior of a trial, as its own `identify` gives it for stated noise.
+
+    Parameters
+    ----------
+    fits : of `identify_trials`. trials : their measurements. trial : number of the machine.
+    """
+    free, chosen = fits.free_parameters, np.array([trial])
+    data = trials.trial(trial)
+    problem = problem_of(free, data)
+    z = free.deviation(fits.values[chosen])
+    start = problem.start(z)
+    linearization = problem.linearize(z, start)
+    frames = find_frame_knowledge(
+        problem, data, z, linearization.next_start, linearization=linearization
+    )
+    prior = fits.prior_variance
+    return compute_posterior(
+        free.robot.with_values(fits.values[trial]),
+        free.places,
+        free.tolerance,
+        fits.decomposition.take(chosen),
+        fits.penalty[chosen],
+        VarianceSources(1.0, None if prior is None else prior[chosen]),
+        frames,
     )

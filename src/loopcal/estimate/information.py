@@ -16,7 +16,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.pose_linearization import LinearizedPoses, linearize_at_readings
+from loopcal.estimate.linearization import LinearizedPoses, linearize_at_readings
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.initial_values import evaluate_measurements, whiten_rows

@@ -4,18 +4,24 @@
 A pose of exact readings has none: the kinematics determine it. A pose of uncertain readings moves
 with its readings or, where there are more actuators than freedoms, with the platform. A pose that
 was measured in full has none either, where closure is linearized there and not solved.
+
+A pose of uncertain readings begins at its recorded reading. Where a reading is missing or not
+believed, the pose begins where its rows measure it in full; otherwise the missing reading is that
+of the nearest pose in the list, that of home, or one of a few values across the stroke, whichever
+fits the rows best.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from loopcal import geometry
+from loopcal import engine, geometry
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.pose_linearization import (
+from loopcal.estimate.linearization import (
     LinearizedPoses,
     PoseStates,
     linearize_closure,
@@ -25,11 +31,17 @@ from loopcal.estimate.pose_linearization import (
     scale_parameters,
     spread_states,
 )
+from loopcal.estimate.observation_rows import ObservationRows, whiten
 from loopcal.findings import report_finding
 from loopcal.mechanism.actuation import DrivenJoints, differentiate_at_pose, solve_at_pose
 from loopcal.mechanism.assembly import Actuator
-from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.solutions import differentiate_by_coordinates, inverse
+from loopcal.mechanism.states import Status
+from loopcal.numerics.decomposition import are_nonzero
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -304,3 +316,274 @@ def stroke_of(robot: Mechanism, actuator: Actuator) -> float:
 def _largest_share(step: FloatArray, longest: FloatArray) -> FloatArray:
     """Return the share (a, n) of steps (a, n, k) that leaves each number within `longest` (k,)."""
     return 1.0 / np.maximum(np.abs(step) / longest, 1.0).max(axis=2, initial=1.0)
+
+
+# Poses that rows measure in full, without readings.
+
+POSE_STEPS = 30
+"""Gauss-Newton steps, at most. A position takes one, an orientation four."""
+
+LONGEST_MEASURED_STEP = 0.5
+"""Longest step, as a share of the robot's size."""
+
+NEGLIGIBLE_STEP = 1e-6
+"""Step, as a share of the size, at which a pose is found: a search begins there, no more."""
+
+FULL_RANK = 1e-6
+"""Smallest singular value of the whitened rows, columns of length one, relative to the largest,
+with which they determine all freedoms."""
+
+
+def measure_poses(
+    robot: Mechanism, rows: Sequence[ObservationRows], trial: IntArray, pose: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return where the rows of k poses, of these trials and numbers (k,), put the platform (k, 4,
+    4), and which poses (k,) they determine in full; T has no meaning for the others.
+
+    Rows that use nuisance parameters, compare poses, or look at joints are passed over.
+    """
+    usable, is_found = _usable_rows(rows, pose), np.zeros(len(pose), dtype=bool)
+    T, active, state = np.tile(robot.home, (len(pose), 1, 1)), np.arange(len(pose)), None
+    for _ in range(POSE_STEPS + 1 if usable else 0):
+        if not active.size:
+            break
+        parts = [
+            _whitened_rows(r, places[active], trial[active], T[active]) for r, places in usable
+        ]
+        residual, by_twist = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
+        closed, slope, is_closed, state = _linearize_freedoms(robot, T[active], state)
+        step, is_full = _least_squares_step(by_twist @ slope, residual)
+        length, longest = np.linalg.norm(step, axis=1), LONGEST_MEASURED_STEP * robot.size
+        step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
+        twist = np.matmul(slope, step[..., None])[..., 0]
+        T[active] = geometry.apply_twist(closed, twist)
+        is_last = is_full & is_closed & (length < NEGLIGIBLE_STEP * robot.size)
+        is_found[active] = is_last
+        goes_on = is_full & ~is_last
+        state = state if goes_on.all() and len(active) == len(pose) else None
+        active = active[goes_on]
+    return T, is_found
+
+
+def _linearize_freedoms(
+    robot: Mechanism, T: FloatArray, state: engine.State | None
+) -> tuple[FloatArray, FloatArray, BoolArray, engine.State | None]:
+    """Return closed poses (k, 4, 4) next to T, the twists (6, f) or (k, 6, f) by what the platform
+    can do there, which poses are closed, and their states.
+    """
+    is_closed = np.ones(len(T), dtype=bool)
+    if set(robot.controlled) == set(robot.freedoms) or len(robot.controlled) == 6:
+        slope = np.diag([1.0 / robot.size] * 3 + [1.0] * 3)[:, robot.program.freedoms]
+        return T, slope, is_closed, None
+    target = read_coordinates(T[None], robot.controlled)
+    state = inverse_trials(robot, robot.values[None], target, state)
+    slope = differentiate_by_coordinates(robot, robot.values[None], state)[0]
+    is_closed = np.asarray(state.status[0] == Status.CONVERGED)
+    return np.where(is_closed[:, None, None], state.T[0], T), slope, is_closed, state
+
+
+def sum_squares_at(
+    rows: Sequence[ObservationRows], trial: IntArray, pose: IntArray, T: FloatArray
+) -> FloatArray:
+    """Return the sum of whitened squares (k,) of the rows of k poses, platform at T (k, 4, 4)."""
+    residuals = [_whitened_rows(r, places, trial, T)[0] for r, places in _usable_rows(rows, pose)]
+    return sum(((residual**2).sum(axis=1) for residual in residuals), start=np.zeros(len(pose)))
+
+
+def _usable_rows(
+    rows: Sequence[ObservationRows], pose: IntArray
+) -> list[tuple[ObservationRows, IntArray]]:
+    """Return the kinds whose rows need nothing but a pose, and their rows (k, c) of k poses."""
+    if not len(pose):
+        return []
+    usable = [
+        r
+        for r in rows
+        if not r.nuisance.shape[1]
+        and r.kind.poses_per_row == 1
+        and not (r.kind.sensed_joints or r.kind.is_of_base)
+        and len(r.poses)
+    ]
+    return [(r, _rows_of_poses(r, pose)) for r in usable]
+
+
+def _rows_of_poses(rows: ObservationRows, pose: IntArray) -> IntArray:
+    """Return the rows (k, c) that observed each of k poses, -1 where there are fewer than c."""
+    order = np.argsort(rows.poses, kind="stable")
+    count = np.bincount(rows.poses, minlength=pose.max() + 1)
+    nth = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+    table = np.full((len(count), count.max()), -1)
+    table[rows.poses[order], nth] = order
+    return table[pose]
+
+
+def _whitened_rows(
+    observed: ObservationRows, rows: IntArray, trial: IntArray, T: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return whitened residuals (k, c m) of rows (k, c) at poses T (k, 4, 4), and their derivatives
+    (k, c m, 6) by the twist.
+    """
+    k, c = rows.shape
+    measured, white = (
+        array[np.where(len(array) > 1, trial, 0)[:, None], np.maximum(rows, 0)]
+        for array in (observed.measured, observed.whitener)
+    )
+    evaluated = observed.kind.evaluate(
+        np.repeat(T, c, axis=0)[None], measured.reshape(1, k * c, -1)
+    )
+    white = np.where(rows[..., None, None] >= 0, white, 0.0)
+    m = white.shape[-1]
+    residual = whiten(white, evaluated.residual.reshape(k, c, m))
+    jacobian = np.matmul(white, evaluated.jacobian.reshape(k, c, m, 6))
+    return residual.reshape(k, c * m), jacobian.reshape(k, c * m, 6)
+
+
+def _least_squares_step(rows: FloatArray, residual: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return steps (k, m) of rows (k, h, m), and which rows determine all of it (k,).
+
+    Where they do not, the step is zero.
+    """
+    k, h, m = rows.shape
+    finite = np.asarray(np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1))
+    length = np.linalg.norm(np.where(finite[:, None, None], rows, 0.0), axis=1)
+    full = finite & (length > 0.0).all(axis=1) & (h >= m)
+    step = np.zeros((k, m))
+    if full.any():
+        U, s, Vt = np.linalg.svd(rows[full] / length[full, None], full_matrices=False)
+        good = are_nonzero(s, FULL_RANK).all(axis=1)
+        full[full] = good
+        along = np.matmul(np.swapaxes(U[good], 1, 2), -residual[full][..., None])
+        along = along / s[good][..., None]
+        step[full] = np.matmul(np.swapaxes(Vt[good], 1, 2), along)[..., 0] / length[full]
+    return step, full
+
+
+TRIED = 9
+"""Values of a missing reading, evenly across its stroke, that are tried."""
+
+
+def first_poses(
+    robot: Mechanism,
+    recorded: FloatArray,
+    sigma: FloatArray,
+    rows: Sequence[ObservationRows],
+    trials: int,
+) -> PoseStates:
+    """Return where the poses of all trials begin, at the robot's present values.
+
+    `recorded` (t | 1, n, actuators) is NaN where a reading was not taken, `sigma` (n, actuators) is
+    infinite where one is not believed.
+    """
+    missing = np.isnan(recorded) | np.isinf(sigma)
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
+    q = _fill_from_nearest(recorded, home)
+    begin = PoseStates(spread_states(robot.home_state, len(q), q.shape[1]), q)
+    if missing.any():
+        trial, pose = np.nonzero(missing.any(axis=2))
+        T, is_full = measure_poses(robot, rows, trial, pose)
+        if is_full.any():
+            where = (trial[is_full], pose[is_full])
+            begin = _begin_at_measured(robot, begin, missing, T[is_full], where)
+        if robot.program.sigma is None and not is_full.all():
+            where = (trial[~is_full], pose[~is_full])
+            begin = _begin_at_best_reading(robot, begin, missing, recorded, rows, where)
+    if robot.program.sigma is not None:
+        begin = _solve_redundant(robot, begin)
+    if len(q) < trials:
+        begin = begin.take(np.zeros(trials, dtype=np.int64))
+    return begin
+
+
+def _begin_at_measured(
+    robot: Mechanism,
+    begin: PoseStates,
+    missing: BoolArray,
+    T: FloatArray,
+    where: tuple[IntArray, IntArray],
+) -> PoseStates:
+    """Return starts with poses (trials, poses) at T (k, 4, 4), missing readings as there."""
+    solution = inverse(robot, T)
+    good = solution.closed
+    chosen = (where[0][good], where[1][good])
+    q = np.where(missing[chosen], solution.q[good], begin.q[chosen])
+    state = map_arrays(lambda array: array[0, good], solution.state)
+    return begin.put_poses(*chosen, PoseStates(state, q))
+
+
+def _begin_at_best_reading(
+    robot: Mechanism,
+    begin: PoseStates,
+    missing: BoolArray,
+    recorded: FloatArray,
+    rows: Sequence[ObservationRows],
+    where: tuple[IntArray, IntArray],
+) -> PoseStates:
+    """Return starts with poses (trials, poses) at the best of a few values of missing readings.
+
+    The values are those of the nearest pose, of home, and across the stroke. Readings that were all
+    recorded, if not believed, come first.
+    """
+    trial, pose = where
+    is_recorded = np.asarray(np.isfinite(recorded[trial, pose]).all(axis=1))
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
+    width = np.array([stroke_of(robot, a) for a in robot.actuators])
+    low = np.array(
+        [
+            h - w / 2 if a.stroke is None else a.stroke[0]
+            for a, h, w in zip(robot.actuators, home, width, strict=True)
+        ]
+    )
+    across = low + width * ((np.arange(TRIED) + 0.5) / TRIED)[:, None]
+    own = begin.q[trial, pose][:, None]
+    others = np.concatenate([home[None], across])
+    tried = np.concatenate([own, np.where(missing[trial, pose][:, None], others, own)], axis=1)
+    count = tried.shape[1]
+    flat = tried.reshape(1, -1, len(home))
+    state = forward_trials(robot, robot.values[None], flat, follow=False)
+    closed = np.asarray(state.status[0] == Status.CONVERGED)
+    T = np.where(closed[:, None, None], state.T[0], robot.home)
+    squares = sum_squares_at(rows, np.repeat(trial, count), np.repeat(pose, count), T)
+    squares = np.where(closed, squares, np.inf).reshape(-1, count)
+    squares[is_recorded & np.isfinite(squares[:, 0]), 0] = -1.0
+    best = squares.argmin(axis=1)
+    good = np.isfinite(squares.min(axis=1))
+    pick = (np.arange(len(pose)) * count + best)[good]
+    chosen = map_arrays(lambda array: array[0, pick], state)
+    q = tried[np.flatnonzero(good), best[good]]
+    return begin.put_poses(trial[good], pose[good], PoseStates(chosen, q))
+
+
+def _fill_from_nearest(recorded: FloatArray, home: FloatArray) -> FloatArray:
+    """Return readings (t, n, a); a missing one is that of the nearest pose that has it, or home."""
+    is_known = np.isfinite(recorded)
+    n = recorded.shape[1]
+    index = np.arange(n)[None, :, None]
+    before = np.maximum.accumulate(np.where(is_known, index, -1), axis=1)
+    after = np.minimum.accumulate(np.where(is_known, index, 2 * n)[:, ::-1], axis=1)[:, ::-1]
+    near = np.where((before >= 0) & (index - before <= after - index), before, after)
+    far = np.where(near < n, near, before)
+    nearest = np.take_along_axis(recorded, np.clip(far, 0, n - 1), axis=1)
+    filled = np.where((far >= 0) & np.isfinite(nearest), nearest, home)
+    return np.where(is_known, recorded, filled)
+
+
+def _solve_redundant(robot: Mechanism, begin: PoseStates) -> PoseStates:
+    """Return poses of redundant readings by their weighted least squares.
+
+    A pose where that fails begins at the nearest pose where it does not.
+    """
+    state = forward_trials(robot, robot.values[None], begin.q, begin.state)
+    good = np.asarray(state.status == Status.CONVERGED)
+    n = good.shape[1]
+    numbers = np.where(good, np.arange(n, dtype=np.float64), np.nan)[..., None]
+    near = _fill_from_nearest(numbers, np.full(1, np.nan))[..., 0]
+    is_known = np.isfinite(near)
+    pick = np.where(is_known, near, 0.0).astype(np.int64)
+    trial = np.arange(len(good))[:, None]
+
+    def chosen(solved: np.ndarray, first: np.ndarray) -> np.ndarray:
+        spread = is_known.reshape(*is_known.shape, *[1] * (solved.ndim - 2))
+        return np.where(spread, solved[trial, pick], first)
+
+    placed = map_arrays(chosen, state, begin.state)
+    return PoseStates(replace(placed, status=np.zeros_like(placed.status)), begin.q)

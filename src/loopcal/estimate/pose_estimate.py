@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.pose_linearization import PoseEstimates
+from loopcal.estimate.linearization import PoseEstimates
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.geometry import wrap_angle

@@ -38,23 +38,24 @@ from loopcal.estimate.elimination import (
     plan_elimination,
 )
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.linearization import LeverageRows, Linearization, Start
+from loopcal.estimate.linearization import (
+    LeverageRows,
+    Linearization,
+    LinearizedPoses,
+    PoseSolution,
+    PoseStates,
+    Start,
+    evaluate_rows,
+    spread_states,
+)
 from loopcal.estimate.observation_rows import TRIAL_BLOCK, ObservationRows, Residuals
-from loopcal.estimate.pose_blocks import BLOCK, PoseBlock, find_components
 from loopcal.estimate.pose_coordinates import (
     MeasuredPoses,
     PoseCoordinates,
     ReadingCoordinates,
     TwistCoordinates,
 )
-from loopcal.estimate.pose_linearization import (
-    LinearizedPoses,
-    PoseSolution,
-    PoseStates,
-    evaluate_rows,
-    spread_states,
-)
-from loopcal.estimate.pose_rows import PoseRows
+from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
@@ -472,7 +473,7 @@ class Problem:
             if coordinates.are_shared and not self.poses.is_kept:
                 return None
             return coordinates.first_states(self.trials)
-        from loopcal.estimate.pose_start import first_poses
+        from loopcal.estimate.pose_coordinates import first_poses
 
         assert self.sigma is not None
         total = max(len(self.readings), int(self.trials.max(initial=0)) + 1)

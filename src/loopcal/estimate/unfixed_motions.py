@@ -23,9 +23,8 @@ from loopcal.estimate.elimination import (
     list_members,
 )
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.linearization import Linearization, LinearizedPoses, Start, linearize_rows
 from loopcal.estimate.observation_rows import ObservationRows
-from loopcal.estimate.pose_linearization import LinearizedPoses, linearize_rows
 from loopcal.estimate.posterior import FrameKnowledge, InstrumentFrame, intersect_motions
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.problem import Problem

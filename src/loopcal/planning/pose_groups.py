@@ -28,8 +28,8 @@ from loopcal import engine
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows
+from loopcal.estimate.linearization import PoseStates
 from loopcal.estimate.pose_coordinates import TwistCoordinates
-from loopcal.estimate.pose_linearization import PoseStates
 from loopcal.estimate.unfixed_motions import unfixed_motions
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.measurements import Measurements

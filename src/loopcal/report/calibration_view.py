@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from loopcal.apply.inspection import IdentifiabilityReport
     from loopcal.diagnose.fit_examination import ReadingError
     from loopcal.diagnose.identifiable_parameters import UsefulAccuracy
-    from loopcal.estimate.prior_conflict import PriorConflict
+    from loopcal.estimate.prior_inflation import PriorConflict
     from loopcal.mechanism.model import Mechanism
     from loopcal.typing import FloatArray
 

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.estimate.identification import check_threads
 from loopcal.estimate.published_steps import identify_per_leg
-from loopcal.estimate.trial_identification import check_threads
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
 from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.optimize import root
 
+from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate_trials

@@ -12,8 +12,8 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 from loopcal.apply.calibration import calibrate
+from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

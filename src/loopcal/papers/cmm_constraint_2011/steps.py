@@ -20,13 +20,7 @@ from loopcal import geometry
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.penalties import Method
-from loopcal.estimate.plane_line_products import (
-    WEIGHTS,
-    Layout,
-    PaperRows,
-    Weights,
-    identify_from_rows,
-)
+from loopcal.estimate.published_steps import WEIGHTS, Layout, PaperRows, Weights, identify_from_rows
 from loopcal.measure.instrument import Gaussian, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations

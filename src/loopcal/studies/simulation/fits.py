@@ -21,12 +21,13 @@ from loopcal.diagnose.gauge_freedoms import twist_weights
 from loopcal.engine import State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import identify
-from loopcal.estimate.plane_line_products import PaperRows, identify_from_rows
+from loopcal.estimate.identification import IdentifiedTrials, identify, identify_trials
 from loopcal.estimate.published_steps import (
     EPSILON,
     LIMIT,
+    PaperRows,
     StepRule,
+    identify_from_rows,
     identify_per_leg,
     make_raw_problem,
     penalize_none,
@@ -34,7 +35,6 @@ from loopcal.estimate.published_steps import (
     penalize_truncated,
     take_steps,
 )
-from loopcal.estimate.trial_identification import IdentifiedTrials, identify_trials
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials
 from loopcal.mechanism.kinematics import forward_trials

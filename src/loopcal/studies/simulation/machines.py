@@ -19,11 +19,11 @@ from msgspec import convert
 from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
 from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed_motions
 from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.estimate.identification import compute_trial_posterior, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.plane_line_products import Layout
+from loopcal.estimate.published_steps import Layout
 from loopcal.estimate.tolerance_components import InflatedTolerances
-from loopcal.estimate.trial_identification import compute_trial_posterior, identify_trials
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot
 from loopcal.measure.instrument import Instrument, Noise, Seed, Uniform, make_random_stream
