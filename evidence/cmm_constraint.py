@@ -12,24 +12,23 @@ from loopcal.papers.cmm_constraint_2011 import steps
 from loopcal.papers.cmm_constraint_2011.steps import (
     ALIGNED,
     BEFORE,
-    ERRORS,
     FRAMES,
-    LINES,
     LS,
     METHODS,
-    NOISES,
+    MM,
     ONE,
     PRIOR,
-    SWEEPS,
+    SIZES,
     TEN,
+    WEIGHTS,
     Cell,
     Study,
     calibrate_fifty,
+    calibrate_figure_5,
     calibrate_grid,
     compare_estimates,
     compute_rank_correlation,
     draw_true_machines,
-    evaluate_arrangement,
     list_printed,
     plan_points,
     rank_candidates,
@@ -63,7 +62,7 @@ def time_linearization(planned: PlaneLineGroups, design: FloatArray) -> float:
 def optimize_from_start(seed: int) -> tuple[Study, list]:
     """Run coordinate exchange from one random start; return the study and its row."""
     began = time.process_time()
-    study = plan_points(seed=seed, sweeps=SWEEPS)
+    study = plan_points(seed=seed)
     spent = time.process_time() - began
     before, after = study.spreads
     cost = spent / time_linearization(study.planned, study.first) if seed == SEED else None
@@ -88,8 +87,7 @@ def compare_weights(study: Study) -> list[list[Any]]:
     """Return errors by LS and MAP for each weighting of the rows, and the ratio of LS to that as
     printed.
     """
-    ten = evaluate_arrangement(TEN, study, SEED, DRAWS)
-    cells = steps.compare_weights(ten, SEED, DRAWS)
+    cells = {w: calibrate_figure_5(study, SEED, DRAWS, weights=w) for w in WEIGHTS}
     position, parameters = "position, aligned [mm]", "parameters without gauge [mm]"
     first = cells["printed"].compute_median(LS, position)
     return [
@@ -104,12 +102,9 @@ def compare_weights(study: Study) -> list[list[Any]]:
 
 def compare_interpretations(study: Study) -> list[list[Any]]:
     """Return figure 5 as printed and under every interpretation."""
-    result = rank_candidates(
-        (evaluate_arrangement(TEN, study, SEED, DRAWS_PER_INTERPRETATION),),
-        SEED,
-        DRAWS_PER_INTERPRETATION,
-    )
-    rows = [[c.reading, c.truth, c.frame, *map(float, c.reductions)] for c in result]
+    result = rank_candidates({TEN: study}, SEED, DRAWS_PER_INTERPRETATION)
+    names = ("reading", "truth", "frame", "parameters", "position", "orientation")
+    rows = [[row[name] for name in names] for row in result]
     return [["as printed", None, None, *map(float, list_printed())], *rows]
 
 
@@ -117,13 +112,18 @@ def identify_with_surfaces(study: Study) -> list[list[Any]]:
     """Return on how many machines fits with surfaces as unknowns converge, and how far their
     estimates are from those of the paper's rows.
     """
-    noise = max(NOISES)
+    forms = SIZES.find("forms")
+    noise = max(forms["noises"]) * MM
     q = study.layout.solve_readings(
-        draw_true_machines(study.robot, ERRORS, MACHINES, SEED), noise, SEED
+        draw_true_machines(study.robot, forms["errors"] * MM, MACHINES, SEED), noise, SEED
     )
     rows = (compare_estimates(study.layout, q, noise, name) for name in METHODS)
     return [
-        [row.method, f"{row.converged} of {row.machines}", row.iterations, row.median, row.largest]
+        [
+            row["method"],
+            f"{row['converged']} of {row['machines']}",
+            *(row[name] for name in ("iterations", "median", "largest")),
+        ]
         for row in rows
     ]
 
@@ -132,15 +132,16 @@ def compare_fifty_points(study: Study) -> list[list[Any]]:
     """Return mean position errors before, by LS and by MAP in each frame, and the share of LS fits
     that converge within 5 iterations.
     """
-    result = [calibrate_fifty(study, groups, SEED, FEW_DRAWS) for groups in LINES]
+    position, planes = steps.STATISTICS[0], SIZES.find("fifty", "planes")
+    cells = {groups: calibrate_fifty(study, groups, SEED, FEW_DRAWS) for groups in planes}
     return [
         [
-            f.groups,
+            groups,
             frame,
-            *(float(f.compute_median(m, frame)[0]) for m in (BEFORE, LS, PRIOR)),
-            f.within_five if frame == ALIGNED else None,
+            *(cell.compute_median(m, f"{position}, {frame}") for m in (BEFORE, LS, PRIOR)),
+            cell.within_five if frame == ALIGNED else None,
         ]
-        for f in result
+        for groups, cell in cells.items()
         for frame in FRAMES
     ]
 
@@ -166,13 +167,11 @@ def collect() -> dict[str, Any]:
         [given, noise, *list_medians(c), c.count_worse(PRIOR, "position, aligned [mm]"), c.failed]
         for (given, noise), c in cells.items()
     ]
-    ten, one = (
-        cells["1", "0.01"],
-        evaluate_arrangement(ONE, plan_points(1, 100, seed=SEED, sweeps=1), SEED, FEW_DRAWS),
-    )
+    plan = plan_points(1, 100, seed=SEED, sweeps=1)
+    one = calibrate_figure_5(plan, SEED, FEW_DRAWS)
     placed = [
-        ["ten planes, a line each", first[1], first[2], *_pair(ten), DRAWS],
-        ["one plane, one line", one.drawn, one.optimized, *_pair(one.cell), FEW_DRAWS],
+        [TEN, first[1], first[2], *_pair(cells["1", "0.01"]), DRAWS],
+        [ONE, *plan.spreads, *_pair(one), FEW_DRAWS],
     ]
     ranks = [
         [

@@ -420,9 +420,9 @@ def run_hexapod_42(noise: tuple[float, float] | None) -> Report:
     from loopcal.papers.hexapod_42 import steps
 
     setup = steps.make_setup()
-    measured = steps.draw_measured_poses(setup, None if noise is None else steps.to_si(noise), 0)
+    measured = setup.actual if noise is None else steps.draw_measured_poses(setup, noise, 0)
     result = steps.iterate(setup, measured, 3)
-    off = result.compute_parameter_errors(setup.truth)
+    off = setup.truth.values - result.values
     shares = {
         "integrated": result.integrated / result.integrated[0],
         "left": off / np.abs(off[0]).max(),
@@ -444,7 +444,7 @@ def run_tsvd_2016(name: str, five: bool) -> Report:
     return {
         "singular_values": steps.linearize(measured).singular_values[0],
         "library": {
-            name: {"values": a.values, "errors": a.errors[:4]} for name, a in library.items()
+            name: {"values": a.values[0], "errors": a.errors[0, :4]} for name, a in library.items()
         },
     }
 
@@ -463,7 +463,7 @@ def run_cmm_constraint_2011() -> Report:
         "design": study.optimized.design,
         "value": study.optimized.value,
         "failed": cell.failed,
-        "errors": dict(cell.errors),
+        "errors": {name: errors[:, :7] for name, errors in cell.errors.items()},
     }
 
 

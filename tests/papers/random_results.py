@@ -35,6 +35,8 @@ def randomize(value: Any, rng: np.random.Generator, spread: float, keep: tuple[t
         return _randomize_array(np.array(value), rng, spread).item()
     if isinstance(value, str):
         return _randomize_text(value, rng, spread)
+    if hasattr(value, "_fields"):  # a named tuple
+        return type(value)(*map(draw, value))
     if type(value) in {list, tuple}:
         return type(value)(map(draw, value))
     if is_dataclass(value) and not isinstance(value, type):

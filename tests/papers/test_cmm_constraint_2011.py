@@ -101,7 +101,7 @@ def test_equation_17_and_the_noise_map_are_derivatives_of_equation_14(study) -> 
         slope = (first - second) / (2 * step)
         np.testing.assert_allclose(slope, a[0, ..., place], atol=1e-8)  # [m2 per m]
     shift = 1e-7 * np.random.default_rng(0).normal(size=at.shape)
-    by_map = (map_displacements(*layout.levers) @ shift[0].reshape(steps.GROUPS, -1, 1))[..., 0]
+    by_map = (map_displacements(*layout.levers) @ shift[0].reshape(layout.groups, -1, 1))[..., 0]
     changed = -linearize_products(at + shift, J)[1][0]
     np.testing.assert_allclose(changed, by_map, atol=1e-12)  # [m2], second order of 1e-7
 
@@ -182,9 +182,9 @@ def test_points_of_a_plane_and_its_line_give_two_equations_fewer(study) -> None:
 
 @pytest.mark.slow
 def test_rank_is_33_for_1_to_30_planes(results) -> None:
-    assert {r.rank for r in results.ranks} == {33}
-    assert {r.groups for r in results.ranks} >= {1, 10, 30}
-    assert all(r.singular_values[32] > 1e8 * r.singular_values[33] for r in results.ranks)
+    assert {row["rank"] for row in results.ranks} == {33}
+    assert {row["groups"] for row in results.ranks} >= {1, 10, 30}
+    assert all(row["smallest"] > 1e8 * row["unused"] for row in results.ranks)
 
 
 @pytest.mark.slow
@@ -241,10 +241,10 @@ def test_every_verdict_can_be_does_not_agree(results) -> None:
     assert len(answers) == 21
     rest = [claim for claim, given in answers.items() if False not in given]
     assert rest in ([], ["11 full_poses"])  # no number falls in all of 12 combinations by chance
-    fifties = tuple(
-        replace(f, statistics={k: v + 1e3 * (k[0] != BEFORE) for k, v in f.statistics.items()})
-        for f in results.draws[0].fifties
-    )
+    fifties = {
+        groups: replace(cell, errors={k: e + 1e3 * (k != BEFORE) for k, e in cell.errors.items()})
+        for groups, cell in results.draws[0].fifties.items()
+    }
     worse = replace(results, draws=(replace(results.draws[0], fifties=fifties),))
     assert next(v for v in judge_claims(worse) if v.name == "full_poses").agrees is False
     undecided = {claim.split()[1] for claim, given in answers.items() if None in given}
@@ -267,10 +267,10 @@ def test_fits_that_did_not_converge_are_left_out_of_the_medians() -> None:
 # that 6 of 6 had a chance of 0.2 %; the evidence has 50
 def test_fits_with_surfaces_as_unknowns_converge_on_every_machine(results) -> None:
     row = results.forms[0]
-    assert (row.noise, row.method) == (max(steps.NOISES), LS)
-    assert (row.machines, row.converged, row.ranks) == (6, 6, (33,))
-    assert row.iterations <= 8
-    assert row.largest < 0.01  # [sd]; second order of the noise
+    assert (row["noise"], row["method"]) == (max(steps.SIZES.find("forms", "noises")), LS)
+    assert (row["machines"], row["converged"], row["ranks"]) == (6, 6, [33])
+    assert row["iterations"] <= 8
+    assert row["largest"] < 0.01  # [sd]; second order of the noise
 
 
 def test_gauge_share_of_random_errors_follows_a_beta_distribution() -> None:

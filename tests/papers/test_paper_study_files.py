@@ -71,11 +71,12 @@ def test_the_noise_study_has_the_errors_and_poses_of_the_tables():
     assert_allclose(poses.coordinates, setup.poses, atol=1e-15)
     (cell,) = calibrate_cells(set_size(study, 0, 2), find_cells(study, method="MAP")[:1])
     assert_allclose(cell.truth, np.tile(setup.truth.values, (2, 1)), rtol=0, atol=1e-15)
-    for limits in hexapod.LEVELS:
-        level = study.instruments[f"{limits[0]:g} mm and {limits[1]:g} rad"]
-        assert level.distribution == "uniform"
-        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(limits[0] * MM, rel=1e-7)
-        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(limits[1], rel=1e-7)
+    assert [level.distribution for level in study.instruments.values()] == ["uniform"] * 8
+    for name, (length, angle) in hexapod.list_noises().items():
+        assert name == f"{length:g} mm and {angle:g} rad"
+        level = study.instruments[name]
+        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(length * MM, rel=1e-7)
+        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(angle, rel=1e-7)
     assert {*hexapod.PER_LEG, hexapod.TOGETHER, hexapod.PRIOR} == set(study.methods)
 
 
@@ -88,11 +89,11 @@ def test_the_sweeps_have_the_settings_and_poses_of_the_reproduction(name):
     keeps = [level.keep for level in study.methods.values() if level.keep is not None]
     assert keeps == list(range(p - 1, p // 3, -1))
     raw = [level for level in study.methods.values() if level.rows == "raw" and level.lam]
-    assert_allclose([level.lam or 0.0 for level in raw], [*tsvd.LAMBDAS, *tsvd.LAMBDAS])
-    assert {level.steps for level in raw} == {None, tsvd.SHORT}
+    assert_allclose([level.lam or 0.0 for level in raw], np.tile(tsvd.list_lambdas(), 2))
+    assert {level.steps for level in raw} == {None, tsvd.SIZES.find("short")}
     for level in study.instruments.values():
-        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(tsvd.LIMITS[0])
-        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(tsvd.LIMITS[3])
+        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(tsvd.list_limits()[0])
+        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(tsvd.list_limits()[3])
     assert study.instruments["5-DOF"].unused == ("psi",)
 
 

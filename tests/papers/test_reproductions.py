@@ -13,7 +13,7 @@ from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.text_file import to_json
 from loopcal.papers.paper import PAPERS, Paper, find_paper
-from loopcal.papers.published import Claim, Figure, Series, Verdict
+from loopcal.papers.published import Figure, PaperText, Series, Verdict, decide
 from loopcal.papers.reproduction import choose_styles, draw, write_folder, write_page
 from tests.papers.small_reproduction import MADE_BY, build_reproduction
 
@@ -24,7 +24,7 @@ def test_number_agrees_within_one_unit_of_its_last_printed_digit() -> None:
     comparison = build_reproduction().content.comparisons[0]
     np.testing.assert_array_equal(comparison.step, [[0.01, 1e-5], [1.0, 0.01]])
     np.testing.assert_array_equal(comparison.within, [[True, True], [False, True]])
-    assert (comparison.agreeing, comparison.count, comparison.largest) == (3, 4, 2.0)
+    assert (comparison.agreeing, comparison.within.size, comparison.largest) == (3, 4, 2.0)
     assert [row[2] for row in comparison.table().rows] == ["0.12", "-3E-05", "7", "1.50"]
 
 
@@ -55,33 +55,25 @@ def test_statements_of_the_paper_and_own_checks_have_two_lists() -> None:
     assert first < text.index("2. **Not confirmed:**")
 
 
-def make_claim(**more: object) -> Claim:
-    record = {"claim": "x is small.", "where": "section 1", "evidence": "x is {x:g}."}
-    return Claim("small", {**record, "agrees": [["x", "below", 1]], **more})
-
-
 @pytest.mark.parametrize(
-    ("more", "x", "draws", "agrees", "word", "reason"),
+    ("agrees", "verdict", "word", "reason"),
     [
-        ({}, 0.5, (), True, "Agrees", "x is 0.5."),
-        ({}, 2.0, (), False, "Does not agree", "x is 2."),
-        ({"disagrees": [["x", "above", 2]]}, 1.5, (), None, "Undecided", "x is 1.5."),
-        ({"disagrees": [["x", "above", 2]]}, 2.5, (), False, "Does not agree", "x is 2.5."),
-        ({}, 0.5, (0.5, 3.0, 0.1, 0.2, 0.9), None, "Depends on the draw",
+        (True, True, "Agrees", "x is 0.5."),
+        (np.False_, False, "Does not agree", "x is 0.5."),
+        (decide(False, np.False_), None, "Undecided", "x is 0.5."),
+        (decide(False, True), False, "Does not agree", "x is 0.5."),
+        ([True, False, True, True, True], None, "Depends on the draw",
          "True in 4 of 5 draws. x is 0.5."),
-        ({}, 0.5, (3.0, 2.0), False, "Does not agree", "True in 0 of 2 draws. x is 0.5."),
+        (np.zeros(2, dtype=bool), False, "Does not agree", "True in 0 of 2 draws. x is 0.5."),
     ],
 )  # fmt: skip
-def test_claim_is_judged_by_its_comparisons(more, x, draws, agrees, word, reason) -> None:
-    verdict = make_claim(**more).judge([{"x": drawn} for drawn in draws], x=x)
-    assert (verdict.agrees, verdict.word, verdict.reason) == (agrees, word, reason)
-
-
-def test_claim_holds_in_a_draw_where_it_holds_in_all_places() -> None:
-    claim = make_claim(evidence="{shares:each; |{name}: {count} of {of}}.")
-    places = {"a": {"x": np.array([0.5, 0.5, 2.0])}, "b": {"x": np.array([0.1, 3.0, 0.1])}}
-    verdict = claim.judge_everywhere(places)
-    assert (verdict.draws, verdict.why) == ((True, False, False), "a: 2 of 3; b: 2 of 3.")
+def test_claim_is_judged_by_one_decision_or_by_that_of_each_draw(
+    tmp_path, agrees, verdict, word, reason
+) -> None:
+    record = "{claim: x is small., where: section 1, evidence: 'x is {x:g}.'}"
+    (tmp_path / "text.yaml").write_text(f"claims:\n  small: {record}\n")
+    judged = PaperText(str(tmp_path / "results.py")).judge("small", agrees, x=0.5)
+    assert (judged.agrees, judged.word, judged.reason) == (verdict, word, reason)
 
 
 @pytest.mark.slow

@@ -67,11 +67,11 @@ class Paper:
 
     def present(self, results: Any, seed: int, trials: int) -> Reproduction:
         """Return computed results as tables, verdicts and figures."""
-        from loopcal.papers.published import PaperText, Published
+        from loopcal.papers.published import PaperFile, PaperText
         from loopcal.papers.reproduction import Reproduction
 
         module = import_module(f"{self.package}.results")
-        source = Published(str(module.__file__)).find("source")
+        source = PaperFile(str(module.__file__), "published.yaml").find("source")
         about = PaperText(str(module.__file__)).about(source=source)
         settings, content = {"seed": seed, "trials": trials}, module.present(results)
         return Reproduction(self.name, self.title, self.source, about, settings, content)

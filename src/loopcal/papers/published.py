@@ -3,36 +3,29 @@
 
 published.yaml holds the printed numbers as text, digit by digit. The last printed digit is the
 yardstick: a computed number agrees if it is within one unit of it ("0.0352" has the unit 1e-4,
-"-9E-05" the unit 1e-5). text.yaml holds the words:
+"-9E-05" the unit 1e-5). sizes.yaml holds the sizes that are ours. text.yaml holds the words:
 
     about: paragraphs at the beginning of the page
     claims:
       NAME:
         claim: a sentence
         where: place in the paper; a claim without it is a check of our own
-        agrees: [[quantity, relation, limit], ...]
-        disagrees: the same; optional
         evidence: sentences that show the numbers
     tables:
       NAME: {title: ..., columns: [...], formats: [...], note: ..., shown: rows on a page}
     figures:
       NAME: {title: ..., x: label, y: label, caption: ..., log: y}
 
-A limit is a number or the name of another quantity. The claim agrees if all comparisons of `agrees`
-hold. Otherwise it does not agree; with comparisons `disagrees` it does not agree if all of those
-hold, and else is undecided. A claim about random numbers is judged in each of several draws. Braces
-hold numbers in the formats of `loopcal.findings.wording`.
+Braces hold numbers in the formats of `loopcal.findings.wording`.
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache, cached_property
 from pathlib import Path
-from string import Formatter
 from typing import Any
 
 import numpy as np
@@ -41,6 +34,8 @@ from loopcal.findings.wording import fill_template
 from loopcal.typing import BoolArray, FloatArray
 
 Cell = str | float | int | bool | None
+Row = dict[str, Any]
+"""A row of a table: its cells by name, in the order of the columns."""
 ROUNDING = 1e-9
 """Of a unit, by which a difference may exceed it: decimal numbers are no binary ones."""
 
@@ -133,27 +128,20 @@ class Printed:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A published table beside computed numbers (r, c), which agree within a yardstick (r, c); by
-    default it is one unit of the last printed digit.
-    """
+    """A published table beside computed numbers (r, c), which agree within a step (r, c)."""
 
     name: str
     title: str
     columns: tuple[str, ...]
     published: Printed
     computed: FloatArray
+    step: FloatArray
     note: str = ""
-    yardstick: FloatArray | None = None
 
     @cached_property
     def difference(self) -> FloatArray:
         """(r, c) computed - published."""
         return self.computed - self.published.values
-
-    @cached_property
-    def step(self) -> FloatArray:
-        """(r, c) within which they agree."""
-        return self.published.unit if self.yardstick is None else self.yardstick
 
     @cached_property
     def within(self) -> BoolArray:
@@ -165,19 +153,9 @@ class Comparison:
         return np.abs(numbers - self.published.values) <= self.step * (1.0 + ROUNDING)
 
     @property
-    def count(self) -> int:
-        """Number of numbers."""
-        return self.within.size
-
-    @property
     def agreeing(self) -> int:
-        """How many agree."""
+        """How many numbers agree."""
         return int(self.within.sum())
-
-    @property
-    def differing(self) -> int:
-        """How many differ."""
-        return self.count - self.agreeing
 
     @property
     def largest(self) -> float:
@@ -216,94 +194,26 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Published:
-    """The published.yaml beside a module of a paper (its `__file__`): texts by keys."""
+class PaperFile:
+    """A file beside a module of a paper (its `__file__`), read when it is first asked."""
 
     module: str
+    name: str
 
     def find(self, *keys: str) -> Any:
-        """Return the text or mapping at these keys."""
-        found = _read_file(self.module, "published.yaml")
+        """Return the text, number, list or mapping at these keys."""
+        found = _read_file(self.module, self.name)
         for key in keys:
             found = found[key]
         return found
 
     def number(self, *keys: str) -> float:
-        """Return the number at these keys."""
+        """Return the printed number at these keys."""
         return float(self.find(*keys))
 
     def table(self, *keys: str) -> Printed:
-        """Return the block of numbers at these keys."""
+        """Return the block of printed numbers at these keys."""
         return Printed.parse(self.find(*keys))
-
-
-@dataclass(frozen=True)
-class PaperText:
-    """The text.yaml beside a module of a paper (its `__file__`), filled with numbers `data`."""
-
-    module: str
-
-    @property
-    def content(self) -> dict[str, Any]:
-        """What the file says."""
-        return _read_file(self.module, "text.yaml")
-
-    def about(self, **data: Any) -> tuple[str, ...]:
-        """Return the paragraphs at the beginning of the page."""
-        return tuple(fill_template(text, **data) for text in self.content["about"])
-
-    def claim(self, name: str) -> Claim:
-        """Return a claim."""
-        return Claim(name, self.content["claims"][name])
-
-    def table(
-        self, name: str, rows: Iterable[Sequence[Any]], file_name: str = "",
-        more: Sequence[tuple[str, str]] = (), /, **data: Any,
-    ) -> Table:  # fmt: skip
-        """Return a table of computed rows; more : titles and formats of further columns."""
-        text = self.content["tables"][name]
-        titles = (text["title"], text.get("note", ""), *text["columns"], *(t for t, _ in more))
-        title, note, *columns = (fill_template(part, **data) for part in titles)
-        formats = (*text["formats"], *(spec for _, spec in more))
-        cells = (
-            tuple(cell.item() if isinstance(cell, np.generic) else cell for cell in row)
-            for row in rows
-        )
-        name, shown = file_name or name, text.get("shown")
-        return Table(name, title, tuple(columns), tuple(cells), formats, note, shown)
-
-    def compare(
-        self, name: str, published: Printed, computed: FloatArray,
-        yardstick: FloatArray | None = None, /, **data: Any,
-    ) -> Comparison:  # fmt: skip
-        """Return a published table beside computed numbers (r, c); see `Comparison`."""
-        text = self.content["tables"][name]
-        note, columns = fill_template(text.get("note", ""), **data), tuple(text["columns"])
-        return Comparison(name, text["title"], columns, published, computed, note, yardstick)
-
-    def figure(
-        self, name: str, series: Iterable[Series], levels: Mapping[str, float] | None = None,
-        file_name: str = "", log: str | None = None, /, *, joined: bool = True, **data: Any,
-    ) -> Figure:  # fmt: skip
-        """Return a figure; log : default that of text.yaml."""
-        text = self.content["figures"][name]
-        title, x, y, caption = (
-            fill_template(text[key], **data) for key in ("title", "x", "y", "caption")
-        )
-        log = str(text.get("log", "y")) if log is None else log
-        name, lines = file_name or name, tuple(series)
-        return Figure(name, title, x, y, caption, lines, levels or {}, log, joined)
-
-
-def last_digit(text: str) -> float:
-    """Return one unit of the last digit of a printed number.
-
-    Examples
-    --------
-    >>> last_digit("-0.0352"), last_digit("-9E-05"), last_digit("200"), last_digit("1.20E-09")
-    (0.0001, 1e-05, 1.0, 1e-11)
-    """
-    return float(Decimal(1).scaleb(int(Decimal(text).as_tuple().exponent)))
 
 
 @cache
@@ -315,11 +225,6 @@ def _read_file(module: str, name: str) -> dict[str, Any]:
 
 OWN_CHECK = "our own check, not a statement of the paper"
 """Place of a claim that the paper does not make."""
-
-RELATIONS: Mapping[str, Callable[[Any, Any], Any]] = {
-    "below": operator.lt, "at most": operator.le, "equals": operator.eq,
-    "differs from": operator.ne, "at least": operator.ge, "above": operator.gt,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -359,59 +264,90 @@ class Verdict:
         return f"True in {sum(map(bool, self.draws))} of {len(self.draws)} draws. {self.why}"
 
 
+Decision = bool | np.bool_ | None
+
+
+def decide(agrees: Decision, disagrees: Decision) -> bool | None:
+    """Return whether numbers support a claim; None if they neither do nor contradict it."""
+    return True if agrees else False if disagrees else None
+
+
 @dataclass(frozen=True)
-class Claim:
-    """A claim of text.yaml: its name and its record."""
+class PaperText:
+    """The text.yaml beside a module of a paper (its `__file__`), filled with numbers `data`."""
 
-    name: str
-    record: Mapping[str, Any]
+    module: str
 
-    def decide(self, data: Mapping[str, Any]) -> bool | None:
-        """Return whether numbers support the claim; None if they cannot decide.
+    def _find(self, *keys: str) -> Any:
+        return PaperFile(self.module, "text.yaml").find(*keys)
 
-        Examples
-        --------
-        >>> record = {"agrees": [["n", "equals", "all"]], "disagrees": [["n", "equals", 0]]}
-        >>> [Claim("lower", record).decide({"n": n, "all": 4}) for n in (4, 0, 1)]
-        [True, False, None]
-        """
-        for key, answer in (("agrees", True), ("disagrees", False)):
-            comparisons = self.record.get(key, ())
-            if all(RELATIONS[how](_find(a, data), _find(b, data)) for a, how, b in comparisons):
-                return answer
-        return None
+    def about(self, **data: Any) -> tuple[str, ...]:
+        """Return the paragraphs at the beginning of the page."""
+        return tuple(fill_template(text, **data) for text in self._find("about"))
 
-    def judge(self, draws: Sequence[Mapping[str, Any]] = (), /, **data: Any) -> Verdict:
-        """Return the verdict; draws : numbers of each repeated draw, which replace those of `data`
-        in the comparisons.
-        """
-        decided = [self.decide({**data, **drawn}) for drawn in draws]
-        return self._word(decided, data, self.decide(data) if not draws else None)
-
-    def judge_everywhere(self, places: Mapping[str, Mapping[str, Any]], /, **data: Any) -> Verdict:
-        """Return the verdict on a claim that holds in a draw if it holds there in all places.
-
-        places : label -> quantity -> (t,) its number in each draw.
-        """
-        held, shares = [], []
-        for label, quantities in places.items():
-            columns = [np.asarray(numbers).tolist() for numbers in quantities.values()]
-            rows = (dict(zip(quantities, row, strict=True)) for row in zip(*columns, strict=True))
-            held.append([self.decide(row) is True for row in rows])
-            shares.append({"name": label, "count": sum(held[-1]), "of": len(held[-1])})
-        draws = [all(draw) for draw in zip(*held, strict=True)]
-        return self._word(draws, {"shares": shares, **data})
-
-    def _word(
-        self, draws: Sequence[bool | None], data: Mapping[str, Any], decided: bool | None = None
+    def judge(
+        self, name: str, agrees: Decision | Sequence[Decision] | BoolArray, /, **data: Any
     ) -> Verdict:
-        if draws:
-            decided = draws[0] if len(set(draws)) == 1 else None
-        claim, why = (fill_template(self.record[key], **data) for key in ("claim", "evidence"))
-        where = self.record.get("where", OWN_CHECK)
-        return Verdict(claim, decided, why, where, self.name, tuple(draws))
+        """Return the verdict on a claim; agrees : one decision, or that of each repeated draw."""
+        record, draws = self._find("claims", name), ()
+        if isinstance(agrees, (Sequence, np.ndarray)):
+            draws = tuple(None if a is None else bool(a) for a in agrees)
+            agrees = draws[0] if len(set(draws)) == 1 else None
+        claim, why = (fill_template(record[key], **data) for key in ("claim", "evidence"))
+        agrees = None if agrees is None else bool(agrees)
+        return Verdict(claim, agrees, why, record.get("where", OWN_CHECK), name, draws)
+
+    def table(
+        self, name: str, rows: Iterable[Row | Sequence[Any]], file_name: str = "",
+        more: Sequence[tuple[str, str]] = (), /, **data: Any,
+    ) -> Table:  # fmt: skip
+        """Return a table of computed rows; more : titles and formats of further columns."""
+        text = self._find("tables", name)
+        titles = (text["title"], text.get("note", ""), *text["columns"], *(t for t, _ in more))
+        title, note, *columns = (fill_template(part, **data) for part in titles)
+        formats = (*text["formats"], *(spec for _, spec in more))
+        cells = (
+            tuple(
+                cell.item() if isinstance(cell, np.generic) else cell
+                for cell in (row.values() if isinstance(row, Mapping) else row)
+            )
+            for row in rows
+        )
+        name, shown = file_name or name, text.get("shown")
+        return Table(name, title, tuple(columns), tuple(cells), formats, note, shown)
+
+    def compare(
+        self, name: str, published: Printed, computed: FloatArray, step: FloatArray | None = None,
+        /, **data: Any,
+    ) -> Comparison:  # fmt: skip
+        """Return a published table beside computed numbers (r, c), which agree within `step` (r,
+        c), by default one unit of the last printed digit.
+        """
+        text = self._find("tables", name)
+        step = published.unit if step is None else step
+        note, columns = fill_template(text.get("note", ""), **data), tuple(text["columns"])
+        return Comparison(name, text["title"], columns, published, computed, step, note)
+
+    def figure(
+        self, name: str, series: Iterable[Series], levels: Mapping[str, float] | None = None,
+        file_name: str = "", log: str | None = None, /, *, joined: bool = True, **data: Any,
+    ) -> Figure:  # fmt: skip
+        """Return a figure; log : default that of text.yaml."""
+        text = self._find("figures", name)
+        title, x, y, caption = (
+            fill_template(text[key], **data) for key in ("title", "x", "y", "caption")
+        )
+        log = str(text.get("log", "y")) if log is None else log
+        name, lines = file_name or name, tuple(series)
+        return Figure(name, title, x, y, caption, lines, levels or {}, log, joined)
 
 
-def _find(term: Any, data: Mapping[str, Any]) -> Any:
-    """Return a number, or the value of a name in the data, such as `best.formula` or `sd[full]`."""
-    return Formatter().get_field(term, (), data)[0] if isinstance(term, str) else term
+def last_digit(text: str) -> float:
+    """Return one unit of the last digit of a printed number.
+
+    Examples
+    --------
+    >>> last_digit("-0.0352"), last_digit("-9E-05"), last_digit("200"), last_digit("1.20E-09")
+    (0.0001, 1e-05, 1.0, 1e-11)
+    """
+    return float(Decimal(1).scaleb(int(Decimal(text).as_tuple().exponent)))

@@ -18,23 +18,28 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     LS,
     METHODS,
     MM,
-    NOISE,
     PRINTED,
     PRIOR,
-    SET,
+    SIZES,
+    Cell,
     Draw,
+    Stated,
 )
-from loopcal.papers.published import Comparison, Figure, PaperText, Printed, Series, Table, Verdict
+from loopcal.papers.published import (
+    Comparison,
+    Figure,
+    PaperText,
+    Printed,
+    Row,
+    Series,
+    Table,
+    Verdict,
+    decide,
+)
 from loopcal.papers.reproduction import Content
 from loopcal.typing import FloatArray
 
 TEXT = PaperText(__file__)
-DRAWS, SEED_STEP = 5, 10
-"""Times that points, machines and noise are drawn, and from the seed of one draw to that of the
-next: each uses a few of the seeds between.
-"""
-SURE = 0.1
-"""A ratio of two medians of some fifty machines, minus one, that is not significant."""
 POSITION_ALIGNED = "position, aligned [mm]"
 NO_GAUGE = "parameters without gauge [mm]"
 WEIGHTS = ("as printed: weight one", "divided by |d_1|", "divided by the sd of each",
@@ -52,55 +57,54 @@ class Results:
 
     study: steps.Study  # the ten groups
     draws: tuple[Draw, ...]  # tables and figures show the first
-    arrangements: tuple[steps.Arrangement, steps.Arrangement, steps.Arrangement]  # TEN, ONE and ANY
-    candidates: tuple[steps.Candidate, ...]  # interpretations
-    forms: tuple[steps.FormRow, ...]  # surfaces as unknowns, the hardest first
+    arrangements: list[Row]  # TEN, ONE and ANY
+    candidates: list[Row]  # interpretations, the nearest first
+    forms: list[Row]  # surfaces as unknowns, the hardest first
     covariance: float  # largest relative difference of a variance of both forms
-    ranks: tuple[steps.GroupRank, ...]  # of random groups
+    ranks: list[Row]  # of random groups
     pair: tuple[int, int]  # points of a group and rank of the equations of all its pairs
     gauge_effects: FloatArray  # (9,) of the directions of GAUGE_NAMES on the rows
-    table_4: Mapping[str, steps.Stated]  # factors as printed
+    table_4: Mapping[str, Stated]  # factors as printed
     conclusion: Mapping[str, str]  # of root mean squares, as printed
 
     @property
-    def cells(self) -> Mapping[tuple[str, str], steps.Cell]:
+    def cells(self) -> Mapping[tuple[str, str], Cell]:
         """Table 3 of the first draw."""
         return self.draws[0].cells
 
     @property
     def trials(self) -> int:
         """Machines of each cell."""
-        return len(self.draws[0].ten.cell.iterations)
+        return len(self.draws[0].weights["full"].iterations)
 
 
 def compute(
-    seed: int, trials: int, progress: Callable[[str], None], draws: int = DRAWS,
-    sweeps: tuple[int, int] = (steps.SWEEPS, 1),
+    seed: int, trials: int, progress: Callable[[str], None], draws: int = 0,
+    sweeps: tuple[int | None, int] = (None, 1),
 ) -> Results:  # fmt: skip
     """Compute everything.
 
-    Parameters
-    ----------
-    draws : of points, machines and noise. sweeps : of the coordinate exchange, on ten planes as in
-        the paper and for the other arrangements.
+    draws : of points, machines and noise, by default those of sizes.yaml. sweeps : of the
+    coordinate exchange, on the planes of study.yaml and for the other arrangements.
     """
     progress("coordinate exchange, ten planes")
     study = steps.plan_points(seed=seed, sweeps=sweeps[0])
     drawn = [steps.compute_draw(study, seed, trials, progress)]
     progress("one plane and one line")
-    one = steps.plan_points(1, steps.GROUPS * steps.POINTS, seed=seed, sweeps=sweeps[1])
+    one = steps.plan_points(**SIZES.find("one_plane"), seed=seed, sweeps=sweeps[1])
     progress("planes of any axis")
     free = steps.plan_points(axes=("x", "y", "z"), seed=seed, sweeps=sweeps[1])
-    one_plane, any_axis = (
-        steps.evaluate_arrangement(name, s, seed, trials)
-        for name, s in ((steps.ONE, one), (steps.ANY, free))
-    )
+    arrangements = [drawn[0].points]
+    for name, points in ((steps.ONE, one), (steps.ANY, free)):
+        cell = steps.calibrate_figure_5(points, seed, trials)
+        arrangements.append(steps.describe_points(name, points, cell))
     progress("interpretations of figure 5")
-    candidates = steps.rank_candidates((drawn[0].ten, one_plane), seed, trials)
+    candidates = steps.rank_candidates({steps.TEN: study, steps.ONE: one}, seed, trials)
     progress("both forms")
     forms = steps.compare_forms(study, seed, trials)
+    draws = draws or SIZES.find("draws")
     for i in range(1, draws):
-        other = seed + SEED_STEP * i
+        other = seed + SIZES.find("seed_step") * i
         points = steps.plan_points(seed=other, sweeps=sweeps[0])
         label = f"draw {i + 1} of {draws}"
         drawn.append(
@@ -109,14 +113,14 @@ def compute(
     return Results(
         study=study,
         draws=tuple(drawn),
-        arrangements=(drawn[0].ten, one_plane, any_axis),
+        arrangements=arrangements,
         candidates=candidates,
         forms=forms,
-        covariance=steps.compare_covariances(study.layout, min(steps.NOISES)),
+        covariance=steps.compare_covariances(study.layout, SIZES.find("forms", "noises")[0] * MM),
         ranks=steps.compute_ranks(study, seed),
         pair=steps.compute_pair_rank(study),
         gauge_effects=steps.compute_gauge_effects(study),
-        table_4={name: steps.Stated(**given) for name, given in PRINTED.find("table_4").items()},
+        table_4={name: Stated(**given) for name, given in PRINTED.find("table_4").items()},
         conclusion=PRINTED.find("conclusion"),
     )
 
@@ -135,12 +139,12 @@ def _compare_tables(results: Results) -> tuple[Comparison, Comparison]:
         "parameters identified": PRINTED.find("parameters"),
         "iterations for 50 points, at most": "5",
     })  # fmt: skip
-    rank = max(r.rank for r in results.ranks)
-    iterations = max(f.most_iterations for f in results.draws[0].fifties)
+    rank = max(row["rank"] for row in results.ranks)
+    iterations = max(int(cell.iterations.max()) for cell in results.draws[0].fifties.values())
     figure, nearest = PRINTED.find("figure_5"), results.candidates[0]
     stated = Printed.parse({name: given["stated"] for name, given in figure.items()})
-    order = {"estimation": 0, "position": 1, "orientation": 2}
-    reductions = np.array([[nearest.reductions[order[name]]] for name in figure])
+    names = {"estimation": "parameters"}
+    reductions = np.array([[nearest[names.get(name, name)]] for name in figure])
     return (
         TEXT.compare("counts", counts, np.array([[float(rank)], [float(iterations)]])),
         TEXT.compare("figure_5", stated, reductions, nearest=nearest),
@@ -149,43 +153,48 @@ def _compare_tables(results: Results) -> tuple[Comparison, Comparison]:
 
 def make_tables(results: Results) -> tuple[Table, ...]:
     """Return all tables of the reproduction."""
-    ranks = [(r.groups, r.points, r.rows, r.rank, r.singular_values[r.rank - 1], r.unused)
-             for r in results.ranks]  # fmt: skip
+    first, trials = results.draws[0], results.trials
     effects = zip(steps.GAUGE_NAMES, results.gauge_effects, strict=True)
     gauge = [(name, MOTIONS[i // 3], effect) for i, (name, effect) in enumerate(effects)]
     printed = ("as printed", "", "", "", *steps.list_printed(), None)
-    candidates = [(c.name, c.reading, c.truth, c.frame, *c.reductions, c.distance)
-                  for c in results.candidates]  # fmt: skip
-    arrangements = [
-        (a.name, a.study.layout.equations, a.drawn, a.optimized, a.gain,
-         *(a.cell.compute_median(m, POSITION_ALIGNED) for m in (LS, PRIOR)))
-        for a in results.arrangements
-    ]  # fmt: skip
     weights = [
         (name, *(c.compute_median(m, e) for m in (LS, PRIOR) for e in (POSITION_ALIGNED, NO_GAUGE)))
-        for name, c in zip(WEIGHTS, results.draws[0].weights.values(), strict=True)
+        for name, c in zip(WEIGHTS, first.weights.values(), strict=True)
     ]
     forms = [
-        (row.noise / MM, row.method, f"{row.converged} of {row.machines}", row.iterations,
-         ", ".join(map(str, row.ranks)), row.median, row.largest)
+        (row["noise"], row["method"], f"{row['converged']} of {row['machines']}",
+         row["iterations"], ", ".join(map(str, row["ranks"])), row["median"], row["largest"])
         for row in results.forms
+    ]  # fmt: skip
+    fifty = [
+        (f"{groups} {'plane, one line' if groups == 1 else 'planes, a line each'}", frame, method,
+         *compute_statistics(cell, method, frame))
+        for groups, cell in first.fifties.items() for method in (BEFORE, *METHODS)
+        for frame in steps.FRAMES
     ]  # fmt: skip
     measures = (POSITION_ALIGNED, "orientation, aligned [deg]", NO_GAUGE)
     absolute = ("position [mm]", "orientation [deg]", "parameters [mm]",
                 "position, gauge at nominal [mm]")  # fmt: skip
     return (
         _list_given(results.study),
-        TEXT.table("ranks", ranks),
+        TEXT.table("ranks", [tuple(row.values())[:-1] for row in results.ranks]),
         TEXT.table("gauge", gauge),
         _list_table_3(results, "table_3", measures),
         _list_table_3(results, "table_3_absolute", absolute),
-        TEXT.table("figure_5_readings", [printed, *candidates]),
-        TEXT.table("arrangements", arrangements, trials=results.trials),
+        TEXT.table("figure_5_readings", [printed, *results.candidates]),
+        TEXT.table("arrangements", results.arrangements, trials=trials),
         TEXT.table("weights", weights),
-        _list_fifty(results),
-        TEXT.table("forms", forms, errors=steps.ERRORS / MM, covariance=results.covariance),
+        TEXT.table("table_4", fifty, trials=trials, noise=PRINTED.number("accuracy", "accuracy"),
+                   failed=sum(cell.failed for cell in first.fifties.values())),
+        TEXT.table("forms", forms, errors=SIZES.find("forms", "errors"),
+                   covariance=results.covariance),
         _list_arithmetic(results),
-    )
+    )  # fmt: skip
+
+
+def compute_statistics(cell: Cell, method: str, frame: str) -> FloatArray:
+    """Return the medians (4,) of STATISTICS in a frame."""
+    return np.array([cell.compute_median(method, f"{s}, {frame}") for s in steps.STATISTICS])
 
 
 def _list_given(study: steps.Study) -> Table:
@@ -213,28 +222,14 @@ def _list_table_3(results: Results, name: str, measures: tuple[str, ...]) -> Tab
     return TEXT.table(name, rows, "", more, trials=results.trials, failed=failed)
 
 
-def _list_fifty(results: Results) -> Table:
-    rows, fifties = [], results.draws[0].fifties
-    for fifty in fifties:
-        plural = "plane, one line" if fifty.groups == 1 else "planes, a line each"
-        rows += [
-            (f"{fifty.groups} {plural}", frame, method, *fifty.compute_median(method, frame))
-            for method, frame in fifty.statistics
-        ]
-    failed = sum(int((~c).sum()) for fifty in fifties for c in fifty.converged.values())
-    noise = PRINTED.number("accuracy", "accuracy") * MM / MM
-    return TEXT.table("table_4", rows, trials=results.trials, noise=noise, failed=failed)
-
-
 def _list_arithmetic(results: Results) -> Table:
     rows: list[tuple[Any, ...]] = []
     for name, given in results.table_4.items():
-        low, high = given.possible
         numbers = (given.before, given.after, given.stated, given.factor)
-        follows = given.excess == 0.0
-        rows.append((f"Table 4, {name}", *numbers, f"{low:.2f} to {high:.2f}", follows))
+        possible = "{:.2f} to {:.2f}".format(*given.possible)
+        rows.append((f"Table 4, {name}", *numbers, possible, given.excess == 0.0))
     for name in ("position", "orientation"):
-        given = steps.Stated(**PRINTED.find("figure_5", name))
+        given = Stated(**PRINTED.find("figure_5", name))
         follows = abs(given.reduction - float(given.stated)) <= 0.5
         numbers = (given.before, given.after, given.stated, given.reduction)
         rows.append((f"Figure 5, {name} [%]", *numbers, None, follows))
@@ -257,7 +252,8 @@ def _draw_figure_4(results: Results) -> Figure:
 
 def _draw_figure_5(results: Results) -> Figure:
     """Return position errors of single poses of the first machine, before and after."""
-    study, made = results.study, results.cells[f"{SET:g}", f"{NOISE:g}"]
+    given, study = SIZES.find("figure_5"), results.study
+    made = results.cells[f"{given['errors']:g}", f"{given['noise']:g}"]
     true, sizes = study.held_out.solve(made.truth[:1]), {}
     for name in (BEFORE, *METHODS):
         T = study.held_out.solve(made.values.get(name, study.robot.parameters.nominal[None])[:1])
@@ -268,8 +264,7 @@ def _draw_figure_5(results: Results) -> Figure:
     order = np.argsort(sizes[BEFORE])
     x = range(1, len(order) + 1)
     lines = [Series.of(label, x, size[order]) for label, size in sizes.items()]
-    count = len(order)
-    return TEXT.figure("figure_5", lines, joined=False, errors=SET, noise=NOISE, count=count)
+    return TEXT.figure("figure_5", lines, joined=False, **given, count=len(order))
 
 
 def _draw_table_3(results: Results) -> Figure:
@@ -301,49 +296,52 @@ def judge_claims(results: Results) -> tuple[Verdict, ...]:
 
 def _judge_equations(results: Results) -> tuple[Verdict, ...]:
     points, rank = results.pair
-    ranks, groups = sorted({r.rank for r in results.ranks}), [r.groups for r in results.ranks]
-    unused = max((r.unused or 0.0) / r.singular_values[0] for r in results.ranks)
+    effect, parameters = results.gauge_effects[:6].max(), int(PRINTED.find("parameters"))
+    ranks = sorted({row["rank"] for row in results.ranks})
+    groups = [row["groups"] for row in results.ranks]
+    unused = max((row["unused"] or 0.0) / row["largest"] for row in results.ranks)
+    missing, judge = points - rank, TEXT.judge
     return (
-        TEXT.claim("independent").judge(effect=results.gauge_effects[:6].max()),
-        TEXT.claim("counted").judge(points=points, rank=rank, missing=points - rank),
-        TEXT.claim("least_squares").judge(
-            least=ranks[0], parameters=int(PRINTED.find("parameters")), ranks=ranks,
-            fewest=min(groups), most=max(groups), largest=unused,
-        ),
+        judge("independent", effect < 1e-9, effect=effect),
+        judge("counted", decide(missing == 1, missing != 2), points=points, rank=rank,
+              missing=missing),
+        judge("least_squares", ranks[0] == parameters, parameters=parameters, ranks=ranks,
+              fewest=min(groups), most=max(groups), largest=unused),
     )  # fmt: skip
 
 
 def _judge_table_3(results: Results) -> tuple[Verdict, ...]:
     from scipy.stats import beta
 
-    draws, cells = results.draws, results.cells
-    shares, place = [], steps.MEASURES.index("parameters [mm]")
+    draws, cells, judge = results.draws, results.cells, TEXT.judge
+    shares, better, place = [], [], steps.MEASURES.index("parameters [mm]")
     for draw in draws:  # by how much the parameter errors decrease with the least noise
         quiet = draw.cells["1", "0.0001"]
         left = (quiet.errors[LS] / quiet.errors[BEFORE])[quiet.converged[LS], place]
         mean = 100.0 * (1.0 - left.mean()) if len(left) else np.nan
-        reached = int((left <= 0.25).sum())
-        shares.append({"mean": mean, "reached": reached, "count": len(left)})
-    better = [_compare_with_before(draw) for draw in draws]
+        shares.append({"mean": mean, "reached": int((left <= 0.25).sum()), "count": len(left)})
+        medians = _list_medians(draw)
+        worse = [f"errors {s} mm with noise {n} mm" for (s, n), (before, ls, _) in medians.items()
+                 if not ls <= before]  # fmt: skip
+        ratio = np.median([medians[key][1] * MM / c.noise for key, c in draw.cells.items()])
+        number = len(medians) - len(worse)
+        better.append({"better": number, "worse": worse or ["none"], "ratio": ratio})
     ranks = [
         {m: steps.compute_rank_correlation(draw.cells.values(), m) for m in METHODS}
         for draw in draws
     ]
-    cell = cells["1", "0.01"]
+    cell, count = cells["1", "0.01"], len(cells)
     return (
-        TEXT.claim("three_quarters").judge(
-            shares, noise=cells["1", "0.0001"].noise / MM,
-            chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)), **shares[0],
-        ),
-        TEXT.claim("better").judge(better, count=len(cells), **better[0]),
-        TEXT.claim("correlation").judge(
-            [{"ranks": r} for r in ranks], count=len(cells),
-            ratios=len({c.ratio for c in cells.values()}), ranks=ranks[0],
-            least={m: min(r[m] for r in ranks) for m in METHODS},
-            parameters=cell.compute_reduction(LS, "parameters [mm]"),
-            position=cell.compute_reduction(LS, "position [mm]"),
-            aligned=cell.compute_reduction(LS, POSITION_ALIGNED),
-        ),
+        judge("three_quarters", [share["mean"] >= 75.0 for share in shares],
+              noise=cells["1", "0.0001"].noise / MM,
+              chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)), **shares[0]),
+        judge("better", [of["better"] == count for of in better], count=count, **better[0]),
+        judge("correlation", [min(of.values()) > 0.7 for of in ranks], count=count,
+              ratios=len({c.ratio for c in cells.values()}), ranks=ranks[0],
+              least={m: min(of[m] for of in ranks) for m in METHODS},
+              parameters=cell.compute_reduction(LS, "parameters [mm]"),
+              position=cell.compute_reduction(LS, "position [mm]"),
+              aligned=cell.compute_reduction(LS, POSITION_ALIGNED)),
     )  # fmt: skip
 
 
@@ -355,140 +353,129 @@ def _list_medians(draw: Draw) -> dict[tuple[str, str], list[float]]:
     }
 
 
-def _compare_with_before(draw: Draw) -> dict[str, Any]:
-    """Return in which cells least squares reduces the median position error."""
-    medians = _list_medians(draw)
-    worse = [f"errors {s} mm with noise {n} mm" for (s, n), (before, ls, _) in medians.items()
-             if not ls <= before]  # fmt: skip
-    ratio = np.median([medians[key][1] * MM / c.noise for key, c in draw.cells.items()])
-    return {"better": len(medians) - len(worse), "worse": worse or ["none"], "ratio": ratio}
-
-
 def _judge_figure_5(results: Results) -> tuple[Verdict, ...]:
-    ranked = sorted(results.candidates, key=lambda candidate: candidate.distance)
+    ranked = sorted(results.candidates, key=lambda row: row["distance"])
     deviation, variance = (
-        next(c for c in ranked if c.reading == reading) for reading in (steps.SD, steps.VARIANCE)
+        next(row for row in ranked if row["reading"] == reading)
+        for reading in (steps.SD, steps.VARIANCE)
     )
-    literal = next(c for c in ranked if c.truth == "all 42" and c.frame == "absolute")
-    texts = [[f"{a:.0f} %" for a in c.reductions] for c in (deviation, variance, literal)]
+    literal = next(r for r in ranked if (r["truth"], r["frame"]) == ("all 42", ABSOLUTE))
+    texts = [
+        [f"{row[name]:.0f} %" for name in ("parameters", "position", "orientation")]
+        for row in (deviation, variance, literal)
+    ]
+    noise = SIZES.find("figure_5", "noise")
     return (
-        TEXT.claim("variances").judge(
-            deviation=deviation, variance=variance, deviations=texts[0], variances=texts[1],
-            given=NOISE, root=np.sqrt(NOISE),
-        ),
-        TEXT.claim("figure_5").judge(literal=literal, reductions=texts[2], nearest=ranked[0]),
+        TEXT.judge("variances", variance["distance"] < deviation["distance"], deviation=deviation,
+                   variance=variance, deviations=texts[0], variances=texts[1], given=noise,
+                   root=np.sqrt(noise)),
+        TEXT.judge("figure_5", literal["distance"] < 10.0, literal=literal, reductions=texts[2],
+                   nearest=ranked[0]),
     )  # fmt: skip
 
 
 def _judge_points(results: Results) -> tuple[Verdict, ...]:
     """Judge the exchange, the number of planes, and fifty points."""
     ten, one, free = results.arrangements
-    cost_ten, cost_one = (a.cell.compute_median(LS, POSITION_ALIGNED) for a in (ten, one))
-    gains = [draw.ten.gain for draw in results.draws]
-    one_plane, five_planes = fifties = results.draws[0].fifties
+    fifties, judge = results.draws[0].fifties, TEXT.judge
     places = {"ls": (ABSOLUTE, LS), "nominal": (AT_NOMINAL, LS), "aligned": (ALIGNED, LS),
               "prior": (ALIGNED, PRIOR)}  # fmt: skip
-    changes = {name: [] for name in places}
-    for name, (frame, method) in places.items():
-        for fifty in fifties:
-            before, after = (fifty.compute_median(m, frame)[0] for m in (BEFORE, method))
-            changes[name].append(f"{before:.2g} to {after:.2g} mm")
-    falls = [
-        bool((fifty.compute_factors(method, frame) > 1.0).all())
-        for fifty in fifties for frame in steps.FRAMES for method in METHODS
-    ]  # fmt: skip
-    factors = ", ".join(f"{f:.1f}" for f in five_planes.compute_factors(PRIOR, ABSOLUTE))
-    within = [draw.fifties[0].within_five for draw in results.draws]
+    changes = {
+        name: [
+            "{:.2g} to {:.2g} mm".format(
+                *(compute_statistics(cell, m, frame)[0] for m in (BEFORE, method))
+            )
+            for cell in fifties.values()
+        ]
+        for name, (frame, method) in places.items()
+    }
+    factors = {
+        (groups, frame, m): compute_statistics(c, BEFORE, frame) / compute_statistics(c, m, frame)
+        for groups, c in fifties.items() for frame in steps.FRAMES for m in METHODS
+    }  # fmt: skip
+    falling = sum(bool((of > 1.0).all()) for of in factors.values())
+    gains = [draw.points["gain"] for draw in results.draws]
+    least, most = min(fifties), max(fifties)
+    within = [draw.fifties[least].within_five for draw in results.draws]
     return (
-        TEXT.claim("exchange").judge(
-            [{"gain": gain} for gain in gains], gain=gains[0], least=min(gains), ten=ten, one=one
-        ),
-        TEXT.claim("one_plane").judge(
-            one=one, ten=ten, free=free, noise=NOISE, cost_one=cost_one, cost_ten=cost_ten,
-            limit=1.5 * cost_ten,
-        ),
-        TEXT.claim("iterations").judge(
-            [{"within": share} for share in within], within=within[0], one=one_plane,
-            five=five_planes, least=min(within), most=max(within),
-        ),
-        TEXT.claim("full_poses").judge(
-            falling=sum(falls), ways=len(falls), factors=factors,
-            stated=", ".join(given.stated for given in results.table_4.values()), **changes,
-        ),
+        judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains), ten=ten,
+              one=one),
+        judge("one_plane", one[LS] < 1.5 * ten[LS], one=one, ten=ten, free=free,
+              noise=SIZES.find("figure_5", "noise"), cost_one=one[LS], cost_ten=ten[LS]),
+        judge("iterations", [share >= 90.0 for share in within], within=within[0],
+              one=int(fifties[least].iterations.max()), five=int(fifties[most].iterations.max()),
+              five_within=fifties[most].within_five, least=min(within), most=max(within)),
+        judge("full_poses", decide(falling == len(factors), falling == 0), falling=falling,
+              ways=len(factors), **changes,
+              factors=", ".join(f"{f:.1f}" for f in factors[most, ABSOLUTE, PRIOR]),
+              stated=", ".join(given.stated for given in results.table_4.values())),
     )  # fmt: skip
 
 
 def _judge_arithmetic(results: Results) -> tuple[Verdict, ...]:
     """Judge the factors of Table 4, and those of root mean squares: rms^2 = mean^2 + sd^2."""
-    table, possible = results.table_4, {}
-    for name in results.conclusion:
+    table, possible, stated = results.table_4, {}, results.conclusion
+    for name in stated:
         mean, sd = (table[f"{name}, {what}"] for what in ("mean", "standard deviation"))
-        before = steps.bound_rms(mean.before, sd.before)
-        after = steps.bound_rms(mean.after, sd.after)
-        possible[name] = before[0] / after[1], before[1] / after[0]
-    excess = max(steps.compute_excess(results.conclusion[name], possible[name])
-                 for name in possible)  # fmt: skip
+        possible[name] = steps.bound_factor((mean.before, sd.before), (mean.after, sd.after))
+    excess = max(steps.compute_excess(stated[name], possible[name]) for name in possible)
     return (
-        *(TEXT.claim("factor").judge(name=name, given=given) for name, given in table.items()),
-        TEXT.claim("conclusion").judge(stated=results.conclusion, possible=possible, excess=excess),
-    )
+        *(TEXT.judge("factor", given.excess == 0.0, name=name, given=given)
+          for name, given in table.items()),
+        TEXT.judge("conclusion", excess == 0.0, stated=stated, possible=possible),
+    )  # fmt: skip
 
 
 def _judge_methods(results: Results) -> tuple[Verdict, Verdict]:
     """Judge the prior, and the weights of the rows."""
-    priors, weights = [], []
+    sure, given, first = SIZES.find("sure"), SIZES.find("figure_5"), results.draws[0]
+    priors, positions = [], []
     for draw in results.draws:
         medians = _list_medians(draw)
         priors.append(
             {
-                "better": sum(prior <= (1.0 + SURE) * ls for _, ls, prior in medians.values()),
+                "better": sum(prior <= (1.0 + sure) * ls for _, ls, prior in medians.values()),
                 "harmed": sum(not prior <= before for before, _, prior in medians.values()),
                 "medians": medians["0.01", "0.1"],
             }
         )
-        position = {n: c.compute_median(LS, POSITION_ALIGNED) for n, c in draw.weights.items()}
-        weights.append(
-            {
-                "position": position,
-                "limit": (1.0 + SURE) * position["full"],
-                "less": {n: 100.0 * (1.0 - position["full"] / p) for n, p in position.items()},
-                "nearer": 100.0 * (1.0 - position["distance"] / position["printed"]),
-            }
-        )
-    parameters = {n: c.compute_median(PRIOR, NO_GAUGE) for n, c in results.draws[0].weights.items()}
-    less, hardest = [w["less"]["printed"] for w in weights], results.cells["0.01", "0.1"]
+        weights = draw.weights.items()
+        positions.append({name: c.compute_median(LS, POSITION_ALIGNED) for name, c in weights})
+    count, position = len(results.cells), positions[0]
+    less = [{n: 100.0 * (1.0 - p["full"] / p[n]) for n in p} for p in positions]
+    from_printed = [of["printed"] for of in less]
     return (
-        TEXT.claim("prior").judge(
-            priors, sure=100 * SURE, count=len(results.cells), trials=results.trials,
-            worse=hardest.count_worse(PRIOR, POSITION_ALIGNED), **priors[0],
-        ),
-        TEXT.claim("weights").judge(
-            weights, parameters=parameters, set=SET, noise=NOISE, lowest=min(less),
-            highest=max(less), **weights[0],
-        ),
+        TEXT.judge("prior", [(p["better"], p["harmed"]) == (count, 0) for p in priors],
+                   sure=100 * sure, count=count, trials=results.trials,
+                   worse=results.cells["0.01", "0.1"].count_worse(PRIOR, POSITION_ALIGNED),
+                   **priors[0]),
+        TEXT.judge("weights", [p["printed"] < (1.0 + sure) * p["full"] for p in positions],
+                   parameters={n: c.compute_median(PRIOR, NO_GAUGE)
+                               for n, c in first.weights.items()},
+                   position=position, less=less[0], lowest=min(from_printed),
+                   highest=max(from_printed), set=given["errors"], noise=given["noise"],
+                   nearer=100.0 * (1.0 - position["distance"] / position["printed"])),
     )  # fmt: skip
 
 
 def _judge_forms(results: Results) -> tuple[Verdict, Verdict]:
     """Judge the two forms of the equations."""
-    forms, (hardest, *others) = results.forms, results.forms
-    noises = [row.noise / MM for row in forms]
-    loud, calm = (
-        max(row.median for row in forms if row.noise / MM == noise)
-        for noise in (max(noises), min(noises))
+    forms, (hardest, *others), judge = results.forms, results.forms, TEXT.judge
+    noises = sorted({row["noise"] for row in forms})
+    calm, loud = (
+        max(row["median"] for row in forms if row["noise"] == noise)
+        for noise in (noises[0], noises[-1])
     )
+    compared, fits = (sum(row[key] for row in forms) for key in ("converged", "machines"))
+    largest = max((row["largest"] for row in forms if row["converged"]), default=np.nan)
+    agrees = decide(largest < 0.05 and results.covariance < 1e-6, compared > 0)
+    converged, rest = (sum(row[key] for row in others) for key in ("converged", "machines"))
     return (
-        TEXT.claim("forms").judge(
-            covariance=results.covariance, compared=sum(row.converged for row in forms),
-            largest=max((row.largest for row in forms if row.converged), default=np.nan),
-            fits=sum(row.machines for row in forms), noise=max(noises), least=min(noises),
-            loud=loud, calm=calm,
-        ),
-        TEXT.claim("converged").judge(
-            hardest=hardest, noise=hardest.noise / MM,
-            converged=sum(row.converged for row in others),
-            fits=sum(row.machines for row in others), most=max(row.iterations for row in forms),
-            ranks=sorted({rank for row in forms for rank in row.ranks}),
-            noises=[f"{noise:g}" for noise in sorted(set(noises))],
-        ),
+        judge("forms", agrees, covariance=results.covariance, compared=compared, largest=largest,
+              fits=fits, noise=noises[-1], least=noises[0], loud=loud, calm=calm),
+        judge("converged", hardest["converged"] == hardest["machines"] and converged == rest,
+              hardest=hardest, noise=hardest["noise"], converged=converged, fits=rest,
+              most=max(row["iterations"] for row in forms),
+              ranks=sorted({rank for row in forms for rank in row["ranks"]}),
+              noises=[f"{noise:g}" for noise in noises]),
     )  # fmt: skip

@@ -8,7 +8,7 @@ and 2 are not in our text.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import hypot
@@ -31,7 +31,7 @@ from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.papers.paper import PAPERS
-from loopcal.papers.published import Published, last_digit
+from loopcal.papers.published import PaperFile, Row, last_digit
 from loopcal.planning.exchange import MovedDesign
 from loopcal.planning.plane_line_planning import (
     PlaneLineGroups,
@@ -39,20 +39,22 @@ from loopcal.planning.plane_line_planning import (
     make_plane_line_instrument,
 )
 from loopcal.studies.simulation.block import calibrate_cells, find_cells, set_size
+from loopcal.studies.specification.study import Study as GridStudy
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 MM = 1e-3
-PRINTED = Published(__file__)
+PRINTED, SIZES = PaperFile(__file__, "published.yaml"), PaperFile(__file__, "sizes.yaml")
 ROBOT = "hexapod-nategh-agheli"
-GROUPS, POINTS, AXES, SWEEPS = 10, 10, ("z",), 3
-"""Planes with a line each, points of each (the paper's 100 positions), axes of the lines (planes of
-equal z), and sweeps of the coordinate exchange.
-"""
-HELD_OUT = 100
-"""Random poses over which errors are taken, as in the paper."""
 TRUTH = 1  # purpose of a random stream
 BEFORE, LS, PRIOR = "before", "LS", "MAP"
 METHODS: Mapping[str, Method] = {LS: lc.LeastSquares(), PRIOR: lc.MAP()}
+ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "aligned")
+"""Placements of the base and the rotation of the platform, which plane and line do not determine:
+as the least deviation leaves them; with poses nearest to the nominal ones, which needs no truth;
+with poses nearest to the true ones.
+"""
+STATISTICS = ("position, mean [mm]", "position, standard deviation [mm]", "orientation, mean [deg]",
+              "orientation, standard deviation [deg]")  # fmt: skip
 MEASURES = (
     "position [mm]",
     "orientation [deg]",
@@ -61,40 +63,18 @@ MEASURES = (
     "parameters [mm]",
     "parameters without gauge [mm]",
     "position, gauge at nominal [mm]",
+    *(f"{name}, {frame}" for frame in FRAMES for name in STATISTICS),
 )
-"""Root mean squares over the held-out poses, and the 2-norm of the errors of the 42 parameters."""
-ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "aligned")
-"""Placements of the base and the rotation of the platform, which plane and line do not determine:
-as the least deviation leaves them; with poses nearest to the nominal ones, which needs no truth;
-with poses nearest to the true ones.
+"""Root mean squares over the held-out poses, the 2-norm of the errors of the 42 parameters, and
+means and standard deviations over the poses.
 """
-STATISTICS = ("position, mean [mm]", "position, standard deviation [mm]", "orientation, mean [deg]",
-              "orientation, standard deviation [deg]")  # fmt: skip
-LINES, FIFTY_SD = (1, 5), 1e-3
-"""Planes with a line each on which fifty points lie, and the standard deviation of the true errors
-of these machines [m]: that of set 3.
-"""
-SET, NOISE = 1.0, 0.01
-"""Of figure 5, as printed [mm]."""
 SD, VARIANCE = "standard deviation", "variance"
-READINGS: Mapping[str, Callable[[float], float]] = {
-    SD: lambda given: given * MM,
-    VARIANCE: lambda given: float(np.sqrt(given)) * MM,
-}
-"""From a printed number to a standard deviation [m]: "variance of 0.01mm" may mean either."""
+"""Interpretations of a printed "variance of 0.01mm"."""
 TEN, ONE, ANY = (
     "ten planes, a line each",
     "one plane, one line",
     "ten planes of any axis, a line each",
 )
-RANKS = ((1, 100), (2, 50), (5, 20), (10, 10), (20, 10), (30, 10))
-"""Groups and points of each, drawn at random, whose rank is computed."""
-ERRORS, NOISES = 1e-3, (1e-6, 1e-5)
-"""Standard deviations [m] of parameters and of held coordinates where both forms are compared."""
-HARDEST, SHARE = (max(NOISES), LS), 5
-"""The noise and method with which fits converge worst, identified on all machines; with the others
-on one machine of so many: these fits take most of the time of the study.
-"""
 GAUGE_NAMES = tuple(
     f"{what} {axis}"
     for what in ("base shifted along", "base rotated about", "platform rotated about")
@@ -132,18 +112,22 @@ class HeldOutPoses:
         return geometry.pose_difference(T, true)
 
     def compute_errors(self, values: FloatArray, truth: FloatArray, true: FloatArray) -> FloatArray:
-        """Return errors (t, 7), see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n,
+        """Return errors (t, m), see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n,
         4, 4) the poses of the truth.
         """
-        sizes, T = {}, self.solve(values)
+        sizes, statistics, T = {}, [], self.solve(values)
         for frame in FRAMES:
-            squares = np.mean(self.compute_twists(T, true, frame) ** 2, axis=1)
+            twists = self.compute_twists(T, true, frame)
+            squares = np.mean(twists**2, axis=1)
             position, rotation = (np.sqrt(squares[:, p].sum(axis=1)) for p in np.s_[3:, :3])
             sizes[frame] = [position / MM, np.rad2deg(rotation)]
+            position, rotation = (np.linalg.norm(twists[..., p], axis=2) for p in np.s_[3:, :3])
+            of_poses = (position / MM, np.rad2deg(rotation))
+            statistics += [part(e, axis=1) for e in of_poses for part in (np.mean, np.std)]
         wrong = values - truth
         lengths = (np.linalg.norm(e, axis=1) / MM for e in (wrong, remove_gauge(self.robot, wrong)))
         columns = (*sizes[ABSOLUTE], *sizes[ALIGNED], *lengths, sizes[AT_NOMINAL][0])
-        return np.stack(columns, axis=1)
+        return np.stack([*columns, *statistics], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +148,8 @@ class Study:
     @cached_property
     def held_out(self) -> HeldOutPoses:
         """Held-out poses, drawn with another seed than the points."""
-        return HeldOutPoses(
-            self.robot, sample_workspace(self.robot, HELD_OUT, self.seed + 1).solution
-        )
+        count = load_study().scores.held_out
+        return HeldOutPoses(self.robot, sample_workspace(self.robot, count, self.seed + 1).solution)
 
     @cached_property
     def spreads(self) -> tuple[float, float]:
@@ -175,18 +158,27 @@ class Study:
         return compute_spread(drawn), compute_spread(self.optimized.rows)
 
 
+def load_study() -> GridStudy:
+    """Return study.yaml."""
+    return PAPERS["cmm-constraint-2011"].load_study()
+
+
 def plan_points(
-    groups: int = GROUPS, points: int = POINTS, axes: tuple[str, ...] = AXES, *, seed: int,
-    sweeps: int,
+    groups: int = 0, points: int = 0, axes: tuple[str, ...] = ("z",), *, seed: int,
+    sweeps: int | None = None,
 ) -> Study:  # fmt: skip
     """Draw groups at random and improve log det of their information by coordinate exchange.
 
-    With 0 sweeps they stay as drawn.
+    groups, points, sweeps : planes with a line each, points of each, and sweeps of the exchange (0:
+    as drawn); by default those of study.yaml. axes : of the lines; z means planes of equal z.
     """
+    (level,) = load_study().poses.values()
+    groups = groups or level.groups
     robot = lc.load_robot(ROBOT)
-    planned = PlaneLineGroups(robot, points, MM, axes)
+    planned = PlaneLineGroups(robot, points or level.count // groups, MM, axes)
     first = planned.draw(groups, seed)
-    return Study(robot, planned, first, improve_groups(planned, first, sweeps), seed)
+    improved = improve_groups(planned, first, level.sweeps if sweeps is None else sweeps)
+    return Study(robot, planned, first, improved, seed)
 
 
 def compute_spread(rows: FloatArray) -> float:
@@ -245,32 +237,26 @@ def remove_gauge(robot: Mechanism, deviation: FloatArray) -> FloatArray:
     return deviation - (deviation @ basis) @ basis.T
 
 
-@dataclass(frozen=True, eq=False)
-class GroupRank:
-    """Rank of random groups. rows : their number. singular_values : (p,)."""
-
-    groups: int
-    points: int
-    rows: int
-    rank: int
-    singular_values: FloatArray
-
-    @property
-    def unused(self) -> float | None:
-        """Largest singular value that does not count; None without one."""
-        s = self.singular_values
-        return float(s[self.rank]) if self.rank < len(s) else None
-
-
-def compute_ranks(study: Study, seed: int) -> tuple[GroupRank, ...]:
+def compute_ranks(study: Study, seed: int) -> list[Row]:
     """Return the ranks of random groups, with the tolerance 1e-10 of the largest singular value."""
     ranks = []
-    for groups, points in RANKS:
-        planned = PlaneLineGroups(study.robot, points, MM, AXES)
+    for groups, points in SIZES.find("ranks"):
+        planned = PlaneLineGroups(study.robot, points, MM, ("z",))
         rows = planned.linearize(planned.draw(groups, seed)).reshape(-1, len(planned.free))
-        s: FloatArray = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
-        ranks.append(GroupRank(groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
-    return tuple(ranks)
+        s = np.linalg.svd(rows, compute_uv=False)
+        rank = int((s > 1e-10 * s[0]).sum())
+        ranks.append(
+            {
+                "groups": groups,
+                "points": points,
+                "rows": len(rows),
+                "rank": rank,
+                "smallest": float(s[rank - 1]),
+                "unused": float(s[rank]) if rank < len(s) else None,
+                "largest": float(s[0]),
+            }
+        )
+    return ranks
 
 
 def compute_gauge_effects(study: Study) -> FloatArray:
@@ -299,40 +285,17 @@ def compute_pair_rank(study: Study) -> tuple[int, int]:
     return len(group), int(np.linalg.matrix_rank(rows, rtol=1e-9))
 
 
-Identified = tuple[Mapping[str, FloatArray], IntArray, Mapping[str, BoolArray]]
-"""Values (t, p) [m] by LS and MAP, iterations (t,) of LS, and which descents (t,) converged."""
-
-
-def compute_median(errors: FloatArray, converged: BoolArray | None = None) -> FloatArray:
-    """Return medians (k,) of errors (t, k) of the converged machines (t,); NaN without any."""
-    kept = errors if converged is None else errors[converged]
-    return np.median(kept, axis=0) if len(kept) else np.full(errors.shape[1], np.nan)
-
-
 @dataclass(frozen=True, eq=False)
 class Cell:
     """t machines with errors of one size, calibrated from points with noise of one size."""
 
     sd: float  # of the parameters [m]
     noise: float  # standard deviation of a held coordinate [m]
-    errors: Mapping[str, FloatArray]  # by BEFORE, LS, MAP, (t, 7) see MEASURES
+    errors: Mapping[str, FloatArray]  # by BEFORE, LS, MAP, (t, m) see MEASURES
     iterations: IntArray  # (t,) of LS
     converged: Mapping[str, BoolArray]  # by LS, MAP, (t,)
     truth: FloatArray  # (t, p) true values [m]
     values: Mapping[str, FloatArray]  # by LS, MAP, (t, p) identified values [m]
-
-    @classmethod
-    def judge(
-        cls, study: Study, sd: float, noise: float, truth: FloatArray, identified: Identified
-    ) -> Cell:
-        """Return identified machines with their errors at the held-out poses."""
-        true, nominal = study.held_out.solve(truth), study.robot.parameters.nominal[None]
-        values, iterations, converged = identified
-        errors = {
-            name: study.held_out.compute_errors(v, truth, true)
-            for name, v in {BEFORE: nominal, **values}.items()
-        }
-        return cls(sd, noise, errors, iterations, converged, truth, values)
 
     @property
     def failed(self) -> int:
@@ -344,10 +307,16 @@ class Cell:
         """Noise over errors. To first order the reductions of cells depend on it only."""
         return float(f"{self.noise / self.sd:.6g}")
 
+    @property
+    def within_five(self) -> float:
+        """Percentage of the machines on which least squares converges within 5 iterations."""
+        return 100.0 * float(np.mean((self.iterations <= 5) & self.converged[LS]))
+
     def compute_median(self, method: str, measure: str) -> float:
-        """Return the median of a measure over the machines on which the method converged."""
-        place = MEASURES.index(measure)
-        return float(compute_median(self.errors[method], self.converged.get(method))[place])
+        """Return the median over the machines on which the method converged; NaN without any."""
+        errors = self.errors[method][:, MEASURES.index(measure)]
+        errors = errors[self.converged.get(method, np.s_[:])]
+        return float(np.median(errors)) if len(errors) else np.nan
 
     def compute_reduction(self, method: str, measure: str) -> float:
         """Return the percentage by which a median falls."""
@@ -363,25 +332,33 @@ class Cell:
 
 def calibrate_cell(
     study: Study, sd: float, noise: float, seed: int, trials: int, gauge_free: bool = False,
-    weights: Weights = "full",
+    weights: Weights = "full", layout: Layout | None = None,
 ) -> Cell:  # fmt: skip
     """Draw machines, hold their coordinates with noise, identify, compare at held-out poses.
 
     sd, noise : standard deviations [m], of a parameter and of a coordinate of a point. The prior of
-    MAP has this sd.
+    MAP has this sd. layout : measured points, by default those of the study.
     """
+    layout = layout or study.layout
     truth = draw_true_machines(study.robot, sd, trials, seed, gauge_free)
-    q = study.layout.solve_readings(truth, noise, seed)
-    identified = identify_machines(PaperRows(study.layout, q, sd, noise, weights))
-    return Cell.judge(study, sd, noise, truth, identified)
-
-
-def identify_machines(problem: PaperRows) -> Identified:
-    """Identify machines by LS and MAP."""
-    descents = {name: identify_from_rows(problem, method) for name, method in METHODS.items()}
-    values = {name: problem.values(descent.deviation) for name, descent in descents.items()}
+    rows = PaperRows(layout, layout.solve_readings(truth, noise, seed), sd, noise, weights)
+    descents = {name: identify_from_rows(rows, method) for name, method in METHODS.items()}
+    values = {name: rows.values(descent.deviation) for name, descent in descents.items()}
     converged = {name: d.status == DescentStatus.CONVERGED for name, d in descents.items()}
-    return values, descents[LS].iterations, converged
+    return judge_cell(study, sd, noise, truth, values, descents[LS].iterations, converged)
+
+
+def judge_cell(
+    study: Study, sd: float, noise: float, truth: FloatArray, values: Mapping[str, FloatArray],
+    iterations: IntArray, converged: Mapping[str, BoolArray],
+) -> Cell:  # fmt: skip
+    """Return identified machines with their errors at the held-out poses."""
+    true, nominal = study.held_out.solve(truth), study.robot.parameters.nominal[None]
+    errors = {
+        name: study.held_out.compute_errors(v, truth, true)
+        for name, v in {BEFORE: nominal, **values}.items()
+    }
+    return Cell(sd, noise, errors, iterations, converged, truth, values)
 
 
 def calibrate_grid(
@@ -390,7 +367,7 @@ def calibrate_grid(
     """Return the 3 x 4 cells by (set, noise) as printed, taken as standard deviations: those of
     study.yaml at the points of this study.
     """
-    grid = set_size(PAPERS["cmm-constraint-2011"].load_study(), seed, trials)
+    grid = set_size(load_study(), seed, trials)
     (level,) = grid.poses.values()
     points = replace(level, coordinates=tuple(map(tuple, study.layout.flat.tolist())))
     grid = replace(grid, poses={"points": points})
@@ -400,11 +377,15 @@ def calibrate_grid(
         for noise in PRINTED.find("noises").split():
             numbers = find_cells(grid, errors=f"set {given}", instrument=f"{noise} mm")
             made = {cell.levels["method"]: cell for cell in calibrate_cells(grid, numbers)}
-            values = {name: cell.values for name, cell in made.items()}
-            converged = {name: cell.is_converged for name, cell in made.items()}
-            identified, sizes = (values, made[LS].iterations, converged), (given, noise)
-            sd, sigma = (float(size) * MM for size in sizes)
-            cells[sizes] = Cell.judge(study, sd, sigma, made[LS].truth, identified)
+            cells[given, noise] = judge_cell(
+                study,
+                float(given) * MM,
+                float(noise) * MM,
+                made[LS].truth,
+                {name: cell.values for name, cell in made.items()},
+                made[LS].iterations,
+                {name: cell.is_converged for name, cell in made.items()},
+            )
     return cells
 
 
@@ -418,124 +399,52 @@ def compute_rank_correlation(cells: Iterable[Cell], method: str) -> float:
     return float(np.corrcoef(first, second)[0, 1])
 
 
-@dataclass(frozen=True, eq=False)
-class FiftyPoints:
-    """t machines calibrated from fifty points."""
-
-    groups: int  # planes
-    iterations: IntArray  # (t,) of least squares
-    converged: Mapping[str, BoolArray]  # by LS, MAP, (t,)
-    # by method and frame (see FRAMES), (t, 4) see STATISTICS, over held-out poses
-    statistics: dict[tuple[str, str], FloatArray]
-
-    @property
-    def within_five(self) -> float:
-        """Percentage of the machines on which least squares converges within 5 iterations."""
-        return 100.0 * float(np.mean((self.iterations <= 5) & self.converged[LS]))
-
-    @property
-    def most_iterations(self) -> int:
-        """Largest number of iterations of least squares."""
-        return int(self.iterations.max())
-
-    def compute_median(self, method: str, frame: str) -> FloatArray:
-        """Return medians (4,) over the machines on which the method converged."""
-        return compute_median(self.statistics[method, frame], self.converged.get(method))
-
-    def compute_factors(self, method: str, frame: str) -> FloatArray:
-        """Return the factors (4,) by which calibration reduces the medians."""
-        return self.compute_median(BEFORE, frame) / self.compute_median(method, frame)
-
-
-def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyPoints:
+def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> Cell:
     """Calibrate machines from fifty random points with the noise of the paper's instrument."""
     points = int(PRINTED.find("points", "measured")) // groups
-    noise = PRINTED.number("accuracy", "accuracy") * MM
     layout = plan_points(groups, points, seed=seed + 2, sweeps=0).layout
-    truth = draw_true_machines(study.robot, FIFTY_SD, trials, seed)
-    problem = PaperRows(layout, layout.solve_readings(truth, noise, seed), FIFTY_SD, noise)
-    values, iterations, converged = identify_machines(problem)
-    statistics, true = {}, study.held_out.solve(truth)
-    for name, v in {BEFORE: study.robot.parameters.nominal[None], **values}.items():
-        T = study.held_out.solve(v)
-        for frame in FRAMES:
-            twists = study.held_out.compute_twists(T, true, frame)
-            position = np.linalg.norm(twists[:, :, 3:], axis=2) / MM
-            rotation = np.rad2deg(np.linalg.norm(twists[:, :, :3], axis=2))
-            statistics[name, frame] = np.stack(
-                [part(e, axis=1) for e in (position, rotation) for part in (np.mean, np.std)],
-                axis=1,
-            )
-    return FiftyPoints(groups, iterations, converged, statistics)
+    sizes = SIZES.find("fifty", "errors") * MM, PRINTED.number("accuracy", "accuracy") * MM
+    return calibrate_cell(study, *sizes, seed, trials, layout=layout)
 
 
-@dataclass(frozen=True, eq=False)
-class Arrangement:
-    """A way to place 100 points."""
-
-    name: str  # TEN, ONE or ANY
-    drawn: float  # see `Study.spreads`
-    optimized: float
-    cell: Cell  # set 3 with noise 0.01 mm, as standard deviations
-    study: Study  # the points
-
-    @property
-    def gain(self) -> float:
-        """Factor by which exchange reduces the standard deviation."""
-        return self.drawn / self.optimized
+def calibrate_figure_5(
+    study: Study, seed: int, trials: int, gauge_free: bool = False, weights: Weights = "full",
+    reading: str = SD,
+) -> Cell:  # fmt: skip
+    """Calibrate machines with the errors and the noise of figure 5, read as SD or VARIANCE."""
+    given = [SIZES.find("figure_5", name) for name in ("errors", "noise")]
+    sd, noise = (size * MM if reading == SD else float(np.sqrt(size)) * MM for size in given)
+    return calibrate_cell(study, sd, noise, seed, trials, gauge_free, weights)
 
 
-def evaluate_arrangement(name: str, study: Study, seed: int, trials: int) -> Arrangement:
-    """Evaluate one way to place the points."""
-    cell = calibrate_cell(study, SET * MM, NOISE * MM, seed, trials)
-    return Arrangement(name, *study.spreads, cell, study)
+def describe_points(name: str, study: Study, cell: Cell) -> Row:
+    """Return the accuracy of one way to place 100 points; cell : of figure 5."""
+    drawn, optimized = study.spreads
+    medians = {m: cell.compute_median(m, "position, aligned [mm]") for m in METHODS}
+    row = {"name": name, "rows": study.layout.equations, "drawn": drawn, "optimized": optimized}
+    return row | {"gain": drawn / optimized} | medians
 
 
 @dataclass(frozen=True, eq=False)
 class Draw:
     """One draw of points, machines and noise."""
 
-    ten: Arrangement  # the ten planes
     cells: Mapping[tuple[str, str], Cell]  # Table 3, by (set, noise) as printed
     weights: Mapping[str, Cell]  # the cell of figure 5 by weights of the rows
-    fifties: tuple[FiftyPoints, ...]  # fifty points on each number of planes in LINES
+    fifties: Mapping[int, Cell]  # from fifty points, by their planes
+    points: Row  # see `describe_points`
 
 
 def compute_draw(study: Study, seed: int, trials: int, progress: Callable[[str], None]) -> Draw:
     """Calibrate the machines of one seed from the points of a study."""
     cells = calibrate_grid(study, seed, trials, progress)
     progress("weights of the rows, and fifty points")
-    ten = evaluate_arrangement(TEN, study, seed, trials)
-    fifties = tuple(calibrate_fifty(study, groups, seed, trials) for groups in LINES)
-    return Draw(ten, cells, compare_weights(ten, seed, trials), fifties)
-
-
-def compare_weights(ten: Arrangement, seed: int, trials: int) -> dict[str, Cell]:
-    """Return calibrations with the errors and the noise of figure 5 by every weighting of the rows,
-    of the same machines.
-    """
-    sizes = SET * MM, NOISE * MM, seed, trials
-    return {
-        weights: ten.cell if weights == "full"
-        else calibrate_cell(ten.study, *sizes, weights=weights)
-        for weights in WEIGHTS
-    }  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """One interpretation of the paper, and the figure 5 that follows from it."""
-
-    name: str  # of the arrangement
-    reading: str
-    truth: str
-    frame: str
-    reductions: FloatArray  # (3,) of parameters, position, orientation by least squares [%]
-
-    @property
-    def distance(self) -> float:
-        """Largest difference from the printed percentages."""
-        return float(np.abs(self.reductions - list_printed()).max())
+    fifties = {
+        groups: calibrate_fifty(study, groups, seed, trials)
+        for groups in SIZES.find("fifty", "planes")
+    }
+    weights = {w: calibrate_figure_5(study, seed, trials, weights=w) for w in WEIGHTS}
+    return Draw(cells, weights, fifties, describe_points(TEN, study, weights["full"]))
 
 
 def list_printed() -> FloatArray:
@@ -545,25 +454,27 @@ def list_printed() -> FloatArray:
     return np.array([PRINTED.number("figure_5", "estimation", "stated"), position, orientation])
 
 
-def rank_candidates(
-    arrangements: Iterable[Arrangement], seed: int, trials: int
-) -> tuple[Candidate, ...]:
-    """Return every interpretation of the paper, the nearest to its printed reductions first."""
-    absolute = ("parameters [mm]", "position [mm]", "orientation [deg]")
-    aligned = ("parameters without gauge [mm]", "position, aligned [mm]",
-               "orientation, aligned [deg]")  # fmt: skip
-    rows = []
-    for arrangement in arrangements:
-        for reading, size in READINGS.items():
+def rank_candidates(studies: Mapping[str, Study], seed: int, trials: int) -> list[Row]:
+    """Return the reductions of figure 5 [%] by least squares under every interpretation of the
+    paper, the nearest to its printed ones first; distance : largest difference from them.
+    """
+    frames = {
+        "absolute": ("parameters [mm]", "position [mm]", "orientation [deg]"),
+        "aligned": ("parameters without gauge [mm]", "position, aligned [mm]",
+                    "orientation, aligned [deg]"),
+    }  # fmt: skip
+    rows, printed = [], list_printed()
+    for name, study in studies.items():
+        for reading in (SD, VARIANCE):
             for truth in ("all 42", "gauge-free"):
-                cell, is_free = arrangement.cell, truth == "gauge-free"
-                if reading != SD or is_free:
-                    sizes = size(SET), size(NOISE)
-                    cell = calibrate_cell(arrangement.study, *sizes, seed, trials, is_free)
-                for frame, names in ((ABSOLUTE, absolute), (ALIGNED, aligned)):
-                    reductions = np.array([cell.compute_reduction(LS, name) for name in names])
-                    rows.append(Candidate(arrangement.name, reading, truth, frame, reductions))
-    return tuple(sorted(rows, key=lambda row: row.distance))
+                is_free = truth == "gauge-free"
+                cell = calibrate_figure_5(study, seed, trials, is_free, reading=reading)
+                for frame, measures in frames.items():
+                    of = [cell.compute_reduction(LS, measure) for measure in measures]
+                    row: Row = {"name": name, "reading": reading, "truth": truth, "frame": frame}
+                    row |= zip(("parameters", "position", "orientation"), of, strict=True)
+                    rows.append(row | {"distance": float(np.abs(of - printed).max())})
+    return sorted(rows, key=lambda row: row["distance"])
 
 
 @dataclass(frozen=True)
@@ -588,8 +499,7 @@ class Stated:
     @property
     def possible(self) -> tuple[float, float]:
         """Least and largest factor of numbers that round to the printed ones."""
-        before, after = (bound_rms(text) for text in (self.before, self.after))
-        return before[0] / after[1], before[1] / after[0]
+        return bound_factor((self.before,), (self.after,))
 
     @property
     def excess(self) -> float:
@@ -597,34 +507,22 @@ class Stated:
         return compute_excess(self.stated, self.possible)
 
 
-def bound_rms(*rounded: str) -> tuple[float, float]:
-    """Return the least and the largest root of the sum of squares of rounded numbers."""
-    low, high = (
-        hypot(*(float(text) + sign * 0.5 * last_digit(text) for text in rounded))
-        for sign in (-1, 1)
+def bound_factor(before: Sequence[str], after: Sequence[str]) -> tuple[float, float]:
+    """Return the least and the largest quotient of roots of sums of squares of rounded numbers."""
+    (least, most), (last, first) = (
+        [
+            hypot(*(float(text) + sign * 0.5 * last_digit(text) for text in rounded))
+            for sign in (-1, 1)
+        ]
+        for rounded in (before, after)
     )
-    return low, high
+    return least / first, most / last
 
 
 def compute_excess(stated: str, possible: tuple[float, float]) -> float:
     """Return by how much a stated number, itself rounded, is outside of what is possible."""
     half, (low, high) = 0.5 * last_digit(stated), possible
     return max(low - half - float(stated), float(stated) - high - half, 0.0)
-
-
-@dataclass(frozen=True)
-class FormRow:
-    """How the two forms differ over many machines, with one noise and one method."""
-
-    noise: float  # [m]
-    method: str  # its name
-    machines: int  # their number
-    converged: int  # on how many both forms converged; the differences are of these
-    iterations: int  # largest number with surfaces as unknowns
-    ranks: tuple[int, ...]  # that occur there
-    # over the machines, of the largest difference of estimates along an identifiable direction [sd]
-    median: float
-    largest: float
 
 
 def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
@@ -650,22 +548,30 @@ def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measureme
     return Measurements(layout.robot.name, q, observations)
 
 
-def compare_forms(study: Study, seed: int, trials: int) -> tuple[FormRow, ...]:
-    """Identify machines in both forms, at several noises and by both methods, HARDEST first: all
-    machines, and a part of them with the others.
+def compare_forms(study: Study, seed: int, trials: int) -> list[Row]:
+    """Identify machines in both forms, at several noises and by both methods, the hardest first:
+    all machines, and a part of them with the others.
     """
-    truth = draw_true_machines(study.robot, ERRORS, trials, seed)
-    rows = {}
-    for noise in NOISES:
-        q = study.layout.solve_readings(truth, noise, seed)
+    forms = SIZES.find("forms")
+    truth = draw_true_machines(study.robot, forms["errors"] * MM, trials, seed)
+    hardest, rows = (max(forms["noises"]), LS), []
+    for noise in forms["noises"]:
+        q = study.layout.solve_readings(truth, noise * MM, seed)
         for name in METHODS:
-            count = trials if (noise, name) == HARDEST else max(trials // SHARE, 2)
-            rows[noise, name] = compare_estimates(study.layout, q[:count], noise, name)
-    return (rows.pop(HARDEST), *rows.values())
+            is_hardest = (noise, name) == hardest
+            count = trials if is_hardest else max(trials // forms["share"], 2)
+            row = compare_estimates(study.layout, q[:count], noise * MM, name)
+            rows.insert(0 if is_hardest else len(rows), row)
+    return rows
 
 
-def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) -> FormRow:
-    """Identify machines with readings (t, n, a) in both forms by one method."""
+def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) -> Row:
+    """Identify machines with readings (t, n, a) in both forms by one method.
+
+    Return the noise [mm], on how many machines both forms converged, iterations and ranks with
+    surfaces as unknowns, and over the converged machines the largest difference of the estimates
+    along an identifiable direction [sd].
+    """
     sd = select_free_parameters(layout.robot).tolerance[0]
     problem = PaperRows(layout, q, sd, noise)
     paper = identify_from_rows(problem, METHODS[name], 1e-6)
@@ -678,9 +584,16 @@ def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) ->
             s, vt = _decompose_rows(PaperRows(layout, q[i : i + 1], sd, noise))
             change = s * (vt @ (fit.robot.values - values[i])) / sd  # in standard deviations
             unlike.append(float(np.abs(change).max()))
-    middle, largest = (float(np.median(unlike)), max(unlike)) if unlike else (np.nan, np.nan)
-    counts = len(q), len(unlike), iterations, tuple(sorted(ranks))
-    return FormRow(noise, name, *counts, middle, largest)
+    return {
+        "noise": noise / MM,
+        "method": name,
+        "machines": len(q),
+        "converged": len(unlike),
+        "iterations": iterations,
+        "ranks": sorted(ranks),
+        "median": float(np.median(unlike)) if unlike else np.nan,
+        "largest": max(unlike, default=np.nan),
+    }
 
 
 def compare_covariances(layout: Layout, noise: float) -> float:

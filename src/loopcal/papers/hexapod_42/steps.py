@@ -1,18 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ten steps of the paper's section 5, repeated with other noises, methods and poses, and the
-origin of its Table 4.
-
- 1 nominal poses, nominal parameters, errors          Setup
- 2 actual poses: inverse kinematics of the nominal,   Setup.actual
-   forward kinematics of the machine with errors
- 3 measured poses: noise added                        draw_measured_poses
- 4 pose errors: measured minus nominal                \
- 5 parameter errors, least squares leg by leg          |
- 6 corrected parameters                                |  iterate
- 7 corrected poses by forward kinematics               |
- 8 corrected pose errors: measured minus corrected     |
- 9 max dQint <= epsilon?                               |
-10 if not, on from step 5 with the corrected errors   /
+"""The ten steps of the paper's section 5 (docs/papers/hexapod-42.md), repeated with other noises,
+methods and poses, and the origin of its Table 4.
 
 Least squares is `identify_per_leg`, one step at a time, every equation of weight one and every
 parameter of scale one. Poses are (x, y, z, alpha, beta, gamma) [m, rad] in the paper's order.
@@ -21,10 +9,11 @@ Derivation: docs/theory/hexapod.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,7 +29,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.papers.paper import PAPERS
-from loopcal.papers.published import Cell, Printed, Published
+from loopcal.papers.published import PaperFile, Printed, Row
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
 from loopcal.studies.specification.levels import PosesLevel
 from loopcal.studies.specification.study import Study
@@ -59,35 +48,19 @@ ORDER = "xyz"
 """
 ANGLES = geometry.parse_orientation(f"euler-{ORDER}")
 GREEK = ("alpha", "beta", "gamma")
-OUTLIER_LEVEL = 0.01
-"""Probability of calling any pose of good data an outlier."""
 
-STATED = (1e-3, 1e-6)
-"""Limits [mm, rad] of the stated noise. The paper gives none for angles: the same number in the
-unit that its Table 6 prints, 0.001 mrad.
+STATED, PRESUMED = "0.001 mm and 1e-06 rad", "1e-06 mm and 1e-09 rad"
+"""Instruments of study.yaml: the stated noise, and that with which Tables 5 and 6 agree, as the
+sweep shows. The paper states none for angles: the same number in the unit that its Table 6 prints,
+0.001 mrad.
 """
-PRESUMED = (1e-6, 1e-9)
-"""Limits [mm, rad] of the noise with which Tables 5 and 6 agree, as the sweep shows."""
-LEVELS = (
-    STATED, (1e-4, 1e-7), (1e-5, 1e-8), (1e-6, 1e-12), PRESUMED, (1e-6, 5e-9), (1e-6, 1e-6),
-    (1e-7, 1e-10),
-)  # fmt: skip
-"""Limits [mm, rad] of the instruments of study.yaml."""
 PER_LEG = ("per leg, 1 step", "per leg, 2 steps", "per leg, 3 steps")
 TOGETHER, PRIOR = "least squares", "MAP"
 """Methods of study.yaml."""
-NARROW, WIDE = "as in the paper", "wide"
-RANGES = {
-    NARROW: ((-10.0, -10.0, 200.0, -3.0, -3.0, -3.0), (10.0, 10.0, 210.0, 3.0, 3.0, 3.0)),
-    WIDE: ((-40.0, -40.0, 170.0, -14.0, -14.0, -14.0), (40.0, 40.0, 230.0, 14.0, 14.0, 14.0)),
-}
-"""Of drawn poses: low and high x, y, z [mm], alpha, beta, gamma [deg]."""
 PAPERS_TEN = "the paper's ten"
-UNMEASURED = 100
-"""Poses that are not measured, on which methods are compared."""
 DRAWN_POSES = 3  # purpose of a random stream
 
-PRINTED = Published(__file__)
+PRINTED, SIZES = PaperFile(__file__, "published.yaml"), PaperFile(__file__, "sizes.yaml")
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +153,18 @@ def to_measurements(
     return Measurements(setup.robot.name, setup.commanded.q, (rows,), labels=labels)
 
 
-def to_si(limits: tuple[float, float]) -> FloatArray:
-    """Return limits (6,) [m, rad] of limits [mm, rad]."""
-    return np.array([limits[0] * MM] * 3 + [limits[1]] * 3)
+def list_noises() -> dict[str, tuple[float, float]]:
+    """Return the limits [mm, rad] of the uniform noise of each instrument of study.yaml."""
+    levels = PAPERS["hexapod-42"].load_study().instruments
+    root = np.sqrt(3.0)
+
+    def read(sigma: float) -> float:
+        return float(f"{root * sigma:.6g}")  # sigmas have nine digits
+
+    return {
+        name: (read(level.sigma_position / MM), read(level.sigma_angle))
+        for name, level in levels.items()
+    }
 
 
 def compute_rms(values: FloatArray) -> float:
@@ -194,7 +176,7 @@ def compute_rms(values: FloatArray) -> float:
 class Iterations:
     """Result of steps 4 to 10. Index k is the state after k iterations, 0 the nominal machine."""
 
-    machines: tuple[Mechanism, ...]  # (k + 1) corrected machines
+    values: FloatArray  # (k + 1, p) corrected parameters [m]
     pose_errors: FloatArray  # (k + 1, n, 6) measured minus corrected [m, rad]
     integrated: FloatArray  # (k + 1,) max dQint [mm + rad]
     conditions: FloatArray  # (6,) condition number of each leg's matrix in the first iteration
@@ -204,20 +186,15 @@ class Iterations:
         met = np.flatnonzero(self.integrated[1:] <= threshold)
         return int(met[0]) + 1 if len(met) else None
 
-    def compute_parameter_errors(self, truth: Mechanism) -> FloatArray:
-        """Return true minus corrected parameters (k + 1, p) [m]."""
-        return truth.values - np.stack([machine.values for machine in self.machines])
-
 
 def draw_measured_poses(
-    setup: Setup, noise: FloatArray | None = None, seed: int = 0, trial: int = 0
+    setup: Setup, limits: tuple[float, float], seed: int = 0, trial: int = 0
 ) -> FloatArray:
-    """Return the true poses (n, 6) with noise uniform in +-`noise` (6,) [m, rad]: step 3. The drawn
-    numbers are those of `simulate_trials` for the same seed and trial.
+    """Return the true poses (n, 6) [m, rad] with uniform noise within limits [mm, rad]: step 3. The
+    drawn numbers are those of `simulate_trials` for the same seed and trial.
     """
-    if noise is None:
-        return setup.actual
     drawn = make_random_stream(seed, trial).uniform(-1.0, 1.0, setup.actual.shape)
+    noise = np.array([limits[0] * MM] * 3 + [limits[1]] * 3)
     return setup.actual + np.roll(drawn, 3, axis=1) * noise  # a kind has its angles first
 
 
@@ -230,21 +207,21 @@ def iterate(
     say. False keeps the matrix of the nominal machine throughout.
     """
     data = to_measurements(setup, measured)
-    nominal = LegForm.at(setup.robot, setup.commanded)
-    machines, errors = [setup.robot], [subtract_poses(measured, setup.poses)]
+    nominal, machine = LegForm.at(setup.robot, setup.commanded), setup.robot
+    values, errors = [machine.values], [subtract_poses(measured, setup.poses)]
     conditions = np.zeros(0)
     for k in range(limit):
         if is_renewed or k == 0:
-            estimate = identify_per_leg(machines[-1], data, steps=1)
+            estimate = identify_per_leg(machine, data, steps=1)
             conditions = estimate.conditions if k == 0 else conditions
-            corrected = estimate.robot
+            machine = estimate.robot
         else:
             change = nominal.fit(to_twists(errors[-1], measured))
-            corrected = machines[-1].with_values(machines[-1].values + change)
-        machines.append(corrected)
-        errors.append(subtract_poses(measured, setup.compute_reached(corrected)))
+            machine = machine.with_values(machine.values + change)
+        values.append(machine.values)
+        errors.append(subtract_poses(measured, setup.compute_reached(machine)))
     stacked = np.stack(errors)
-    return Iterations(tuple(machines), stacked, integrate_errors(stacked), conditions)
+    return Iterations(np.stack(values), stacked, integrate_errors(stacked), conditions)
 
 
 def integrate_errors(errors: FloatArray) -> FloatArray:
@@ -261,6 +238,7 @@ def integrate_errors(errors: FloatArray) -> FloatArray:
 class Level:
     """Results with one level of noise."""
 
+    limits: tuple[float, float]  # [mm, rad]
     # (t, 4): rms of pose residuals [mm], [rad] and of parameter errors [mm], max dQint [mm + rad]
     sizes: FloatArray
     needed: FloatArray  # (t,) iterations, infinite for never
@@ -275,37 +253,27 @@ class Level:
         return (sizes >= self.sizes.min(axis=0)) & (sizes <= self.sizes.max(axis=0))
 
 
-@dataclass(frozen=True)
-class MethodResult:
-    """Root mean squares [mm] over draws: parameters, and positions in the narrow and wide range."""
-
-    parameters: float
-    narrow: float
-    wide: float
-
-
-def calibrate_methods(
-    study: Study, limits: tuple[float, float], methods: Sequence[str]
-) -> Iterator[CalibratedCell]:
-    """Yield the cells of a study with one level of noise, method by method."""
-    instrument = f"{limits[0]:g} mm and {limits[1]:g} rad"
-    for method in methods:
-        yield from calibrate_cells(study, find_cells(study, instrument=instrument, method=method))
-
-
 def load_study(seed: int, trials: int) -> Study:
     """Return study.yaml with so many draws."""
     return set_size(PAPERS["hexapod-42"].load_study(), seed, trials)
 
 
+def calibrate_methods(
+    study: Study, instrument: str, methods: Sequence[str]
+) -> Iterator[CalibratedCell]:
+    """Yield the cells of a study with one level of noise, method by method."""
+    for method in methods:
+        yield from calibrate_cells(study, find_cells(study, instrument=instrument, method=method))
+
+
 def sweep_noise(
     setup: Setup, iterations: int, threshold: float, seed: int, trials: int
-) -> dict[tuple[float, float], Level]:
+) -> dict[str, Level]:
     """Repeat the ten steps at every level of noise; sizes are those after `iterations`."""
     levels, study, commanded = {}, load_study(seed, trials), setup.commanded
-    for limits in LEVELS:
+    for instrument, limits in list_noises().items():
         integrated, sizes = [], np.zeros((trials, 4))
-        for i, cell in enumerate(calibrate_methods(study, limits, PER_LEG)):
+        for i, cell in enumerate(calibrate_methods(study, instrument, PER_LEG)):
             T = forward_trials(setup.robot, cell.values, commanded.q[None], commanded.state).T
             measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
             residual = np.stack(
@@ -314,7 +282,7 @@ def sweep_noise(
                     for poses, reached in zip(measured, T, strict=True)
                 ]
             )
-            integrated.append([integrate_errors(of_trial[None])[0] for of_trial in residual])
+            integrated.append(integrate_errors(residual))
             if i + 1 == iterations:
                 by_dimension = residual[..., :3] / MM, residual[..., 3:]
                 error = (setup.truth.values - cell.values)[:, None] / MM
@@ -322,55 +290,64 @@ def sweep_noise(
                 sizes = np.column_stack([*rms, integrated[-1]])
         met = np.array(integrated) <= threshold
         needed = np.where(met.any(axis=0), 1.0 + met.argmax(axis=0), np.inf)
-        levels[limits] = Level(sizes, needed)
+        levels[instrument] = Level(limits, sizes, needed)
     return levels
 
 
-def compare_methods(setup: Setup, seed: int, trials: int) -> dict[str, MethodResult]:
+def compare_methods(setup: Setup, seed: int, trials: int) -> list[Row]:
     """Compare the paper's method, all legs weighted together, and MAP on the same stated noise."""
     cells = calibrate_methods(load_study(seed, trials), STATED, (PER_LEG[-1], TOGETHER, PRIOR))
     names = ("leg by leg, unweighted (the paper)", "all legs, weighted by the noise",
              "the same with tolerances as prior (MAP)")  # fmt: skip
     values = {"not calibrated": setup.robot.values[None]}
     values |= {name: cell.values for name, cell in zip(names, cells, strict=True)}
-    unmeasured = [setup.take(draw_poses(name, UNMEASURED, seed)) for name in RANGES]
-    results = {}
+    unmeasured = {
+        name: setup.take(draw_poses(name, SIZES.find("unmeasured"), seed))
+        for name in SIZES.find("ranges")
+    }
+    rows = []
     for name, v in values.items():
-        errors = [compute_rms((v - setup.truth.values) / MM)]
-        for poses in (other.commanded for other in unmeasured):  # at equal readings
+        row: Row = {"method": name, "parameters": compute_rms((v - setup.truth.values) / MM)}
+        for place, other in unmeasured.items():  # at equal readings
+            poses = other.commanded
             predicted, true = (
                 forward_trials(setup.robot, machine, poses.q[None], poses.state).T[..., :3, 3]
                 for machine in (v, setup.truth.values[None])
             )
             squares = np.sum(((predicted - true) / MM) ** 2, axis=-1)
-            errors.append(float(np.sqrt(np.mean(squares))))
-        results[name] = MethodResult(*errors)
-    return results
+            row[place] = float(np.sqrt(np.mean(squares)))
+        rows.append(row)
+    return rows
 
 
-def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> list[tuple[Cell, ...]]:
-    """Return table rows for other numbers and ranges of poses."""
-    sets = [("first of the paper", setup.poses[:n]) for n in (7, 8, 9)]
+def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> list[Row]:
+    """Calibrate from other numbers and ranges of poses."""
+    sets = [("first of the paper", setup.poses[:n]) for n in SIZES.find("first")]
     sets.append((PAPERS_TEN, setup.poses))
-    for name, counts in ((NARROW, (20, 40)), (WIDE, (10, 20, 40))):
+    for name, counts in SIZES.find("drawn").items():
         sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
-    rows: list[tuple[Cell, ...]] = []
-    study, methods = load_study(seed, trials), (PER_LEG[-1], TOGETHER)
+    study, rows = load_study(seed, trials), []
     for name, poses in sets:
         other = setup.take(poses)
         exact = iterate(other, other.actual)
         level = PosesLevel(len(poses), coordinates=tuple(map(tuple, poses.tolist())))
-        cells = calibrate_methods(replace(study, poses={name: level}), STATED, methods)
-        errors = [compute_rms((cell.values - setup.truth.values) / MM) for cell in cells]
-        left = compute_rms(exact.compute_parameter_errors(setup.truth)[-1] / MM)
-        needed = exact.count_needed(threshold)
-        rows.append((name, len(poses), needed, left, float(exact.conditions.max()), *errors))
+        study = replace(study, poses={name: level})
+        row: Row = {
+            "poses": name,
+            "number": len(poses),
+            "iterations": exact.count_needed(threshold),
+            "left": compute_rms((setup.truth.values - exact.values[-1]) / MM),
+            "condition": float(exact.conditions.max()),
+        }
+        for cell in calibrate_methods(study, STATED, (PER_LEG[-1], TOGETHER)):
+            row[cell.levels["method"]] = compute_rms((cell.values - setup.truth.values) / MM)
+        rows.append(row)
     return rows
 
 
 def draw_poses(name: str, n: int, seed: int) -> FloatArray:
-    """Return poses (n, 6) [m, rad] drawn uniformly in one of RANGES."""
-    low, high = (np.array(end) * np.array([MM] * 3 + [np.pi / 180.0] * 3) for end in RANGES[name])
+    """Return poses (n, 6) [m, rad] drawn uniformly in one of the ranges."""
+    low, high = np.array(SIZES.find("ranges", name)) * np.array([MM] * 3 + [np.pi / 180.0] * 3)
     return make_random_stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
 
 
@@ -379,50 +356,16 @@ def recover_noise(setup: Setup) -> FloatArray:
 
     residual = noise + D (true - corrected parameters), with D the change of the coordinates.
     """
-    D = _linearize_truth(setup).D
+    D = linearize_truth(setup).D
     rates = ANGLES.rates_inverse(setup.actual[:, 3:])
     by_coordinates = np.concatenate([D[:, 3:], rates @ D[:, :3]], axis=1)
     errors = to_values(setup.robot, PRINTED.table("table_5", "after").values * 1e-3 * MM)
     return PRINTED.table("table_6", "after").values / TO_PRINTED - by_coordinates @ errors
 
 
-def compute_explained_share(setup: Setup, residuals: FloatArray) -> FloatArray:
-    """Return the share (6,) of each leg's residuals (n, 6) [m, rad] that parameters explain."""
-    return _linearize_truth(setup).explain(to_twists(residuals, setup.actual))
-
-
-def _linearize_truth(setup: Setup) -> LegForm:
+def linearize_truth(setup: Setup) -> LegForm:
+    """Return the matrices at the machine with errors."""
     return LegForm.at(setup.truth, forward(setup.truth, setup.commanded.q, setup.commanded))
-
-
-@dataclass(frozen=True)
-class Order:
-    """Agreement of one product of three rotations with Table 4: rms over the poses [mm], [rad]."""
-
-    formula: str
-    position: float
-    rotation: float
-
-
-@dataclass(frozen=True)
-class ReducedFit:
-    """A fit without one pose. drop : by which chi-square falls."""
-
-    label: str
-    chi_square: float
-    degrees: float
-    p_value: float
-    drop: float
-
-
-@dataclass(frozen=True)
-class Outliers:
-    """The search for outliers."""
-
-    labels: tuple[str, ...]  # of the outliers, in the order in which they were removed
-    # fits without each pose, before the first removal and after the last
-    first: tuple[ReducedFit, ...]
-    last: tuple[ReducedFit, ...]
 
 
 def write_rotation(order: str, angles: tuple[int, ...] = (0, 1, 2)) -> str:
@@ -439,11 +382,10 @@ def write_rotation(order: str, angles: tuple[int, ...] = (0, 1, 2)) -> str:
     return " ".join(reversed(turns) if order.islower() else turns)
 
 
-def rank_euler_orders(setup: Setup, nominal: FloatArray, measured: FloatArray) -> tuple[Order, ...]:
-    """Return all products, the best first: 12 sequences of axes, angles in any order.
+def rank_euler_orders(setup: Setup, nominal: FloatArray, measured: FloatArray) -> list[Row]:
+    """Return the rms differences [mm, rad] of all products, the best first: 12 sequences of axes,
+    angles in any order.
 
-    Parameters
-    ----------
     setup : machines of Tables 2 and 3. nominal, measured : (n, 6) poses of Table 4 [m, rad].
     """
     orders = []
@@ -458,9 +400,24 @@ def rank_euler_orders(setup: Setup, nominal: FloatArray, measured: FloatArray) -
             commanded = inverse(setup.robot, wanted)
             reached = forward(setup.truth, commanded.q, commanded).T
             change = geometry.pose_difference(reached, printed)
-            sizes = (compute_rms(part) for part in (change[:, 3:] / MM, change[:, :3]))
-            orders.append(Order(write_rotation(order, angles), *sizes))
-    return tuple(sorted(orders, key=lambda o: o.position))
+            orders.append(
+                {
+                    "formula": write_rotation(order, angles),
+                    "position": compute_rms(change[:, 3:] / MM),
+                    "rotation": compute_rms(change[:, :3]),
+                }
+            )
+    return sorted(orders, key=lambda order: order["position"])
+
+
+class Outliers(NamedTuple):
+    """Labels of outliers in the order of their removal, and the fits without each pose before the
+    first removal and after the last.
+    """
+
+    labels: list[str]
+    first: list[Row]
+    last: list[Row]
 
 
 def find_rounding(printed: Printed) -> FloatArray:
@@ -473,29 +430,36 @@ def search_outliers(setup: Setup, printed: Printed) -> Outliers:
 
     Removing a pose lowers the chi-square of a least-squares fit (all legs, weighted by the rounding
     of each printed number) by a chi-square of its 6 equations if it belongs to the same machine.
-    The pose with the largest drop is removed while that drop is too large at OUTLIER_LEVEL.
+    The pose with the largest drop is removed while that drop is too large.
     """
     data = to_measurements(setup, printed.values / TO_PRINTED, find_rounding(printed))
-    method = lc.LeastSquares()
-    keep, labels, rounds = np.arange(len(printed.rows)), [], []
+    method, keep = lc.LeastSquares(), np.arange(len(printed.rows))
+    labels, rounds = [], []
     while True:
         whole = lc.identify(setup.robot, data.take(keep), method).chi_square
         fits = []
         for pose in keep:
-            fit = lc.identify(setup.robot, data.take(keep[keep != pose]), method)
-            test = fit.residual_test
-            numbers = (test.chi_square, test.degrees, test.p_value, whole - test.chi_square)
-            fits.append(ReducedFit(data.labels[pose], *numbers))
-        rounds.append(tuple(fits))
-        worst = int(np.argmax([fit.drop for fit in fits]))
-        largest = float(compute_chi_square_quantile(6, OUTLIER_LEVEL / len(keep)))
-        if fits[worst].drop <= largest or fits[worst].degrees < 6:
-            return Outliers(tuple(labels), rounds[0], rounds[-1])
-        labels.append(fits[worst].label)
+            test = lc.identify(setup.robot, data.take(keep[keep != pose]), method).residual_test
+            fits.append(
+                {
+                    "label": data.labels[pose],
+                    "chi_square": test.chi_square,
+                    "degrees": test.degrees,
+                    "p_value": test.p_value,
+                    "drop": whole - test.chi_square,
+                }
+            )
+        rounds.append(fits)
+        worst = max(range(len(keep)), key=lambda i: fits[i]["drop"])
+        level = SIZES.find("outlier_level") / len(keep)
+        largest = float(compute_chi_square_quantile(6, level))
+        if fits[worst]["drop"] <= largest or fits[worst]["degrees"] < 6:
+            return Outliers(labels, rounds[0], rounds[-1])
+        labels.append(fits[worst]["label"])
         keep = np.delete(keep, worst)
 
 
-def calibrate_from_print(setup: Setup, printed: Printed) -> Mapping[str, tuple[int | None, float]]:
+def calibrate_from_print(setup: Setup, printed: Printed) -> list[Row]:
     """Return number of poses and rms parameter error [mm] of calibrations from Table 4 itself: as
     printed, with row A2 corrected, without it, unrounded, and with all legs weighted.
     """
@@ -505,22 +469,22 @@ def calibrate_from_print(setup: Setup, printed: Printed) -> Mapping[str, tuple[i
     repaired[odd] = np.round(actual[odd] / unit) * unit
     keep = np.arange(len(measured)) != odd
     nine = setup.take(setup.poses[keep])
-    before = setup.robot.values - setup.truth.values
-    rows: dict[str, tuple[int | None, float]] = {"not calibrated": (None, compute_rms(before) / MM)}
+    made: list[tuple[str, int | None, FloatArray]] = [("not calibrated", None, setup.robot.values)]
     for name, other, poses in (
         ("Table 4 as printed", setup, measured),
         ("row A2 computed, rounded as row A1", setup, repaired),
         ("without row A2", nine, measured[keep]),
         ("computed poses in full", setup, actual),
     ):
-        error = iterate(other, poses).compute_parameter_errors(setup.truth)[-1]
-        rows[name] = len(poses), compute_rms(error) / MM
+        made.append((name, len(poses), iterate(other, poses).values[-1]))
     data = to_measurements(nine, measured[keep], find_rounding(printed)[keep])
     for name, method in (
         ("least squares", lc.LeastSquares()),
         ("tolerances as prior (MAP)", lc.MAP()),
     ):
-        error = lc.identify(setup.robot, data, method).robot.values - setup.truth.values
         title = f"without row A2, all legs weighted by the rounding, {name}"
-        rows[title] = len(data.labels), compute_rms(error) / MM
-    return rows
+        made.append((title, len(nine.poses), lc.identify(setup.robot, data, method).robot.values))
+    return [
+        {"name": name, "number": n, "error": compute_rms(v - setup.truth.values) / MM}
+        for name, n, v in made
+    ]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.steps import (
     BEFORE,
     CROSS,
-    GAIN,
     HINDSIGHT,
     LS,
     NARROW,
@@ -44,14 +43,16 @@ from loopcal.papers.tsvd_2016.steps import (
     RAW_RE,
     RAW_TSVD,
     RE,
+    ROBOTS,
+    SIZES,
     TSVD,
     WHITENED,
     WIDE,
     Case,
     Draws,
-    Situation,
+    Sweep,
 )
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 TEXT = PaperText(__file__)
@@ -59,13 +60,9 @@ DIVERGED = "diverged"
 """Cell of a number that a diverged fit does not have."""
 ROUNDING = 1e-10
 """Size below which an error [mm, deg, tolerances] is rounding."""
-RIDGE_STEPS = (5, 10, 20, 50, 100)
-"""Iterations of RE after which its curve over lambda is examined."""
 NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi [rad]")
-SIZES: dict[str, tuple[str, ...]] = {
-    "3-PRS": ("platform_radius", "base_radius", "rod"),
-    "RU-PUS-PRS": ("platform_radius", "base_radius", "rod", "post"),
-}
+DIMENSIONS = ("platform_radius", "base_radius", "rod", "post")
+"""Of a robot file, as far as it has them."""
 IDENTIFIED = (
     (LS, 6), (RE, 6), (TSVD, 6), (RANKED, 5), (RE, 5), (TSVD, 5), (WHITENED, 6), (PRIOR, 6),
     (PRIOR, 5),
@@ -83,6 +80,9 @@ NAMED, LONG = 6, 50
 """Parameters named in a legend, and iterations above which their axis is logarithmic."""
 LABELS = ("position [mm]", "phi and theta [deg]")
 SETTING, LOG = {RE: "lambda", TSVD: "k"}, {RE: "xy", TSVD: "y"}
+NAMES = {"ls": LS, "ridge": RE, "tsvd": TSVD}
+"""Of the paper's methods in the evidence of claims."""
+Place = TypeVar("Place")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,21 +91,26 @@ class Results:
 
     cases: Mapping[tuple[str, int], Case]  # both manipulators, each with 6- and 5-DOF measurement
     draws: tuple[Draws, ...]  # of both manipulators
-    # best lambda and errors of RE after RIDGE_STEPS, 3-PRS with 6-DOF measurement
+    # best lambda and errors of RE after some iterations, 3-PRS with 6-DOF measurement
     ridge_steps: list[tuple[int | str, float, FloatArray]]
     noise: Printed  # Appendix 1 as printed
+
+    @property
+    def sweeps(self) -> dict[str, Sweep]:
+        """The paper's methods on drawn machines, by structure and measurement."""
+        return {sweep.study.label: sweep for draws in self.draws for sweep in draws.sweeps}
 
 
 def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
     """Compute everything: one machine of each kind with the printed noise, then drawn machines."""
     cases = {}
-    for name in steps.ROBOTS:
+    for name in ROBOTS:
         whole = steps.measure_case(name, seed)
         for measured in (whole, whole.five):
             cases[name, measured.freedoms] = steps.solve_case(measured, progress)
     progress("ridge steps")
-    ridge_steps = steps.follow_ridge(cases["3-PRS", 6].study, RIDGE_STEPS)
-    draws = tuple(steps.draw_machines(name, seed, trials, progress) for name in steps.ROBOTS)
+    ridge_steps = steps.follow_ridge(cases["3-PRS", 6].study)
+    draws = tuple(steps.draw_machines(name, seed, trials, progress) for name in ROBOTS)
     return Results(cases, draws, ridge_steps, steps.PRINTED.table("appendix_1"))
 
 
@@ -122,6 +127,11 @@ def show_number(value: float) -> Cell:
     return float(value) if abs(value) > ROUNDING else 0.0
 
 
+def show_all(values: Iterable[float]) -> list[Cell]:
+    """Return numbers as cells, see `show_number`."""
+    return [show_number(value) for value in values]
+
+
 def _compare_counts(results: Results) -> Comparison:
     """Return the numbers that the text states, beside the computed ranks."""
     tripod = results.cases["3-PRS", 6]
@@ -134,42 +144,42 @@ def _compare_counts(results: Results) -> Comparison:
 
 def make_tables(results: Results) -> tuple[Table, ...]:
     """Return all tables: the analogues of Tables 1 to 8, and the figures as numbers."""
-    cases, draws = results.cases.values(), results.draws
-    ridge = [(n, lam, *map(show_number, errors[:2])) for n, lam, errors in results.ridge_steps]
-    noise, limits = results.noise.values, np.array([*steps.LIMITS[:3] * 1e3, *steps.LIMITS[3:]])
+    cases, draws, noise = results.cases.values(), results.draws, results.noise.values
+    ridge = [(n, lam, *show_all(errors[:2])) for n, lam, errors in results.ridge_steps]
+    limits = steps.list_limits() * np.array([1e3] * 3 + [1.0] * 3)
     largest, rms = np.abs(noise).max(axis=0), np.sqrt(np.mean(noise**2, axis=0))
+    columns = (NOISE_COLUMNS, largest, limits, rms, limits / np.sqrt(3.0))
     return (
-        TEXT.table("given", [row for name in steps.ROBOTS for row in _list_machine(name)]),
-        TEXT.table(
-            "noise", zip(NOISE_COLUMNS, largest, limits, rms, limits / np.sqrt(3.0), strict=True)
-        ),
-        _list_ranks(cases),
-        *(_list_outputs(name, results) for name in steps.ROBOTS),
+        TEXT.table("given", [row for name in ROBOTS for row in _list_machine(name)]),
+        TEXT.table("noise", zip(*columns, strict=True)),
+        _list_ranks(results),
+        *(_list_outputs(name, results) for name in ROBOTS),
         *map(make_medians, draws),
         *map(make_ratios, draws),
-        _list_convergence(cases),
+        _list_convergence(results),
         TEXT.table("ridge_steps", ridge),
-        *(_list_identified(name, results) for name in steps.ROBOTS),
+        *(_list_identified(name, results) for name in ROBOTS),
         *map(_list_curves, cases),
-        *(make_median_curves(situation) for draw in draws for situation in draw.situations),
+        *map(make_median_curves, results.sweeps.values()),
         *map(_list_history, cases),
     )
 
 
 def _list_machine(name: str) -> list[tuple[str, str, str]]:
     robot = steps.load_machine(name)
-    record = robot.record.record  # of the file: dimensions in SI
-    rows = [(name, size.replace("_", " "), f"{1e3 * getattr(record, size):g} mm")
-            for size in SIZES[name]]  # fmt: skip
-    tilts = ", ".join(f"{tilt:g}" for tilt in steps.EVALUATED_TILTS)
-    heights = ", ".join(f"{1e3 * z:g}" for z in steps.HEIGHTS)
+    sizes = vars(robot.record.record)  # of the file: dimensions in SI
+    rows = [(name, size.replace("_", " "), f"{1e3 * sizes[size]:g} mm")
+            for size in DIMENSIONS if size in sizes]  # fmt: skip
+    tilts = ", ".join(f"{tilt:g}" for tilt in SIZES.find("evaluated_tilts"))
+    heights = ", ".join(f"{1e3 * z:g}" for z in SIZES.find("heights"))
     z = f" at z {heights} mm" if "z" in robot.controlled else ""
-    return [*rows, (name, "output range", f"96 poses, tilts of {tilts} deg{z}")]
+    count = SIZES.find("evaluated")
+    return [*rows, (name, "output range", f"{count} poses, tilts of {tilts} deg{z}")]
 
 
-def _list_ranks(cases: Iterable[Case]) -> Table:
+def _list_ranks(results: Results) -> Table:
     rows = []
-    for case in cases:
+    for case in results.cases.values():
         s = case.singular_values
         null = "; ".join(map(str, case.known.unidentifiable)) or None
         values = (s[0], s[-2], s[-1], s[0] / s[case.rank - 1])
@@ -186,12 +196,13 @@ def _list_outputs(name: str, results: Results) -> Table:
         commanded = study.compute_commanded_errors(values)[0]
         errors = study.compute_output_errors(values)[0, :4]
         rows.append(("", method, None, *errors, *commanded, None, None))
-    for freedoms in (6, 5):
-        for method, answer in results.cases[name, freedoms].answers.items():
-            numbers = map(show_number, (*answer.errors[:4], *answer.commanded))
-            end = DIVERGED if answer.is_diverged else "yes" if answer.is_converged else "no"
-            label = (f"{freedoms}-DOF", method, answer.setting)
-            rows.append((*label, *numbers, answer.iterations, end))
+    for case in (results.cases[name, freedoms] for freedoms in (6, 5)):
+        for method, answer in case.answers.items():
+            numbers = show_all((*answer.errors[0, :4], *answer.commanded[0]))
+            end = "yes" if answer.is_converged[0] else "no"
+            end = DIVERGED if case.is_diverged(method) else end
+            label = (f"{case.study.freedoms}-DOF", method, case.describe_setting(method))
+            rows.append((*label, *numbers, answer.iterations[0], end))
     number = TABLES[name][1]
     return TEXT.table("outputs", rows, f"table_{number}", name=name, number=number)
 
@@ -199,35 +210,36 @@ def _list_outputs(name: str, results: Results) -> Table:
 def _list_identified(name: str, results: Results) -> Table:
     study = results.cases[name, 6].study
     columns = [study.trials.truth[0]]
-    columns += [results.cases[name, f].answers[m].values for m, f in IDENTIFIED]
+    columns += [results.cases[name, f].answers[m].values[0] for m, f in IDENTIFIED]
     values = to_paper_units(study, np.array(columns)).T
     labels = zip(study.robot.parameters.names, list_units(study.robot), strict=True)
-    rows = [(*label, *map(show_number, row)) for label, row in zip(labels, values, strict=True)]
+    rows = [(*label, *show_all(row)) for label, row in zip(labels, values, strict=True)]
     number = TABLES[name][0]
     return TEXT.table("identified", rows, f"table_{number}", name=name, number=number)
 
 
-def _list_convergence(cases: Iterable[Case]) -> Table:
+def _list_convergence(results: Results) -> Table:
     rows = []
-    for case in cases:
+    for case in results.cases.values():
         cells = []
         for method in (LS if case.study.freedoms == 6 else RANKED, RE, TSVD, WHITENED, PRIOR):
             answer = case.answers[method]
-            more = "" if answer.is_converged else "more than "
-            cells.append(DIVERGED if answer.is_diverged else f"{more}{answer.iterations:,}")
+            number = f"{'' if answer.is_converged[0] else 'more than '}{answer.iterations[0]:,}"
+            cells.append(DIVERGED if case.is_diverged(method) else number)
         rows.append((case.study.label, *cells))
     return TEXT.table("convergence", rows)
 
 
 def _list_curves(case: Case) -> Table:
-    rows = []
-    for algorithm, sweep in case.sweeps.items():
-        for i, setting in enumerate(sweep.settings):
+    sweep, rows = case.sweep, []
+    for algorithm, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 is LS
+        for i, setting in enumerate(sweep.settings[algorithm][first:]):
             spacing = None
             if algorithm == RE:
                 spacing = "equal intervals" if case.is_equal[i] else "equal ratios"
-            errors = map(show_number, sweep.errors[i, :3])
-            rows.append((algorithm, setting, spacing, *errors, sweep.runs.count[i]))
+            errors = show_all(sweep.curves[algorithm][0, first + i, :3])
+            count = sweep.counts[algorithm][0, first + i]
+            rows.append((algorithm, setting, spacing, *errors, count))
     low, high = case.bracket
     name = f"curves_{case.study.file}"
     return TEXT.table("curves", rows, name, case=case.study.label, low=low, high=high)
@@ -236,14 +248,13 @@ def _list_curves(case: Case) -> Table:
 def _list_history(case: Case) -> Table:
     robot = case.study.robot
     rows = [
-        (algorithm, i, *map(show_number, values))
+        (algorithm, i, *show_all(values))
         for algorithm in (LS, RE, TSVD)
         for i, values in zip(*collect_history(case, algorithm), strict=True)
     ]
     labels = zip(robot.parameters.names, list_units(robot), strict=True)
     more = [(f"{parameter} [{unit}]", ".3g") for parameter, unit in labels]
-    name = f"history_{case.study.file}"
-    return TEXT.table("history", rows, name, more, case=case.study.label)
+    return TEXT.table("history", rows, f"history_{case.study.file}", more, case=case.study.label)
 
 
 def make_medians(draws: Draws) -> Table:
@@ -257,10 +268,10 @@ def make_medians(draws: Draws) -> Table:
             cells += [show_number(middle[i]), f"{low} to {high}"]
         after: list[Cell] = [None, None]
         if method in draws.commanded:
-            after = [show_number(x) for x in np.median(draws.commanded[method], axis=0)]
+            after = show_all(np.median(draws.commanded[method], axis=0))
         lost = np.isinf(draws.errors[method][:, 0]).sum()
         rows.append((method, *cells, *after, show_number(middle[3]), lost))
-    name = f"draws_{steps.ROBOTS[draws.name].replace('-', '_')}"
+    name = f"draws_{ROBOTS[draws.name].replace('-', '_')}"
     return TEXT.table("draws", rows, name, name=draws.name, trials=len(draws))
 
 
@@ -269,57 +280,49 @@ def make_ratios(draws: Draws) -> Table:
     rows = []
     for other in COMPARED:
         columns = (draws.compute_ratio(PRIOR, other), *draws.compute_ratio_interval(PRIOR, other))
-        cells = (show_number(column[i]) for i in (0, 1) for column in columns)
-        rows.append((f"MAP over {other}", *cells))
-    name = f"ratios_{steps.ROBOTS[draws.name].replace('-', '_')}"
+        rows.append((f"MAP over {other}", *show_all(np.array([c[:2] for c in columns]).T.ravel())))
+    name = f"ratios_{ROBOTS[draws.name].replace('-', '_')}"
     return TEXT.table("ratios", rows, name, name=draws.name, trials=len(draws))
 
 
-def make_median_curves(situation: Situation) -> Table:
+def make_median_curves(sweep: Sweep) -> Table:
     """Return median errors at every lambda and k."""
-    rows, short = [], np.median(situation.short, axis=0)[:, :2]
-    for algorithm, settings in situation.settings.items():
-        for i, errors in enumerate(situation.compute_median(algorithm)[:, :3]):
-            early: list[Cell] = [None, None]
-            if algorithm == RE and i > 0:
-                early = [show_number(x) for x in short[i - 1]]
-            rows.append((algorithm, settings[i], *map(show_number, errors), *early))
-    name = f"curves_{situation.file}_machines"
-    data = {"name": situation.label, "trials": len(situation)}
-    return TEXT.table("median_curves", rows, name, **data)
+    rows, short = [], np.median(sweep.short, axis=0)[:, :2]
+    for algorithm, settings in sweep.settings.items():
+        for i, errors in enumerate(sweep.compute_median(algorithm)[:, :3]):
+            is_early = algorithm == RE and i > 0
+            early = show_all(short[i - 1]) if is_early else [None, None]
+            rows.append((algorithm, settings[i], *show_all(errors), *early))
+    name, data = f"curves_{sweep.study.file}_machines", {"name": sweep.study.label}
+    return TEXT.table("median_curves", rows, name, **data, trials=len(sweep))
 
 
 def to_document(draws: Draws, seed: int) -> dict[str, Any]:
     """Return the draws for evidence: tables by name, and which curves have an interior minimum."""
-    tables = {
-        "medians": make_medians(draws),
-        "ratios": make_ratios(draws),
-        "curves": make_median_curves(draws.six),
-        "curves_5": make_median_curves(draws.five),
-    }
-
-    def describe(situation: Situation, algorithm: str, measure: int) -> dict[str, Any]:
-        median = situation.compute_median(algorithm)[:, measure]
-        is_higher = situation.compute_rises(algorithm, measure) > GAIN
-        return {"median": steps.compute_rise(median) > GAIN, "machines": int(is_higher.sum())}
-
-    inside = {
-        str(situation.freedoms): {
-            algorithm: {name: describe(situation, algorithm, i)
-                        for i, name in enumerate(steps.MEASURES[:2])}
-            for algorithm in (RE, TSVD)
-        }
-        for situation in draws.situations
-    }  # fmt: skip
-    columns = ("columns", "formats", "rows")
+    curves = map(make_median_curves, draws.sweeps)
+    tables = dict(
+        zip(
+            ("medians", "ratios", "curves", "curves_5"),
+            (make_medians(draws), make_ratios(draws), *curves),
+            strict=True,
+        )
+    )
+    gain, inside = SIZES.find("gain"), {}
+    for sweep in draws.sweeps:
+        of_sweep = inside[str(sweep.study.freedoms)] = {RE: {}, TSVD: {}}
+        for algorithm, measures in of_sweep.items():
+            for i, name in enumerate(steps.MEASURES[:2]):
+                median = steps.compute_rise(sweep.compute_median(algorithm)[:, i]) > gain
+                machines = int((sweep.compute_rises(algorithm, i) > gain).sum())
+                measures[name] = {"median": median, "machines": machines}
     return {
         "robot": draws.name,
         "seed": seed,
         "draws": len(draws),
         "minimum_inside": inside,
         "tables": {
-            name: {key: [list(x) if key == "rows" else x for x in getattr(table, key)]
-                   for key in columns}
+            name: {"columns": list(table.columns), "formats": list(table.formats),
+                   "rows": [list(row) for row in table.rows]}
             for name, table in tables.items()
         },
     }  # fmt: skip
@@ -329,20 +332,15 @@ def collect_history(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
     """Return iterations (k + 1,) and identified errors (k + 1, p) [mm, rad] of LS, or of RE or TSVD
     at their best setting; NaN after a step that diverged.
     """
-    sweep, i = _find_run(case, algorithm)
-    done, history = sweep.runs.done[:, i], sweep.runs.history[:, i]
+    runs, i = case.sweep.runs, case.sweep.places[algorithm][0]
+    done, history = runs.done[:, i], runs.history[:, i]
     end = int(np.searchsorted(done, done[-1])) + 1
     return done[:end], to_paper_units(case.study, history[:end])
 
 
-def _find_run(case: Case, algorithm: str) -> tuple[steps.Sweep, int]:
-    sweep = case.sweeps[RE if algorithm == RE else TSVD]
-    return sweep, 0 if algorithm == LS else sweep.best
-
-
-def to_paper_units(measured: steps.Study, values: FloatArray) -> FloatArray:
+def to_paper_units(study: steps.Study, values: FloatArray) -> FloatArray:
     """Return deviations from nominal [mm, rad] of values (.., p)."""
-    return (values - measured.robot.parameters.nominal) / steps.list_scales(measured.robot)
+    return (values - study.robot.parameters.nominal) / steps.list_scales(study.robot)
 
 
 def list_units(robot: Mechanism) -> tuple[str, ...]:
@@ -353,22 +351,21 @@ def list_units(robot: Mechanism) -> tuple[str, ...]:
 def make_figures(results: Results) -> tuple[Figure, ...]:
     """Return all figures: the analogues of figures 6 to 11, and medians over many machines."""
     figures = []
-    for draws, situation in ((d, s) for d in results.draws for s in d.situations):
-        prior = draws.compute_median(PRIOR if situation.freedoms == 6 else PRIOR_FIVE)
-        for algorithm, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 has no place on its axis
-            settings, errors = situation.settings[algorithm], situation.compute_median(algorithm)
-            file = f"medians_{situation.file}_{algorithm.lower()}"
-            drawn = algorithm, settings[first:], errors[first:], prior
-            data = {"name": situation.label, "trials": len(draws)}
-            figures.append(_draw_curve("medians", file, *drawn, **data))
+    for draws in results.draws:
+        for sweep, method in zip(draws.sweeps, (PRIOR, PRIOR_FIVE), strict=True):
+            prior, data = draws.compute_median(method), {"name": sweep.study.label}
+            for a, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 has no place on its axis
+                drawn = a, sweep.settings[a][first:], sweep.compute_median(a)[first:], prior
+                file = f"medians_{sweep.study.file}_{a.lower()}"
+                figures.append(_draw_curve("medians", file, *drawn, **data, trials=len(draws)))
     for case in results.cases.values():
-        number, prior = FIGURES[case.study.name, case.study.freedoms], case.answers[PRIOR].errors
-        for algorithm, part in ((RE, "a"), (TSVD, "b")):
-            sweep = case.sweeps[algorithm]
-            drawn = algorithm, sweep.settings, sweep.errors, prior
+        number = FIGURES[case.study.name, case.study.freedoms]
+        for a, first, part in ((RE, 1, "a"), (TSVD, 0, "b")):
+            errors = case.sweep.curves[a][0, first:]
+            drawn = a, case.sweep.settings[a][first:], errors, case.answers[PRIOR].errors[0]
             data = {"number": f"{number}({part})", "case": case.study.label,
-                    "best": case.answers[algorithm].setting,
-                    "diverged": int(sweep.runs.is_diverged.sum())}  # fmt: skip
+                    "best": case.describe_setting(a),
+                    "diverged": int(np.isinf(errors[:, 0]).sum())}  # fmt: skip
             figures.append(_draw_curve("curve", f"figure_{number}{part}", *drawn, **data))
     for freedoms, algorithms in ((6, (LS, RE, TSVD)), (5, (RE, TSVD))):
         case = results.cases["RU-PUS-PRS", freedoms]
@@ -408,101 +405,96 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
         Series.of(names[i] if i in named else f"_{names[i]}", done[usable], values[usable, i])
         for i in (*named, *(i for i in chosen if i not in named))
     ]
-    answer, what = case.answers[algorithm], "lengths" if unit == "mm" else "angles"
+    what, is_diverged = "lengths" if unit == "mm" else "angles", case.is_diverged(algorithm)
     number = HISTORIES[case.study.freedoms]
-    method = algorithm if algorithm == LS else f"{algorithm} ({answer.setting})"
+    method = algorithm if algorithm == LS else f"{algorithm} ({case.describe_setting(algorithm)})"
     return TEXT.figure(
         "history", lines, None, f"figure_{number}_{algorithm.lower()}_{what}", log, number=number,
-        method=f"{method}, {DIVERGED}" if answer.is_diverged else method, what=what, unit=unit,
+        method=f"{method}, {DIVERGED}" if is_diverged else method, what=what, unit=unit,
         case=case.study.label, chosen=len(chosen), count=len(names), named=len(named),
-        file=case.study.file, diverged=answer.is_diverged,
+        file=case.study.file, diverged=is_diverged,
     )  # fmt: skip
 
 
 def _draw_steps(results: Results) -> Figure:
     """Return the largest component of each step."""
     lines, longest = [], 0
-    for name in steps.ROBOTS:
+    for name in ROBOTS:
         case = results.cases[name, 6]
         for algorithm in (LS, RE, TSVD):
-            sweep, i = _find_run(case, algorithm)
-            done, sizes = sweep.runs.done[:, i], sweep.runs.steps[:, i]
+            runs, i = case.sweep.runs, case.sweep.places[algorithm][0]
+            done, sizes = runs.done[:, i], runs.steps[:, i]
             end = int(np.searchsorted(done, done[-1]))
             done, usable = done[:end] + 1, np.isfinite(sizes[:end])
-            lost = f" ({DIVERGED})" * case.answers[algorithm].is_diverged
-            label = f"{algorithm}, {name}{lost}"
+            label = f"{algorithm}, {name}{f' ({DIVERGED})' * case.is_diverged(algorithm)}"
             lines.append(Series.of(label, done[usable], sizes[:end][usable]))
             longest = max(longest, int(done.max(initial=0)))
     log = "xy" if longest > LONG else "y"
     return TEXT.figure("convergence", lines, {"end of the iteration": 1e-6}, "", log)
 
 
-Numbers = Mapping[str, Any]
-"""Quantity -> (t,) its number in each draw."""
-
-
 def judge_claims(results: Results) -> tuple[Verdict, ...]:
     """Return a verdict for each claim."""
-    draws = results.draws
-    situations = {s.label: s for draw in draws for s in draw.situations}
-    six, five = ({draw.situations[i].label: draw for draw in draws} for i in (0, 1))
-    before = {s.label: (draw, s) for draw in draws for s in draw.situations}
-    trials, judge = len(draws[0]), _judge_places
+    draws, sweeps, judge = results.draws, results.sweeps, _judge_places
+    six, five = ({d.sweeps[i].study.label: d for d in draws} for i in (0, 1))
+    whole = {draw.name: draw for draw in draws}
+    before = {sweep.study.label: (draw, sweep) for draw in draws for sweep in draw.sweeps}
     with np.errstate(divide="ignore", invalid="ignore"):
         return (
-            *map(_judge_curve, situations.values()),
+            *map(_judge_curve, sweeps.values()),
             judge("ls_stable", six, _find_diverged, limit=LINEARIZATIONS),
             judge("ls_not_best", six, _compare_unseen),
-            judge("tsvd_best", situations, _compare_best, trials=trials),
+            judge("tsvd_best", sweeps, _compare_best, trials=len(draws[0])),
             judge("ls_fails", five, _compare_five),
             judge("no_solution", five, _compare_exact),
-            judge("six_better", {draw.name: draw for draw in draws}, _compare_parameters),
+            judge("six_better", whole, _compare_parameters),
             judge("deviate", before, _compare_deviations),
-            judge("faster", situations, _compare_speed),
+            judge("faster", sweeps, _compare_speed),
             _judge_lambda(results),
-            _judge_ratio(draws, "no_rule", CROSS, RAW_RE),
-            judge("k_near_j", situations, _find_best_k),
+            _judge_groups("no_rule", draws, {(CROSS, RAW_RE): 1.1}, sign=-1.0),
+            judge("k_near_j", sweeps, _find_best_k),
             _judge_noise(results.noise),
             *_judge_own_checks(draws),
         )
 
 
+Held = tuple[BoolArray, dict[str, Any]]
+"""Whether a claim holds in each draw (t,) at a place, and the numbers that the evidence shows."""
+
+
 def _judge_places(
-    claim: str, places: Mapping[str, Any], compare: Callable[[Any], tuple[Numbers, dict[str, Any]]],
-    **data: Any,
-) -> Verdict:  # fmt: skip
-    """Judge a claim that holds in a draw if it holds in all places; `compare` returns the numbers
-    of a place, and those that the evidence shows.
-    """
-    numbers, rows = {}, []
-    for label, place in places.items():
-        numbers[label], row = compare(place)
-        rows.append({"name": label, **row})
-    return TEXT.claim(claim).judge_everywhere(numbers, rows=rows, **data)
+    claim: str, places: Mapping[str, Place], compare: Callable[[Place], Held], **data: Any
+) -> Verdict:
+    """Judge a claim that holds in a draw if it holds there in all places."""
+    held, rows, shares = [], [], []
+    for name, place in places.items():
+        holds, row = compare(place)
+        held.append(holds)
+        rows.append({"name": name, **row})
+        shares.append({"name": name, "count": int(holds.sum()), "of": len(holds)})
+    return TEXT.judge(claim, np.all(held, axis=0), rows=rows, shares=shares, **data)
 
 
-def _judge_curve(situation: Situation) -> Verdict:
+def _judge_curve(sweep: Sweep) -> Verdict:
     """Judge the curves over lambda and k of one figure: position and angle, each machine."""
-    rises = {a: [situation.compute_rises(a, i) for i in (0, 1)] for a in (RE, TSVD)}
-    errors = ("position", "angle")
-    places = {error: {"least_ridge": rises[RE][i], "least_tsvd": rises[TSVD][i]}
-              for i, error in enumerate(errors)}  # fmt: skip
-    curves = [
-        {"letter": SETTING[algorithm], "error": error, "count": int((rise[i] > GAIN).sum()),
-         "of": len(situation), **_describe_curve(situation, algorithm, i)}
-        for algorithm, rise in rises.items() for i, error in enumerate(errors)
-    ]  # fmt: skip
-    short = [
-        sum(steps.compute_rise(curve) > GAIN for curve in situation.short[:, :, i]) for i in (0, 1)
-    ]
-    return TEXT.claim("u_shape").judge_everywhere(
-        places, name=situation.label, curves=curves, iterations=steps.SHORT,
-        number=FIGURES[situation.name, situation.freedoms], short=short,
+    gain, curves, held = SIZES.find("gain"), [], np.ones(len(sweep), dtype=bool)
+    for algorithm in (RE, TSVD):
+        for i, error in enumerate(("position", "angle")):
+            is_inside = sweep.compute_rises(algorithm, i) > gain
+            held &= is_inside
+            curves.append(
+                {"letter": SETTING[algorithm], "error": error, "count": int(is_inside.sum()),
+                 "of": len(sweep), **_describe_curve(sweep, algorithm, i)}
+            )  # fmt: skip
+    short = [sum(steps.compute_rise(c) > gain for c in sweep.short[:, :, i]) for i in (0, 1)]
+    return TEXT.judge(
+        "u_shape", held, name=sweep.study.label, curves=curves, iterations=SIZES.find("short"),
+        number=FIGURES[sweep.study.name, sweep.study.freedoms], short=short,
     )  # fmt: skip
 
 
-def _describe_curve(situation: Situation, algorithm: str, i: int) -> dict[str, str]:
-    curve, settings = situation.compute_median(algorithm)[:, i], situation.settings[algorithm]
+def _describe_curve(sweep: Sweep, algorithm: str, i: int) -> dict[str, str]:
+    curve, settings = sweep.compute_median(algorithm)[:, i], sweep.settings[algorithm]
     usable = np.flatnonzero(np.isfinite(curve))
     if not usable.size:
         return dict.fromkeys(("first", "least", "last"), DIVERGED)
@@ -513,41 +505,39 @@ def _describe_curve(situation: Situation, algorithm: str, i: int) -> dict[str, s
     }
 
 
-def _find_diverged(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+def _find_diverged(draw: Draws) -> Held:
     """Return where LS diverges, and its iterations, with 6-DOF measurement."""
-    lost, count = np.isinf(draw.six.chosen[LS].errors[:, 0]), draw.six.chosen[LS].iterations
-    row = {"diverged": int(lost.sum()), "slow": int((count >= LINEARIZATIONS).sum())}
-    return {"most_diverged": lost, "most_iterations": count}, row
+    ls = draw.sweeps[0].chosen[LS]
+    is_lost, is_slow = np.isinf(ls.errors[:, 0]), ls.iterations >= LINEARIZATIONS
+    return ~is_lost & ~is_slow, {"diverged": int(is_lost.sum()), "slow": int(is_slow.sum())}
 
 
-def _compare_unseen(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+def _compare_unseen(draw: Draws) -> Held:
     """Compare RE and TSVD with LS at settings that were best on other machines."""
-    ratios = {key: draw.six.compare_unseen(a) for key, a in (("ridge", RE), ("tsvd", TSVD))}
-    row = {key: format_pair(np.median(ratio, axis=0)) for key, ratio in ratios.items()}
-    return {f"most_{key}": ratio.max(axis=1) for key, ratio in ratios.items()}, row
+    ratios = {name: draw.sweeps[0].compare_unseen(a) for name, a in NAMES.items() if a != LS}
+    row = {name: format_pair(np.median(ratio, axis=0)) for name, ratio in ratios.items()}
+    return np.all([(ratio < 1.0).all(axis=1) for ratio in ratios.values()], axis=0), row
 
 
-def _compare_best(situation: Situation) -> tuple[Numbers, dict[str, Any]]:
+def _compare_best(sweep: Sweep) -> Held:
     """Compare TSVD with LS and RE, each of the three at the bottom of its curve."""
-    chosen = {key: situation.chosen[a] for key, a in (("ls", LS), ("ridge", RE), ("tsvd", TSVD))}
-    tsvd, ridge = chosen["tsvd"], chosen["ridge"]
-    numbers = {
-        f"most_{key}": (tsvd.errors[:, :2] / chosen[key].errors[:, :2]).max(axis=1)
-        for key in ("ridge", "ls")
-    }
-    medians = {key: np.median(of.errors, axis=0) for key, of in chosen.items()}
+    tsvd, ridge = sweep.chosen[TSVD], sweep.chosen[RE]
+    holds = [
+        ((tsvd.errors[:, :2] / sweep.chosen[a].errors[:, :2]).max(axis=1) <= 1.0) for a in (RE, LS)
+    ]
+    medians = {name: np.median(sweep.chosen[a].errors, axis=0) for name, a in NAMES.items()}
     commanded = int(((tsvd.commanded / ridge.commanded).max(axis=1) <= 1.0).sum())
-    return numbers, {"commanded": commanded, **format_all(**medians)}
+    return np.all(holds, axis=0), {"commanded": commanded, **format_all(**medians)}
 
 
-def _compare_five(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+def _compare_five(draw: Draws) -> Held:
     """Return where LS diverges with 5-DOF measurement, and by how much RE and TSVD improve."""
-    chosen = draw.five.chosen
+    chosen = draw.sweeps[1].chosen
     ridge, tsvd = (_compare_with_before(draw, chosen[a].errors) for a in (RE, TSVD))
-    lost = np.isinf(chosen[LS].errors[:, 0])
-    row = {"diverged": int(lost.sum()), "of": len(lost), "ridge": float(np.median(ridge)),
+    is_lost = np.isinf(chosen[LS].errors[:, 0])
+    row = {"diverged": int(is_lost.sum()), "of": len(is_lost), "ridge": float(np.median(ridge)),
            "tsvd": float(np.median(tsvd))}  # fmt: skip
-    return {"least_diverged": lost, "most_ridge": ridge, "most_tsvd": tsvd}, row
+    return is_lost & (ridge < 1.0) & (tsvd < 1.0), row
 
 
 def _compare_with_before(draw: Draws, errors: FloatArray) -> FloatArray:
@@ -555,79 +545,76 @@ def _compare_with_before(draw: Draws, errors: FloatArray) -> FloatArray:
     return (errors[:, :2] / draw.errors[BEFORE][:, :2]).max(axis=1)
 
 
-def _compare_exact(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+def _compare_exact(draw: Draws) -> Held:
     """Return the error of the poses that exact 5-DOF measurements leave."""
-    exact = draw.five.exact
+    exact = draw.sweeps[1].exact
     left = "{:.0e} mm / {:.0e} deg".format(*exact.max(axis=0)[:2])
     row = {"left": left, "parameters": float(np.median(exact[:, 3]))}
-    return {"least_left": _compare_with_before(draw, exact)}, row
+    return _compare_with_before(draw, exact) > 1e-3, row
 
 
-def _compare_parameters(draw: Draws) -> tuple[Numbers, dict[str, Any]]:
+def _compare_parameters(draw: Draws) -> Held:
     """Compare the parameter errors of the paper's RE and TSVD with 5- and 6-DOF measurement."""
-    numbers, row = {}, {}
-    for key, algorithm in (("ridge", RE), ("tsvd", TSVD)):
-        six, five = (s.chosen[algorithm].errors[:, 3] for s in draw.situations)
-        numbers[f"least_{key}"] = five / six
-        row |= {f"{key}_six": float(np.median(six)), f"{key}_five": float(np.median(five))}
-    prior = {"six": draw.compute_median(PRIOR)[3], "five": draw.compute_median(PRIOR_FIVE)[3]}
-    return numbers, {**row, **prior}
+    holds, row = [], {}
+    for name, algorithm in (("ridge", RE), ("tsvd", TSVD)):
+        six, five = (sweep.chosen[algorithm].errors[:, 3] for sweep in draw.sweeps)
+        holds.append(five / six > 1.0)
+        row |= {f"{name}_six": float(np.median(six)), f"{name}_five": float(np.median(five))}
+    row |= {"six": draw.compute_median(PRIOR)[3], "five": draw.compute_median(PRIOR_FIVE)[3]}
+    return np.all(holds, axis=0), row
 
 
-def _compare_deviations(place: tuple[Draws, Situation]) -> tuple[Numbers, dict[str, Any]]:
+def _compare_deviations(place: tuple[Draws, Sweep]) -> Held:
     """Return both halves: parameters farther from the truth than nominal, and better poses."""
-    draw, situation = place
-    used = [situation.chosen[a].errors for a in (RANKED, RE, TSVD)]
+    draw, sweep = place
+    used = [sweep.chosen[a].errors for a in (RANKED, RE, TSVD)]
     worse = np.array([errors[:, 4] for errors in used])
     left = np.array([_compare_with_before(draw, errors) for errors in used])
-    shares = dict(zip(("ls", "ridge", "tsvd"), np.median(worse, axis=1), strict=True))
-    numbers = {"least_worse": worse.min(axis=0), "most_left": left.max(axis=0)}
-    return numbers, {**shares, "left": np.median(left)}
+    row = dict(zip(NAMES, np.median(worse, axis=1), strict=True))
+    return (worse > 0.0).all(axis=0) & (left < 0.5).all(axis=0), {**row, "left": np.median(left)}
 
 
-def _compare_speed(situation: Situation) -> tuple[Numbers, dict[str, Any]]:
-    chosen = {"ls": RANKED, "ridge": RE, "tsvd": TSVD}
-    counts = {key: situation.chosen[a].iterations for key, a in chosen.items()}
-    numbers = {f"most_{key}": counts["tsvd"] / counts[key] for key in ("ls", "ridge")}
-    return numbers, {key: f"{np.median(count):,.0f}" for key, count in counts.items()}
+def _compare_speed(sweep: Sweep) -> Held:
+    used = zip(NAMES, (RANKED, RE, TSVD), strict=True)
+    counts = {name: sweep.chosen[a].iterations for name, a in used}
+    holds = (counts["tsvd"] < counts["ls"]) & (counts["tsvd"] < counts["ridge"])
+    return holds, {name: f"{np.median(count):,.0f}" for name, count in counts.items()}
 
 
-def _find_best_k(situation: Situation) -> tuple[Numbers, dict[str, Any]]:
+def _find_best_k(sweep: Sweep) -> Held:
     """Return the best k, all parameters included, by its distance from their number."""
-    ks = situation.settings[TSVD].astype(int)
-    best = np.array([ks[steps.find_bottom(curve)] for curve in situation.curves[TSVD]])
+    ks = sweep.settings[TSVD].astype(int)
+    best = np.array([ks[steps.find_bottom(curve)] for curve in sweep.curves[TSVD]])
     distance = (ks[0] - best) / ks[0]
     row = {"low": int(best.min()), "high": int(best.max()), "middle": float(np.median(best)),
            "of": int(ks[0])}  # fmt: skip
-    return {"most_distance": distance, "least_distance": distance}, row
+    return (distance <= 0.1) & (distance > 0.0), row
 
 
 def _judge_lambda(results: Results) -> Verdict:
     """Judge the range of the best lambda, looked for beyond that range, and its differences."""
-    best = {s.label: s.chosen[RE].settings for d in results.draws for s in d.situations}
-    first, *others = (draws.six.chosen[RE].settings for draws in results.draws)
+    best = {label: sweep.chosen[RE].settings for label, sweep in results.sweeps.items()}
+    first, *others = (draws.sweeps[0].chosen[RE].settings for draws in results.draws)
     apart = np.max([np.maximum(first / other, other / first) for other in others], axis=0)
-    values = np.array(list(best.values()))
-    numbers = {"least_lambda": values.min(axis=0), "most_lambda": values.max(axis=0),
-               "least_factor": apart}  # fmt: skip
+    values, lambdas = np.array(list(best.values())), steps.list_lambdas()
+    holds = (values.min(axis=0) > 0.9e-5) & (values.max(axis=0) < 1.1) & (apart > 9.9)
     rows = [{"name": name, "low": s.min(), "middle": np.median(s), "high": s.max()}
             for name, s in best.items()]  # fmt: skip
     by_steps = [{"end": f"after {n}" if isinstance(n, int) else n, "value": value}
                 for n, value, _ in results.ridge_steps]  # fmt: skip
-    low, high = steps.LAMBDAS.min(), steps.LAMBDAS.max()
-    claim = TEXT.claim("lambda_range")
-    return claim.judge_everywhere({"": numbers}, rows=rows, by_steps=by_steps, low=low, high=high)
+    ends = {"low": lambdas.min(), "high": lambdas.max()}
+    return TEXT.judge("lambda_range", holds, rows=rows, by_steps=by_steps, **ends)
 
 
 def _judge_noise(noise: Printed) -> Verdict:
-    shares = noise.values * np.array([steps.MM] * 3 + [1.0] * 3) / steps.LIMITS
+    shares = noise.values * np.array([steps.MM] * 3 + [1.0] * 3) / steps.list_limits()
     largest, rms = np.abs(noise.values).max(axis=0), float(np.sqrt(np.mean(shares**2)))
     # three standard deviations of the rms of that many uniform numbers
-    spread = 3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))
-    return TEXT.claim("noise").judge(
-        largest=float(np.abs(shares).max()), off=abs(rms - 1.0 / np.sqrt(3.0)), allowed=spread,
-        count=shares.size, length=largest[:3].max(), angle=largest[3:].max(),
-        degrees=np.rad2deg(largest[3:].max()), rms=rms,
+    allowed = 3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))
+    is_uniform = abs(rms - 1.0 / np.sqrt(3.0)) < allowed
+    return TEXT.judge(
+        "noise", np.abs(shares).max() <= 1.0 and is_uniform, count=shares.size, rms=rms,
+        length=largest[:3].max(), angle=largest[3:].max(), degrees=np.rad2deg(largest[3:].max()),
     )  # fmt: skip
 
 
@@ -636,53 +623,42 @@ def _judge_own_checks(draws: Sequence[Draws]) -> tuple[Verdict, ...]:
     near the best choice.
     """
     raw = (RAW_LS, RAW_RE, RAW_TSVD)
+    wrong = [(p, m) for p in (NARROW, WIDE) for m in raw]
+    near = {(PRIOR, CROSS): 1.05, (PRIOR, HINDSIGHT): 1.15}
+    judge = _judge_groups
+    return (
+        judge("five_usable", draws, {(RAW_FIVE, RAW_LS): 1.1}),
+        judge("mixed_units", draws, {(WHITENED, RAW_LS): 0.9}, first=1),
+        judge("map_better", draws, dict.fromkeys([(PRIOR, m) for m in raw], 1.0)),
+        judge("map_tolerances", draws, dict.fromkeys(wrong, 1.0), factor=SIZES.find("factor")),
+        judge("map_near_best", draws, near, only="3-PRS"),
+    )
+
+
+def _judge_groups(
+    claim: str, draws: Sequence[Draws], limits: Mapping[tuple[str, str], float], *,
+    sign: float = 1.0, first: int = 0, only: str = "", **data: Any,
+) -> Verdict:  # fmt: skip
+    """Judge ratios of medians in each group of machines, see `Draws.list_groups`.
+
+    limits : of each pair of methods, which the largest ratio of all structures (or `only` one), in
+    position and angle (with first = 1 in the angle alone), stays below, or with sign = -1 exceeds.
+    """
+    held = []
+    for members in zip(*(draw.list_groups() for draw in draws), strict=True):
+        chosen = [d for d in members if only in ("", d.name)]
+        largest = {p: np.max([d.compute_ratio(*p)[first:2] for d in chosen]) for p in limits}
+        held.append(all(sign * largest[p] < sign * limit for p, limit in limits.items()))
     methods = {"prior": PRIOR, "narrow": NARROW, "wide": WIDE, "ls": RAW_LS, "six": RAW_LS,
                "ridge": RAW_RE, "tsvd": RAW_TSVD, "five": RAW_FIVE}  # fmt: skip
     rows = [
         {"name": d.name, **format_all(**{key: d.compute_median(m) for key, m in methods.items()}),
          "gcv": format_pair(d.compute_ratio(PRIOR, CROSS)),
-         "hindsight": format_pair(d.compute_ratio(PRIOR, HINDSIGHT))}
+         "hindsight": format_pair(d.compute_ratio(PRIOR, HINDSIGHT)),
+         "ratio": format_pair(d.compute_ratio(*next(iter(limits)))[first:2])}
         for d in draws
     ]  # fmt: skip
-    better = {"most": [(PRIOR, m) for m in raw]}
-    wrong = {"most": [(p, m) for p in (NARROW, WIDE) for m in raw]}
-    near = {"gcv": [(PRIOR, CROSS)], "hindsight": [(PRIOR, HINDSIGHT)]}
-    tripod = [d for d in draws if d.name == "3-PRS"]
-    return (
-        _judge_groups("five_usable", draws, {"most": [(RAW_FIVE, RAW_LS)]}, rows=rows),
-        _judge_ratio(draws, "mixed_units", WHITENED, RAW_LS, first=1),
-        _judge_groups("map_better", draws, better, rows=rows),
-        _judge_groups("map_tolerances", draws, wrong, rows=rows, factor=steps.FACTOR),
-        _judge_groups("map_near_best", tripod, near, rows=rows),
-    )
-
-
-def _judge_ratio(
-    draws: Sequence[Draws], claim: str, method: str, other: str, first: int = 0
-) -> Verdict:
-    """Judge one ratio of medians, see `_judge_groups`."""
-    ratios = [{"name": d.name, "ratio": format_pair(d.compute_ratio(method, other)[first:2])}
-              for d in draws]  # fmt: skip
-    return _judge_groups(claim, draws, {"most": [(method, other)]}, first, ratios=ratios)
-
-
-def _judge_groups(
-    claim: str, draws: Sequence[Draws], pairs: Mapping[str, list[tuple[str, str]]], first: int = 0,
-    /, **data: Any,
-) -> Verdict:  # fmt: skip
-    """Judge ratios of medians in each group of machines.
-
-    A number is the largest of its ratios, of all structures, in position and angle, or with
-    first = 1 in the angle alone.
-    """
-    groups = [
-        {
-            name: float(np.max([d.compute_ratio(*pair)[first:2] for d in members for pair in of]))
-            for name, of in pairs.items()
-        }
-        for members in zip(*(draw.list_groups() for draw in draws), strict=True)
-    ]
-    return TEXT.claim(claim).judge(groups, groups=len(groups), trials=len(draws[0]), **data)
+    return TEXT.judge(claim, held, groups=len(held), trials=len(draws[0]), rows=rows, **data)
 
 
 def format_all(**errors: FloatArray) -> dict[str, str]:

@@ -1,22 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nine steps of the paper, for t machines or t settings of lambda and k at once; one machine
-with the printed noise, and many drawn machines.
-
- 1 nominal parameters, e = 0                          `load_machine`
- 2 forward kinematic model                            `forward_trials`
- 3 measured poses                                     `list_measured_poses`
- 4 measured data: true machine, with noise            `simulate_trials`
- 5 error transfer matrix T_j of pose j                `differentiate_pose`, x y z phi theta (psi)
- 6 identification matrix H, all T_j in one column     `make_raw_problem`: one triangular factor
- 7 de from H de = D, by LS, RE or TSVD                `take_steps`, with the filter factors below
- 8 e + de; again from step 5 unless |de| is small     `take_steps`
- 9 save e
+"""The nine steps of the paper (docs/papers/tsvd-2016.md), for t machines or t settings of lambda
+and k at once; one machine with the printed noise, and many drawn machines.
 
 Raw numbers as in the paper: millimeters and radians, every equation and every parameter of weight
-one, and the filter acts on the step. With H = U S V' and s_i = S_ii the step is de = sum f_i (u_i'D
-/ s_i) v_i, where f_i = 1 for LS, s_i^2 / (s_i^2 + lambda) for RE, and 1 for i <= k, else 0, for
-TSVD. As in the paper the true machine decides which lambda and k are best: the bottom of the curve,
-the smallest product of the errors in position and angle.
+one, and the filter acts on the step (`loopcal.estimate.published_steps`). As in the paper the true
+machine decides which lambda and k are best: the bottom of the curve, the smallest product of the
+errors in position and angle.
 
 Dimensions, poses, true errors and output range are ours: the paper's Tables 1 to 4 are not in our
 text. The noise is the paper's (Appendix 1). Poses are x, y, z, phi, theta, psi with tilt and
@@ -43,7 +32,6 @@ from loopcal.estimate.published_steps import (
     StepRule,
     list_raw_units,
     make_raw_problem,
-    penalize_none,
     penalize_ridge,
     penalize_truncated,
     take_steps,
@@ -55,23 +43,15 @@ from loopcal.mechanism.kinematics import compute_readings, forward_trials, inver
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.numerics.decomposition import Decomposition, are_nonzero
-from loopcal.papers.published import Published
+from loopcal.papers.published import PaperFile
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 MM = 1e-3
-PRINTED = Published(__file__)
+PRINTED, SIZES = PaperFile(__file__, "published.yaml"), PaperFile(__file__, "sizes.yaml")
 ROBOTS = {"RU-PUS-PRS": "ru-pus-prs", "3-PRS": "3-prs"}
 """Names in the paper, and of our robot files."""
 COLUMNS = ("x", "y", "z", "phi", "theta", "psi")
-LENGTH_ERRORS, ANGLE_ERRORS = (0.05e-3, 0.1e-3), (2.5e-4, 5e-4)
-"""Least and largest size of true errors [m], [rad]; the sign is drawn."""
-TILTS, AZIMUTHS = (10.0, 20.0, 30.0), 12
-EVALUATED_TILTS, EVALUATED = (5.0, 15.0, 25.0, 35.0), 96
-HEIGHTS = (0.65, 0.7, 0.75)
-"""Of measured poses and output range [m], if z is free."""
-LIMITS = np.array([0.01e-3] * 3 + [np.deg2rad(0.01)] * 3)
-"""Limits of the noise [m, rad], as Appendix 1 shows."""
 MEASURES = (
     "position [mm]",
     "phi and theta [deg]",
@@ -88,25 +68,16 @@ LIBRARY: Mapping[str, Method] = {
     WHITENED: lc.LeastSquares(), CROSS: lc.Ridge(lc.GCV()), PRIOR: lc.MAP(),
 }  # fmt: skip
 """Methods of the library: rows whitened, columns scaled by tolerance."""
-EQUAL_INTERVALS, EQUAL_RATIOS = 11, 13
-"""Lambdas from the smallest singular value that is not zero to 1, the paper's range, in equal
-intervals as it says and in equal ratios as well.
-"""
-TRIED = np.array([1e-20, 1e-18, 1e-16, 1e-14, 1e-12, 1e3, 1e6])
-"""Lambdas among which the ends of convergence are looked for."""
-LAMBDAS = np.logspace(-6.0, 4.0, 11)
-"""Of RE on drawn machines, wider than the range from 1e-5 to 1 that the paper states."""
-TOGETHER = 10
-"""Machines at a time, for memory."""
-SHORT = 19
-"""Iterations of RE after which its curves are examined, too: one of the states in its history."""
-GAIN = 1.05
-"""A curve has an interior minimum if both of its ends are this many times higher."""
 
 BEFORE, TRUE = "before calibration", "true parameters known"
 RAW_LS, RAW_RE, RAW_TSVD = "raw LS", "raw RE at its best", "raw TSVD at its best"
 RAW_FIVE = "raw LS with rank detection, 5-DOF"
 RE_FIVE, TSVD_FIVE = "raw RE at its best, 5-DOF", "raw TSVD at its best, 5-DOF"
+RAW = {
+    RAW_LS: (0, LS), RAW_RE: (0, RE), RAW_TSVD: (0, TSVD), RAW_FIVE: (1, RANKED), RE_FIVE: (1, RE),
+    TSVD_FIVE: (1, TSVD),
+}  # fmt: skip
+"""Methods of the paper: 0 with 6-DOF and 1 with 5-DOF measurement, and the algorithm."""
 HINDSIGHT = "whitened ridge, best lambda in hindsight"
 NARROW, WIDE = "MAP, tolerances a third of the spread", "MAP, tolerances three times the spread"
 WHITENED_FIVE, PRIOR_FIVE = "whitened LS, 5-DOF", "MAP, 5-DOF"
@@ -114,20 +85,27 @@ METHODS = (
     BEFORE, RAW_LS, RAW_RE, RAW_TSVD, RAW_FIVE, RE_FIVE, TSVD_FIVE, WHITENED, CROSS, PRIOR, NARROW,
     WIDE, HINDSIGHT, WHITENED_FIVE, PRIOR_FIVE, TRUE,
 )  # fmt: skip
-FACTOR = 3.0
-"""Between the tolerances of NARROW and WIDE and the true spread."""
-GROUPS = 5
-"""Groups of machines for claims about medians: each is a smaller draw of the study."""
-HINDSIGHT_LAMBDAS = np.logspace(-2.5, 2.5, 11)
-"""Of ridge on whitened, scaled rows, where 1 is MAP."""
-RESAMPLES = 2000
 
 
-class Labelled:
-    """Base of what belongs to one structure, measured in 6 or 5 coordinates of a pose."""
+def list_limits() -> FloatArray:
+    """Return the limits (6,) of the noise [m, rad]."""
+    limits = SIZES.find("limits")
+    return np.array([limits["length"] * MM] * 3 + [np.deg2rad(limits["angle"])] * 3)
 
-    name: str
-    freedoms: int
+
+def list_lambdas(key: str = "exponents") -> FloatArray:
+    """Return the lambdas of RE on drawn machines."""
+    return np.logspace(*SIZES.find(key))
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """t machines of one structure, measured."""
+
+    name: str  # of the structure in the paper
+    robot: Mechanism  # as designed
+    trials: Trials  # true machines and their measurements
+    freedoms: int = len(COLUMNS)  # measured coordinates of a pose, 6 or 5
 
     @property
     def label(self) -> str:
@@ -138,16 +116,6 @@ class Labelled:
     def file(self) -> str:
         """The same in names of files."""
         return f"{ROBOTS[self.name].replace('-', '_')}_{self.freedoms}"
-
-
-@dataclass(frozen=True, eq=False)
-class Study(Labelled):
-    """t machines of one structure, measured."""
-
-    name: str  # of the structure in the paper
-    robot: Mechanism  # as designed
-    trials: Trials  # true machines and their measurements
-    freedoms: int = len(COLUMNS)  # measured coordinates of a pose, 6 or 5
 
     @property
     def kind(self) -> Component:
@@ -161,7 +129,7 @@ class Study(Labelled):
         """The same measurements without psi."""
         sensor, measured = self.trials.instrument.sensors[0], self.trials.measured[0][..., :5]
         kind = replace(self.kind, components=self.kind.components[:5])
-        sensor = replace(sensor, kind=kind, noise=lc.Uniform(LIMITS[:5]))
+        sensor = replace(sensor, kind=kind, noise=lc.Uniform(list_limits()[:5]))
         instrument = lc.Instrument((sensor,))
         trials = replace(self.trials, instrument=instrument, measured=(measured,))
         return replace(self, trials=trials, freedoms=5)
@@ -250,7 +218,7 @@ def measure_machines(name: str, truth: FloatArray, seed: int = 0) -> Study:
     and 4.
     """
     robot, kind = load_machine(name), Component(COLUMNS, "tilt-torsion")
-    instrument = lc.Instrument((lc.Sensor(kind, lc.Uniform(LIMITS)),))
+    instrument = lc.Instrument((lc.Sensor(kind, lc.Uniform(list_limits())),))
     poses = list_measured_poses(robot)
     return Study(name, robot, simulate_trials(robot, truth, poses, instrument, seed))
 
@@ -270,20 +238,23 @@ def read_noise() -> FloatArray:
 
 
 def list_measured_poses(robot: Mechanism) -> FloatArray:
-    """Return controlled coordinates (36, c) [m, rad]: 12 azimuths at each of TILTS.
+    """Return controlled coordinates (36, c) [m, rad]: 12 azimuths at each tilt.
 
     Free z takes the three heights in turn.
     """
-    phi, theta = (g.ravel() for g in np.meshgrid(np.arange(AZIMUTHS) * 360.0 / AZIMUTHS, TILTS))
+    n, heights = SIZES.find("azimuths"), np.array(SIZES.find("heights"))
+    grid = np.meshgrid(np.arange(n) * 360.0 / n, SIZES.find("tilts"))
+    phi, theta = (g.ravel() for g in grid)
     i = np.arange(len(phi))
-    return _list_coordinates(robot, phi, theta, np.array(HEIGHTS)[(i // AZIMUTHS + i) % 3])
+    return _list_coordinates(robot, phi, theta, heights[(i // n + i) % len(heights)])
 
 
 def list_output_range(robot: Mechanism) -> FloatArray:
     """Return controlled coordinates (96, c) [m, rad]: tilts of 5 to 35 degrees, more azimuths."""
-    heights = HEIGHTS if "z" in robot.controlled else (0.0,)
-    count = EVALUATED // (len(EVALUATED_TILTS) * len(heights))
-    grid = np.meshgrid(np.arange(count) * 360.0 / count, EVALUATED_TILTS, heights)
+    heights = SIZES.find("heights") if "z" in robot.controlled else (0.0,)
+    tilts = SIZES.find("evaluated_tilts")
+    count = SIZES.find("evaluated") // (len(tilts) * len(heights))
+    grid = np.meshgrid(np.arange(count) * 360.0 / count, tilts, heights)
     return _list_coordinates(robot, *(g.ravel() for g in grid))
 
 
@@ -300,9 +271,8 @@ def draw_true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
     Machine i is the same for any number of machines.
     """
     table = robot.parameters
-    low, high = np.array(
-        [LENGTH_ERRORS if d is Dimension.LENGTH else ANGLE_ERRORS for d in table.dimensions]
-    ).T
+    lengths, angles = SIZES.find("length_errors"), SIZES.find("angle_errors")
+    low, high = np.array([lengths if d is Dimension.LENGTH else angles for d in table.dimensions]).T
     values = []
     for trial in range(trials):
         drawn = make_random_stream(seed, trial, ERRORS)
@@ -348,173 +318,61 @@ def find_bottom(errors: FloatArray) -> int:
     return int(np.argmin(np.where(np.isnan(product), np.inf, product)))
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Result of one method."""
+def compute_rise(curve: FloatArray) -> float:
+    """Return the lower end of a curve (s,), relative to its least inner value; 0 with no inside.
 
-    setting: str  # lambda or k
-    values: FloatArray  # (p,) [SI], NaN if diverged
-    errors: FloatArray  # (5,), see MEASURES
-    commanded: FloatArray  # (2,), see `Study.compute_commanded_errors`
-    iterations: int
-    is_converged: bool
-
-    @property
-    def is_diverged(self) -> bool:
-        """Whether there is no answer."""
-        return not np.isfinite(self.values).all()
-
-
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """One algorithm over its setting."""
-
-    settings: FloatArray  # (s,) lambda or k
-    runs: Iterations  # of all settings
-    errors: FloatArray  # (s, 5), see MEASURES
-    best: int  # place of the bottom of the curve
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """One manipulator and one number of measured coordinates."""
-
-    study: Study  # one machine
-    singular_values: FloatArray  # (p,) of the raw identification matrix at nominal parameters
-    rank: int  # of them
-    known: Identifiability  # identifiability of the same measurements
-    is_equal: BoolArray  # (s,) which lambdas are at equal intervals
-    sweeps: Mapping[str, Sweep]  # by RE and TSVD, which begins with all k: LS
-    answers: dict[str, Answer]  # by method
-    bracket: tuple[float, float]  # smallest and largest lambda of those tried that does not diverge
-    # largest component [mm, rad] of the first step if (H'H)^-1 H'D is computed as printed
-    normal_equations: float
-
-
-def solve_case(measured: Study, progress: Callable[[str], None]) -> Case:
-    """Run all methods on one machine's measurements."""
-    progress(f"{measured.label} measurement")
-    p, s = len(measured.robot.parameters), linearize(measured).singular_values[0]
-    rank = int(are_nonzero(s).sum())
-    lambdas, is_equal = space_lambdas(s[rank - 1])
-    ks = np.arange(p, p // 3, -1)
-
-    def run(penalty: FloatArray, settings: FloatArray, first: int = 0) -> Sweep:
-        runs = iterate(measured, penalty)
-        errors = measured.compute_output_errors(runs.values, runs.machine)
-        return Sweep(settings, runs, errors, first + find_bottom(errors[first:]))
-
-    def answer(sweep: Sweep, setting: str) -> Answer:
-        i, runs = sweep.best, sweep.runs
-        commanded = measured.compute_commanded_errors(runs.values[[i]], runs.machine[[i]])[0]
-        end = int(runs.count[i]), bool(runs.is_converged[i])
-        return Answer(setting, runs.values[i], sweep.errors[i], commanded, *end)
-
-    ridge = run(penalize_ridge(lambdas, p), lambdas)
-    truncated = run(penalize_truncated(ks, p), ks.astype(np.float64), first=1)
-    plain = run(penalize_none(p), np.zeros(1))
-    ranked = run(penalize_truncated(np.array([rank]), p), np.zeros(1))
-    safe = TRIED[~iterate(measured, penalize_ridge(TRIED, p), limit=3).is_diverged]
-    return Case(
-        study=measured,
-        singular_values=s,
-        rank=rank,
-        known=lc.identifiability(measured.robot.nominal, measured.trials.trial(0)),
-        is_equal=is_equal,
-        sweeps={RE: ridge, TSVD: truncated},
-        answers={
-            LS: answer(plain, "-"),
-            RANKED: answer(ranked, f"rank {rank}"),
-            RE: answer(ridge, f"lambda = {lambdas[ridge.best]:.2g}"),
-            TSVD: answer(truncated, f"k = {ks[truncated.best]}"),
-            **run_library(measured),
-        },
-        bracket=(float(safe.min()), float(safe.max())),
-        normal_equations=solve_normal_equations(measured),
-    )
-
-
-def space_lambdas(smallest: float) -> tuple[FloatArray, BoolArray]:
-    """Return lambdas (s,) from the smallest singular value to 1, and which are equidistant."""
-    intervals = np.linspace(smallest, 1.0, EQUAL_INTERVALS)
-    ratios = np.geomspace(smallest, 1.0, EQUAL_RATIOS)
-    lambdas = np.unique(np.concatenate([intervals, ratios[1:-1]]))
-    return lambdas, np.isin(lambdas, intervals)
-
-
-def solve_normal_equations(measured: Study) -> float:
-    """Return the first step of LS as printed, with the inverse of H'H: only here it is formed.
-
-    With a null direction H'H is singular up to rounding, and so its inverse is rounding.
+    Settings that diverged are no part of the curve.
     """
-    d = linearize(measured)
-    H = (d.singular_values[0][:, None] * d.directions[0].T) / d.scale
-    try:
-        step = np.linalg.inv(H.T @ H) @ (H.T @ d.projections[0])
-    except np.linalg.LinAlgError:
-        return float("inf")
-    return float(np.abs(step).max())
-
-
-def run_library(measured: Study) -> dict[str, Answer]:
-    """Return the results of LIBRARY."""
-    answers = {}
-    for name, method in LIBRARY.items():
-        fit = lc.identify_trials(measured.robot, measured.trials, method)
-        setting = {WHITENED: "-", PRIOR: "lambda = 1, by definition"}.get(name)
-        setting = setting or f"lambda = {float(fit.penalty[0, 0]):.2g}, chosen"
-        errors = measured.compute_output_errors(fit.values)[0]
-        commanded = measured.compute_commanded_errors(fit.values)[0]
-        end = int(fit.iterations[0]), bool(fit.converged[0])
-        answers[name] = Answer(setting, fit.values[0], errors, commanded, *end)
-    return answers
-
-
-def follow_ridge(
-    measured: Study, counts: tuple[int, ...]
-) -> list[tuple[int | str, float, FloatArray]]:
-    """Return the best lambda and its errors (5,) after each number of RE iterations, and at the end
-    of the iteration.
-    """
-    smallest = float(linearize(measured).singular_values[0, -1])
-    lambdas = np.geomspace(smallest, 1.0, EQUAL_RATIOS)
-    penalty = penalize_ridge(lambdas, len(measured.robot.parameters))
-    history = iterate(measured, penalty, limit=max(counts), ahead=0.0).history
-    ends: dict[int | str, FloatArray] = {n: history[min(n, len(history) - 1)] for n in counts}
-    ends["at convergence"] = iterate(measured, penalty).values
-    rows = []
-    for count, values in ends.items():
-        errors = measured.compute_output_errors(values, np.zeros(len(values), dtype=np.int64))
-        best = find_bottom(errors)
-        rows.append((count, float(lambdas[best]), errors[best]))
-    return rows
+    usable = curve[np.isfinite(curve)]
+    if len(usable) < 3:
+        return 0.0
+    return float(min(usable[0], usable[-1]) / usable[1:-1].min())
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """One algorithm with one setting for each of t machines."""
+    """One method on t machines, each with one setting."""
 
     settings: FloatArray  # (t,) lambda or k
+    values: FloatArray  # (t, p) [SI], NaN if diverged
     iterations: IntArray  # (t,)
+    is_converged: BoolArray  # (t,)
     errors: FloatArray  # (t, 5), see MEASURES, infinite if diverged
     commanded: FloatArray  # (t, 2), see `Study.compute_commanded_errors`, infinite if diverged
 
+    @classmethod
+    def judge(
+        cls, study: Study, settings: FloatArray, values: FloatArray, iterations: IntArray,
+        is_converged: BoolArray,
+    ) -> Chosen:  # fmt: skip
+        """Return identified machines with their errors."""
+        errors = mark_diverged(study.compute_output_errors(values))
+        commanded = mark_diverged(study.compute_commanded_errors(values))
+        return cls(settings, values, iterations, is_converged, errors, commanded)
+
+
+def mark_diverged(errors: FloatArray) -> FloatArray:
+    """Count diverged machines as infinitely wrong, so that medians stay honest."""
+    return np.where(np.isnan(errors), np.inf, errors)
+
 
 @dataclass(frozen=True, eq=False)
-class Situation(Labelled):
-    """One structure, t drawn machines, and the paper's methods."""
+class Sweep:
+    """The paper's methods on t machines, over their settings."""
 
-    name: str  # of the structure
-    freedoms: int  # measured coordinates, 6 or 5
+    study: Study
     # (s,) of RE (lambda, rising) and TSVD (k, falling); the first one of both is LS: lambda = 0,
     # and k the number of parameters
     settings: Mapping[str, FloatArray]
     curves: Mapping[str, FloatArray]  # (t, s, 5) errors at them, see MEASURES, infinite if diverged
-    # (t, s - 1, 5) errors of RE after `SHORT` iterations, infinite if diverged before
+    counts: Mapping[str, IntArray]  # (t, s) iterations
+    # (t, s - 1, 5) errors of RE after the short iteration, infinite if diverged before
     short: FloatArray
-    # by algorithm; RE and TSVD at the bottom of their curves, without LS
+    # of LS and RANKED, and of RE and TSVD at the bottom of their curves, without LS
     chosen: Mapping[str, Chosen]
     exact: FloatArray  # (t, 5) errors of LS with rank detection, measured without noise
+    runs: Iterations  # of the last machines: for each machine all k, then all lambdas
+    places: Mapping[str, IntArray]  # (t,) of the chosen settings, among all of a machine
 
     def __len__(self) -> int:
         return len(self.exact)
@@ -542,39 +400,35 @@ class Situation(Labelled):
         return ratios
 
 
-def compute_rise(curve: FloatArray) -> float:
-    """Return the lower end of a curve (s,), relative to its least inner value; 0 with no inside.
-
-    Settings that diverged are no part of the curve.
+def run_settings(
+    study: Study, lambdas: FloatArray, progress: Callable[[str], None] = lambda _: None
+) -> Sweep:
+    """Run the paper's methods on all machines, RE with these lambdas and TSVD with k from the
+    number of parameters to a third of it.
     """
-    usable = curve[np.isfinite(curve)]
-    if len(usable) < 3:
-        return 0.0
-    return float(min(usable[0], usable[-1]) / usable[1:-1].min())
-
-
-def run_situation(measured: Study, progress: Callable[[str], None] = lambda _: None) -> Situation:
-    """Run the paper's methods on drawn machines."""
-    p, t = len(measured.robot.parameters), len(measured.trials)
+    p, t, null = len(study.robot.parameters), len(study.trials), 6 - study.freedoms
     ks = np.arange(p, p // 3, -1)
-    k = len(ks)
-    penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(LAMBDAS, p)])
-    settings = np.concatenate([ks.astype(np.float64), LAMBDAS])
+    k, together = len(ks), SIZES.find("together")
+    penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(lambdas, p)])
+    settings = np.concatenate([ks.astype(np.float64), lambdas])
     parts = []
-    for first in range(0, t, TOGETHER):
-        progress(f"{measured.label}, machine {first + 1} of {t}")
-        machines = np.arange(first, min(first + TOGETHER, t))
+    for first in range(0, t, together):
+        progress(f"{study.label}, machine {first + 1} of {t}")
+        machines = np.arange(first, min(first + together, t))
         run = iterate(
-            measured, np.tile(penalty, (len(machines), 1)), np.repeat(machines, len(penalty))
+            study, np.tile(penalty, (len(machines), 1)), np.repeat(machines, len(penalty))
         )
-        state = min(int(np.searchsorted(run.done.max(axis=1), SHORT)), len(run.done) - 1)
+        state = np.searchsorted(run.done.max(axis=1), SIZES.find("short"))
         is_ridge = np.tile(np.arange(len(penalty)) >= k, len(machines))
-        short = measured.compute_output_errors(run.history[state, is_ridge], run.machine[is_ridge])
-        errors = measured.compute_output_errors(run.values, run.machine)
-        parts.append([x.reshape(len(machines), -1, *x.shape[1:])
-                      for x in (errors, run.count, run.values, short)])  # fmt: skip
-    errors, count, value, short = (np.concatenate(x) for x in zip(*parts, strict=True))
-    errors, machines, null = mark_diverged(errors), np.arange(t), 6 - measured.freedoms
+        history = run.history[min(int(state), len(run.done) - 1), is_ridge]
+        short = study.compute_output_errors(history, run.machine[is_ridge])
+        errors = study.compute_output_errors(run.values, run.machine)
+        arrays = (errors, run.count, run.values, run.is_converged, short)
+        parts.append([x.reshape(len(machines), -1, *x.shape[1:]) for x in arrays])
+    errors, count, values, is_converged, short = (
+        np.concatenate(part) for part in zip(*parts, strict=True)
+    )
+    errors, machines = mark_diverged(errors), np.arange(t)
     places = {
         LS: np.zeros(t, np.int64),
         RANKED: np.full(t, null),
@@ -582,61 +436,157 @@ def run_situation(measured: Study, progress: Callable[[str], None] = lambda _: N
         TSVD: 1 + np.array([find_bottom(curve) for curve in errors[:, 1:k]]),
     }
     chosen = {
-        algorithm: Chosen(
-            settings[place],
-            count[machines, place],
-            errors[machines, place],
-            mark_diverged(measured.compute_commanded_errors(value[machines, place])),
+        algorithm: Chosen.judge(
+            study, settings[place], *(x[machines, place] for x in (values, count, is_converged))
         )
         for algorithm, place in places.items()
     }
-    exact = measured.with_noise(np.zeros(measured.freedoms))
+    exact = study.with_noise(np.zeros(study.freedoms))
     free = iterate(exact, penalize_truncated(np.array([p - null]), p), machines)
-    return Situation(
-        name=measured.name,
-        freedoms=measured.freedoms,
-        settings={RE: np.array([0.0, *LAMBDAS]), TSVD: ks.astype(np.float64)},
-        curves={RE: np.delete(errors, np.s_[1:k], axis=1), TSVD: errors[:, :k]},
+    with_ls = np.r_[0, k : len(penalty)]
+    return Sweep(
+        study=study,
+        settings={RE: np.array([0.0, *lambdas]), TSVD: ks.astype(np.float64)},
+        curves={RE: errors[:, with_ls], TSVD: errors[:, :k]},
+        counts={RE: count[:, with_ls], TSVD: count[:, :k]},
         short=mark_diverged(short),
         chosen=chosen,
         exact=mark_diverged(exact.compute_output_errors(free.values)),
+        runs=run,
+        places=places,
     )
 
 
-def mark_diverged(errors: FloatArray) -> FloatArray:
-    """Count diverged machines as infinitely wrong, so that medians stay honest."""
-    return np.where(np.isnan(errors), np.inf, errors)
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One machine with the printed noise and one number of measured coordinates."""
+
+    sweep: Sweep
+    singular_values: FloatArray  # (p,) of the raw identification matrix at nominal parameters
+    rank: int  # of them
+    known: Identifiability  # identifiability of the same measurements
+    is_equal: BoolArray  # (s,) which lambdas have equal intervals
+    answers: Mapping[str, Chosen]  # by method of the paper and of LIBRARY
+    bracket: tuple[float, float]  # smallest and largest lambda of those tried that does not diverge
+    # largest component [mm, rad] of the first step if (H'H)^-1 H'D is computed as printed
+    normal_equations: float
+
+    @property
+    def study(self) -> Study:
+        """The measurements."""
+        return self.sweep.study
+
+    def is_diverged(self, method: str) -> bool:
+        """Return whether a method has no answer."""
+        return not np.isfinite(self.answers[method].values).all()
+
+    def describe_setting(self, method: str) -> str:
+        """Return lambda or k of a method."""
+        form = {
+            RANKED: f"rank {self.rank}",
+            RE: "lambda = {:.2g}",
+            TSVD: "k = {:.0f}",
+            CROSS: "lambda = {:.2g}, chosen",
+            PRIOR: "lambda = 1, by definition",
+        }.get(method, "-")
+        return form.format(self.answers[method].settings[0])
+
+
+def solve_case(study: Study, progress: Callable[[str], None]) -> Case:
+    """Run all methods on one machine's measurements."""
+    progress(f"{study.label} measurement")
+    p, s = len(study.robot.parameters), linearize(study).singular_values[0]
+    rank, tried = int(are_nonzero(s).sum()), np.array(SIZES.find("tried"))
+    lambdas, is_equal = space_lambdas(s[rank - 1])
+    sweep = run_settings(study, lambdas)
+    safe = tried[~iterate(study, penalize_ridge(tried, p), limit=3).is_diverged]
+    return Case(
+        sweep=sweep,
+        singular_values=s,
+        rank=rank,
+        known=lc.identifiability(study.robot.nominal, study.trials.trial(0)),
+        is_equal=is_equal,
+        answers={**sweep.chosen, **run_library(study)},
+        bracket=(float(safe.min()), float(safe.max())),
+        normal_equations=solve_normal_equations(study),
+    )
+
+
+def space_lambdas(smallest: float) -> tuple[FloatArray, BoolArray]:
+    """Return lambdas (s,) from the smallest singular value to 1, and which are equidistant."""
+    intervals = np.linspace(smallest, 1.0, SIZES.find("equal_intervals"))
+    ratios = np.geomspace(smallest, 1.0, SIZES.find("equal_ratios"))
+    lambdas = np.unique(np.concatenate([intervals, ratios[1:-1]]))
+    return lambdas, np.isin(lambdas, intervals)
+
+
+def solve_normal_equations(study: Study) -> float:
+    """Return the first step of LS as printed, with the inverse of H'H: only here it is formed.
+
+    With a null direction H'H is singular up to rounding, and so its inverse is rounding.
+    """
+    d = linearize(study)
+    H = (d.singular_values[0][:, None] * d.directions[0].T) / d.scale
+    try:
+        step = np.linalg.inv(H.T @ H) @ (H.T @ d.projections[0])
+    except np.linalg.LinAlgError:
+        return float("inf")
+    return float(np.abs(step).max())
+
+
+def run_library(study: Study, methods: Mapping[str, Method] = LIBRARY) -> dict[str, Chosen]:
+    """Return the results of methods of the library."""
+    answers = {}
+    for name, method in methods.items():
+        fit = lc.identify_trials(study.robot, study.trials, method)
+        answers[name] = Chosen.judge(
+            study, fit.penalty[:, 0], fit.values, fit.iterations, fit.converged
+        )
+    return answers
+
+
+def follow_ridge(study: Study) -> list[tuple[int | str, float, FloatArray]]:
+    """Return the best lambda and its errors (5,) after each number of RE iterations, and at the end
+    of the iteration.
+    """
+    counts = SIZES.find("ridge_steps")
+    smallest = float(linearize(study).singular_values[0, -1])
+    lambdas = np.geomspace(smallest, 1.0, SIZES.find("equal_ratios"))
+    penalty = penalize_ridge(lambdas, len(study.robot.parameters))
+    history = iterate(study, penalty, limit=max(counts), ahead=0.0).history
+    ends: dict[int | str, FloatArray] = {n: history[min(n, len(history) - 1)] for n in counts}
+    ends["at convergence"] = iterate(study, penalty).values
+    rows = []
+    for count, values in ends.items():
+        errors = study.compute_output_errors(values, np.zeros(len(values), dtype=np.int64))
+        best = find_bottom(errors)
+        rows.append((count, float(lambdas[best]), errors[best]))
+    return rows
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Results of t drawn machines.
+    """Results of t drawn machines of a structure.
 
     The paper's methods take the setting that is best for the true machine. The library's methods
     choose theirs from the data; MAP is given the true spread of the errors as its tolerances.
     """
 
-    name: str  # of the structure
-    six: Situation  # the paper's methods with 6- and 5-DOF measurement
-    five: Situation
+    name: str
+    sweeps: tuple[Sweep, ...]  # the paper's methods with 6- and 5-DOF measurement
     errors: Mapping[str, FloatArray]  # method -> (t, 5), see MEASURES, infinite if diverged
     # method -> (t, 2), see `Chosen`; without HINDSIGHT, which takes another lambda for each measure
     commanded: Mapping[str, FloatArray]
 
     def __len__(self) -> int:
-        return len(self.six)
-
-    @property
-    def situations(self) -> tuple[Situation, Situation]:
-        """With 6- and 5-DOF measurement."""
-        return self.six, self.five
+        return len(self.sweeps[0])
 
     def list_groups(self) -> tuple[Draws, ...]:
-        """Return groups of machines of about equal size, `GROUPS` or as many as there are machines.
+        """Return groups of machines of about equal size, at most one for each machine.
 
-        They hold the errors of the methods; the situations stay those of all machines.
+        They hold the errors of the methods; the sweeps stay those of all machines.
         """
-        places = np.array_split(np.arange(len(self)), min(GROUPS, len(self)))
+        places = np.array_split(np.arange(len(self)), min(SIZES.find("groups"), len(self)))
         return tuple(
             replace(self, errors={m: errors[place] for m, errors in self.errors.items()})
             for place in places
@@ -663,9 +613,9 @@ class Draws:
 
 
 def _resample_medians(values: FloatArray) -> FloatArray:
-    """Return medians (RESAMPLES, ..) of machines drawn with replacement, always the same ones."""
-    t = len(values)
-    drawn = make_random_stream(0, 0, RESAMPLING).integers(0, t, (RESAMPLES, t))
+    """Return medians (r, ..) of machines drawn with replacement, always the same ones."""
+    t, count = len(values), SIZES.find("resamples")
+    drawn = make_random_stream(0, 0, RESAMPLING).integers(0, t, (count, t))
     return np.median(values[drawn], axis=1)
 
 
@@ -679,34 +629,29 @@ def draw_machines(
     """Draw machines, measure and identify them by all methods."""
     truth = draw_true_values(load_machine(name), trials, seed)
     whole = measure_machines(name, truth, seed)
-    six, five = (run_situation(study, progress) for study in (whole, whole.five))
+    lambdas = list_lambdas()
+    sweeps = tuple(run_settings(study, lambdas, progress) for study in (whole, whole.five))
     progress(f"{name}, methods of loopcal")
-    values = {BEFORE: np.repeat(whole.robot.parameters.nominal[None], trials, axis=0), TRUE: truth}
-    scaled = {NARROW: lc.Ridge(FACTOR**2), WIDE: lc.Ridge(FACTOR**-2)}
+    factor = SIZES.find("factor")
+    scaled = {NARROW: lc.Ridge(factor**2), WIDE: lc.Ridge(factor**-2)}
     without = {WHITENED_FIVE: lc.LeastSquares(), PRIOR_FIVE: lc.MAP()}
+    values = {BEFORE: np.repeat(whole.robot.parameters.nominal[None], trials, axis=0), TRUE: truth}
     for study, methods in ((whole, {**LIBRARY, **scaled}), (whole.five, without)):
         for method, how in methods.items():
             values[method] = lc.identify_trials(study.robot, study.trials, how).values
     errors = {m: whole.compute_output_errors(v) for m, v in values.items()}
     commanded = {m: whole.compute_commanded_errors(v) for m, v in values.items()}
     start, tried = None, []
-    for lam in HINDSIGHT_LAMBDAS:  # each machine and measure takes the best one
+    for lam in list_lambdas("hindsight_exponents"):  # each machine and measure takes the best one
         options = lc.FitOptions(start=start)
         fit = lc.identify_trials(whole.robot, whole.trials, lc.Ridge(float(lam)), options=options)
         start = fit.values
         tried.append(whole.compute_output_errors(fit.values))
     errors[HINDSIGHT] = np.min(tried, axis=0)
-    for method, algorithm, situation in (
-        (RAW_LS, LS, six),
-        (RAW_RE, RE, six),
-        (RAW_TSVD, TSVD, six),
-        (RAW_FIVE, RANKED, five),
-        (RE_FIVE, RE, five),
-        (TSVD_FIVE, TSVD, five),
-    ):
-        errors[method] = situation.chosen[algorithm].errors
-        commanded[method] = situation.chosen[algorithm].commanded
+    for method, (place, algorithm) in RAW.items():
+        chosen = sweeps[place].chosen[algorithm]
+        errors[method], commanded[method] = chosen.errors, chosen.commanded
     errors, commanded = (
         {m: mark_diverged(of[m]) for m in METHODS if m in of} for of in (errors, commanded)
     )
-    return Draws(name, six, five, errors, commanded)
+    return Draws(name, sweeps, errors, commanded)
