@@ -143,8 +143,8 @@ def _compare_tables(results: Results) -> tuple[Comparison, Comparison]:
     iterations = max(int(cell.iterations.max()) for cell in results.draws[0].fifties.values())
     figure, nearest = PRINTED.find("figure_5"), results.candidates[0]
     stated = Printed.parse({name: given["stated"] for name, given in figure.items()})
-    names = {"estimation": "parameters"}
-    reductions = np.array([[nearest[names.get(name, name)]] for name in figure])
+    names = ["parameters" if name == "estimation" else name for name in figure]
+    reductions = np.array([[nearest[name]] for name in names])
     return (
         TEXT.compare("counts", counts, np.array([[float(rank)], [float(iterations)]])),
         TEXT.compare("figure_5", stated, reductions, nearest=nearest),

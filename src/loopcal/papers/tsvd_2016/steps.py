@@ -411,13 +411,14 @@ def run_settings(
     k, together = len(ks), SIZES.find("together")
     penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(lambdas, p)])
     settings = np.concatenate([ks.astype(np.float64), lambdas])
-    parts = []
+    parts, runs = [], []
     for first in range(0, t, together):
         progress(f"{study.label}, machine {first + 1} of {t}")
         machines = np.arange(first, min(first + together, t))
         run = iterate(
             study, np.tile(penalty, (len(machines), 1)), np.repeat(machines, len(penalty))
         )
+        runs = [run]  # of these machines; histories are large
         state = np.searchsorted(run.done.max(axis=1), SIZES.find("short"))
         is_ridge = np.tile(np.arange(len(penalty)) >= k, len(machines))
         history = run.history[min(int(state), len(run.done) - 1), is_ridge]
@@ -452,7 +453,7 @@ def run_settings(
         short=mark_diverged(short),
         chosen=chosen,
         exact=mark_diverged(exact.compute_output_errors(free.values)),
-        runs=run,
+        runs=runs[0],
         places=places,
     )
 
