@@ -64,13 +64,20 @@ def probe(robot, truth, points, offset=(0.0, 0.0)) -> list[float]:
     return heights
 
 
-def write_g30(points, heights, name: str = "report.txt") -> None:
-    lines = [
-        f"Bed X:{x:.2f} Y:{y:.2f} Z:{h:.3f}\nok\n"
-        f"X:{x:.2f} Y:{y:.2f} Z:10.00 E:0.00 Count X:1 Y:2 Z:3"
-        for (x, y), h in zip(points, heights, strict=True)
-    ]
-    Path(name).write_text("\n".join(lines) + "\n")
+G30 = ("{}", "Bed X:{x:.2f} Y:{y:.2f} Z:{h:.3f}\nok\nX:{x:.2f} Y:{y:.2f} Z:10.00 E:0 Count X:1\n")
+M114 = ("{}", "X:{x:.2f} Y:{y:.2f} Z:{h:.3f} E:0.00 Count X:100 Y:200 Z:300\n")
+G32, BED = (
+    ("G32 bed probe heights:{}, mean 0, deviation 0", " {h:.3f}"),
+    "G30 P{i} X{x:.3f} Y{y:.3f} Z-99999 ; point\n",
+)
+G31, M851 = "G31 P500 X15 Y5 Z2.5 ; inductive probe\n", "M851 X20.00 Y-10.00 Z-1.50\n"
+
+
+def write_points(points, heights, file="report.txt", text=G30[0], line=G30[1]) -> None:
+    """Write a text with a line for each point."""
+    rows = enumerate(zip(points, heights, strict=True))
+    lines = "".join(line.format(i=i, x=x, y=y, h=h) for i, ((x, y), h) in rows)
+    Path(file).write_text(text.format(lines))
 
 
 def check_calibration(words: str, truth, tolerance: float = 6e-6) -> None:
@@ -86,19 +93,38 @@ def check_calibration(words: str, truth, tolerance: float = 6e-6) -> None:
     assert (errors < sizes).all(), errors
 
 
-def test_g30_of_marlin_leads_to_the_truth() -> None:
-    robot, truth = make_truth("m503.gcode")
-    heights = probe(robot, truth, POINTS)
+REPORTS = {
+    "G30": (MARLIN, (0.0, 0.0), {"report.txt": G30}),
+    "probe beside the nozzle": (MARLIN + M851, (20.0, -10.0), {"report.txt": G30}),
+    "touches by hand": (MARLIN, (0.0, 0.0), {"m114.txt": M114}),
+    "G32": (REPRAP, (0.0, 0.0), {"report.txt": G32, "bed.g": ("M561\n{} S6\n", BED)}),
+    "probe in another file": (
+        REPRAP,
+        (15.0, 5.0),
+        {"report.txt": G32, "bed.g": ("{}", BED.replace(" ", "").lower()), "probe.g": (G31, "")},
+    ),
+}
+"""Configuration, offset of the probe [mm], and the files of the heights that it reports."""
+
+
+@pytest.mark.parametrize("name", REPORTS)
+def test_reported_heights_lead_to_the_truth(name: str) -> None:
+    text, offset, files = REPORTS[name]
+    config = "m503.gcode" if text.startswith(MARLIN) else "config.g"
+    Path(config).write_text(text)
+    robot, truth = make_truth(config)
+    heights = probe(robot, truth, POINTS, offset)
     assert np.ptp(heights) > 0.1
-    write_g30(POINTS, heights)
-    check_calibration("m503.gcode --probes report.txt", truth)
+    for file, form in files.items():
+        write_points(POINTS, heights, file, *form)
+    check_calibration(" ".join([config, *(f"--probes {file}" for file in files)]), truth)
 
 
 def test_a_height_entered_as_z_would_move_the_radius_in_the_wrong_direction() -> None:
     """Why the import exists: commanded readings with the reported height as z."""
     robot, truth = make_truth("m503.gcode")
     heights = np.array(probe(robot, truth, POINTS))
-    write_g30(POINTS, heights)
+    write_points(POINTS, heights)
     assert run("import m503.gcode --probes report.txt -o printer.yaml --data heights.csv") == 0
     text = Path("heights.csv").read_text()
     place = robot.parameters.names.index("radius")
@@ -144,30 +170,6 @@ def test_a_dry_run_of_g33_leads_to_the_truth() -> None:
     check_calibration("m503.gcode --probes g33.txt", truth)
 
 
-def test_positions_of_m114_are_touches_by_hand() -> None:
-    robot, truth = make_truth("m503.gcode")
-    heights = probe(robot, truth, POINTS)
-    lines = [
-        f"X:{x:.2f} Y:{y:.2f} Z:{h:.3f} E:0.00 Count X:100 Y:200 Z:300"
-        for (x, y), h in zip(POINTS, heights, strict=True)
-    ]
-    Path("m114.txt").write_text("\n".join(lines))
-    check_calibration("m503.gcode --probes m114.txt", truth)
-
-
-def test_g32_of_reprapfirmware_with_the_points_of_bed_g() -> None:
-    robot, truth = make_truth("config.g")
-    heights = probe(robot, truth, POINTS)
-    Path("report.txt").write_text(
-        "G32 bed probe heights:"
-        + "".join(f" {h:.3f}" for h in heights)
-        + ", mean 0.1, deviation 0.2"
-    )
-    bed = [f"G30 P{i} X{x:.3f} Y{y:.3f} Z-99999 ; point" for i, (x, y) in enumerate(POINTS)]
-    Path("bed.g").write_text("M561\n" + "\n".join(bed) + " S6\n")
-    check_calibration("config.g --probes report.txt --probes bed.g", truth)
-
-
 @pytest.mark.slow
 def test_a_height_map_of_reprapfirmware() -> None:
     robot, truth = make_truth("config.g")
@@ -186,25 +188,6 @@ def test_a_height_map_of_reprapfirmware() -> None:
         assert lc.load_run("run").result["fit"]["dof"] > 0
     Path("heightmap.csv").write_text("\n".join([head, titles, stated, *rows[:-1]]))
     assert run("import config.g --probes heightmap.csv -o p.yaml --data h.csv") == 1
-
-
-def test_a_probe_beside_the_nozzle_is_taken_into_account() -> None:
-    offset = (20.0, -10.0)
-    Path("m503.gcode").write_text(MARLIN + "M851 X20.00 Y-10.00 Z-1.50\n")
-    robot, truth = make_truth("m503.gcode")
-    write_g30(POINTS, probe(robot, truth, POINTS, offset))
-    check_calibration("m503.gcode --probes report.txt", truth)
-
-
-def test_the_offset_of_a_probe_may_be_in_another_file() -> None:
-    robot, truth = make_truth("config.g")
-    heights = probe(robot, truth, POINTS, (15.0, 5.0))
-    cells = " ".join(f"{h:.3f}" for h in heights)
-    Path("report.txt").write_text(f"G32 bed probe heights: {cells}, mean 0, deviation 0")
-    bed = [f"g30p{i}x{x:.3f}y{y:.3f}z-99999" for i, (x, y) in enumerate(POINTS)]
-    Path("bed.g").write_text("\n".join(bed))
-    Path("probe.g").write_text("G31 P500 X15 Y5 Z2.5 ; inductive probe\n")
-    check_calibration("config.g --probes report.txt --probes bed.g --probes probe.g", truth)
 
 
 @pytest.mark.parametrize(
@@ -239,7 +222,7 @@ def test_reports_that_cannot_be_used_are_refused(config, report, words, capsys) 
 
 def test_a_point_out_of_reach_is_named(capsys) -> None:
     points = [*POINTS[:-1], (5000.0, 0.0)]
-    write_g30(points, [0.0] * len(points))
+    write_points(points, [0.0] * len(points))
     assert run("import m503.gcode --probes report.txt -o p.yaml --data h.csv") == 1
     assert f"the probed point {len(points)}" in " ".join(capsys.readouterr().err.split())
 
@@ -267,7 +250,7 @@ def test_calibrate_says_what_to_type_for_a_configuration(name, words, capsys) ->
 def test_one_wrong_height_is_an_outlier_and_no_target_that_stands_still(capsys) -> None:
     robot, truth = make_truth("m503.gcode")
     heights = probe(robot, truth, POINTS)
-    write_g30([*POINTS, (10.0, -20.0)], [*heights, 9.999])
+    write_points([*POINTS, (10.0, -20.0)], [*heights, 9.999])
     words = "--probes report.txt -o printer.yaml --data heights.csv --sigma-height 0.02mm"
     assert run(f"import m503.gcode {words}") == 0
     assert run("calibrate printer.yaml heights.csv -o run") == 2
