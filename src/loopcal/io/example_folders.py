@@ -35,8 +35,6 @@ def describe_example(folder: Path) -> str:
 def list_example_files(name: str) -> Mapping[str, Path]:
     """Return the files of an example by name.
 
-    Raises
-    ------
     DataError : `files.no-example`.
     """
     examples = list_examples()
@@ -52,8 +50,6 @@ def list_example_files(name: str) -> Mapping[str, Path]:
 def write_example(name: str, path: str | Path) -> tuple[str, ...]:
     """Copy an example into a new folder; return the names of its files.
 
-    Raises
-    ------
     DataError, FileError : no such example; the folder exists, or cannot be written.
     """
     path = as_path(path, "folder")

@@ -182,8 +182,6 @@ def collect_records(
 ) -> Records:
     """Return the fields with axes as arrays.
 
-    Parameters
-    ----------
     labels : source of the names along an axis, or the names; numbers from 1 for other axes.
     """
     variables, shown = [], {}

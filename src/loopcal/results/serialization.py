@@ -25,16 +25,12 @@ _PLAIN = frozenset({type(None), bool, int, str})
 def to_json(value: Any, nulls: dict[str, str] | None = None, path: tuple[str, ...] = ()) -> Any:
     """Return a value as dictionaries, lists, strings, numbers, booleans and None.
 
-    Parameters
-    ----------
     value : dataclasses, findings, arrays, enums (written by their names in lower case), paths,
         named tuples, and lists and mappings of these. A number that is not finite becomes None.
     nulls : where given, receives the path of every such number, such as
         `parameters/3/plus_minus`, and the reason: `INFINITE` or `UNDEFINED`.
     path : keys that lead to `value`, for `nulls` and for the error.
 
-    Raises
-    ------
     TypeError : a value of another type; the text names its path.
 
     Examples

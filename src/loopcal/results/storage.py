@@ -23,8 +23,6 @@ def restore(of_class: type[Stored], content: Mapping[str, Any], **given: Any) ->
     Keys are those of `FIELDS` of its class, or the names of its attributes. Where there is no key,
     an attribute has its default. Null for a number is NaN.
 
-    Parameters
-    ----------
     content : numbers that are not finite may be restored already, see `restore_numbers`.
     given : attributes that are not in `content`, or are to be taken instead.
     """
@@ -80,8 +78,6 @@ def restore_arrays(
 ) -> Stored | None:
     """Return an object from what `store_arrays` returned; None where an array is missing.
 
-    Parameters
-    ----------
     given : the attributes that are not stored.
     """
     stored = _list_stored(of_class)

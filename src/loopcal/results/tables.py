@@ -71,8 +71,6 @@ class Table:
     def to_text(self, width: int | None = None) -> str:
         """Return the table as lines of text without trailing blanks.
 
-        Parameters
-        ----------
         width : characters of a line. Headings and columns that wrap are broken to keep to it; where
             that is not enough the table is wider. Default: no limit.
         """
@@ -292,8 +290,6 @@ Block = str | Table
 def render_text(blocks: Iterable[Block], width: int) -> str:
     """Return blocks as plain text, with an empty line around tables.
 
-    Parameters
-    ----------
     blocks : paragraphs and tables. An empty paragraph is an empty line.
     width : characters of a line. Paragraphs are wrapped; numbers in tables are never cut.
     """

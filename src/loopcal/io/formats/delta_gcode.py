@@ -277,8 +277,6 @@ class DeltaFirmware(ABC):
     def load(self, path: Path) -> GcodeFile:
         """Read a file.
 
-        Raises
-        ------
         FileError : no M665, inches, a word that is not a number or contradicts the firmware.
         """
         lines = read_text(path, GcodeFile.what).splitlines(keepends=True)
@@ -510,8 +508,6 @@ def import_probes(
 
     `robot_text` states the geometry with which the firmware probed, as `path` does.
 
-    Raises
-    ------
     FileError : no heights, a report that cannot be used, or a point out of reach.
     """
     from loopcal.measure.kinds.poses import Component

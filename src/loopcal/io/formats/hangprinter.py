@@ -124,8 +124,6 @@ class Samples:
 def read(path: Path, options: ImportOptions) -> Imported:
     """Read robot and samples.
 
-    Raises
-    ------
     FileError
         Not JSON, a key is missing or has other values, or the known poses do not determine an
         anchor and the file states none.
@@ -214,8 +212,6 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
     The known poses determine an anchor least along its line. A taped length therefore replaces its
     distance.
 
-    Raises
-    ------
     FileError : no pose is known, or the known poses do not determine an anchor.
     """
     from loopcal.geometry import ANCHOR_RANK, solve_line_anchor

@@ -145,8 +145,6 @@ def read(path: Path, options: ImportOptions) -> Imported:
     """Read geometry and measurements: heights as the component z, distances as separations of two
     poses.
 
-    Raises
-    ------
     FileError : an option is missing or not a number, or the printer is not a delta.
     """
     from loopcal.measure.kinds.distance import Separation
@@ -233,8 +231,6 @@ def _list_records(cfg: KlipperConfig, name: str, suffixes: Sequence[str]) -> lis
 
     Klipper reads up to the first number that is missing, and ignores all records behind it.
 
-    Raises
-    ------
     FileError : a record lacks one of its parts (suffixes of its name), or a number is left out.
     """
     pattern = re.compile(rf"{name}(\d+)({'|'.join(suffixes)})")

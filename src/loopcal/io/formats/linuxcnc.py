@@ -120,8 +120,6 @@ class HalFile(ValueFile):
 def read(path: Path, options: ImportOptions) -> Imported:
     """Read the pins.
 
-    Raises
-    ------
     FileError : a pin is missing or not a number, or no unit of length is given.
     """
     hal = _read_hal(path)

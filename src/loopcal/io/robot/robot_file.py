@@ -96,8 +96,6 @@ def remove_mark(text: str) -> str:
 def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     """Return the robot's values (p,) [SI], with those of the file's table in place.
 
-    Raises
-    ------
     FileError
         A bad row, an unknown or duplicate parameter, a value that is not a number, a wrong unit.
     """
@@ -277,8 +275,6 @@ def get_source(robot: Mechanism) -> RobotSource:
 def find_robot_file(source: str | Path) -> Path:
     """Return the file of a robot that is given as a file or by the name of a shipped robot.
 
-    Raises
-    ------
     FileError : neither of them.
     """
     path, shipped = as_path(source, WHAT), list_shipped_robots()
@@ -365,8 +361,6 @@ OWN_KEYS = ("on", "mount", "joint", "family")
 def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> PlacedStages:
     """Return a chain with the records of its stages.
 
-    Raises
-    ------
     FileError : a stage is neither a joint nor a robot, or a key of it does not fit; at its line.
     """
     assert isinstance(chain, Stages)
@@ -542,12 +536,8 @@ WIDTH = 120
 def format_new_robot(family: str, name: str) -> str:
     """Return the text of a robot file of a valid robot, in which the user replaces the numbers.
 
-    Parameters
-    ----------
     family : a family, or the name of a shipped robot to start from. name : of the new robot.
 
-    Raises
-    ------
     MechanismError : neither a family nor a shipped robot.
     """
     shipped = list_shipped_robots()
@@ -584,13 +574,9 @@ def format_new_robot(family: str, name: str) -> str:
 def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:
     """Return the text of a robot's file with further parameters fixed.
 
-    Parameters
-    ----------
     robot : from `load_robot`, with any values.
     dropped : parameter to fix -> comment that is written after it.
 
-    Raises
-    ------
     MechanismError : the robot was not loaded from a file.
     """
     source = get_source(robot)

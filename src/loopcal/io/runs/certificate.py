@@ -105,8 +105,6 @@ class Administration:
 def load_administration(path: str | Path) -> Administration:
     """Read the administrative data of a certificate.
 
-    Raises
-    ------
     FileError : a key is missing or unknown, a text is empty, or not a date or code, at its line.
     """
     file = read_yaml(path, "certificate file", has_names=False)
@@ -188,12 +186,8 @@ prefix are of the DCC. Elements without any content are left out.
 def format_certificate(run: Run, administration: Administration) -> str:
     """Return the certificate of a run as XML.
 
-    Parameters
-    ----------
     run : a run folder. administration : what the run does not know; see `load_administration`.
 
-    Raises
-    ------
     DataError : a robot file instead of a run, or a run that failed.
     FileError : `files.run-changed`.
     """

@@ -251,8 +251,6 @@ def repeat_fit(
 
     Runs of earlier versions do not state their options as data; theirs are taken as the usual ones.
 
-    Raises
-    ------
     EstimationError : the estimate is another one. DataError : an option is an object without a
         name. FileError : see `Run.load_measurements`.
     """
@@ -340,8 +338,6 @@ def write_run_folder(
 def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the contents of result.json and arrays.npz of a run folder.
 
-    Raises
-    ------
     FileError : not a run folder, made by a newer loopcal, or damaged; with the file and what is
         wrong in it. What loopcal reads back is declared in `run_result` and `run_arrays`.
     """
@@ -439,8 +435,6 @@ def refuse_changed_run(run: Run) -> None:
 def load_run_or_robot(path: str | Path) -> Run:
     """Read a run folder, or a robot file (or a shipped robot by its name) as if it were a run.
 
-    Raises
-    ------
     FileError : neither of them.
     """
     path = as_path(path, "run folder or robot file")

@@ -449,8 +449,6 @@ def read_run_arrays(path: Path, digest: str | None) -> dict[str, np.ndarray]:
 def find_problem(arrays: Mapping[str, np.ndarray], is_complete: bool = True) -> str | None:
     """Return what is wrong with the arrays of a run; None where nothing is.
 
-    Parameters
-    ----------
     arrays : name -> array. is_complete : whether LATER are needed, as from format 2 on.
     """
     needed = [*FIT, *(LATER if is_complete else ())]
