@@ -13,7 +13,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.io.formats.delta_gcode import read_reports
-from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_g30
+from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_points
 
 NOISE = 0.02
 """Of the simulated probe [mm], as the command for Marlin states it."""
@@ -47,7 +47,7 @@ def check_recommendation(truth, code: str, accuracy: float = 0.2e-3) -> None:
 def test_commands_for_marlin_lead_to_a_recommendation(commands) -> None:
     Path("m503.gcode").write_text(MARLIN)
     robot, truth = make_truth("m503.gcode")
-    write_g30(POINTS, add_noise(probe(robot, truth, POINTS)), "g30.txt")
+    write_points(POINTS, add_noise(probe(robot, truth, POINTS)), "g30.txt")
     importing, calibrating = commands[:2]
     assert importing.startswith("import m503.gcode")
     assert main(importing.split()) == 0

@@ -17,7 +17,7 @@ import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
-from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, TRUE, probe, write_g30
+from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, TRUE, probe, write_points
 
 NOISE = 0.02
 """Of the simulated probe [mm]."""
@@ -53,7 +53,7 @@ IMPORT = {
 
 def probe_marlin(robot: Mechanism, truth: Mechanism, noise: np.ndarray) -> None:
     Path("m503.gcode").write_text(MARLIN)
-    write_g30(POINTS, np.add(probe(robot, truth, POINTS), noise))
+    write_points(POINTS, np.add(probe(robot, truth, POINTS), noise))
 
 
 def probe_reprap(robot: Mechanism, truth: Mechanism, noise: np.ndarray) -> None:

@@ -9,6 +9,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
@@ -162,15 +163,10 @@ class Table:
             ]
             for cell, width in zip(cells, widths, strict=True)
         ]
-        height = max(len(lines) for lines in broken)
-        padded = [lines + [""] * (height - len(lines)) for lines in broken]
-        return [(" " * GAP).join(self._aligned(row, widths)) for row in zip(*padded, strict=True)]
-
-    def _aligned(self, cells: Sequence[str], widths: Sequence[int]) -> list[str]:
-        """Return cells padded to the widths of their columns."""
+        aligns = [str.ljust if column.align == "left" else str.rjust for column in self.columns]
         return [
-            cell.ljust(width) if column.align == "left" else cell.rjust(width)
-            for cell, width, column in zip(cells, widths, self.columns, strict=True)
+            (" " * GAP).join(align(*pair) for align, *pair in zip(aligns, row, widths, strict=True))
+            for row in zip_longest(*broken, fillvalue="")
         ]
 
 

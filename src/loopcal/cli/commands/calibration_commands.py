@@ -248,7 +248,7 @@ def compensate(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.runs.result_files import format_compensation, load_targets
-    from loopcal.io.runs.run_folder import find_failure, load_posterior_or_robot
+    from loopcal.io.runs.run_folder import find_failure, load_run_or_robot
     from loopcal.report.calibration_view import view_compensation
 
     inputs = (run, targets, None if controller is None else Path(controller))
@@ -256,7 +256,8 @@ def compensate(
     failure = find_failure(run)
     if failure is not None and not force:
         return Output(None, list, [with_hint(failure)])
-    known = load_posterior_or_robot(run)
+    source = load_run_or_robot(run)
+    known = source.load_posterior() if run.is_dir() else source.robot
     robot = known if isinstance(known, lc.Mechanism) else known.robot
     coordinates, labels = load_targets(targets, robot)
     old = None if controller is None else lc.load_robot(controller)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -96,14 +96,14 @@ class Samples:
     gear: float
     motors: FloatArray
     known: FloatArray
-    anchors: FloatArray | None = None
-    taped: FloatArray = field(default_factory=lambda: np.empty(0))
-    findings: tuple[Finding, ...] = ()
+    anchors: FloatArray | None
+    taped: FloatArray
+    findings: tuple[Finding, ...]
 
     @property
     def is_taped(self) -> BoolArray:
         """Which lines were taped (n,)."""
-        return np.isfinite(self.taped) if self.taped.size else np.zeros(len(self.radius), bool)
+        return np.isfinite(self.taped)
 
     @property
     def share(self) -> FloatArray:
@@ -142,7 +142,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
         sigma_position=Quantity(options.choose_noise("position") / MM, "mm"),
     )
     text = format_robot(samples, anchors, path, options)
-    priors = []
+    findings = [finding]
     if samples.is_taped.any():
         prior = report_finding(
             "files.taped-prior",
@@ -150,14 +150,14 @@ def read(path: Path, options: ImportOptions) -> Imported:
             sigma=Quantity(options.choose_noise("tape") / MM, "mm"),
             is_assumed=options.is_noise_assumed("tape"),
         )
-        priors.append(prior)
+        findings.append(prior)
     # without known poses all positions are NaN, to be filled in
     n, k = len(samples.motors), len(samples.known)
     known = samples.known * MM if k else np.full((n, FREEDOMS), np.nan)
     rows = options.observe(Position(), np.arange(len(known)), known, "line", "position")
     labels = tuple(f"{'known' if i < k else 'sample'}{i + 1}" for i in range(n))
     measurements = Measurements(options.name, samples.motors, (rows,), labels=labels)
-    return Imported(text, measurements, (finding, *priors, *samples.findings))
+    return Imported(text, measurements, (*findings, *samples.findings))
 
 
 def parse(path: Path) -> Samples:
@@ -184,11 +184,9 @@ def parse(path: Path) -> Samples:
         if len(anchors) != lines:
             sentence = f"{ANCHORS!r} has {len(anchors)} rows, but there are {lines} lines"
             raise FileError(f"{sentence}; write one row for each", path)
-    gear, findings = float(motor_teeth / spool_teeth), tuple(_report_ignored(content))
-    taped = _parse_taped(content, path, lines)
-    return Samples(
-        radius, advantage, per_spool, gear, motors * DEG, known, anchors, taped, findings
-    )
+    gear, taped = float(motor_teeth / spool_teeth), _parse_taped(content, path, lines)
+    spools, findings = (radius, advantage, per_spool, gear), tuple(_report_ignored(content))
+    return Samples(*spools, motors * DEG, known, anchors, taped, findings)
 
 
 def _parse_taped(content: dict[str, Any], path: Path, lines: int) -> FloatArray:

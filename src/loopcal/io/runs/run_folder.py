@@ -66,9 +66,6 @@ if TYPE_CHECKING:
     from loopcal.typing import Progress
 
 
-# Whether the numbers of a run may be written for a machine: corrected robot, controller,
-# commands.
-
 ROBOT, FAILED_ROBOT = "robot.yaml", "robot-not-calibrated.yaml"
 """The corrected robot file of a run, and that of a calibration that failed."""
 
@@ -109,9 +106,6 @@ def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
     if "verdict" not in result and (status != CONVERGED or "passed" not in result):
         return report_finding("gates.run-without-verdict", run=str(path))
     return None
-
-
-# A calibration that was read from its run folder.
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,11 +269,8 @@ def repeat_fit(
             run.initial_robot, data, earlier, limb, options=options, progress=progress
         )
     estimate, sd = run.arrays["estimate"], fit.standard_deviations
-    is_other = len(estimate) != len(sd)
-    if not is_other:
-        allowed = EQUAL * np.where(np.isfinite(sd), sd, np.inf)
-        is_other = bool((np.abs(fit.estimate - estimate) > allowed).any())
-    if is_other:
+    allowed = EQUAL * np.where(np.isfinite(sd), sd, np.inf)
+    if len(estimate) != len(sd) or (np.abs(fit.estimate - estimate) > allowed).any():
         raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
     return fit, data
 
@@ -457,9 +448,3 @@ def find_failure(path: str | Path) -> Finding | None:
     if not path.is_file() or not read_yaml(path, "robot file").text.startswith(NOT_CALIBRATED):
         return None
     return report_finding("gates.run-not-calibrated", run=str(path), reasons=())
-
-
-def load_posterior_or_robot(path: str | Path) -> Mechanism | Posterior:
-    """Read a run folder with its uncertainties, or a robot file (or shipped robot) without any."""
-    source = load_run_or_robot(path)
-    return source.load_posterior() if Path(path).is_dir() else source.robot
