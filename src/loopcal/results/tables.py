@@ -163,9 +163,12 @@ class Table:
             ]
             for cell, width in zip(cells, widths, strict=True)
         ]
-        aligns = [str.ljust if column.align == "left" else str.rjust for column in self.columns]
+        shown = tuple(zip(self.columns, widths, strict=True))
         return [
-            (" " * GAP).join(align(*pair) for align, *pair in zip(aligns, row, widths, strict=True))
+            (" " * GAP).join(
+                cell.ljust(width) if column.align == "left" else cell.rjust(width)
+                for cell, (column, width) in zip(row, shown, strict=True)
+            )
             for row in zip_longest(*broken, fillvalue="")
         ]
 
