@@ -131,7 +131,9 @@ def format_draws(
     names, units, factors : (p,) names, symbols of units, and their factors to SI. weight : (T,) of
     the draws, whose sum is 1; None where all weigh the same.
     """
-    columns = {} if weight is None else {"weight": map(repr, weight.tolist())}
+    columns: dict[str, Iterable[str]] = {}
+    if weight is not None:
+        columns["weight"] = map(repr, weight.tolist())
     for name, unit, factor, column in zip(names, units, factors, draws.T.tolist(), strict=True):
         columns[f"{name} [{unit}]"] = (format_scaled(value, factor) for value in column)
     return format_columns(columns)
