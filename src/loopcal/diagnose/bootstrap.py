@@ -45,7 +45,7 @@ from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import linearize_rows
 from loopcal.estimate.observation_rows import linked_blocks
-from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.penalties import MAP
 from loopcal.estimate.resampling import ResampleFits, Resamples, draw_centers, fit_resamples
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
@@ -422,10 +422,10 @@ class Bootstrap(TableResult):
             findings.append(report_finding("sampling.failures", failed=self.failed, count=total))
         codes = ("sampling.bootstrap-agrees", "sampling.bootstrap-differs")
         findings += report_intervals(self.intervals(kind="percentile"), *codes)
-        if not isinstance(self.fit.method, MAP | LeastSquares):
+        if self.fit.method.is_biased:
             name = type(self.fit.method).__name__
             findings.append(report_finding("sampling.bias-not-drawn", method=name))
-        if self.scheme == "normal" or not isinstance(self.fit.method, MAP | LeastSquares):
+        if self.scheme == "normal" or self.fit.method.is_biased:
             return tuple(findings)
         stated = np.where(self.is_known, self.fit.standard_deviations, np.nan)
         ratio = self.standard_deviations / stated
@@ -497,7 +497,7 @@ def bootstrap(
     blocks, linear = choose_blocks(data, unit), linearize_fit(fit, data)
     rng, errors, batches = np.random.default_rng(np.random.SeedSequence(seed)), None, []
     if scheme != "pairs":
-        shift = _shift_truth(linear, isinstance(fit.method, MAP))
+        shift = _shift_truth(linear, fit.method.has_prior)
         errors = compute_block_errors(linear, blocks, shift)
     for first in range(0, count, BATCH):
         progress(first, count, "fitting resamples")
@@ -569,7 +569,7 @@ def _draw_resamples(
         offset = errors.draw(factor, sigma, rng)
     z, nuisance = linear.linearization.deviation, linear.problem.nuisance
     center = np.zeros((count, z.shape[1]))
-    if isinstance(fit.method, MAP):
+    if fit.method.has_prior:
         center = draw_centers(linear, count, rng) + (0.0 if errors is None else z)
     prior = None
     if fit.options.prior is not None:

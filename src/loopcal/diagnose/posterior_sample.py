@@ -30,7 +30,6 @@ from loopcal.diagnose.intervals import (
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import prepare_fitted_data
-from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.prior import WithPrior
 from loopcal.estimate.resampling import repeat_trial, resample_rows
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
@@ -278,7 +277,7 @@ def sample_posterior(
         raise EstimationError(f"{count} draws: give at least 100")
     if not fit.converged:
         raise EstimationError(report_finding("sampling.not-converged"))
-    if not isinstance(fit.method, MAP | LeastSquares):
+    if fit.method.is_biased:
         name = type(fit.method).__name__
         raise EstimationError(report_finding("sampling.method-without-prior", method=name))
     if not fit.residual_test.intervals:

@@ -437,10 +437,13 @@ def descend(
         They become shorter at least by the ratio of the last two.
     """
     control = control or StepControl()
-    run = _Run(problem, method, tolerance, control, sufficient)
     z = np.array(deviation, dtype=np.float64)
     progress(0, 1, "fitting")
-    run.begin(z, start, arrival)
+    with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
+        begin = problem.start(z) if start is None else start
+        first = replace(_clear_failed(problem.linearize(z, begin)), deviation=z)
+    arrival = np.full(len(z), np.inf) if arrival is None else arrival
+    run = _Run(problem, method, tolerance, control, sufficient, first, arrival)
     deviations, costs = [z.copy()], [run.point.cost.copy()]
 
     def observe() -> None:
@@ -529,24 +532,18 @@ class _Run:
         tolerance: float,
         control: StepControl,
         sufficient: float,
+        first: Linearization,
+        arrival: FloatArray,
     ) -> None:
         self.problem, self.method, self.tolerance = problem, method, tolerance
         self.control, self.sufficient = control, sufficient
         self.fixed = fix_penalty(method, problem.parameters)
-
-    def begin(self, z: FloatArray, start: Start | None, arrival: FloatArray | None) -> None:
-        """Linearize at the deviations z (t, p) from which the trials start."""
-        t, problem = len(z), self.problem
-        with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
-            begin = problem.start(z) if start is None else start
-            first = _clear_failed(problem.linearize(z, begin))
-        arrival = np.full(t, np.inf) if arrival is None else arrival
-        self.point = self.locate(replace(first, deviation=z), arrival)
+        self.point, t = self.locate(first, arrival), len(first.deviation)
         running, bad = DescentStatus.RUNNING.value, DescentStatus.BAD_START.value
         self.status = np.where(np.isfinite(self.point.cost), running, bad).astype(int)
         self.taken = np.zeros(t, dtype=np.int64)
         self.chains = _FullSteps(self.point)
-        self.damping = _Damping(t, self.control.damping, self.point.linear_model)
+        self.damping = _Damping(t, control.damping, self.point.linear_model)
         self.marks = np.full((t, 3), np.inf)  # of the last progress, and evaluations since then
         self.age = np.zeros(t, dtype=np.int64)
 

@@ -378,18 +378,6 @@ def linearize_rows(
     )
 
 
-def list_twist_rows(
-    rows: ObservationRows, poses: LinearizedPoses, trials: IntArray
-) -> engine.TwistRows:
-    """Return the whitened rows of a kind by the platform's twist; arguments as of `evaluate_rows`.
-
-    For kinds that observe one pose in each row, and no joints.
-    """
-    evaluated, white = evaluate_rows(rows, poses, trials, None)
-    by_twist = rows.whiten_columns(white, evaluated.jacobian)
-    return engine.TwistRows(rows.poses, by_twist, rows.whiten(white, evaluated.residual, trials))
-
-
 def coordinate_derivative(jacobian: FloatArray, Y: FloatArray) -> FloatArray:
     """Return derivatives (a, r, m, k) of rows by the coordinates of a pose.
 

@@ -151,7 +151,14 @@ def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
 
 
 class Method(Protocol):
-    """The interface of a method, with what most methods do."""
+    """The interface of a method, with what most methods do.
+
+    `has_prior`: whether it takes the stated tolerances as standard deviations of a prior.
+    `is_biased`: whether its penalty is neither nothing nor such a prior.
+    """
+
+    has_prior: ClassVar[bool] = False
+    is_biased: ClassVar[bool] = True
 
     def required_equations(self, parameters: int) -> int:
         """Return how many equations the method needs for this many parameters."""
@@ -183,6 +190,14 @@ class Method(Protocol):
         """
         return None
 
+    def lacks_tolerances(self, free: FreeParameters) -> BoolArray:
+        """Return the parameters (p,) without whose stated tolerance that variance is not known."""
+        return np.zeros_like(free.assumed)
+
+    def choice(self) -> tuple[str, float | tuple[float, ...] | Rule] | None:
+        """Return name and value of the number, or the rule, that regularizes; None without any."""
+        return None
+
 
 @dataclass(frozen=True)
 class LeastSquares(Method):
@@ -197,6 +212,7 @@ class LeastSquares(Method):
     """
 
     name: ClassVar[str] = "least-squares"
+    is_biased: ClassVar[bool] = False
 
     def required_equations(self, parameters: int) -> int:
         """Return the number of parameters."""
@@ -240,6 +256,10 @@ class TruncatedSVD(Method):
         k = _apply_rule(self.k, decomposition) if callable(self.k) else np.atleast_1d(self.k)
         first = np.arange(decomposition.singular_values.shape[1]) < k[:, None]
         return np.where(first & decomposition.used, 0.0, np.inf)
+
+    def choice(self) -> tuple[str, int | Rule]:
+        """Return the truncation."""
+        return "k", self.k
 
 
 @dataclass(frozen=True)
@@ -330,6 +350,10 @@ class Ridge(Method):
         lam = 1.0 if callable(self.lam) else np.asarray(self.lam)
         return np.asarray(free.assumed & np.broadcast_to(lam > 0.0, free.assumed.shape))
 
+    def choice(self) -> tuple[str, float | tuple[float, ...] | Rule]:
+        """Return the ridge parameter."""
+        return "lam", self.lam
+
 
 @dataclass(frozen=True)
 class MAP(Method):
@@ -357,6 +381,8 @@ class MAP(Method):
     """
 
     name: ClassVar[str] = "map"
+    has_prior: ClassVar[bool] = True
+    is_biased: ClassVar[bool] = False
     inflation: float | Rule = 1.0
     free: tuple[bool, ...] = ()
     noise: Literal["given", "estimated"] = "given"
@@ -534,13 +560,9 @@ def describe_regularization(
     method: Method, decomposition: Decomposition, penalty: FloatArray
 ) -> Regularization | None:
     """Return the regularization of trial 0; None for methods without a parameter to choose."""
-    if isinstance(method, Ridge):
-        name, stated = "lam", method.lam
-    elif isinstance(method, TruncatedSVD):
-        name, stated = "k", method.k
-    else:
+    if (choice := method.choice()) is None:
         return None
-    score, is_at_limit, rule = None, False, "fixed"
+    (name, stated), score, is_at_limit, rule = choice, None, False, "fixed"
     if callable(stated):
         value = float(np.atleast_1d(np.asarray(stated(decomposition)))[0])
         rule = getattr(stated, "__name__", type(stated).__name__)

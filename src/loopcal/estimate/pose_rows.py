@@ -27,6 +27,7 @@ from functools import cached_property
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import (
     NodeMembers,
@@ -45,8 +46,8 @@ from loopcal.estimate.linearization import (
     PoseSolution,
     PoseStates,
     Start,
+    evaluate_rows,
     linearize_rows,
-    list_twist_rows,
 )
 from loopcal.estimate.observation_rows import ObservationRows, consecutive_pairs, find_needed_poses
 from loopcal.estimate.pose_coordinates import PoseCoordinates
@@ -291,7 +292,12 @@ class PoseRows:
                 all_values = self.free.values(z)
                 states = self.coordinates.close(all_values, block.poses, None, True)
                 poses = self.coordinates.linearize(all_values, states, block.poses, False)
-            observed = [list_twist_rows(r, poses, trials) for r in block.rows if len(r.poses)]
+            observed = []
+            for r in (r for r in block.rows if len(r.poses)):
+                evaluated, white = evaluate_rows(r, poses, trials, None)
+                by_twist = r.whiten_columns(white, evaluated.jacobian)
+                residual = r.whiten(white, evaluated.residual, trials)
+                observed.append(engine.TwistRows(r.poses, by_twist, residual))
             values = self.free.values(z[: len(states.state.T)])  # one trial may stand for all
             inputs = values, readings, states.state, self.free.columns, observed, factor
             factor, is_finite = fold_pose_rows(robot, *inputs, solution.driven)

@@ -35,7 +35,7 @@ from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.losses import Loss, describe_loss
 from loopcal.estimate.null_space import Combination, sparsify_basis
 from loopcal.estimate.options import FitOptions
-from loopcal.estimate.penalties import MAP, Method, Regularization, Ridge
+from loopcal.estimate.penalties import Method, Regularization
 from loopcal.estimate.posterior import NOISE, CovariancePart, Posterior, combine_degrees
 from loopcal.estimate.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.findings import Finding, report_finding
@@ -202,7 +202,7 @@ def report_divergence(
 
     Nothing is reported where the tolerances are a prior: then `PriorConflict` tests them.
     """
-    if isinstance(method, MAP):
+    if method.has_prior:
         return []
     far = np.flatnonzero((np.abs(deviation) > FAR) & ~free.assumed)
     if len(far) == 0:
@@ -239,7 +239,7 @@ def report_used_poses(
 
 def report_equations(equations: int, parameters: int, method: Method) -> list[Finding]:
     """Return how many directions are known from tolerances alone."""
-    if equations >= parameters or not isinstance(method, MAP):
+    if equations >= parameters or not method.has_prior:
         return []
     return [
         report_finding(
@@ -257,7 +257,7 @@ def report_unknown_bias(
     """Return why a ridge has no intervals, where its bias is not known: where `prior`, see
     `Method.prior_variance`, is NaN.
     """
-    if not isinstance(method, Ridge) or prior is None or not np.isnan(prior).any():
+    if prior is None or not np.isnan(prior).any():
         return []
     lacking = method.lacks_tolerances(free)
     return [
@@ -479,7 +479,7 @@ class Identification(TableResult):
             return None
         if self.options.prior is not None:
             return report_finding("prior.intervals", source="the earlier calibration")
-        if isinstance(self.method, MAP) and not self.free_parameters.assumed.all():
+        if self.method.has_prior and not self.free_parameters.assumed.all():
             return report_finding("prior.intervals", source="the tolerances")
         return None
 
