@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a hanging printer: anchors, spools, known and unknown poses, refusals."""
+"""Samples of a hanging printer: anchors, spools, known poses, taped lengths, refusals."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal import forward, inverse
 from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import FileError
@@ -15,7 +17,32 @@ from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ImportOptions
-from tests.cable_robot import NAMES, TRUTH, compute_paid_out, format_samples, simulate_example
+from tests.cable_robot import (
+    LINE,
+    NAMES,
+    POSITION,
+    TRUTH,
+    compute_paid_out,
+    format_samples,
+    load_real_samples,
+    simulate_example,
+    solve_reference,
+)
+
+TAPED = "line_lengths_when_at_origin"
+LENGTHS = [NAMES.index(f"{line}.length") for line in "ABCD"]
+ANCHORS = [i for i, name in enumerate(NAMES) if "anchor" in name]
+PRIOR = np.array([200.0, 200, 200, 5] * 4 + [3.0] + [0.3] * 4)
+"""Tolerances of the robot file with a tape of 5 mm [mm]."""
+
+WRONG_LENGTHS = ["many", 1500, [1500] * 3, [1500] * 5, [1500, 1, 1, -2], [[1, 2, 3, 4]], ["1"] * 4]
+WRONG_LENGTHS += [[True, 1, 1, 1]]
+
+PUBLISHED = [
+    *(16.83, -1584.86, -113.17, 1290.18, 1229.19, -157.45),
+    *(-1409.88, 742.61, -151.80, 21.85, -0.16, 2343.67),
+]
+"""Anchors of the real machine [mm]."""
 
 
 def read(folder, found: dict, **reading: Any):
@@ -92,16 +119,12 @@ def test_estimated_anchors_are_exact_without_noise_and_buildup(tmp_path) -> None
     )  # [mm], condition 1e3 of lengths of 1e3 mm
 
 
-def test_stated_anchors_are_used(tmp_path) -> None:
+def test_stated_anchors_are_used_and_need_no_known_pose(tmp_path) -> None:
     anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
     robot, _ = read(tmp_path, simulate_example() | {"anchors": anchors, "xyz_of_samp": [[0, 0, 0]]})
     np.testing.assert_allclose(
         robot.values[:16].reshape(4, 4)[:, :3] * 1e3, anchors, rtol=0, atol=1e-9
     )
-
-
-def test_stated_anchors_need_no_known_pose(tmp_path) -> None:
-    anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
     robot, imported = read(tmp_path, simulate_example() | {"anchors": anchors, "xyz_of_samp": []})
     assert imported.measurements is not None
     assert imported.measurements.n_rows == 0
@@ -157,6 +180,8 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
         ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows, but there are 4 lines"),
         ({"xyz_of_samp": []}, "no pose is known; add known poses"),
         ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not determine the anchor of line A"),
+        *(({TAPED: lengths}, "a list of 4 lengths in mm is needed") for lengths in WRONG_LENGTHS),
+        *(({TAPED: [v, 1, 1, 1]}, "is not finite") for v in (float("inf"), float("nan"))),
     ],
 )
 def test_invalid_samples_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
@@ -181,3 +206,140 @@ def test_file_without_samples_is_refused(tmp_path, text, sentence) -> None:
     path.write_text(text)
     with pytest.raises(FileError, match=sentence):
         hangprinter.read(path, ImportOptions("printer"))
+
+
+# Lengths that were measured by hand are prior knowledge with a stated standard deviation.
+
+
+def tape(seed: int, sigma: float = 5.0) -> dict[str, Any]:
+    """Return samples of the example's machine with taped lengths; sigma in mm."""
+    lengths = TRUTH[LENGTHS] + sigma * np.random.default_rng(seed).standard_normal(4)
+    return simulate_example(seed) | {TAPED: lengths.round(1).tolist()}
+
+
+def fit_samples(folder: Path, samples: dict[str, Any], sigma: float, **options: Any):
+    """Return the fit of some samples; sigma of lines and positions in mm."""
+    noise = {"sigma_line": sigma * 1e-3, "sigma_position": sigma * 1e-3}
+    robot, imported = read(folder, samples, **noise, **options)
+    assert imported.measurements is not None
+    return lc.identify(robot, imported.measurements)
+
+
+def measure_error(fit: lc.Identification, truth: Any) -> float:
+    """Return the rms distance of the anchors from others [mm]."""
+    apart = 1e3 * fit.robot.values[ANCHORS] - np.asarray(truth)
+    return float(np.sqrt((apart.reshape(4, 3) ** 2).sum(axis=1).mean()))
+
+
+def test_taped_lengths_are_nominal_values_with_the_tolerance_of_the_tape(tmp_path) -> None:
+    robot, imported = read(tmp_path, tape(3), sigma_tape=7e-3)
+    table = robot.parameters
+    np.testing.assert_allclose(table.nominal[LENGTHS] * 1e3, tape(3)[TAPED], rtol=1e-12)
+    np.testing.assert_allclose(table.tolerance[LENGTHS], 7e-3, rtol=1e-12)
+    np.testing.assert_allclose(table.tolerance[ANCHORS], 0.2, rtol=1e-12)
+    apart = np.linalg.norm(table.nominal[ANCHORS].reshape(4, 3), axis=1)
+    np.testing.assert_allclose(apart, table.nominal[LENGTHS], rtol=1e-9)
+    (finding,) = [f for f in imported.findings if f.code == "files.taped-prior"]
+    assert "4 lengths" in str(finding)
+    assert "standard deviation of 7 mm" in str(finding)
+    assert "assumed" not in str(finding)
+    robot, imported = read(tmp_path, tape(3))  # no sigma is stated
+    np.testing.assert_allclose(robot.parameters.tolerance[LENGTHS], 0.01, rtol=1e-12)
+    assert any("standard deviation of 10 mm (assumed)" in str(f) for f in imported.findings)
+
+
+@pytest.mark.parametrize("empty", [None, 0])
+def test_line_that_was_not_taped_is_left_to_the_data(tmp_path, empty) -> None:
+    samples = tape(3)
+    samples[TAPED][1] = empty
+    robot, imported = read(tmp_path, samples, sigma_tape=5e-3)
+    np.testing.assert_allclose(
+        robot.parameters.tolerance[LENGTHS], [5e-3, 0.2, 5e-3, 5e-3], rtol=1e-12
+    )
+    assert any(f.code == "files.taped-prior" and f.data["count"] == 3 for f in imported.findings)
+    samples[TAPED] = [empty] * 4
+    without, _ = read(tmp_path, {k: v for k, v in samples.items() if k != TAPED})
+    robot, imported = read(tmp_path, samples)
+    np.testing.assert_array_equal(robot.values, without.values)
+    assert not any(f.code == "files.taped-prior" for f in imported.findings)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1 / 25.4, 10 / 0.9])
+def test_tape_in_another_unit_is_refused(tmp_path, factor) -> None:
+    samples = tape(3)
+    samples[TAPED] = [length * factor for length in samples[TAPED]]
+    with pytest.raises(FileError) as refused:
+        read(tmp_path, samples)
+    assert refused.value.code == "files.taped-length-far-off"
+    assert "line A was taped at" in str(refused.value)
+
+
+def test_estimate_is_that_of_least_squares_updated_with_the_tape(tmp_path) -> None:
+    """The reference shares no code: dense least squares, then the conditional normal distribution
+    given the tolerances. The problem is not linear, so the two differ by a share of the sd.
+    """
+    samples = tape(5)
+    fit = fit_samples(tmp_path, samples, LINE, sigma_tape=5e-3)
+    reference = solve_reference(samples, LINE, POSITION, TRUTH)
+    nominal = 1e3 * fit.initial.values
+    gain = reference.covariance @ np.linalg.inv(reference.covariance + np.diag(PRIOR**2))
+    updated = reference.values + gain @ (nominal - reference.values)
+    sd = np.sqrt(np.diag(reference.covariance - gain @ reference.covariance))
+    assert (np.abs(1e3 * fit.robot.values - updated) < 0.15 * sd).all()
+    mine = 1e3 * np.sqrt(np.diag(fit.covariance))
+    np.testing.assert_allclose(mine, sd, rtol=0.1)
+    assert sd[LENGTHS].max() < 0.5 * reference.sd[LENGTHS].max()
+
+
+def test_taped_lengths_improve_the_anchors_of_simulated_machines(tmp_path) -> None:
+    errors = []
+    for seed in range(4):
+        samples = tape(seed + 20)
+        plain = {key: value for key, value in samples.items() if key != TAPED}
+        fits = (
+            fit_samples(tmp_path, plain, LINE),
+            fit_samples(tmp_path, samples, LINE, sigma_tape=5e-3),
+        )
+        errors.append([measure_error(fit, TRUTH[ANCHORS]) for fit in fits])
+    before, after = np.sqrt((np.array(errors) ** 2).mean(axis=0))
+    assert after < 0.7 * before
+    assert after < 10.0  # [mm]
+
+
+def test_taped_lengths_bring_a_real_machine_closer_to_its_published_anchors(
+    tmp_path, data_folder
+) -> None:
+    samples = load_real_samples(data_folder)
+    plain = {key: value for key, value in samples.items() if key != TAPED}
+    before = measure_error(fit_samples(tmp_path, plain, 0.6), PUBLISHED)
+    fit = fit_samples(tmp_path, samples, 0.6, sigma_tape=10e-3)
+    assert fit.converged
+    assert fit.prior_conflict is not None
+    assert not fit.prior_conflict.conflict
+    after = measure_error(fit, PUBLISHED)
+    assert (round(before, 1), round(after, 1)) == (18.7, 12.7)  # [mm], the numbers of the page
+
+
+def test_tape_reduces_the_uncertainty_of_the_anchors_along_their_lines_to_a_quarter(
+    tmp_path, data_folder, root
+) -> None:
+    samples = load_real_samples(data_folder)
+    names = ("A.anchor.y", "B.anchor.x", "C.anchor.x", "D.anchor.z")
+    page = (root / "docs" / "cable-robots.md").read_text("utf-8")
+    for what, found in (
+        ("none", {key: value for key, value in samples.items() if key != TAPED}),
+        ("5 mm", samples),
+    ):
+        fit = fit_samples(tmp_path, found, 1.0, sigma_tape=5e-3)
+        half = [1e3 * fit.plus_minus[NAMES.index(name)] for name in names]  # [mm]
+        cells = " | ".join(f"{value:.0f} mm" for value in half)
+        assert f"| {what} | {cells} |" in page
+
+
+def test_stated_anchors_are_prior_knowledge_only_with_their_sigma(tmp_path) -> None:
+    anchors = TRUTH[ANCHORS].reshape(4, 3).round(0).tolist()
+    for options, sd in (({}, 0.2), ({"sigma_anchor": 0.012}, 0.012)):
+        robot, _ = read(tmp_path, simulate_example() | {"anchors": anchors}, **options)
+        np.testing.assert_allclose(robot.parameters.tolerance[ANCHORS], sd, rtol=1e-12)
+    robot, _ = read(tmp_path, simulate_example(), sigma_anchor=0.012)  # nobody stated any
+    np.testing.assert_allclose(robot.parameters.tolerance[ANCHORS], 0.2, rtol=1e-12)
