@@ -7,7 +7,6 @@ and are not checked. A number that is not finite is null in the file.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import os
@@ -16,9 +15,11 @@ import struct
 import tokenize
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, make_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Literal, NamedTuple, dataclass_transform
+from types import GenericAlias
+from typing import Any, BinaryIO, Literal, NamedTuple
 
 import numpy as np
 
@@ -42,114 +43,70 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 """Half a character: part of a file name that is not UTF-8."""
 
 
-@dataclass_transform(frozen_default=True)
-class _Part:
-    """A mapping in result.json, of which only the fields are read."""
-
-    OTHER_KEYS: ClassVar[bool] = True
-
-    def __init_subclass__(cls) -> None:
-        dataclass(frozen=True, eq=False, repr=False)(cls)
-
-
-class StoredParameter(_Part):
-    """An entry of `fit.parameters` or, for setup parameters, of `fit.local`."""
-
-    name: str
-    plus_minus: float | None
-    estimate: float | None = None
-    unit: str = ""
-
-
-class StoredFit(_Part):
-    """The identification under `fit`."""
-
-    parameters: tuple[StoredParameter, ...]
-    status: str
-    local: tuple[StoredParameter, ...] = ()
-    dropped: tuple[str, ...] | None = None
-    sigma_scale: float | None = None
-
-
-class StoredSplit(_Part):
-    """The held-out poses under `split`."""
-
-    held_out: tuple[str, ...]
-
-
-class StoredInput(_Part):
-    """An input file under `made_by.inputs`."""
-
-    path: str
-    sha256: str
-
-
-class StoredOrigin(_Part):
-    """The provenance under `made_by`."""
-
-    command: tuple[str, ...]
-    inputs: dict[str, StoredInput]
+Number = float | None
+PARAMETERS = [{"name": str, "plus_minus": Number, "estimate?": Number, "unit?": str}]
+SOURCE = {
+    "kind": str,
+    "name": str,
+    "evaluation": str,
+    "degrees": Number,
+    "position": Number,
+    "orientation": Number,
+    "parameters": {"*": Number},
+    "halved": ({"position_rms": Number, "orientation_rms": Number, "worst_parameter_sd": Number},),
+}
+BUDGET = {
+    "position": {"rms": Number},
+    "orientation": {"rms": Number},
+    "parameters": {"*": Number},
+    "worst_parameter": str,
+    "poses": int,
+    "over": str,
+    "finding": {"text": str},
+    "sources?": ([SOURCE],),  # earlier versions state none
+}
+STATED = {
+    "format": Literal[1, 2],
+    "made_by": {"command": [str], "inputs": {"*": {"path": str, "sha256": str}}},
+    "fit": {
+        "parameters": PARAMETERS,
+        "status": str,
+        "local?": PARAMETERS,  # setup parameters
+        "dropped?": ([str],),
+        "sigma_scale?": Number,
+    },
+    "verdict?": (Literal["calibrated", "reservations", "not_calibrated", "undecided"],),
+    "passed?": (bool,),
+    "reasons?": [str],
+    "split?": ({"held_out": [str]},),
+    "expected_error?": (BUDGET,),
+    "nulls?": {"*": str},
+    "files?": {"*": str},
+}
+"""What loopcal reads back from result.json: types by key, `[of]` for a list, `(of,)` for a value
+that may be null, `*` for any key. A key with a question mark may be absent.
+"""
 
 
-class StoredErrors(_Part):
-    """The errors of poses under `expected_error.position` and `.orientation`."""
-
-    rms: float | None
-
-
-class StoredHalf(_Part):
-    """What half the sigma of a source leaves, under `halved`."""
-
-    position_rms: float | None
-    orientation_rms: float | None
-    worst_parameter_sd: float | None
-
-
-class StoredSource(_Part):
-    """A source of errors under `expected_error.sources`."""
-
-    kind: str
-    name: str
-    evaluation: str
-    degrees: float | None
-    position: float | None
-    orientation: float | None
-    parameters: dict[str, float | None]
-    halved: StoredHalf | None
+def make_type(form: Any) -> Any:
+    """Return the type of a form of content; a mapping is a record that ignores other keys."""
+    if isinstance(form, list):
+        return GenericAlias(tuple, (make_type(form[0]), ...))
+    if isinstance(form, tuple):
+        return make_type(form[0]) | None
+    if not isinstance(form, dict):
+        return form
+    if "*" in form:
+        return GenericAlias(dict, (str, make_type(form["*"])))
+    needed = [(key, make_type(of)) for key, of in form.items() if "?" not in key]
+    others = [(key.rstrip("?"), make_type(of), None) for key, of in form.items() if "?" in key]
+    return make_dataclass("Stated", [*needed, *others], namespace={"OTHER_KEYS": True})
 
 
-class StoredSentence(_Part):
-    """A finding, of which the sentence is read."""
-
-    text: str
-
-
-class StoredBudget(_Part):
-    """The uncertainty budget under `expected_error`; earlier versions state no `sources`."""
-
-    position: StoredErrors
-    orientation: StoredErrors
-    parameters: dict[str, float | None]
-    worst_parameter: str
-    poses: int
-    over: str
-    finding: StoredSentence
-    sources: tuple[StoredSource, ...] | None = None
-
-
-class StoredResult(_Part):
-    """What loopcal reads back from result.json."""
-
-    format: Literal[1, 2]
-    made_by: StoredOrigin
-    fit: StoredFit
-    verdict: Literal["calibrated", "reservations", "not_calibrated", "undecided"] | None = None
-    passed: bool | None = None
-    reasons: tuple[str, ...] = ()
-    split: StoredSplit | None = None
-    expected_error: StoredBudget | None = None
-    nulls: dict[str, str] = field(default_factory=dict)
-    files: dict[str, str] = field(default_factory=dict)
+@cache
+def get_record() -> Any:
+    """Return the record of STATED, which is made where the first result is read."""
+    return make_type(STATED)
 
 
 NEEDED = ("verdict", "passed", "reasons", "split", "files")
@@ -164,7 +121,7 @@ LARGEST = 1e100
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """Return the content of result.json of a run, of which `StoredResult` is checked; FileError
+    """Return the content of result.json of a run, of which `STATED` is checked; FileError
     where it is no run, made by a newer loopcal, or damaged.
     """
     content = read_json(path, "run result", f"this file of a run is damaged; {REPEAT}", TABLE_SIZE)
@@ -180,10 +137,9 @@ def read_result(path: Path) -> dict[str, Any]:
     text, plain = json.dumps(content, ensure_ascii=False), content
     if _SURROGATE.search(text):
         plain = json.loads(_SURROGATE.sub("?", text))
-    stated = read_record(
-        YamlFile(path, "", {}, plain), plain, StoredResult, None, word=report_damage
-    )
-    if problem := _find_contradiction(stated):
+    file = YamlFile(path, "", {}, plain)
+    stated = read_record(file, plain, get_record(), None, word=report_damage)
+    if problem := _find_contradiction(stated.expected_error):
         raise report_damage(path, problem)
     return content
 
@@ -228,9 +184,8 @@ def report_damage(path: Path, problem: str) -> FileError:
     return FileError(report_finding("files.run-damaged", problem=problem), path)
 
 
-def _find_contradiction(stated: StoredResult) -> str | None:
-    """Return what of a result cannot be true; None where everything can."""
-    budget = stated.expected_error
+def _find_contradiction(budget: Any) -> str | None:
+    """Return what of the budget of a result cannot be true; None where everything can."""
     if budget is None:
         return None
     tables = {"expected_error.parameters": budget.parameters}
@@ -238,7 +193,7 @@ def _find_contradiction(stated: StoredResult) -> str | None:
     for i, source in enumerate(budget.sources or ()):
         tables[f"expected_error.sources entry {i + 1}.parameters"] = source.parameters
         numbers += [source.position, source.orientation]
-        numbers += () if source.halved is None else dataclasses.astuple(source.halved)
+        numbers += () if source.halved is None else astuple(source.halved)
     for name, table in tables.items():
         if budget.worst_parameter and budget.worst_parameter not in table:
             return f"{name!r} lacks the worst parameter {budget.worst_parameter!r}"
