@@ -47,14 +47,7 @@ from loopcal.io.core.limits import (
 from loopcal.io.core.text_file import as_path, read_bytes, write_text
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.measurement_file import FORMAT
-from loopcal.io.exports.profile import (
-    ColumnSource,
-    PatternClock,
-    Place,
-    Profile,
-    normalize_name,
-    strip_target,
-)
+from loopcal.io.exports.profile import ColumnSource, PatternClock, Place, Profile, normalize_name
 from loopcal.plain_text import quote
 
 # The lines of an export as cells, each with the header that applies to it.
@@ -92,7 +85,7 @@ def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[
     """
     record = profile.record
     sources = [place for source in profile.columns.values() for place in source.places]
-    named = {place for place in (*sources, *record.matrix_places) if isinstance(place, str)}
+    named = {place for place in (*sources, *record.matrix) if isinstance(place, str)}
     lines: list[Line] = []
     header, nearest, skipped = None, None, 0
     text = _decode(path, profile).replace("\r\n", "\n").replace("\r", "\n")
@@ -101,7 +94,7 @@ def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[
         LINE_LENGTH.check(len(line), "export", path, number)
         is_comment = record.comment is not None and line.lstrip().startswith(record.comment)
         ignored = profile.ignored
-        is_ignored = ignored is not None and clock.search(ignored, line, ("ignore",))
+        is_ignored = ignored is not None and clock.match(ignored.search, line, ("ignore",))
         if number <= record.skip or not line.strip() or is_comment or is_ignored:
             skipped += bool(line.strip())
             continue
@@ -294,25 +287,22 @@ def _check_readings(row: Row, known: Row, profile: Profile) -> None:
 def list_headers(profile: Profile) -> dict[str, str | None]:
     """Return column -> unit of the measurement file, None for text."""
     units = {name: source.symbol for name, source in profile.columns.items() if name != "pose"}
-    units |= {name: "1" for name in ("qw", "qx", "qy", "qz") if profile.record.matrix_places}
-    names = [column.name for column in profile.measured]
+    units |= {name: "1" for name in ("qw", "qx", "qy", "qz") if profile.record.matrix}
     first: dict[str, str | None] = {"pose": None}
     if len(profile.targets) < 2:
-        measured = [profile.name_measured(name) for name in names]
+        measured = [profile.name_measured(name) for name in profile.measured]
         others = {n: u for n, u in units.items() if n not in measured}
         return first | others | {n: units[n] for n in measured}
     shared = {n: u for n, u in units.items() if not _belongs_to_target(n, profile)}
-    values = list(dict.fromkeys(strip_target(name) for name in names))
-    beside = [n for n in units if n not in shared and n not in values]
-    pairs = [(name, target) for target in profile.targets for name in values]
+    beside = [n for n in units if n not in shared and n not in profile.measured]
+    pairs = [(name, target) for target in profile.targets for name in profile.measured]
     pairs += [(name, target) for name in beside for target in profile.targets]
     return first | shared | {_add_target(name, target): units[name] for name, target in pairs}
 
 
 def _belongs_to_target(name: str, profile: Profile) -> bool:
     """Return whether a column belongs to a target, not to the pose."""
-    values = {strip_target(column.name) for column in profile.measured}
-    return name.removeprefix(SIGMA) in values or name.startswith((COVARIANCE, NOTE))
+    return name.removeprefix(SIGMA) in profile.measured or name.startswith((COVARIANCE, NOTE))
 
 
 def _add_target(name: str, target: str) -> str:
@@ -444,10 +434,11 @@ def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:
             continue
         text = " ".join("" if cell in profile.missing else cell for cell in cells).strip()
         if source.pattern is not None:
-            groups = clock.match_all(source.pattern, text, ("columns", "pose", "match"))
-            if groups is None:
+            match = clock.match(source.pattern.fullmatch, text, ("columns", "pose", "match"))
+            if match is None:
                 raise Misfit(f"the name {quote(text)} does not match {source.pattern.pattern}")
-            row |= {k: (groups[k] or "").strip() for k in ("pose", "target") if k in groups}
+            groups = match.groupdict("")
+            row |= {k: groups[k].strip() for k in ("pose", "target") if k in groups}
         else:
             row[name] = make_name(text) if name.startswith(NOTE) else text
             row[name] = _parse_time(text, source) if name == TIME else row[name]
@@ -460,8 +451,8 @@ def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:
         raise Misfit(
             f"{quote(row['pose'])} is not a name of a pose: it is empty or contains {LINK!r}"
         )
-    if profile.record.matrix_places:
-        cells = (_get_cell(line, place) for place in profile.record.matrix_places)
+    if profile.record.matrix:
+        cells = (_get_cell(line, place) for place in profile.record.matrix)
         row |= _to_quaternion([_parse_number(cell, profile, "matrix") for cell in cells])
     return row
 

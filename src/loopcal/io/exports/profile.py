@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib import resources
+from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -42,7 +43,7 @@ from loopcal.plain_text import quote
 from loopcal.units import Dimension, find_unit, list_symbols, parse_quantity
 
 if TYPE_CHECKING:
-    from loopcal.measure.kinds.kind import Column, Kind
+    from loopcal.measure.kinds.kind import Kind
 
 
 # Regular expressions of users, with a limit on their time.
@@ -68,22 +69,16 @@ class PatternClock:
         self.seconds: float = seconds
         self.remaining: float = seconds
 
-    def search(self, pattern: Pattern, text: str, location: Location) -> bool:
-        """Return whether the pattern at `location` of the profile occurs; raise FileError."""
-        return self._measure(pattern.search, text, location) is not None
-
-    def match_all(
-        self, pattern: Pattern, text: str, location: Location
-    ) -> dict[str, str | None] | None:
-        """Return the groups of the pattern where it is the whole text, else None; FileError."""
-        match = self._measure(pattern.fullmatch, text, location)
-        return None if match is None else match.groupdict()
-
-    def _measure(self, match: Callable[..., Any], text: str, location: Location) -> Any:
+    def match(
+        self, find: Callable[..., regex.Match[str] | None], text: str, location: Location
+    ) -> regex.Match[str] | None:
+        """Return what `find`, such as `search` of the pattern at `location` of the profile, finds
+        in a text; raise FileError.
+        """
         start = time.process_time()
         self.remaining += SECONDS_PER_LINE
         try:
-            return match(text, timeout=max(self.remaining, SECONDS_PER_LINE))
+            return find(text, timeout=max(self.remaining, SECONDS_PER_LINE))
         except TimeoutError:
             finding = report_finding("files.pattern-too-slow", seconds=self.seconds)
             raise self.file.error(finding, location) from None
@@ -91,35 +86,24 @@ class PatternClock:
             self.remaining -= time.process_time() - start
 
 
-def compile_pattern(text: str) -> Pattern:
-    """Return a pattern that `refuse_pattern` accepted, as a PatternClock matches it."""
-    return regex.compile(text)
-
-
 def refuse_pattern(file: YamlFile, text: str, location: Location) -> None:
-    """Raise FileError for text that is no regular expression, or beyond a limit."""
-    for limit, count in ((PATTERN_LENGTH, len(text)), (PATTERN_COUNTS, _multiply_counts(text))):
-        limit.check(count, f"pattern {_name_pattern(text)}", file.path, file.line(location))
+    """Raise FileError for text that is no regular expression, or beyond a limit: of its length, or
+    of the product of all counts in braces, the larger one of each pair.
+    """
+    shown = quote(text if len(text) <= 40 else f"{text[:40]}..")
+    pairs = (match.groups("0") for match in _COUNT.finditer(text))
+    counts = math.prod(max(int(n) for n in (*pair, "1") if n) for pair in pairs)
+    for limit, count in ((PATTERN_LENGTH, len(text)), (PATTERN_COUNTS, counts)):
+        limit.check(count, f"pattern {shown}", file.path, file.line(location))
     try:
         re.compile(text)
-        compile_pattern(text)
+        regex.compile(text)
     except (re.error, regex.error) as error:
-        sentence = f"{_name_pattern(text)} is not a regular expression ({error}); correct it"
+        sentence = f"{shown} is not a regular expression ({error}); correct it"
         raise file.error(sentence, location) from None
     except (RecursionError, OverflowError):
-        sentence = f"the pattern {_name_pattern(text)} is too deeply nested; simplify it"
+        sentence = f"the pattern {shown} is too deeply nested; simplify it"
         raise file.error(sentence, location) from None
-
-
-def _name_pattern(text: str) -> str:
-    """Return a pattern in quotes, shortened for messages."""
-    return quote(text if len(text) <= 40 else f"{text[:40]}..")
-
-
-def _multiply_counts(text: str) -> int:
-    """Return the product of all counts in braces, the larger one of each pair."""
-    found = (match.groups("0") for match in _COUNT.finditer(text))
-    return math.prod(max(int(n) for n in (*pair, "1") if n) for pair in found)
 
 
 # Profiles: how to read the text that an instrument's software exports.
@@ -137,8 +121,7 @@ def normalize_name(text: str) -> str:
     return " ".join(unicodedata.normalize("NFC", text.replace("\ufeff", " ")).split())
 
 
-def normalize_places(places: Iterable[Place]) -> tuple[Place, ...]:
-    """Return places with their names as `normalize_name` does."""
+def _normalize_places(places: Iterable[Place]) -> tuple[Place, ...]:
     return tuple(normalize_name(p) if isinstance(p, str) else p for p in places)
 
 
@@ -168,7 +151,7 @@ class ColumnSource:
     @property
     def places(self) -> tuple[Place, ...]:
         """Names in the export's header, or places counted from 1."""
-        return normalize_places(self.from_ if isinstance(self.from_, tuple) else (self.from_,))
+        return _normalize_places(self.from_ if isinstance(self.from_, tuple) else (self.from_,))
 
     @property
     def symbol(self) -> str | None:
@@ -186,7 +169,7 @@ class ColumnSource:
     @cached_property
     def pattern(self) -> Pattern | None:
         """The compiled `match`."""
-        return None if self.match is None else compile_pattern(self.match)
+        return None if self.match is None else regex.compile(self.match)
 
 
 @dataclass(frozen=True)
@@ -225,10 +208,8 @@ class ProfileRecord:
     readings: Mapping[str, ColumnSource] = field(default_factory=dict)
     matrix: tuple[Place, ...] = ()
 
-    @property
-    def matrix_places(self) -> tuple[Place, ...]:
-        """Names in the export's header, or places counted from 1, of the rotation matrix."""
-        return normalize_places(self.matrix)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "matrix", _normalize_places(self.matrix))
 
 
 @dataclass(frozen=True)
@@ -253,7 +234,7 @@ class Profile:
     @cached_property
     def ignored(self) -> Pattern | None:
         """The compiled `ignore`."""
-        return None if self.record.ignore is None else compile_pattern(self.record.ignore)
+        return None if self.record.ignore is None else regex.compile(self.record.ignore)
 
     @cached_property
     def columns(self) -> Mapping[str, ColumnSource]:
@@ -273,14 +254,21 @@ class Profile:
         return tuple(number for number in numbers if number is not None)
 
     @property
-    def measured(self) -> tuple[Column, ...]:
-        """The columns of the kind; none for readings alone."""
-        return () if self.kind is None else self.kind.columns
+    def measured(self) -> tuple[str, ...]:
+        """The columns of the kind, of several targets each once without its target; none for
+        readings alone.
+        """
+        names = [] if self.kind is None else [column.name for column in self.kind.columns]
+        return tuple(dict.fromkeys(self.strip_target(name) for name in names))
 
     @property
     def targets(self) -> tuple[str, ...]:
         """Targets of the kind; empty for a kind without targets."""
         return getattr(self.kind, "targets", ())
+
+    def strip_target(self, column: str) -> str:
+        """Return the name of a column without its target where there are several: `x` of `a.x`."""
+        return column.partition(".")[2] if len(self.targets) > 1 else column
 
     def with_point(self, text: str) -> str:
         """Return a number with a decimal point; a misplaced point becomes an invalid number."""
@@ -294,11 +282,6 @@ class Profile:
     def name_measured(self, name: str) -> str:
         """Return the profile's name of a measured column: `measured.NAME` where it is stated so."""
         return MEASURED + name if MEASURED + name in self.columns else name
-
-
-def strip_target(column: str) -> str:
-    """Return the name of a column of several targets without its target: `x` for `a.x`."""
-    return column.partition(".")[2]
 
 
 FORMAT = 1
@@ -353,7 +336,7 @@ def read_profile(path: str | Path) -> Profile:
         raise file.error(f"{sentence}; {act}", ("encoding",)) from None
     profile = Profile(file, record, kind)
     if "matrix" in file.content:
-        places = record.matrix_places
+        places = record.matrix
         _check_places(file, places, ("matrix",))
         is_pose = kind is not None and kind.name == "pose"
         is_quaternion = is_pose and getattr(kind, "orientation", None) == "quaternion"
@@ -381,12 +364,8 @@ def _read_kind(file: YamlFile, record: ProfileRecord) -> Kind | None:
 def check_columns(profile: Profile) -> None:
     """Raise FileError for columns that a measurement file of this kind cannot have, or lacks."""
     file, record = profile.file, profile.record
-    several = len(profile.targets) > 1
-    measured = list(
-        dict.fromkeys(strip_target(c.name) if several else c.name for c in profile.measured)
-    )
-    measured = measured[-3:] if record.matrix else measured
-    dimensions = _list_dimensions(profile.kind, several)
+    measured = profile.measured[-3:] if record.matrix else profile.measured
+    dimensions = _list_dimensions(profile)
     subject = (
         "a table of readings (no kind is stated)"
         if profile.kind is None
@@ -418,27 +397,22 @@ def check_columns(profile: Profile) -> None:
             )
             raise file.error(f"{sentence}; correct it", ("columns",))
     pattern = record.columns["pose"].pattern if "pose" in record.columns else None
-    if several and (pattern is None or "target" not in pattern.groupindex):
+    if len(profile.targets) > 1 and (pattern is None or "target" not in pattern.groupindex):
         sentence = "the kind has several targets, each with a line of its own"
         act = "add (?P<target>..) to 'match' of 'pose'"
         raise file.error(f"{sentence}; {act}", ("columns", "pose"))
 
 
-def _list_dimensions(kind: Kind | None, several: bool) -> dict[str, tuple[Dimension, ...]]:
+def _list_dimensions(profile: Profile) -> dict[str, tuple[Dimension, ...]]:
     """Return the dimensions of the columns of a kind, of sigma and (two) of covariances."""
-    if kind is None:
+    if profile.kind is None:
         return {}
-
-    def list_plain(columns: Sequence[Column]) -> dict[str, Dimension]:
-        return {strip_target(c.name) if several else c.name: c.dimension for c in columns}
-
-    noise = list_plain(kind.noise_columns)
-    dimensions: dict[str, tuple[Dimension, ...]] = {
-        name: (d,) for name, d in list_plain(kind.columns).items()
+    noise = {profile.strip_target(c.name): c.dimension for c in profile.kind.noise_columns}
+    return {
+        **{profile.strip_target(c.name): (c.dimension,) for c in profile.kind.columns},
+        **{SIGMA + name: (d,) for name, d in noise.items()},
+        **{f"{COVARIANCE}{a}.{b}": (noise[a], noise[b]) for a, b in permutations(noise, 2)},
     }
-    dimensions |= {SIGMA + name: (d,) for name, d in noise.items()}
-    pairs = ((a, b) for a in noise for b in noise if a != b)
-    return dimensions | {f"{COVARIANCE}{a}.{b}": (noise[a], noise[b]) for a, b in pairs}
 
 
 def _check_source(
