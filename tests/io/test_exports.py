@@ -11,11 +11,13 @@ from loopcal import geometry
 from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
 from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.exports.conversion import convert_export
+from loopcal.io.exports.conversion import Conversion, convert_export
 from loopcal.io.exports.profile import read_profile
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.initial_values import evaluate_measurements, guess_nuisance_values, whiten_rows
 from loopcal.mechanism.solutions import forward
+from tests.io import export_texts, test_profiles
+from tests.io.export_texts import read_rows
 
 EXAMPLES = Path("examples/exports").resolve()
 CASES = {
@@ -82,28 +84,8 @@ settings: {kind: position, noise: {x: 1 um, y: 1 um, z: 1 um}}
 EXPORT = "Liste\nName;X;Y;Z\nP1;1,5;2;3\n\nP2;4;5;6e-1\n"
 
 
-def convert(folder, export: str | bytes = EXPORT, profile: str = PROFILE):
-    (folder / "profile.yaml").write_text(profile, encoding="utf-8")
-    raw = export if isinstance(export, bytes) else export.encode()
-    (folder / "export.txt").write_bytes(raw)
-    return convert_export(folder / "export.txt", read_profile(folder / "profile.yaml"))
-
-
-def read_rows(text: str) -> list[str]:
-    return [line for line in text.rstrip("\n").split("\n") if not line.startswith("#")][1:]
-
-
-@pytest.mark.parametrize(
-    "raw",
-    [
-        EXPORT.encode(),
-        EXPORT.replace("\n", "\r\n").encode("utf-8-sig"),
-        EXPORT.replace("\n", "\r").encode(),
-        EXPORT.replace("P1", '"P1"').encode(),
-    ],
-)
-def test_line_ends_byte_order_marks_and_quotes_make_no_difference(tmp_path, raw) -> None:
-    assert read_rows(convert(tmp_path, raw).text) == ["P1,1.5,2,3", "P2,4,5,6e-1"]
+def convert(folder, export: str | bytes = EXPORT, profile: str = PROFILE) -> Conversion:
+    return export_texts.convert(folder, export, profile)
 
 
 def test_stated_encoding_is_used(tmp_path) -> None:
@@ -211,85 +193,72 @@ def test_export_that_does_not_fit_the_profile_is_refused_with_the_reason(tmp_pat
 BAD_PROFILES = {
     "no delimiter": ("delimiter: semicolon\n", "", None, "no key 'delimiter'"),
     "an unknown delimiter": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'; allowed: 'comma'"),
-    "a comma for two things": (
-        "semicolon",
-        "comma",
-        3,
-        "a comma cannot be both the decimal mark and the separator",
-    ),
+    "a comma for two things": ("semicolon", "comma", 3, "both the decimal mark and the separator"),
     "an unknown key": ("decimal", "decimals", 3, "unknown key 'decimals'.*did you mean 'decimal'"),
-    "an unknown column": (
-        "  z:",
-        "  zz:",
-        8,
-        "'zz' is not a column of measurement files of the kind 'position'",
-    ),
+    "an unknown column": ("  z:", "  zz:", 8, "'zz' is not a column of .* the kind 'position'"),
     "a missing column": ("  z: {from: Z, unit: mm}\n", "", 4, "states 0 sources of 'z'"),
-    "no unit": ("from: Z, unit: mm", "from: Z", 8, "'z' has no unit"),
-    "an unknown unit": (
-        "from: Z, unit: mm",
-        "from: Z, unit: mmm",
-        8,
-        "'mmm' is not a unit.*did you mean 'mm'",
-    ),
-    "a unit of a text column": (
-        "from: Name",
-        "from: Name, unit: mm",
-        5,
-        "'pose' is text and has no unit",
-    ),
-    "an invalid column number": (
-        "from: Z",
-        "from: 0",
-        8,
-        "0 is neither a name in the export's header nor a place",
-    ),
+    "no unit": ("Z, unit: mm", "Z", 8, "'z' has no unit"),
+    "an unknown unit": ("Z, unit: mm", "Z, unit: mmm", 8, "'mmm' is not .*did you mean 'mm'"),
+    "a unit of text": ("Name", "Name, unit: mm", 5, "'pose' is text and has no unit"),
+    "an invalid column number": ("from: Z", "from: 0", 8, "0 is neither a name in .* nor a place"),
     "no source": ("{from: Z, unit: mm}", "Z", 8, "'columns.z' is the text 'Z'"),
-    "an invalid pattern": (
-        "from: Name",
-        "from: Name, match: '('",
-        5,
-        "is not a regular expression",
+    "an invalid pattern": ("Name", "Name, match: '('", 5, "is not a regular expression"),
+    "a pattern without a pose": ("Name", "Name, match: 'P.'", 5, "this pattern finds no pose"),
+    "no pattern": ("position,", "position, targets: [a, b],", 5, "to 'match' of 'pose'"),
+    "an unknown kind": ("position", "positon", 9, "is not a kind .* .did you mean 'position'"),
+    "a matrix of four": ("decimal", "matrix: [1, 2, 3, 4]\ndecimal", 3, "matrix has nine columns"),
+    "no kind": ("kind: position, ", "", 9, "no kind of measurement is stated"),
+    "a newer format": ("format: 1", "format: 7", 1, "this file has format 7"),
+    "an angle for a length": ("X, unit: mm", "X, unit: deg", 6, "'deg' is not a unit of 'x'"),
+    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 8, "not a unit"),
+    "an unknown sigma": (
+        "  z:",
+        "  sigma.w: {from: C, unit: mm}\n  z:",
+        8,
+        "'sigma.w' is not a column .*did you mean 'sigma",
     ),
-    "a pattern without a pose": (
-        "from: Name",
-        "from: Name, match: 'P.'",
-        5,
-        "this pattern finds no pose",
-    ),
-    "targets without a pattern": (
-        "position,",
-        "position, targets: [a, b],",
-        5,
-        "to 'match' of 'pose'",
-    ),
-    "an unknown kind": (
-        "position",
-        "positon",
-        9,
-        "is not a kind of measurement .did you mean 'position'",
-    ),
-    "an unknown encoding": (
-        "decimal",
-        "encoding: utf-99\ndecimal",
-        3,
-        "'utf-99' is not a known encoding",
-    ),
-    "a matrix of four": (
-        "decimal",
-        "matrix: [1, 2, 3, 4]\ndecimal",
-        3,
-        "a matrix has nine columns",
-    ),
+    "another unit in the header": ("from: X", 'from: "X [m]"', 6, "header is 'X .m.', but"),
+    "degrees in the header": ("from: X", 'from: "X (°)"', 6, "write the unit deg"),
+    "no readings": ("settings", "readings:\nsettings", 9, "'readings' is empty"),
+    "an empty value": ("delimiter", "missing: [null]\ndelimiter", 2, "'missing entry 1' is empty"),
+} | {
+    name: ("decimal", f"encoding: {name}\ndecimal", 3, f"'{name}' is not a known encoding")
+    for name in ("utf-99", "hex", "rot13")
 }
+BAD_UNCERTAINTIES = {
+    "factor 0": ("factor: 0.5, floor", "factor: 0, floor", 9, "'factor' is 0; write a positive"),
+    "floor 0": ("floor: 0.002 mm", "floor: 0 mm", 9, "'floor' is 0 mm; write a positive quantity"),
+    "floor in degrees": ("floor: 0.002 mm", "floor: 2 deg", 9, "deg"),
+    "floor without unit": ("floor: 0.002 mm", "floor: 2", 9, "unit"),
+    "factor of x": ('mm]", unit: mm', 'mm]", unit: mm, factor: 2', 6, "'factor' belongs to"),
+    "floor of x": ('mm]", unit: mm', 'mm]", unit: mm, floor: 1 um', 6, "'floor' belongs to"),
+}
+BAD_READINGS = {
+    "no pose": ("pose: {from: Point}, ", "", 4, "add the column 'pose'"),
+    "a measured column": (
+        "pose: {from: Point}",
+        "pose: {from: Point}, x: {from: L1, unit: mm}",
+        4,
+        r"'x' is not a column of a table of readings \(no kind is stated\)",
+    ),
+    "noise": ("robot: hexapod-42", "noise: {x: 1 um}", 12, "unknown key 'noise'"),
+}
+REFUSED_PROFILES = [
+    pytest.param(profile, *case, id=name)
+    for profile, cases in (
+        (PROFILE, BAD_PROFILES),
+        (test_profiles.PROFILE, BAD_UNCERTAINTIES),
+        (test_profiles.READINGS, BAD_READINGS),
+    )
+    for name, case in cases.items()
+]
 
 
-@pytest.mark.parametrize("case", BAD_PROFILES)
-def test_invalid_profile_is_refused_with_its_line(tmp_path, case) -> None:
-    old, new, line, message = BAD_PROFILES[case]
-    assert old in PROFILE
+@pytest.mark.parametrize(("profile", "old", "new", "line", "message"), REFUSED_PROFILES)
+def test_invalid_profile_is_refused_with_its_line(tmp_path, profile, old, new, line, message):
+    assert old in profile
     with pytest.raises(FileError, match=message) as caught:
-        convert(tmp_path, EXPORT, PROFILE.replace(old, new, 1))
+        convert(tmp_path, EXPORT, profile.replace(old, new, 1))
     assert caught.value.line == line
     assert "\n" not in str(caught.value)
 

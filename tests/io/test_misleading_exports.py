@@ -10,19 +10,9 @@ from loopcal.cli.entry_point import main
 from loopcal.diagnose.conventions.convention_check import check_conventions
 from loopcal.errors import FileError, LoopcalError
 from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.exports.conversion import convert_export
-from loopcal.io.exports.profile import read_profile
 from loopcal.io.robot.robot_file import load_robot
+from tests.io.export_texts import BY_NAME, convert, read_table_lines
 
-BY_NAME = """format: 1
-delimiter: comma
-columns:
-  pose: {from: Name}
-  x: {from: X, unit: mm}
-  y: {from: Y, unit: mm}
-  z: {from: Z, unit: mm}
-settings: {kind: position, noise: {"*": 1 um}}
-"""
 BY_PLACE = BY_NAME.replace("Name", "1").replace("X", "2").replace("Y", "3").replace("Z", "4")
 TARGETS = """format: 1
 delimiter: semicolon
@@ -40,16 +30,6 @@ READINGS = (
     + ", ".join(f"q{i}: {{from: J{i}, unit: mm}}" for i in range(1, 7))
     + "}\nsettings:"
 )
-
-
-def convert(folder, export: str, profile: str):
-    (folder / "profile.yaml").write_text(profile, encoding="utf-8")
-    (folder / "export.txt").write_text(export, encoding="utf-8")
-    return convert_export(folder / "export.txt", read_profile(folder / "profile.yaml"))
-
-
-def read_table_lines(text: str) -> list[str]:
-    return [line for line in text.rstrip("\n").split("\n") if not line.startswith("#")]
 
 
 @pytest.mark.parametrize(
@@ -251,37 +231,6 @@ def test_joint_with_reading_and_measurement_has_two_columns(tmp_path) -> None:
         convert(tmp_path, "Name,B1,J1\n1,5,7\n", JOINT.replace("  measured.q1", "  q1"))
 
 
-BAD = {
-    "hex": ("delimiter", "encoding: hex\ndelimiter", 2, "'hex' is not a known encoding"),
-    "rot13": ("delimiter", "encoding: rot13\ndelimiter", 2, "'rot13' is not a known encoding"),
-    "a newer format": ("format: 1", "format: 7", 1, "this file has format 7"),
-    "an angle for a length": ("from: X, unit: mm", "from: X, unit: deg", 5, ("'deg' is not a unit "
-                                                                            "of 'x'")),
-    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, ("'mm' is not "
-                                                                                     "a unit")),
-    "an unknown sigma": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is not a "
-                                                                              "column .*did you "
-                                                                              "mean 'sigma")),
-    "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, ("header is "  # noqa: E501
-                                                                                        "'X .m.', but")),  # noqa: E501
-    "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, ("write the "
-                                                                                    "unit "
-                                                                                   "deg")),
-    "no readings": ("settings", "readings:\nsettings", 8, "'readings' is empty"),
-    "an empty value": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing entry 1' is "
-                                                                          "empty")),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_profile_with_wrong_units_or_encoding_is_refused_with_its_line(tmp_path, case) -> None:
-    old, new, line, message = BAD[case]
-    assert old in BY_NAME
-    with pytest.raises(FileError, match=message) as caught:
-        convert(tmp_path, "Name,X,Y,Z\n1,1,2,3\n", BY_NAME.replace(old, new, 1))
-    assert caught.value.line == line
-
-
 @pytest.mark.parametrize("word", ["null", "true", "No", "a"])
 def test_setting_that_yaml_would_convert_is_quoted(tmp_path, word) -> None:
     profile = BY_NAME.replace("settings: {", f"settings: {{session: '{word}', poses: poses.csv, ")
@@ -297,64 +246,38 @@ def test_import_reports_targets_with_different_times(tmp_path, monkeypatch, caps
     monkeypatch.chdir(tmp_path)
     lines = "Name;X;Y;Z;When\nP1_a;1;2;3;2026-05-04\nP1_b;1;2;3;2026-05-05\n"
     convert(tmp_path, lines, TARGETS.replace("MORE", "time: {from: When}"))
-    assert main(["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]) == 0
+    words = ["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]
+    assert main(words) == 0
     assert "note: 1 line of further targets state another time" in capsys.readouterr().out
-    assert (
-        main(
-            [
-                "import",
-                "export.txt",
-                "--profile",
-                "profile.yaml",
-                "-o",
-                "data.csv",
-                "--json",
-                "--force",
-            ]
-        )
-        == 0
-    )
+    assert main([*words, "--json", "--force"]) == 0
     assert len(json.loads(capsys.readouterr().out)["notes"]) == 1
 
 
 HEADER = (
     "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],temperature [degC],x [mm],y [mm],z [mm]\n"
 )
-ROWS = HEADER + "".join(f"P{i},{i},0,{i % 3},0,0,{i % 2},20,{i},2,3\n" for i in range(4))
 FRONT = "# kind: position\n# noise: {'*': 1 um}\n"
-BY_PROFILE = "profile"
+ROWS = FRONT + HEADER + "".join(f"P{i},{i},0,{i % 3},0,0,{i % 2},20,{i},2,3\n" for i in range(4))
 REFUSED = {
-    "semicolons": (
-        (FRONT + ROWS.replace(",", ";")).encode(),
-        f"columns are separated by semicolons; .*{BY_PROFILE}",
-    ),
-    "tabs": (
-        (FRONT + ROWS.replace(",", "\t")).encode(),
-        f"columns are separated by tabs; .*{BY_PROFILE}",
-    ),
-    "latin-1": (
-        ("## Länge\n" + FRONT + ROWS).encode("latin-1"),
-        f"is not UTF-8 text .*{BY_PROFILE}",
-    ),
-    "utf-16": ((FRONT + ROWS).encode("utf-16"), f"is not UTF-8 text .*{BY_PROFILE}"),
+    "semicolons": (ROWS.replace(",", ";"), "columns are separated by semicolons; .*profile"),
+    "tabs": (ROWS.replace(",", "\t"), "columns are separated by tabs; .*profile"),
+    "latin-1": (("## Länge\n" + ROWS).encode("latin-1"), "is not UTF-8 text .*profile"),
+    "utf-16": (ROWS.encode("utf-16"), "is not UTF-8 text .*profile"),
     "capitals": (
-        (FRONT + ROWS.replace("x [mm]", "X [mm]")).encode(),
+        ROWS.replace("x [mm]", "X [mm]"),
         r"column 'X' is unknown \(did you mean 'x \[mm\]'\?\)",
     ),
     "brackets": (
-        (FRONT + ROWS.replace("x [mm]", "x (mm)")).encode(),
+        ROWS.replace("x [mm]", "x (mm)"),
         r"'x \(mm\)' is unknown \(did you mean 'x \[mm\]'\?\)",
     ),
     "both": (
-        (FRONT + ROWS.replace("q1 [mm]", "Q1(mm)")).encode(),
+        ROWS.replace("q1 [mm]", "Q1(mm)"),
         r"'Q1\(mm\)' is unknown \(did you mean 'q1 \[mm\]'\?\)",
     ),
-    "ice": (
-        (FRONT + ROWS.replace(",20,2,", ",-300,2,")).encode(),
-        r"data.csv:6: .*is -300 degC, below absolute zero",
-    ),
+    "ice": (ROWS.replace(",20,2,", ",-300,2,"), "data.csv:6: .*is -300 degC, below absolute zero"),
     "still": (
-        (FRONT + re.sub(",20,.,2", ",20,1,2", ROWS)).encode(),
+        re.sub(",20,.,2", ",20,1,2", ROWS),
         r"stay within 0 mm, but the robot moves it by [\d.]+ mm",
     ),
 }
@@ -363,7 +286,8 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_measurement_file_of_another_program_is_refused_with_advice(tmp_path, case) -> None:
     content, message = REFUSED[case]
-    (tmp_path / "data.csv").write_bytes(content)
+    raw = content if isinstance(content, bytes) else content.encode()
+    (tmp_path / "data.csv").write_bytes(raw)
     robot = load_robot("hexapod-42")
     with pytest.raises(LoopcalError, match=message) as caught:
         check_conventions(robot, load_measurements(tmp_path / "data.csv", robot))
@@ -372,7 +296,7 @@ def test_measurement_file_of_another_program_is_refused_with_advice(tmp_path, ca
 
 def test_temperature_of_zero_kelvin_is_accepted(tmp_path) -> None:
     (tmp_path / "data.csv").write_text(
-        FRONT + ROWS.replace("[degC]", "[degF]").replace(",20,2,", ",-459.67,2,")
+        ROWS.replace("[degC]", "[degF]").replace(",20,2,", ",-459.67,2,")
     )
     data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
     assert data.observations[0].context["temperature"][2] == pytest.approx(

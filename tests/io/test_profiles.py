@@ -8,9 +8,10 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.exports.conversion import Conversion, convert_export
-from loopcal.io.exports.profile import read_profile
+from loopcal.io.exports.conversion import Conversion
 from loopcal.io.robot.robot_file import load_robot
+from tests.io import export_texts
+from tests.io.export_texts import read_rows
 
 PROFILE = """format: 1
 delimiter: semicolon
@@ -58,16 +59,7 @@ def robot():
 
 
 def convert(folder, export: str | bytes = EXPORT, profile: str = PROFILE) -> Conversion:
-    """Convert an export."""
-    (folder / "profile.yaml").write_text(profile, encoding="utf-8")
-    raw = export if isinstance(export, bytes) else export.encode()
-    (folder / "export.txt").write_bytes(raw)
-    return convert_export(folder / "export.txt", read_profile(folder / "profile.yaml"))
-
-
-def read_rows(text: str) -> list[str]:
-    """Return the rows below the header."""
-    return [line for line in text.rstrip("\n").split("\n") if not line.startswith("#")][1:]
+    return export_texts.convert(folder, export, profile)
 
 
 def test_expanded_uncertainties_are_divided_and_zeros_become_the_floor(tmp_path, robot) -> None:
@@ -110,24 +102,6 @@ def test_factor_writes_no_more_than_seventeen_digits(tmp_path) -> None:
     cells = read_rows(convert(tmp_path, profile=third).text)[0].split(",")
     assert float(cells[1]) == pytest.approx(12.5 / 3, rel=1e-15)
     assert all(len(re.sub(r"\D", "", cell).lstrip("0")) <= 17 for cell in cells[1:])
-
-
-WRONG_PROFILES = {
-    "factor: 0.5, floor": ("factor: 0, floor", "'factor' is 0; write a positive number"),
-    "floor: 0.002 mm": ("floor: 0 mm", "'floor' is 0 mm; write a positive quantity"),
-    "floor: 0.002 mm}\n  sigma.y": ("floor: 2 deg}\n  sigma.y", "deg"),
-    "floor: 0.002 mm}\n  sigma.z": ("floor: 2}\n  sigma.z", "unit"),
-    '"X [mm]", unit: mm': ('"X [mm]", unit: mm, factor: 2', "'factor' belongs to columns of"),
-    '"Z [mm]", unit: mm': ('"Z [mm]", unit: mm, floor: 1 um', "'floor' belongs to columns of"),
-}
-
-
-@pytest.mark.parametrize("old", WRONG_PROFILES)
-def test_wrong_factor_or_floor_is_refused_with_its_line(tmp_path, old) -> None:
-    new, sentence = WRONG_PROFILES[old]
-    with pytest.raises(FileError, match=r"profile\.yaml:\d+: ") as refused:
-        convert(tmp_path, profile=PROFILE.replace(old, new, 1))
-    assert sentence in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -194,36 +168,13 @@ def test_table_of_readings_alone_is_joined_with_measured_values(tmp_path, robot)
     assert data.is_held_out.tolist() == [False, True, False]
 
 
-READINGS_PROFILES = {
-    "no pose": ("pose: {from: Point}, ", "", "add the column 'pose'"),
-    "a measured column": (
-        "pose: {from: Point}",
-        "pose: {from: Point}, x: {from: L1, unit: mm}",
-        "'x' is not a column of a table of readings (no kind is stated)",
-    ),
-    "noise": ("robot: hexapod-42", "noise: {x: 1 um}", "unknown key 'noise'"),
-}
-
-
-@pytest.mark.parametrize("case", READINGS_PROFILES)
-def test_wrong_profile_of_readings_is_refused(tmp_path, case) -> None:
-    old, new, sentence = READINGS_PROFILES[case]
-    with pytest.raises(FileError) as refused:
-        convert(tmp_path, LENGTHS, READINGS.replace(old, new))
-    assert sentence in str(refused.value)
-
-
-def test_profile_without_kind_and_readings_is_refused(tmp_path) -> None:
-    with pytest.raises(FileError, match="no kind of measurement is stated"):
-        convert(tmp_path, profile=PROFILE.replace("kind: position, ", ""))
-
-
 def test_unknown_use_is_a_line_that_does_not_fit(tmp_path) -> None:
     found = convert(tmp_path, LENGTHS.replace("held-out", "validate"), READINGS)
     assert found.misfits == ((3, "the use 'validate' is not fit or held-out"),)
 
 
 HOSTILE = {
+    "old Mac lines": lambda text: text.replace("\n", "\r").encode(),
     "Windows lines": lambda text: text.replace("\n", "\r\n").encode(),
     "byte order mark": lambda text: text.encode("utf-8-sig"),
     "blanks at the ends of lines": lambda text: text.replace("\n", "   \n").encode(),
