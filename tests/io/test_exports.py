@@ -13,7 +13,6 @@ from loopcal.errors import FileError
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import Conversion, convert_export
 from loopcal.io.exports.profile import read_profile
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.initial_values import evaluate_measurements, guess_nuisance_values, whiten_rows
 from loopcal.mechanism.solutions import forward
 from tests.io import export_texts, test_profiles
@@ -25,11 +24,6 @@ CASES = {
     "six-dof.txt": (8, 2, []),
     "cmm-spheres.csv": (8, 3, []),
 }
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("hexapod-42")
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -10,7 +10,6 @@ import pytest
 from loopcal.errors import LoopcalError
 from loopcal.io.data.measurement_file import list_measurement_files, load_measurements
 from loopcal.io.data.measurement_writer import save_measurements
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.directions import Inclination
 from loopcal.measure.kinds.poses import Component
@@ -35,11 +34,6 @@ pose,{Q.replace("mm", "m")},tilt_x [arcsec],tilt_y [mrad]
 b,.001,.001,.001,.001,.001,.001,10,0.1
 d,.004,.004,.004,.004,.004,.004,20,0.2
 """
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("hexapod-42")
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from loopcal.errors import DataError, LoopcalError
 from loopcal.io.core.csv_table import format_exact, parse_exact
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.data.measurement_writer import format_data_sheet, save_measurements
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.position import Position
@@ -35,11 +34,6 @@ a,monday,0,0,0,0,0,0,1,2,200
 b,monday,1,1,1,1,1,1,1,2,201
 c,tuesday,2,2,2,2,2,2,1,2,202
 """
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("hexapod-42")
 
 
 def write(folder, text: str):
@@ -135,45 +129,6 @@ def test_stated_unknowns_match_patterns_and_are_kept_in_subsets(tmp_path, robot)
     ].tolerance == 0.002
 
 
-STATEMENT_CASES = {
-    "no such unknown": (
-        "ball.x: fixed",
-        "ball.q: fixed",
-        "no setup parameter 'ball.q'; it has monday.tracker.rx",
-    ),
-    "no unit": ("sd: 1 mm", "sd: 1", "'1' has no unit"),
-    "an angle for a length": (
-        "start: 12 mm",
-        "start: 12 mrad",
-        "start': 'mrad' is a unit of angle",
-    ),
-    "a sigma of zero": ("sd: 1 mm", "sd: 0 mm", "the standard deviation is 0 mm"),
-    "a start alone": ("start: 12 mm, sd: 1 mm", "start: 12 mm", "state either 'sd' or 'fixed"),
-    "fixed and with sd": ("sd: 1 mm", "sd: 1 mm, fixed: true", "state either 'sd' or 'fixed"),
-    "an unknown statement": (
-        "ball.x: fixed",
-        "ball.x: free",
-        "'free' does not state knowledge.*write 'fixed'",
-    ),
-    "a misspelt key": (
-        "sd: 1 mm",
-        "sd: 1 mm, stat: 3 mm",
-        "unknown key 'stat'.*did you mean 'start'",
-    ),
-    "lengths and angles": ("tracker.r?", "tracker.*", "matches lengths and angles"),
-    "a list": (UNKNOWNS, "[ball.x]", "'unknowns' must name"),
-}
-
-
-@pytest.mark.parametrize("case", STATEMENT_CASES)
-def test_invalid_statement_about_unknowns_is_refused_with_its_line(tmp_path, robot, case) -> None:
-    old, new, message = STATEMENT_CASES[case]
-    assert old in TEXT
-    with pytest.raises(LoopcalError, match=message) as caught:
-        load_measurements(write(tmp_path, TEXT.replace(old, new, 1)), robot)
-    assert f"{tmp_path / 'data.csv'}:6: " in str(caught.value)
-
-
 READINGS = """# kind: component
 # components: [z]
 # noise: {z: 1 um}
@@ -199,23 +154,6 @@ def test_noise_of_readings_is_read_and_an_empty_cell_is_a_missing_reading(tmp_pa
     kept = data.take([2, 1])
     assert kept.reading_sigma is not None
     assert kept.reading_sigma[:, 5].tolist() == [np.inf, np.inf]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("5 um", "5", r"data.csv:4: 'reading_noise.q1': '5' has no unit"),
-        ("5 um", "-5 um", r"data.csv:4: the noise of readings is -5 um"),
-        ("q1: 5 um", "q9: 5 um", r"data.csv:4: unknown key 'q9' in 'reading_noise'"),
-        ("{q1: 5 um, q2: 0 mm}", "5 deg", r"data.csv:4: 'reading_noise': 'deg' is a unit of angle"),
-        (",7,", ",-7,", r"data.csv:6: column 'sigma.q6' is negative"),
-        ("sigma.q6 [um]", "sigma.q6", r"data.csv:5: column 'sigma.q6' has no unit"),
-        (",7,", ",,", (r"data.csv:6: column 'sigma.q6' is empty, and no other noise")),
-    ],
-)
-def test_invalid_noise_of_readings_is_refused(tmp_path, robot, old, new, message) -> None:
-    with pytest.raises(LoopcalError, match=message):
-        load_measurements(write(tmp_path, READINGS.replace(old, new, 1)), robot)
 
 
 CONTEXT = """# kind: component
@@ -259,27 +197,47 @@ def test_temperature_of_a_pose_applies_to_its_rows_in_other_files(tmp_path, robo
     np.testing.assert_array_equal(data.observations[0].context["temperature"], [21.0, np.nan])
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            "[degC]",
-            "[mm]",
-            "column 'temperature' has the unit 'mm'; write one of .degC., .K., .degF.",
-        ),
-        (" [degC]", "", "column 'temperature' has no unit"),
-        (
-            "2026-05-04T10:22:31.5",
-            "4.5.2026 10:22",
-            r"data.csv:5: column 'time' is '4.5.2026 10:22', but a date and time",
-        ),
-        ("temperature.frame", "temperature.", "column 'temperature.' is unknown"),
-        (",20.5,", ",warm,", "column 'temperature' is 'warm', but a number"),
-    ],
+STATEMENTS = (
+    ("ball.x: fixed", "ball.q: fixed", "no setup parameter 'ball.q'; it has monday.tracker.rx"),
+    ("sd: 1 mm", "sd: 1", "'1' has no unit"),
+    ("start: 12 mm", "start: 12 mrad", "start': 'mrad' is a unit of angle"),
+    ("sd: 1 mm", "sd: 0 mm", "the standard deviation is 0 mm"),
+    ("start: 12 mm, sd: 1 mm", "start: 12 mm", "state either 'sd' or 'fixed"),
+    ("sd: 1 mm", "sd: 1 mm, fixed: true", "state either 'sd' or 'fixed"),
+    ("ball.x: fixed", "ball.x: free", "'free' does not state knowledge.*write 'fixed'"),
+    ("sd: 1 mm", "sd: 1 mm, stat: 3 mm", "unknown key 'stat'.*did you mean 'start'"),
+    ("tracker.r?", "tracker.*", "matches lengths and angles"),
+    (UNKNOWNS, "[ball.x]", "'unknowns' must name"),
 )
-def test_invalid_times_and_temperatures_are_refused(tmp_path, robot, old, new, message) -> None:
-    with pytest.raises(LoopcalError, match=message):
-        load_measurements(write(tmp_path, CONTEXT.replace(old, new, 1)), robot)
+REFUSED = {
+    TEXT: [(old, new, 6, message) for old, new, message in STATEMENTS]
+    + [("a,monday", '"a,monday', 8, "not valid CSV.*quotes")],
+    READINGS: [
+        ("5 um", "5", 4, "'reading_noise.q1': '5' has no unit"),
+        ("5 um", "-5 um", 4, "the noise of readings is -5 um"),
+        ("q1: 5 um", "q9: 5 um", 4, "unknown key 'q9' in 'reading_noise'"),
+        ("{q1: 5 um, q2: 0 mm}", "5 deg", 4, "'reading_noise': 'deg' is a unit of angle"),
+        (",7,", ",-7,", 6, "column 'sigma.q6' is negative"),
+        ("sigma.q6 [um]", "sigma.q6", 5, "column 'sigma.q6' has no unit"),
+        (",7,", ",,", 6, "column 'sigma.q6' is empty, and no other noise"),
+    ],
+    CONTEXT: [
+        ("[degC]", "[mm]", 4, "'temperature' has the unit 'mm'; write one of .degC., .K., .degF."),
+        (" [degC]", "", 4, "column 'temperature' has no unit"),
+        ("2026-05-04T10:22:31.5", "4.5.2026 10:22", 5, "'time' is '4.5.2026 10:22', but a date"),
+        ("temperature.frame", "temperature.", 4, "column 'temperature.' is unknown"),
+        (",20.5,", ",warm,", 5, "column 'temperature' is 'warm', but a number"),
+    ],
+}
+CASES = [(text, *case) for text, cases in REFUSED.items() for case in cases]
+
+
+@pytest.mark.parametrize(("text", "old", "new", "line", "message"), CASES)
+def test_invalid_file_is_refused_with_its_line(tmp_path, robot, text, old, new, line, message):
+    assert old in text
+    with pytest.raises(LoopcalError, match=message) as caught:
+        load_measurements(write(tmp_path, text.replace(old, new, 1)), robot)
+    assert str(caught.value).startswith(f"{tmp_path / 'data.csv'}:{line}: ")
 
 
 @pytest.mark.parametrize("name", ["a;b", "two\nlines", " a", ""])
@@ -291,11 +249,6 @@ def test_pose_name_that_cannot_be_written_is_refused_before_writing(tmp_path, ro
     with pytest.raises(DataError, match="two poses are named 'a'"):
         save_measurements(twice, tmp_path / "data.csv", robot)
     assert not (tmp_path / "data.csv").exists()
-
-
-def test_unclosed_quote_is_refused_with_its_line(tmp_path, robot) -> None:
-    with pytest.raises(LoopcalError, match=r"data.csv:8: not valid CSV.*quotes"):
-        load_measurements(write(tmp_path, TEXT.replace("a,monday", '"a,monday')), robot)
 
 
 def test_filled_in_data_sheet_is_read_as_measurements(tmp_path, robot) -> None:

@@ -8,7 +8,6 @@ from loopcal.errors import DataError, LoopcalError
 from loopcal.io.data.kind_settings import list_kind_settings
 from loopcal.io.data.measurement_file import load_measurements, load_poses
 from loopcal.io.data.measurement_writer import format_template, save_measurements
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.poses import Component, Pose
@@ -19,11 +18,6 @@ from loopcal.mechanism.solutions import inverse
 
 EXAMPLES = [kind for cls in KINDS.values() for kind in cls.examples() if kind.columns]
 IDS = [f"{kind.name}-{i}" for i, kind in enumerate(EXAMPLES)]
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("hexapod-42")
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import pytest
 from loopcal.errors import FileError
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import Conversion
-from loopcal.io.robot.robot_file import load_robot
 from tests.io import export_texts
 from tests.io.export_texts import read_rows
 
@@ -51,11 +50,6 @@ P1;fit;1,5;2;3;4;5;6
 P2;held-out;0;0;0;0;0;1e-1
 P3;;1;1;1;1;1;1
 """
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("hexapod-42")
 
 
 def convert(folder, export: str | bytes = EXPORT, profile: str = PROFILE) -> Conversion:

@@ -12,6 +12,7 @@ from loopcal.errors import FileError
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
 from loopcal.measure.measurements import Measurements
+from tests.findings.expectations import expect_refusal
 
 HEAD = "# kind: component\n# components: [x]\n# noise: {x: 1 um}\n"
 READINGS = "pose,left [deg],right [deg]\na,100,30\nb,101,31\n"
@@ -74,9 +75,8 @@ def test_file_that_does_not_exist_is_refused_and_not_searched_for_elsewhere(fold
 
 def test_controller_is_beside_the_file_or_shipped_and_not_in_the_current_folder(folders) -> None:
     (folders / "robot.yaml").unlink()  # one of this name is in the current folder
-    with pytest.raises(FileError) as caught:
+    with expect_refusal("files.reference-missing", FileError):
         load(folders, COMMANDED, "robot.yaml")
-    assert caught.value.code == "files.reference-missing"
     load(folders, COMMANDED, "five-bar")
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.errors import FileError
+from tests.findings.expectations import expect_refusal
 
 DATA = Path("examples/hexapod-42/measurements.csv").resolve()
 
@@ -33,9 +34,8 @@ def test_saved_report_is_loaded_as_a_run(tmp_path, calibrated) -> None:
     assert report.split.held_out is not None
     assert held_out is not None
     assert held_out.labels == report.split.held_out.labels == run.held_out
-    with pytest.raises(FileError) as caught:
+    with expect_refusal("files.folder-in-use", FileError):
         lc.save_run(tmp_path / "run", report)
-    assert caught.value.code == "files.folder-in-use"
 
 
 def test_changed_or_missing_measurements_of_a_run_are_refused(tmp_path, calibrated) -> None:

@@ -34,18 +34,12 @@ from loopcal.io.exports.profile import (
     with_local_settings,
 )
 from loopcal.io.exports.sheet_filling import fill_sheet
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
 
 TARGETS = ("SMR1", "SMR2", "SMR3")
 N = 14
 Points = Sequence[tuple[str, np.ndarray]]
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("hexapod-42")
 
 
 @pytest.fixture(scope="module")

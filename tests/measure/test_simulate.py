@@ -30,6 +30,7 @@ from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.solutions import inverse
 from loopcal.parameters import ParameterTable
 from tests import zoo
+from tests.findings.expectations import expect_refusal
 
 SIGMA = np.array([5e-6, 5e-6, 5e-6, 1e-6, 1e-6, 1e-6])
 COMMANDED = zoo.make_poses(
@@ -174,11 +175,13 @@ def test_readings_outside_the_stroke_are_refused_by_name_value_and_stroke(robot)
 
 def test_readings_of_another_robot_are_refused_with_the_actuators(robot):
     data = Measurements("delta", np.zeros((2, 3)), ())
-    with pytest.raises(DataError) as error:
+    with expect_refusal(
+        "data.wrong-actuator-count",
+        DataError,
+        columns=3,
+        actuators=tuple(a.name for a in robot.actuators),
+    ):
         check_actuators(data, robot)
-    assert error.value.code == "data.wrong-actuator-count"
-    assert error.value.args[0].data["columns"] == 3
-    assert error.value.args[0].data["actuators"] == tuple(a.name for a in robot.actuators)
 
 
 def test_duplicate_row_is_refused():
@@ -187,10 +190,8 @@ def test_duplicate_row_is_refused():
     once = Measurements("toy", np.array([[1.0], [1.0], [2.0]]), (rows,))
     check_duplicates(once)
     twice = Measurements("toy", np.ones((3, 1)), (rows,))
-    with pytest.raises(DataError) as error:
+    with expect_refusal("data.duplicate-rows", DataError, poses=("1", "3")):
         check_duplicates(twice)
-    assert error.value.code == "data.duplicate-rows"
-    assert error.value.args[0].data["poses"] == ("1", "3")
     check_duplicates(twice, allow=True)
 
 
