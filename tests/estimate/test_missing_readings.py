@@ -15,7 +15,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import PoseStates
 from loopcal.estimate.pose_coordinates import measure_poses
 from loopcal.estimate.pose_estimate import report_doubtful_readings
-from loopcal.estimate.pose_rows import PoseRows
+from loopcal.estimate.pose_rows import PoseSearch
 from loopcal.estimate.problem import problem_of
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
@@ -73,7 +73,7 @@ def evaluation_counter(monkeypatch):
 
         monkeypatch.setattr(owner, attribute, wrapped)
 
-    counting(PoseRows, "_evaluate", "evaluations")
+    counting(PoseSearch, "evaluate", "evaluations")
     counting(trials_module, "follow_path", "followed")
     return count
 

@@ -70,20 +70,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
-    """What is solved for: deviations z (a, p) and numbers (a,) of the trials.
-
-    `solves_nuisance` tells whether nuisance parameters are; `located` are the poses of every block
-    where these have no coordinates.
-    """
-
-    z: FloatArray
-    trials: IntArray
-    solves_nuisance: bool
-    located: list[LinearizedPoses] | None
-
-
-@dataclass(frozen=True, eq=False)
 class _Point:
     """All rows at closed poses and nuisance parameters, and the parts of the next step.
 
@@ -192,8 +178,8 @@ class PoseRows:
         nuisance = start.predict_nuisance(z) if solves_nuisance else fixed
         if self.coordinates.count:
             assert start.poses is not None
-            task = _Task(z, trials, solves_nuisance, None)
-            point, is_converged = self._minimize(task, start.poses, nuisance, control)
+            search = PoseSearch(self, z, trials, solves_nuisance)
+            point, is_converged = search.minimize(start.poses, nuisance, control)
             assert point.states is not None
             is_free = self.coordinates.is_free(np.arange(len(self.member)))
             estimates = PoseEstimates(
@@ -209,8 +195,8 @@ class PoseRows:
             known = self.solve_exact_poses(z, start, derivatives)
         if solves_nuisance:
             located = [known.linearized] if known.linearized else self._locate_blocks(z)
-            task = _Task(z, trials, solves_nuisance, located)
-            nuisance = self._minimize(task, None, nuisance, control)[0].nuisance
+            search = PoseSearch(self, z, trials, solves_nuisance, located)
+            nuisance = search.minimize(None, nuisance, control)[0].nuisance
         return PoseSolution(nuisance, known.linearized, known.states, driven=known.driven)
 
     def solve_exact_poses(
@@ -273,7 +259,7 @@ class PoseRows:
             kinds = self.linearize_kinds(block, poses, trials, solution.nuisance)
             node_rows = divide_among_nodes(kinds, block.members, tree)
             for group in block.groups:
-                rest = self._eliminate(block, group, kinds)[0].rest
+                rest = self.eliminate(block, group, kinds, self.nuisance)[0].rest
                 node_rows.append(NodeRows(group.structure, group.nodes, group.components, rest))
             yield block, node_rows, poses.is_lost(block.is_needed)
 
@@ -363,8 +349,8 @@ class PoseRows:
         joints = {}
         for name in self.coordinates.names:
             parts = [np.broadcast_to(p.joints[name], p.is_reached.shape) for p in located]
-            joints[name] = np.concatenate(parts, axis=1)[:, self._pose_order]
-        return np.concatenate([p.T[0] for p in located])[self._pose_order], joints
+            joints[name] = np.concatenate(parts, axis=1)[:, self.pose_order]
+        return np.concatenate([p.T[0] for p in located])[self.pose_order], joints
 
     def _locate_blocks(self, z: FloatArray, start: Start | None = None) -> list[LinearizedPoses]:
         """Return the closed poses of every block, from home or a start."""
@@ -387,33 +373,62 @@ class PoseRows:
         return self.coordinates.linearize(values, states, block.poses, derivatives)
 
     @cached_property
-    def _pose_order(self) -> IntArray:
+    def pose_order(self) -> IntArray:
         """First places (n,) of all poses among those of the blocks, one after the other."""
         poses = np.concatenate([block.poses for block in self.blocks])
         return np.unique(poses, return_index=True)[1]
 
-    def _minimize(
-        self, task: _Task, begin: PoseStates | None, nuisance: FloatArray | None, control: Halving
+    def eliminate(
+        self,
+        block: PoseBlock,
+        group: ComponentGroup,
+        kinds: Sequence[KindRows | None],
+        nuisance: NuisanceElimination | None,
+    ) -> tuple[Elimination, FloatArray]:
+        """Eliminate the coordinates of a group's components from their stacked rows.
+
+        Return also the sums of squares (a, C) before.
+        """
+        tree, k = None if nuisance is None else nuisance.tree, self.coordinates.count
+        rows = stack_rows(block, group, kinds, k, tree)
+        squares = (rows[..., -1] ** 2).sum(axis=2)
+        return eliminate_columns(rows, group.poses.shape[1] * k), squares
+
+
+class PoseSearch:
+    """The search for the best poses and nuisance parameters at deviations z (a, p) of trials (a,).
+
+    `solves_nuisance` tells whether nuisance parameters are solved for; `located` are the poses of
+    every block where these have no coordinates.
+    """
+
+    def __init__(
+        self,
+        rows: PoseRows,
+        z: FloatArray,
+        trials: IntArray,
+        solves_nuisance: bool,
+        located: list[LinearizedPoses] | None = None,
+    ) -> None:
+        self.rows, self.values, self.trials = rows, rows.free.values(z), trials
+        self.nuisance = rows.nuisance if solves_nuisance else None
+        self.located = located
+
+    def minimize(
+        self, begin: PoseStates | None, nuisance: FloatArray | None, control: Halving
     ) -> tuple[_Point, BoolArray]:
         """Return the best poses and nuisance parameters, and which trials (a,) converged."""
 
         def is_part_worse(point: _Point, candidate: _Point) -> BoolArray:
-            grew = ~(candidate.squares <= point.squares)[:, self.member]
+            grew = ~(candidate.squares <= point.squares)[:, self.rows.member]
             return grew | ~candidate.is_reached
 
-        def propose(point: _Point) -> _Step:
-            return self._propose(task, point)
+        first = self.evaluate(begin, nuisance)
+        alone = None if self.nuisance is not None else is_part_worse
+        return minimize_by_halving(first, self.propose, self.move, control, alone)
 
-        def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
-            return self._move(task, point, step, share)
-
-        first = self._evaluate(task, begin, nuisance)
-        alone = None if task.solves_nuisance else is_part_worse
-        return minimize_by_halving(first, propose, move, control, alone)
-
-    def _evaluate(
+    def evaluate(
         self,
-        task: _Task,
         begin: PoseStates | None,
         nuisance: FloatArray | None,
         is_still: BoolArray | None = None,
@@ -424,10 +439,11 @@ class PoseRows:
         not close are not followed. Rows of located poses that no nuisance parameter changes are
         left out.
         """
-        values, k, a = self.free.values(task.z), self.coordinates.count, len(task.z)
-        n, components = len(self.member), len(self.first_pose)
+        pose_rows, values, a = self.rows, self.values, len(self.values)
+        coordinates, k = pose_rows.coordinates, pose_rows.coordinates.count
+        n, components = len(pose_rows.member), len(pose_rows.first_pose)
         tree, factors = None, None
-        if task.solves_nuisance and self.nuisance is not None:
+        if self.nuisance is not None:
             tree = self.nuisance.tree
             factors = NodeFactors(tree, a, 0)
         squares, gain, cost = np.zeros((a, components)), np.zeros(a), np.zeros(a)
@@ -435,26 +451,26 @@ class PoseRows:
         is_unobservable = np.zeros((a, n, k), dtype=bool)
         linearized, solutions, closed = [], [], []
         is_reached, is_lost = np.zeros((a, n), dtype=bool), np.zeros(a, dtype=bool)
-        for i, block in enumerate(self.blocks):
-            if task.located is None:
+        for i, block in enumerate(pose_rows.blocks):
+            if self.located is None:
                 assert begin is not None
                 states = begin.take_poses(block.poses)
-                solved = self.coordinates.close(values, block.poses, states, is_still is None)
+                solved = coordinates.close(values, block.poses, states, is_still is None)
                 if is_still is not None:
                     solved = _keep_still(solved, states, is_still[:, block.poses])
                 closed.append(solved)
-                poses = self.coordinates.linearize(values, solved, block.poses)
+                poses = coordinates.linearize(values, solved, block.poses)
             else:
-                poses = task.located[i]
+                poses = self.located[i]
             is_reached[:, block.poses] = poses.is_reached
             is_lost |= poses.is_lost(block.is_needed)
-            linearized = [poses] if self.is_kept else []
-            kinds = self.linearize_kinds(block, poses, task.trials, nuisance, False)
+            linearized = [poses] if pose_rows.is_kept else []
+            kinds = pose_rows.linearize_kinds(block, poses, self.trials, nuisance, False)
             node_rows = divide_among_nodes(kinds, block.members, tree)
             node_rows = [part for part in node_rows if part.structure >= 0]
             cost += sum((part.rows[..., -1] ** 2).sum(axis=(1, 2)) for part in node_rows)
             for group in block.groups:
-                best, before = self._eliminate(block, group, kinds, task.solves_nuisance)
+                best, before = pose_rows.eliminate(block, group, kinds, self.nuisance)
                 squares[:, group.components] = before
                 gain += best.explained.sum(axis=1)
                 rank[:, group.components] = best.rank
@@ -469,11 +485,11 @@ class PoseRows:
                 fold_node_rows(empty_factor(0, 0), factors, node_rows)
         cost = cost + squares.sum(axis=1)
         if factors is not None and self.nuisance is not None and nuisance is not None:
-            unknowns = self.nuisance.take(task.trials)
+            unknowns = self.nuisance.take(self.trials)
             cost = cost + unknowns.prior_cost(nuisance)
             unknowns.fold_priors(factors, nuisance)
         return _Point(
-            states=PoseStates.join_poses(closed, self._pose_order) if closed else None,
+            states=PoseStates.join_poses(closed, pose_rows.pose_order) if closed else None,
             nuisance=nuisance,
             linearized=linearized,
             is_reached=is_reached,
@@ -486,14 +502,14 @@ class PoseRows:
             is_unobservable=is_unobservable,
         )
 
-    def _propose(self, task: _Task, point: _Point) -> _Step:
+    def propose(self, point: _Point) -> _Step:
         """Return the Gauss-Newton step of all poses and nuisance parameters.
 
         The share of it that is tried first is one for all poses of a component, or of a trial where
         nuisance parameters move, too.
         """
-        a, nuisance, change = len(task.z), None, point.gain
-        u = np.zeros((a, len(self.member), self.coordinates.count))
+        rows, a, nuisance, change = self.rows, len(self.values), None, point.gain
+        u = np.zeros((a, len(rows.member), rows.coordinates.count))
         if point.factors is not None:
             nuisance = eliminate_tree(point.factors)[0].shift
             change = change + point.factors.squared_change(nuisance)
@@ -505,40 +521,23 @@ class PoseRows:
                 right = np.concatenate([nuisance[:, path], right], axis=2)
             best = -np.matmul(solution, right[..., None])[..., 0]
             u[:, numbers] = best.reshape(a, *numbers.shape, -1)
-        each = self.coordinates.limit_step(u)
-        if task.solves_nuisance:
+        each = rows.coordinates.limit_step(u)
+        if self.nuisance is not None:
             share = np.repeat(each.min(axis=1, keepdims=True), each.shape[1], axis=1)
         else:
-            least = np.ones((a, len(self.first_pose)))
-            np.minimum.at(least.T, self.member, each.T)
-            share = least[:, self.member]
+            least = np.ones((a, len(rows.first_pose)))
+            np.minimum.at(least.T, rows.member, each.T)
+            share = least[:, rows.member]
         return _Step(u, nuisance, change, share)
 
-    def _move(self, task: _Task, point: _Point, step: _Step, share: FloatArray) -> _Point:
+    def move(self, point: _Point, step: _Step, share: FloatArray) -> _Point:
         """Return the point to which shares (a, n) of a step lead."""
         states, nuisance = point.states, point.nuisance
         if states is not None:
-            states = self.coordinates.move(states, share[..., None] * step.u)
+            states = self.rows.coordinates.move(states, share[..., None] * step.u)
         if step.nuisance is not None and nuisance is not None:
             nuisance = nuisance + share[:, :1] * step.nuisance
-        return self._evaluate(task, states, nuisance, is_still=share == 0.0)
-
-    def _eliminate(
-        self,
-        block: PoseBlock,
-        group: ComponentGroup,
-        kinds: Sequence[KindRows | None],
-        with_nuisance: bool = True,
-    ) -> tuple[Elimination, FloatArray]:
-        """Eliminate the coordinates of a group's components from their stacked rows.
-
-        Return also the sums of squares (a, C) before.
-        """
-        tree = self.nuisance.tree if with_nuisance and self.nuisance is not None else None
-        k = self.coordinates.count
-        rows = stack_rows(block, group, kinds, k, tree)
-        squares = (rows[..., -1] ** 2).sum(axis=2)
-        return eliminate_columns(rows, group.poses.shape[1] * k), squares
+        return self.evaluate(states, nuisance, is_still=share == 0.0)
 
 
 def _keep_still(solved: PoseStates, before: PoseStates, is_still: BoolArray) -> PoseStates:
