@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of poses by parameters and readings: values and batches."""
+"""Derivatives of poses and passive joints by parameters and readings, and the three maps of
+parameters: onto displacements, onto transmission terms, and shared by several limbs.
+"""
 
 from dataclasses import replace
 
@@ -8,15 +10,27 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism.assembly import Address, LinearMap
+from loopcal.errors import MechanismError
+from loopcal.mechanism.assembly import Actuator, Address, LinearMap
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.kinematics import forward_trials
-from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
+from loopcal.mechanism.solutions import forward, make_solution
+from loopcal.mechanism.transmission import (
+    TERMS,
+    harmonic_frequencies,
+    joint_slopes,
+    joints_from_readings,
+    nominal_terms,
+    readings_from_joints,
+    term_derivatives,
+)
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian, compile_quickly
 from tests.mechanism.derivatives import check_pose_derivatives
+from tests.mechanism.families.test_gough import CHAIN
 from tests.mechanism.kinematics.test_kinematics import sample_inverse
 
 
@@ -157,3 +171,194 @@ def test_failed_rows_have_nan_derivatives_and_do_not_change_other_rows():
     result = differentiate_pose(robot, values, q, forward_trials(robot, values, q))
     assert np.isnan(result.parameters[0, 1]).all()
     assert np.isfinite(result.parameters[0, [0, 2]]).all()
+
+
+def build_ups_hexapod():
+    return build(replace(CHAIN, error_model="complete").expand())
+
+
+@pytest.mark.parametrize("name", ["mixed_hexapod", "three_prs", "planar_rrr"])
+def test_passive_joint_derivatives_agree_with_differences(name):
+    robot, sol, _ = sample_inverse(name, 1)
+    values, q = robot.values[None], sol.q[None]
+    state = forward_trials(robot, values, q, start=sol.state)
+    result = differentiate_passive_joints(robot, values, q, state)
+    assert result.names == sol.passive_names
+    dimensions = [*robot.parameters.dimensions, *(a.dimension for a in robot.actuators)]
+    unit = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions])
+    moved, p = np.diag(unit), values.shape[1]
+
+    def joints(x):  # one trial a parameter or reading
+        at = forward_trials(
+            robot, values + x[0] * moved[:, :p], q + x[0] * moved[:, None, p:], start=state
+        )
+        by_limb = sorted(
+            (limb, g, k)
+            for g, group in enumerate(robot.program.groups)
+            for k, limb in enumerate(group.limbs)
+        )
+        return np.concatenate(
+            [
+                at.joints[g][:, 0, k, : len(robot.program.groups[g].joints)][
+                    :, list_passive_joints(robot, limb)
+                ]
+                for limb, g, k in by_limb
+            ],
+            axis=1,
+        )
+
+    both = np.concatenate([result.parameters, result.readings], axis=-1)[0, 0] * unit
+    check_jacobian(
+        joints, both.T[..., None], np.zeros(1), scale=0.1,
+        atol=1e-6, atol_reason="closure to 1e-13, condition of platform and limb 30 each, step 1e-4",  # noqa: E501
+    )  # fmt: skip
+
+
+def list_passive_joints(robot, limb):
+    return [
+        j for j, joint in enumerate(robot.assembly.limbs[limb].joints) if joint.actuator is None
+    ]
+
+
+def test_passive_joint_derivatives_do_not_depend_on_row_blocks():
+    robot = build_ups_hexapod()
+    q = np.random.default_rng(0).uniform(-0.01, 0.01, (1, 700, 6))
+    values = robot.values[None]
+    state = forward_trials(robot, values, q)
+    whole = differentiate_passive_joints(robot, values, q, state)
+    single = forward(robot, q[0, 600:601])
+    alone = differentiate_passive_joints(robot, values, q[:, 600:601], single.state)
+    # numpy's matmul rounds a batch by its size; a turn per meter is about 10
+    assert_allclose(whole.parameters[:, 600:601], alone.parameters, rtol=0, atol=1e-11)
+    assert make_solution(robot, state, q[0]).passive_names == whole.names
+
+
+def test_failed_rows_have_nan_derivatives_of_passive_joints():
+    robot, q = build_ups_hexapod(), np.zeros((1, 2, 6))
+    q[0, 1, 2] = np.nan
+    result = differentiate_passive_joints(
+        robot, robot.values[None], q, forward_trials(robot, robot.values[None], q)
+    )
+    assert np.isfinite(result.parameters[0, 0]).all()
+    assert np.isnan(result.parameters[0, 1]).all()
+
+
+def test_ups_legs_have_no_locked_joint():
+    # regression: at slide length zero the universal joint had no effect and both axes were locked
+    robot = build_ups_hexapod()
+    assert robot.findings == ()
+    assert_array_equal([g.locked for g in robot.program.groups], [(False, False, False)])
+
+
+@pytest.mark.parametrize("name", ["hexapod", "delta", "three_prs", "mixed_hexapod"])
+def test_displacement_jacobian_agrees_with_differences(name):
+    robot = getattr(zoo, name)()
+    values = robot.values + np.random.default_rng(1).normal(size=(2, len(robot.parameters))) * 1e-3
+
+    def slots(x):
+        e, tau = robot.slots(values + x)
+        return np.concatenate([e, tau.reshape(2, -1)], axis=1)
+
+    scale = np.array(
+        [
+            1.0 if d is not Dimension.LENGTH else 0.2 * robot.size
+            for d in robot.parameters.dimensions
+        ]
+    )
+    check_jacobian(
+        slots, robot.slots.jacobian(values), np.zeros(len(robot.parameters)), scale=scale
+    )
+
+
+def test_shared_map_jacobian_of_a_delta_agrees_with_differences():
+    for shared in zoo.delta().assembly.shared:
+        inputs = np.array([[0.12, 0.5, 0.27, 0.3], [0.11, 2.5, 0.25, 0.29]])
+        check_jacobian(
+            lambda x, g=shared, v=inputs: g.value(v + x),
+            shared.jacobian(inputs),
+            np.zeros(4),
+            scale=0.1,
+            automatic=lambda x, g=shared, v=inputs: g.value(v + x),
+        )
+
+
+def test_nominal_values_give_zero_displacements():
+    for robot in (zoo.hexapod(), zoo.delta(), zoo.mixed_hexapod()):
+        e, tau = robot.slots(robot.values[None])
+        assert_array_equal(e, 0.0)
+        assert_array_equal(tau, nominal_terms(robot.actuators)[None])
+
+
+def test_maps_of_stacked_trials_equal_single_trials_bit_for_bit():
+    robot = zoo.delta()
+    values = robot.values + np.random.default_rng(1).normal(size=(7, len(robot.parameters))) * 1e-3
+    together = robot.slots(values)
+    for i in range(7):
+        for a, b in zip(together, robot.slots(values[i : i + 1]), strict=True):
+            assert_array_equal(a[i], b[0])
+
+
+FIRST = {"offset": 0.1, "gain": 1.001, "sin1": 2e-5, "cos1": -1e-5, "sin2": 5e-6, "cos2": 3e-6}
+
+ACTUATORS = (
+    Actuator("a", Dimension.LENGTH, period=0.005, terms=FIRST),
+    Actuator("b", Dimension.LENGTH, terms={"offset": -0.2, "gain": -1.0}),
+    Actuator("c", Dimension.ANGLE, period=2 * np.pi, terms={"sin1": 0.02, "cos2": 0.01}),
+)  # fmt: skip
+
+READINGS = np.random.default_rng(4).uniform(-0.1, 0.1, (1, 6, 3))
+
+
+def test_transmission_derivatives_agree_with_differences():
+    tau, w = nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
+    check_jacobian(
+        lambda x: joints_from_readings(READINGS + x[0], tau, w), joint_slopes(READINGS, tau, w)[..., None], np.zeros(1), scale=0.0005,  # noqa: E501
+        automatic=lambda x: joints_from_readings(READINGS + x[0], tau, w),
+    )  # fmt: skip
+    for i in range(len(TERMS)):
+        unit = np.zeros_like(tau)
+        unit[..., i] = 1.0
+        column = term_derivatives(READINGS, tau, w)[i]
+        check_jacobian(
+            lambda x, u=unit: joints_from_readings(READINGS, tau + x[0] * u, w),
+            column[..., None],
+            np.zeros(1),
+            scale=1.0,
+            atol=1e-12,
+            atol_reason="rounding; no approach, no backlash",
+        )
+
+
+def test_transmission_round_trips_to_rounding():
+    tau, w = nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
+    assert_allclose(
+        readings_from_joints(joints_from_readings(READINGS, tau, w), tau, w),
+        READINGS,
+        rtol=0,
+        atol=1e-16 / 0.9 * 10,
+    )
+
+
+def test_actuator_without_period_has_no_harmonics():
+    columns = term_derivatives(
+        READINGS, nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
+    )
+    for term, column in zip(TERMS, columns, strict=True):
+        if term.startswith(("sin", "cos")):
+            assert_array_equal(column[..., 1], 0.0)
+
+
+def test_parameter_values_are_checked_and_read_only():
+    robot = zoo.hexapod()
+    with pytest.raises(
+        MechanismError, match=r"hexapod has 42 parameters, but values of shape \(41,\)"
+    ):
+        robot.with_values(np.zeros(41))
+    broken = np.array(robot.values)
+    broken[13] = np.nan
+    with pytest.raises(MechanismError, match=r"the value of leg2\.length is not finite"):
+        robot.with_values(broken)
+    changed = robot.with_values(robot.values + 1e-3)
+    assert_array_equal(changed.nominal.values, robot.values)
+    with pytest.raises(ValueError, match="read-only"):
+        changed.values[0] = 0.0

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scores of blocks: against calibrations made by hand, their coverage, and their bits."""
+"""The scores of blocks: against calibrations made by hand, their coverage, and their bits; trials
+that are calibrated one by one; effects that a fit does not know of.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,7 @@ import json
 import os
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,23 +18,39 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import loopcal as lc
 from loopcal.apply.accuracy import pose_uncertainty
+from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
 from loopcal.errors import DataError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.measure.instrument import make_random_stream
+from loopcal.measure.instrument import Gaussian, Uniform, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import Disturbance, sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.studies.simulation.block import compute_block, list_tasks, make_stream, replay_trial
 from loopcal.studies.simulation.fits import OUTCOMES
+from loopcal.studies.simulation.machines import (
+    AlteredNoise,
+    alter_noise,
+    draw_motion,
+    make_disturbance,
+)
 from loopcal.studies.specification.levels import (
+    Backlash,
+    EffectsLevel,
     ErrorsLevel,
     InstrumentLevel,
     MethodLevel,
     NoiseLevel,
+    Outliers,
     PosesLevel,
+    Scores,
+    ThermalGrowth,
 )
+from loopcal.units import Dimension
 from tests.studies.studies import CAMERA, SIGMA, compute_cells, make_study
 
 ROTATION_FREE = ("orientation", "covered_orientation", "angles")
@@ -267,3 +286,203 @@ def test_columns_are_those_of_the_study():
     undefined = {c.name for c, v in zip(study.columns, result.T, strict=True) if np.isnan(v).any()}
     assert all(name.startswith(ROTATION_FREE) for name in undefined)
     assert CAMERA.components == ("x", "y", "z")
+
+
+@pytest.mark.slow
+def test_errors_in_fitted_frames_are_those_of_one_calibration():
+    tracker = InstrumentLevel(("position",), sigma_position=2e-5, unknown_frames=("base", "tool"))
+    study = make_study("hexapod-42", instruments={"t": tracker}, poses={"40": PosesLevel(40)})
+    (together,) = compute_cells(study)
+    (each,) = compute_cells(
+        make_study(
+            "hexapod-42",
+            instruments={"t": tracker},
+            poses={"40": PosesLevel(40)},
+            scores=Scores(held_out=5, intervals="adjusted"),
+        )
+    )
+    for name in ("position", "orientation", "position_before", "parameters", "rank"):
+        assert_allclose(together[name], each[name], rtol=1e-4)
+    (base,) = compute_cells(
+        make_study(
+            "hexapod-42",
+            instruments={"t": tracker},
+            poses={"40": PosesLevel(40)},
+            scores=Scores(held_out=5, frame="base"),
+        )
+    )
+    assert np.all(base["position"] > 1.5 * together["position"])
+    assert_array_equal(base["covered_position"], 1.0)  # a frame that nothing determines
+
+
+def test_trials_that_are_refused_are_counted():
+    methods = {"huber": MethodLevel("least-squares", loss="huber")}
+    (scores,) = compute_cells(make_study(methods=methods, poses={"2": PosesLevel(2)}))
+    assert {OUTCOMES[int(code)] for code in scores["outcome"]} == {"study.refused"}
+    assert np.isnan(scores["position"]).all()
+
+
+def test_losses_resist_outliers():
+    methods = {"plain": MethodLevel("map"), "tukey": MethodLevel("map", loss="tukey")}
+    effects = {"outliers": EffectsLevel(outliers=Outliers(0.1, 30.0))}
+    plain, tukey = compute_cells(
+        make_study(methods=methods, effects=effects, poses={"20": PosesLevel(20)})
+    )
+    assert np.median(tukey["position"]) < 0.6 * np.median(plain["position"])
+    assert tukey["covered_position"].mean() > 0.8
+
+
+def test_adjusted_intervals_cover_the_truth_where_the_noise_is_larger_than_stated():
+    effects = {"noise": EffectsLevel(noise=2.0)}
+    scores = [
+        compute_cells(
+            make_study(
+                effects=effects,
+                poses={"20": PosesLevel(20)},
+                replicates=15,
+                block=15,
+                scores=Scores(held_out=5, intervals=intervals),
+            )
+        )[0]
+        for intervals in ("stated", "adjusted")
+    ]
+    assert_allclose(scores[0]["position"], scores[1]["position"], rtol=1e-6)
+    assert scores[0]["covered_position"].mean() < 0.8
+    assert scores[1]["covered_position"].mean() > 0.88
+
+
+def test_verdicts_are_those_of_calibrations():
+    scores = Scores(held_out=6, verdict=True, limit_position=1e-3)
+    effects = {"none": EffectsLevel(), "noise": EffectsLevel(noise=4.0)}
+    study = make_study(scores=scores, effects=effects, replicates=2, block=2)
+    good, bad = compute_cells(study)
+    assert set(good["verdict"]) <= {0.0, 1.0}
+    assert_array_equal(bad["verdict"], 3.0)  # not calibrated
+
+
+STATED = np.array([1e-5, 2e-5])
+
+NORMAL, UNIFORM = Gaussian(STATED), Uniform(STATED * np.sqrt(3.0))
+
+POSES = 10
+
+EXACT = build_instrument(InstrumentDescription(sigma_position=1e-12, sigma_angle=1e-12))
+
+
+def draw(effects: EffectsLevel, n: int = 40_000, stated=NORMAL) -> np.ndarray:
+    """Return noise (n, 2) in stated sigmas, which are those that the fit is told."""
+    noise = AlteredNoise(stated, effects)
+    assert_array_equal(noise.sigma, stated.sigma)
+    return noise.draw(make_random_stream(1, 0), n) / STATED
+
+
+def disturb(effects: EffectsLevel, name: str = "linear-delta") -> tuple[Any, ...]:
+    """Return robot, disturbance, trials with it, and trials without it."""
+    robot = lc.load_robot(name)
+    poses, truth = sample_workspace(robot, POSES, 1).coordinates, sample_truth(robot, 3, 1)
+    disturbance = make_disturbance(robot, truth, poses, effects, 1)
+    moved = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=disturbance)
+    return robot, disturbance, moved, simulate_trials(robot, truth, poses, EXACT, 1)
+
+
+def test_without_effects_the_noise_is_the_stated_one():
+    plain = Gaussian(STATED).draw(make_random_stream(1, 0), 50) / STATED
+    assert_allclose(draw(EffectsLevel(), 50), plain)
+    instrument = build_instrument(InstrumentDescription())
+    assert alter_noise(instrument, EffectsLevel(drift=1.0)) is instrument
+
+
+@pytest.mark.parametrize(
+    ("effects", "stated", "sd", "rtol"),
+    [
+        (EffectsLevel(noise=2.5), NORMAL, 2.5, 0.02),
+        (EffectsLevel(noise=2.0), UNIFORM, 2.0, 0.02),
+        (EffectsLevel(degrees=4.0), NORMAL, 1.0, 0.05),
+        (EffectsLevel(correlation=0.7), NORMAL, 1.0, 0.03),
+    ],
+)
+def test_altered_noise_has_the_standard_deviation_that_is_asked_for(effects, stated, sd, rtol):
+    drawn = draw(effects, stated=stated)
+    assert_allclose(drawn.std(axis=0), sd, rtol=rtol)
+    if stated is UNIFORM:  # it stays uniform
+        assert np.abs(drawn).max() <= 2.0 * np.sqrt(3.0)
+    if effects.degrees is not None:  # it has heavy tails
+        assert np.mean(np.abs(drawn) > 4.0) > 20 * np.mean(np.abs(draw(EffectsLevel())) > 4.0)
+    if effects.correlation:
+        neighbors = np.mean(drawn[1:] * drawn[:-1], axis=0)
+        assert_allclose(neighbors, effects.correlation, rtol=0.03)
+
+
+def test_the_stated_share_of_rows_is_far_off():
+    plain, wrong = draw(EffectsLevel(), 200), draw(EffectsLevel(outliers=Outliers(0.05, 30.0)), 200)
+    distance = np.linalg.norm(wrong - plain, axis=1)
+    assert np.count_nonzero(distance) == 10
+    assert_allclose(distance[distance > 0], 30.0)
+
+
+def test_a_share_of_less_than_one_row_is_off_in_as_many_trials():
+    noise = AlteredNoise(Gaussian(STATED), EffectsLevel(outliers=Outliers(0.05, 1000.0)))
+    streams = [make_random_stream(1, trial) for trial in range(2000)]
+    sizes = np.array([np.abs(noise.draw(stream, 6) / STATED).max(axis=1) for stream in streams])
+    assert set((sizes > 100.0).sum(axis=1)) == {0, 1}
+    assert abs(np.mean(sizes > 100.0) - 0.05) < 0.008
+
+
+def test_drift_and_jump_have_the_stated_size_and_no_mean():
+    drift = draw_motion(EffectsLevel(drift=1e-4), 5, POSES, 1)
+    assert_allclose(np.linalg.norm(drift[:, -1] - drift[:, 0], axis=1), 1e-4)
+    assert_allclose(drift.mean(axis=1), 0.0, atol=1e-18)
+    jump = draw_motion(EffectsLevel(jump=5e-5), 5, POSES, 1)
+    assert_allclose(np.linalg.norm(jump[:, 5] - jump[:, 4], axis=1), 5e-5)
+    assert_allclose(np.ptp(jump[:, :5], axis=1), 0.0, atol=1e-18)
+
+
+@pytest.mark.parametrize("name", ["linear-delta", "hexapod-42"])
+def test_drift_moves_what_is_measured_and_not_the_machine(name):
+    _, disturbance, moved, plain = disturb(EffectsLevel(drift=1e-4), name)
+    assert_array_equal(moved.T, plain.T)
+    shift = (moved.measured[0] - plain.measured[0])[..., 3:]
+    assert_allclose(shift, disturbance.motion, atol=1e-15)
+
+
+def test_lengths_grow_with_the_temperature():
+    thermal = ThermalGrowth(expansion=1e-5, rise=4.0)
+    robot, _, trials, _ = disturb(EffectsLevel(thermal=thermal))
+    is_length = np.array([d is Dimension.LENGTH for d in robot.parameters.dimensions])
+    for pose, growth in enumerate(np.linspace(-2e-5, 2e-5, POSES)):
+        warm = trials.truth * np.where(is_length, 1.0 + growth, 1.0)
+        T = forward_trials(robot, warm, trials.readings[None, [pose]]).T
+        assert_allclose(trials.T[:, pose], T[:, 0], atol=1e-12)
+
+
+def test_every_pose_of_a_disturbed_machine_may_be_another_machine():
+    robot = lc.load_robot("five-bar")
+    poses, truth = sample_workspace(robot, POSES, 1).coordinates, sample_truth(robot, 3, 1)
+    nothing = Disturbance(values=np.zeros((1, POSES, truth.shape[1])))
+    plain = simulate_trials(robot, truth, poses, EXACT, 1)
+    same = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=nothing)
+    assert_array_equal(same.measured[0], plain.measured[0])
+
+
+def test_backlash_lags_behind_the_direction_of_motion():
+    robot, disturbance, trials, plain = disturb(EffectsLevel(backlash=Backlash(length=2e-5)))
+    direction = np.sign(np.diff(trials.readings, axis=0))
+    assert_allclose(disturbance.readings[0, 1:], -1e-5 * direction)
+    T = forward_trials(robot, trials.truth, trials.readings[None] + disturbance.readings).T
+    assert_allclose(trials.T, T, atol=1e-12)
+    assert_array_equal(trials.readings, plain.readings)  # the controller does not know it
+
+
+def test_effects_make_calibrations_worse_and_leave_the_machines():
+    effects = {
+        "none": EffectsLevel(),
+        "noise": EffectsLevel(noise=3.0),
+        "drift": EffectsLevel(drift=6e-4),
+        "warm": EffectsLevel(thermal=ThermalGrowth(1.2e-5, 60.0)),
+        "backlash": EffectsLevel(backlash=Backlash(length=2e-4)),
+    }
+    none, *others = compute_cells(make_study(effects=effects, replicates=20, block=20))
+    for scores in others:
+        assert_array_equal(scores["position_before"], none["position_before"])
+        assert np.median(scores["position"]) > 1.2 * np.median(none["position"])
+        assert scores["noise_scale"].mean() > 1.3

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study survives what happens to its driver and its workers, and its folder is continued."""
+"""A study survives what happens to its driver and its workers, and its folder is continued; poses
+are planned ahead of time, each once; the memory of a driver does not grow with the number of
+trials.
+"""
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
-from collections.abc import Callable
+import tracemalloc
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,18 +33,37 @@ from loopcal.studies.files.store import (
 )
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.running import (
+    KEPT_POSES,
+    MOST_WAITING,
+    MissingBlock,
+    Schedule,
     Share,
     count_blocks,
     count_stored,
+    estimate_time,
     read_source,
     run_blocks,
     run_study,
+    view_estimate,
 )
-from loopcal.studies.simulation.block import BlockTask, PosesTask
+from loopcal.studies.simulation.block import BlockTask, PosesTask, compute_task, list_tasks
+from loopcal.studies.simulation.machines import CellPoses
+from loopcal.studies.specification.levels import (
+    EffectsLevel,
+    ErrorsLevel,
+    InstrumentLevel,
+    MethodLevel,
+    NoiseLevel,
+    PosesLevel,
+)
+from loopcal.studies.specification.study import Study, compute_key, describe_cell
+from loopcal.typing import FloatArray
 from tests.findings.expectations import expect_refusal, list_codes
 from tests.studies.small_study import CELLS, write_study
+from tests.studies.studies import make_study
 
 ROOT = str(Path(__file__).parents[2])
+
 RESULT = Path(ROOT, "docs", "evidence", "study_interruption.json")
 
 
@@ -308,3 +332,206 @@ def test_counts_of_shares_add_up(undisturbed) -> None:
         assert sum(count_blocks(study, share) for share in shares) == 16
     with open_store(undisturbed) as store:
         assert sum(count_stored(study, store, Share(part, 5)) for part in range(1, 6)) == 16
+
+
+SIZE = 50
+
+ALLOWED = 150_000
+
+
+"""Bytes, of statements that SQLite and Python keep; the scores of 90,000 more trials would take
+14 MB.
+"""
+
+
+def make_scores(task: Any) -> FloatArray | CellPoses:
+    """Return scores that cost nothing, in place of `compute_task`."""
+    if isinstance(task, PosesTask):
+        return CellPoses([[0.0, 0.3]] * 12, [[0.0, 0.3]] * 5)
+    return np.zeros((SIZE, 20))
+
+
+class Cheap:
+    """This process, with scores that cost nothing."""
+
+    def map_blocks(
+        self, function: Callable[[Any], Any], tasks: Iterable[Any]
+    ) -> Generator[Answer[Any, Any], None, None]:
+        yield from Serial().map_blocks(make_scores, tasks)
+
+
+def empty_free_lists(done: int, _total: int, _what: str) -> None:
+    """Let the interpreter return its free lists, which keep up to 2,000 tuples of each length."""
+    if done % 500 == 0:
+        gc.collect()
+
+
+def measure_peak(folder: Path, replicates: int) -> int:
+    """Return the largest memory [bytes] of a driver that stores this many trials of one cell."""
+    study = make_study("five-bar", replicates=replicates, block=SIZE)
+    with open_study(folder, StudySource(study), resume=True) as store:
+        tracemalloc.start()
+        try:
+            report = run_blocks(study, store, Cheap(), progress=empty_free_lists)
+            assert report.is_complete
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+
+def test_memory_of_a_driver_is_that_of_a_tenth_of_the_trials(tmp_path) -> None:
+    measure_peak(tmp_path / "first", 2 * SIZE)  # what is loaded once
+    few = measure_peak(tmp_path / "few", 10_000)
+    many = measure_peak(tmp_path / "many", 100_000)
+    assert many < few + ALLOWED, (few, many)
+
+
+def test_memory_of_a_driver_that_continues_does_not_grow_with_what_is_stored(tmp_path) -> None:
+    measure_peak(tmp_path / "study", 2 * SIZE)
+    few = measure_peak(tmp_path / "study", 10_000)
+    measure_peak(tmp_path / "study", 150_000)
+    last = measure_peak(tmp_path / "study", 150_000 + SIZE)
+    assert last < few + ALLOWED, (few, last)
+
+
+POSES = CellPoses([[0.1, 0.2]], [[0.3, 0.4]])
+
+METHODS = {"LS": MethodLevel("least-squares"), "MAP": MethodLevel("map")}
+
+
+def list_missing(study: Study) -> Iterator[Iterator[MissingBlock]]:
+    for cell in study.cells:
+        contents = [describe_cell(study, cell) | {"block": block} for block in range(study.blocks)]
+        yield iter([MissingBlock(compute_key(c), cell.number, c) for c in contents])
+
+
+def make_poses(count: int) -> dict[str, PosesLevel]:
+    return {str(n): PosesLevel(n) for n in range(4, 4 + count)}
+
+
+def make_schedule(**changes: Any) -> Schedule:
+    return Schedule(list_missing(make_study("five-bar", **changes)))
+
+
+def name(task: BlockTask | PosesTask | None) -> str:
+    """Return "poses", the cell and block, or "none"."""
+    if task is None:
+        return "none"
+    return "poses" if isinstance(task, PosesTask) else f"{task.cell}/{task.block}"
+
+
+def take_poses(schedule: Schedule) -> PosesTask:
+    task = next(schedule)
+    assert isinstance(task, PosesTask)
+    return task
+
+
+def take_names(schedule: Schedule, count: int) -> list[str]:
+    return [name(next(schedule)) for _ in range(count)]
+
+
+def count_poses(schedule: Schedule) -> int:
+    """Return how many poses are computed until the schedule ends."""
+    count = 0
+    for task in schedule:
+        if isinstance(task, PosesTask):
+            schedule.add_poses(task, POSES)
+            count += 1
+    return count
+
+
+def test_one_worker_gets_the_tasks_of_the_study() -> None:
+    study = make_study("five-bar", replicates=12, poses=make_poses(2))
+    schedule, blocks = Schedule(list_missing(study)), []
+    for task in schedule:
+        if isinstance(task, PosesTask):
+            poses = compute_task(task)
+            assert isinstance(poses, CellPoses)
+            schedule.add_poses(task, poses)
+        else:
+            blocks.append(task)
+    assert blocks == list(list_tasks(study))
+
+
+def test_poses_of_the_next_cell_are_computed_beside_the_blocks_of_this_one() -> None:
+    schedule = make_schedule(replicates=18, poses=make_poses(3))
+    schedule.add_poses(take_poses(schedule), POSES)
+    assert take_names(schedule, 1) == ["0/0"]
+    second = take_poses(schedule)
+    assert take_names(schedule, 2) == ["0/1", "0/2"]
+    third = take_poses(schedule)  # rather than none
+    assert take_names(schedule, 2) == ["none", "none"]
+    schedule.add_poses(third, POSES)
+    schedule.add_poses(second, POSES)
+    assert take_names(schedule, 6) == ["2/0", "2/1", "2/2", "1/0", "1/1", "1/2"]
+    assert next(schedule, "end") == "end"
+
+
+def test_many_workers_compute_poses_of_many_cells_at_once() -> None:
+    schedule = make_schedule(poses=make_poses(MOST_WAITING + 5))
+    assert take_names(schedule, MOST_WAITING + 1) == [*["poses"] * MOST_WAITING, "none"]
+
+
+def test_cells_with_the_same_poses_wait_for_one_task() -> None:
+    schedule = make_schedule(methods=METHODS, poses=make_poses(2))
+    first = take_poses(schedule)
+    second = take_poses(schedule)
+    assert name(next(schedule)) == "none"
+    schedule.add_poses(second, POSES)
+    assert take_names(schedule, 3) == ["2/0", "3/0", "none"]
+    schedule.add_poses(first, POSES)
+    assert take_names(schedule, 2) == ["0/0", "1/0"]
+
+
+def test_later_cells_take_the_poses_of_earlier_ones() -> None:
+    factors = {"methods": METHODS, "order": ("method", "poses")}
+    assert count_poses(make_schedule(poses=make_poses(3), **factors)) == 3
+    many = KEPT_POSES + 1  # the oldest ones are forgotten, one after the other
+    assert count_poses(make_schedule(poses=make_poses(many), **factors)) == 2 * many
+
+
+def test_cells_whose_poses_are_given_up_are_left_out() -> None:
+    schedule = make_schedule(methods=METHODS, poses=make_poses(2))
+    first, second = take_poses(schedule), take_poses(schedule)
+    schedule.add_poses(second, POSES)
+    assert schedule.give_up(first) == [0, 1]
+    assert take_names(schedule, 2) == ["2/0", "3/0"]
+    assert next(schedule, "end") == "end"
+
+
+def test_poses_depend_on_what_determines_them_only() -> None:
+    """Planned ones on tolerances and instrument too, none on what is done with measurements."""
+    factors: dict[str, dict[str, Any]] = {
+        "instruments": {"a": InstrumentLevel(), "b": InstrumentLevel(sigma_angle=1.0)},
+        "noise": {"1": NoiseLevel(), "2": NoiseLevel(2.0)},
+        "errors": {"1": ErrorsLevel(), "2": ErrorsLevel(2.0)},
+        "methods": METHODS,
+        "effects": {"none": EffectsLevel(), "more": EffectsLevel(2.0)},
+    }
+    counts = {}
+    for choice in ("random", "planned"):
+        poses = {choice: PosesLevel(5, choice)}
+        for factor, levels in factors.items():
+            counts[choice, factor] = count_poses(make_schedule(poses=poses, **{factor: levels}))
+    assert {key for key, count in counts.items() if count == 2} == {
+        ("planned", factor) for factor in ("instruments", "noise", "errors")
+    }
+    true_errors = {"1": ErrorsLevel(), "2": ErrorsLevel(error_factor=2.0)}
+    planned = {"planned": PosesLevel(5, "planned")}
+    assert count_poses(make_schedule(poses=planned, errors=true_errors)) == 1
+
+
+@pytest.mark.slow
+def test_time_estimate_counts_planning_once_for_all_blocks_and_cells_that_share_poses() -> None:
+    planned = {"6": PosesLevel(6, "planned"), "8": PosesLevel(8, "planned")}
+    study = make_study("five-bar", poses=planned, methods=METHODS, replicates=6000)
+    estimate = estimate_time(study, workers=1)
+    assert (estimate.cells, estimate.blocks, estimate.plans) == (4, 4000, 2)
+    total = 4000 * estimate.seconds_per_block + 2 * estimate.seconds_per_plan
+    assert estimate.worker_seconds == pytest.approx(total)
+    assert estimate.seconds == pytest.approx(total)
+    page = [str(line) for line in view_estimate(study, estimate, lambda seconds: f"{seconds} s")]
+    assert page[-1].startswith("This includes planning poses, ")
+    assert page[-1].endswith(" s 2 times")
+    shown = view_estimate(make_study("five-bar"), estimate, lambda seconds: f"{seconds} s")
+    assert "planning" not in str(shown)

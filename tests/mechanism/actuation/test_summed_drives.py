@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings that are weighted sums of joint values, against closed forms and a constraint solver."""
+"""Readings that are weighted sums of joint values, against closed forms and a constraint solver;
+sums that no machine has are refused; belts that are read by their lengths.
+"""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +11,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from scipy.optimize import fsolve
+from scipy.optimize import fsolve, least_squares
 from scipy.spatial.transform import Rotation
 
+import loopcal as lc
 from loopcal.apply.calibration import calibrate
+from loopcal.errors import FileError, MechanismError
 from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.io.robot.robot_file import list_shipped_robots
@@ -19,7 +24,7 @@ from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.readings import select_joint_values
 from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
-from loopcal.mechanism.actuation import solve_at_pose
+from loopcal.mechanism.actuation import differentiate_at_pose, solve_at_pose
 from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.modes import find_assembly_modes
@@ -95,7 +100,6 @@ stages:
       - {name: k, tip: [-1000, -700, 0], ending: distance, attach: [150, -100, 0], actuated: k}
       - {name: h, tip: [1000, -700, 0], ending: distance, attach: [150, 100, 0], actuated: h}
 """
-
 
 ARM = """format: 1
 family: stages
@@ -291,7 +295,9 @@ def test_the_arm_on_the_page_of_robots_is_that_of_its_formula(tmp_path: Path, ro
 # --- fewer readings than lengths
 
 ANCHORS = {"m": (-1.0, 0.8), "n": (1.0, 0.8), "k": (-1.0, -0.7), "h": (1.0, -0.7)}
+
 POINTS = {"m": (-0.15, -0.1), "n": (-0.15, 0.1), "k": (0.15, -0.1), "h": (0.15, 0.1)}
+
 SUMS = {"q1": ("m", 1.0, "n"), "q2": ("m", 2.0, "k"), "q3": ("n", 2.0, "h")}
 
 
@@ -495,3 +501,151 @@ def test_sums_of_a_stage_are_solved_in_the_chain(tmp_path: Path) -> None:
     assert_allclose(forward(robot, solved.q).T, solved.T, rtol=0, atol=1e-11)
     assert_allclose(solved.q[:, 0], wanted[:, 2], rtol=0, atol=1e-11)
     assert_allclose(solved.T[:, :3, 3], wanted[:, :3], rtol=0, atol=1e-11)
+
+
+SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, sum: {n: 1, h: 2}}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence", "line"),
+    [
+        (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which no limb", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 1, h: 2}}", "'k' of limb 'K' is in no sum", 8),
+        (SECOND, "q2: {reads: length, sum: {m: 2, n: 2}}\n  k: {reads: length}",
+         "singular: that of actuator 'q2' follows", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 0, k: 0}}", "all weights in the sum", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 1, k: .inf}}", "is inf; write a finite number", 9),
+        (SECOND, "q2: {reads: length, sum: [m, k]}",
+         "'actuators.q2.sum' is a list of 2, but a mapping is needed", 9),
+        (SECOND, "q2: {reads: lenght, sum: {m: 1, k: 2}}",
+         "'lenght' .did you mean 'length'..; allowed: 'length', 'angle'", 9),
+        (SECOND, "q2: {reads: length}", "'q2' drives no joint and states no `sum:`", 9),
+        ("[weight.n]", "[weight.k]", "no term 'weight.k'", 8),
+        ("[weight.n]", "[wait.n]", "no term 'wait.n'", None),
+        (f"  {THIRD}\n", "", "'h' of limb 'H' is in no sum", 8),
+        (f"  {THIRD}\n", "  h: {reads: length}\n  k: {reads: length}\n",
+         "redundant readings cannot be sums", None),
+        (THIRD, f"{THIRD}\n  m: {{reads: length}}\n  k: {{reads: length}}",
+         "5 readings .* are sums of 4 joints", 12),
+        (f"  {SECOND}\n  {THIRD}\n", "  q2: {reads: length, sum: {k: 1, h: 2}}\n",
+         "2 readings of 4 driven joints for 3 freedoms", None),
+        (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "drives a joint that slides", None),
+        (THIRD, "q3: {triangle: {foot: [1, 0, 0], head: [0, 1, 0]}}", "beside sums", 10),
+    ],
+)  # fmt: skip
+def test_impossible_sums_are_refused_in_one_sentence(tmp_path, old, new, sentence, line):
+    assert load_text(tmp_path, PLATE).has_open_sums
+    assert old in PLATE
+    with pytest.raises((FileError, MechanismError), match=sentence) as error:
+        load_text(tmp_path, PLATE.replace(old, new, 1))
+    text = str(error.value)
+    assert "\n" not in text
+    assert "robot.yaml" in text
+    assert line is None or f"line {line}" in text or f":{line}" in text
+
+
+def test_a_sum_of_an_angle_and_a_length_is_refused(tmp_path: Path) -> None:
+    text = WRIST.replace("{joint: R, name: b", "{joint: P, name: b").replace(
+        "start: 60", "start: 6"
+    )
+    with pytest.raises(FileError, match="is a sum of the angle 'j3' and the length 'j2'"):
+        load_text(tmp_path, text)
+
+
+def test_sums_that_do_not_hold_the_platform_are_refused(tmp_path: Path) -> None:
+    # no cable holds the plate against rotation about the point in which all of them meet
+    text = PLATE
+    for point in ("[-150, -100, 0]", "[-150, 100, 0]", "[150, -100, 0]", "[150, 100, 0]"):
+        text = text.replace(f"attach: {point}", "attach: [0, 0, 0]")
+    with pytest.raises((FileError, MechanismError), match=r"can rotate|leave|free|hold"):
+        load_text(tmp_path, text)
+    symmetric = PLATE.replace(SECOND, "q2: {reads: length, sum: {k: 1, h: 1}}").replace(
+        THIRD, "q3: {reads: length, sum: {m: 1, n: 1, k: 1, h: 2}}"
+    )
+    symmetric = symmetric.replace("-700", "-800").replace("150, 100", "150, 99.999")
+    assert load_text(tmp_path, symmetric).has_open_sums
+
+
+def test_a_drive_of_two_stages_is_refused(tmp_path: Path) -> None:
+    text = CELL.replace("joint: {kind: P, axis: z}", "joint: {kind: P, axis: z, drive: q1}")
+    with pytest.raises(FileError, match="actuator 'q1' drives the stages 'lift' and 'plate'"):
+        load_text(tmp_path, text)
+
+
+SIZE = 4.3  # [m] of the machine
+
+
+@pytest.fixture(scope="module")
+def machine():
+    """A machine that differs from its file, positions (50, 2) and their readings in closed form."""
+    nominal = lc.load_robot("belt-4")
+    robot = nominal.with_values(lc.sample_truth(nominal, 1, seed=4)[0])
+    x = np.random.default_rng(1).uniform([-1.1, -0.7], [1.1, 0.7], (50, 2))
+    return robot, x, compute_belt_readings(robot.values, x)
+
+
+def compute_belt_readings(values, x, module=np):
+    """Return the readings (.., 4) [m] at positions (.., 2), by parameter values (12,)."""
+    anchors = values.reshape(4, 3)
+    return module.linalg.norm(x[..., None, :] - anchors[:, :2], axis=-1) - anchors[:, 2]
+
+
+def intersect_circles(values, q):
+    """Return the positions (n, 2) where the first and second belt meet, above their anchors."""
+    anchors = values.reshape(4, 3)
+    a, b = anchors[0, :2], anchors[1, :2]
+    r, s = (q[:, :2] + anchors[:2, 2]).T
+    span = np.linalg.norm(b - a)
+    along = (r**2 - s**2 + span**2) / (2 * span)
+    across = np.sqrt(r**2 - along**2)
+    unit = (b - a) / span
+    return a + along[:, None] * unit + across[:, None] * np.array([-unit[1], unit[0]])
+
+
+def test_inverse_kinematics_are_distances_from_the_anchors(machine):
+    robot, x, readings = machine
+    solution = lc.inverse(robot, x)
+    assert solution.converged.all()
+    assert_allclose(solution.q, readings, atol=1e-9 * SIZE, rtol=0)
+
+
+def test_forward_kinematics_are_intersections_of_circles(machine):
+    robot, x, readings = machine
+    solution = lc.forward(robot, readings)
+    assert solution.converged.all()
+    T = solution.T
+    assert_allclose(intersect_circles(robot.values, readings), x, atol=1e-9)
+    assert_allclose(T[:, :2, 3], x, atol=1e-9 * SIZE, rtol=0)
+    assert_allclose(T[:, :3, :3], np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-12)
+
+
+def test_contradicting_readings_lead_to_their_least_squares_position(machine):
+    robot, x, readings = machine
+    shown = readings + 1e-3 * np.random.default_rng(2).standard_normal(readings.shape)
+    found = lc.forward(robot, shown).T[:, :2, 3]
+    for start, q, position in zip(x, shown, found, strict=True):
+
+        def gap(p, q=q):
+            return compute_belt_readings(robot.values, p) - q
+
+        best = least_squares(gap, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        assert_allclose(position, best.x, atol=1e-8 * SIZE)  # [m] of scipy's minimum
+
+
+@pytest.mark.slow
+def test_sensitivities_agree_with_automatic_derivatives(machine):
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    compute = partial(compute_belt_readings, module=jax.numpy)
+    robot, x, readings = machine
+    state = lc.forward(robot, readings).state
+    found = differentiate_at_pose(robot, robot.values[None], readings[None], state)
+    by_values = jax.jacobian(compute)(robot.values, x)
+    by_position = jax.vmap(jax.jacobian(compute, argnums=1), (None, 0))(robot.values, x)
+    assert_allclose(found.readings[0][0], by_values, atol=1e-11)
+    assert_allclose(found.readings[1][0], by_position, atol=1e-11)
+    # the pose at given readings, by least squares of equal weights: x' = -(J'J)^-1 J' dq/dp
+    D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
+    expected = -np.linalg.pinv(np.asarray(by_position)) @ np.asarray(by_values)
+    assert_allclose(D[:, 3:5], expected, atol=1e-10)

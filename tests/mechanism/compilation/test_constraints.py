@@ -1,23 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limbs are checked one by one; redundant closure equations; mechanisms without any length."""
+"""Limbs and mobility: mechanisms that cannot work are refused when they are built, with the
+correction to make; redundant closure equations; limbs that constrain nothing.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import NDArray
 
+from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.geometry import invert_pose
-from loopcal.mechanism.assembly import Joint, Limb, Link
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.assembly import Actuator, Address, Joint, Limb, LinearMap, Link
 from loopcal.mechanism.compilation import build
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.modes import find_assembly_modes
 from loopcal.mechanism.solutions import forward, inverse
+from loopcal.parameters import Parameter
+from loopcal.units import Dimension
 from tests import zoo
 
 HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))
-
 
 RIGID = ("rigid",) * 3
 
@@ -208,3 +216,252 @@ def test_spherical_robot_without_lengths_has_a_size_of_one_meter():
     result = inverse(robot, asked)
     assert result.converged.all()
     assert_allclose(forward(robot, result.q).T, result.T, atol=1e-10)
+
+
+Array = NDArray[np.float64]
+
+BASE = [
+    [500, -40, 0],
+    [500, 40, 0],
+    [-215, 453, 0],
+    [-285, 413, 0],
+    [-285, -413, 0],
+    [-215, -453, 0],
+]
+
+PLATFORM = [
+    [185, -240, 0],
+    [185, 240, 0],
+    [115, 280, 0],
+    [-300, 40, 0],
+    [-300, -40, 0],
+    [115, -280, 0],
+]
+
+PROBE = """  - name: probe
+    ending: rigid
+    chain:
+      - {joint: U, name: lower, axes: [x, y]}
+      - {joint: P, name: slide, axis: z, start: 600}
+      - {joint: R, name: first, axis: z}
+      - {joint: R, name: middle, axis: y, start: 5}
+      - {joint: R, name: last, axis: z}
+    attach: {pitch: 5}
+"""
+
+
+def load_hexapod(folder: Path, limbs: str = "") -> Mechanism:
+    """Return the hexapod with further limbs."""
+    lines = ["format: 1", "family: limbs", "name: hexapod", "units: {length: mm, angle: deg}"]
+    lines += ["controlled: [x, y, z, roll, pitch, yaw]", "actuators:"]
+    lines += [f"  q{i}: {{reads: length}}" for i in range(1, 7)] + ["limbs:"]
+    for i, (tip, attach) in enumerate(zip(BASE, PLATFORM, strict=True), 1):
+        lines += [f"  - name: leg{i}", "    ending: distance", f"    tip: {tip}"]
+        lines += [f"    attach: {attach}", f"    actuated: q{i}"]
+        lines += ["    errors: [{of: base, shift: [x, y, z], tolerance: {sd: 0.1}}]"]
+    path = folder / f"hexapod{len(limbs)}.yaml"
+    path.write_text("\n".join(lines) + "\n" + limbs + "home: {z: 600}\n", "utf-8")
+    return load_robot(path)
+
+
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory: pytest.TempPathFactory) -> tuple[Mechanism, Mechanism]:
+    folder = tmp_path_factory.mktemp("robots")
+    return load_hexapod(folder), load_hexapod(folder, PROBE)
+
+
+def draw_poses(n: int) -> Array:
+    """Draw coordinates (n, 6), shifts up to 0.6 m and turns up to 1.5 rad."""
+    wide, middle = np.repeat([0.6, 1.5], 3), np.array([0, 0, 0.6, 0, 0, 0])
+    return middle + np.random.default_rng(2).uniform(-wide, wide, (n, 6))
+
+
+def test_the_wrist_of_a_probe_passes_its_singularity(machines: tuple[Mechanism, Mechanism]) -> None:
+    plain, probed = machines
+    target = np.zeros((9, 6))
+    target[:, 2], target[:, 4] = 0.6, np.linspace(-0.3, 0.3, 9)
+    solution = inverse(probed, target)
+    assert solution.converged.all()  # those below -5 degrees were in another mode
+    assert_allclose(solution.q, inverse(plain, target).q, atol=1e-12)  # [m] rounding
+    back = forward(probed, solution.q)
+    assert back.converged.all()
+    assert np.abs(geometry.pose_difference(back.T, solution.T)).max() < 1e-9
+    middle = solution.passive[:, list(solution.passive_names).index("probe.middle")]
+    assert middle.min() < -0.1 < 0.1 < middle.max()
+
+
+def test_modes_of_the_actuated_loops_are_those_without_the_probe(machines):
+    plain, probed = machines
+    target = draw_poses(40)
+    expected, solution = inverse(plain, target), inverse(probed, target)
+    both = expected.closed & solution.closed
+    assert both.sum() > 30
+    assert 2 < expected.converged.sum() < 38
+    # the probe needs more steps of a path, so that a row may be refused, but no other is taken
+    assert not (solution.converged & ~expected.converged).any()
+    assert (solution.converged & expected.converged).sum() > 0.9 * expected.converged.sum()
+
+
+def strip_parameters(assembly, **changes):
+    """Return the assembly without parameters and with these changes."""
+    return replace(assembly, parameters=(), maps=(), shared=(), **changes)
+
+
+HEXAPOD = strip_parameters(zoo.hexapod().assembly)
+
+PRS = strip_parameters(zoo.three_prs().assembly)
+
+
+def change_limb(assembly, i, **changes):
+    limbs = list(assembly.limbs)
+    limbs[i] = replace(limbs[i], **changes)
+    return replace(assembly, limbs=tuple(limbs))
+
+
+def make_five_legs():
+    return replace(HEXAPOD, limbs=HEXAPOD.limbs[:5], actuators=HEXAPOD.actuators[:5])
+
+
+def add_fixed_rod():
+    """Return a hexapod with a seventh rod of fixed length."""
+    rod = replace(
+        HEXAPOD.limbs[0], name="rod", actuator=None, attachment=HEXAPOD.limbs[3].attachment
+    )
+    gap = HEXAPOD.home @ rod.attachment.transform[:, 3] - rod.links[0].transform[:, 3]
+    return replace(HEXAPOD, limbs=(*HEXAPOD.limbs, replace(rod, length=float(np.linalg.norm(gap)))))
+
+
+def make_singular_hexapod():
+    """Return a hexapod whose platform is similar and parallel to the base: it is singular."""
+    base = zoo.HEXAPOD_BASE * zoo.MM
+    limbs = tuple(
+        replace(
+            limb,
+            links=(Link("base", zoo.place(b)),),
+            attachment=Link("platform", zoo.place(0.6 * b)),
+        )
+        for limb, b in zip(HEXAPOD.limbs, base, strict=True)
+    )
+    return replace(HEXAPOD, limbs=limbs)
+
+
+INVALID_ASSEMBLIES = {
+    "five legs": (
+        make_five_legs,
+        (
+            r"hexapod: at home the platform can still move with every actuator locked "
+            r"\((rotation|translation) .*5 of 6 freedoms"
+        ),
+    ),
+    "similar base and platform": (make_singular_hexapod, r"at home the platform can still move"),
+    "a rod too many": (
+        add_fixed_rod,
+        r"hexapod is over-constrained: it has 6 actuators, but .* only 5 of 6 freedoms",
+    ),
+    "a coordinate too few": (
+        lambda: replace(PRS, controlled=("z",)),
+        r"3-PRS can be moved in 3 freedoms or more, but names only 1 controlled coordinates",
+    ),
+    "a coordinate that cannot be controlled": (
+        lambda: replace(PRS, controlled=("z", "x", "psi")),
+        r"cannot be set independently at home",
+    ),
+    "an unknown coordinate": (
+        lambda: replace(PRS, controlled=("z", "tilt", "x")),
+        r"'tilt' is not a platform coordinate; allowed are x, y, z",
+    ),
+    "an unknown freedom": (
+        lambda: replace(PRS, freedoms=("x", "w")),
+        r"'w' is not a freedom of a platform; allowed are rx, ry",
+    ),
+    "two rotations": (
+        lambda: replace(PRS, freedoms=("rx", "ry", "z")),
+        r"3-PRS has the freedoms rx and ry, which define no pose: .* add a limb with the joint",
+    ),
+    "an unknown ending": (
+        lambda: change_limb(PRS, 0, ending="magnet"),
+        r"limb 'limb1' ends in 'magnet'; allowed endings are rigid, ball, distance",
+    ),
+    "a link too few": (
+        lambda: change_limb(PRS, 0, links=PRS.limbs[0].links[:2]),
+        r"limb 'limb1' has 2 joints and 2 links; give one link more than joints",
+    ),
+    "two limbs of one name": (
+        lambda: change_limb(PRS, 1, name="limb1"),
+        r"two limbs are called 'limb1'; give each its own name",
+    ),
+    "an actuator twice": (
+        lambda: replace(HEXAPOD, actuators=HEXAPOD.actuators[:1] * 2),
+        r"two actuators are called 'q1'",
+    ),
+    "an actuator without a joint": (
+        lambda: replace(
+            HEXAPOD, actuators=(*HEXAPOD.actuators, Actuator("spare", Dimension.LENGTH))
+        ),
+        r"actuator 'spare' drives 0 joints; let it drive one",
+    ),
+    "a joint with an unknown actuator": (
+        lambda: change_limb(HEXAPOD, 2, actuator="q9"),
+        r"(actuator 'q3' drives 0 joints|driven by 'q9')",
+    ),
+    "an actuator that is not listed": (
+        lambda: replace(HEXAPOD, actuators=HEXAPOD.actuators[:5]),
+        r"a joint is driven by 'q6', which is not among the actuators; add it or correct the name",
+    ),
+    "legs that are too short": (
+        lambda: replace(
+            change_limb(HEXAPOD, 0, actuator=None, length=0.01),
+            actuators=HEXAPOD.actuators[1:],
+            controlled=("x", "y", "z", "phi", "theta"),
+        ),
+        r"the loops of hexapod cannot be closed at its home pose: .* mm stay open",
+    ),
+}
+
+
+def test_singular_home_is_called_singular_and_its_actuators_are_named(root, tmp_path) -> None:
+    """Arm and rod of every limb are in one line: 300 mm - 75 mm = 112.5 mm + 112.5 mm."""
+    text = (root / "src" / "loopcal" / "robots" / "3-rrr.yaml").read_text("utf-8")
+    stretched = text.replace("tip: [180, 0, 0]", "tip: [112.5, 0, 0]")
+    stretched = stretched.replace("length: 180", "length: 112.5").replace(
+        "start: 129", "start: 180"
+    )
+    (tmp_path / "robot.yaml").write_text(stretched, "utf-8")
+    sentence = "home pose is singular: there, q1, q2 and q3 do not move the platform"
+    with pytest.raises(MechanismError, match=sentence) as error:
+        load_robot(tmp_path / "robot.yaml")
+    assert "stay open" not in str(error.value)
+
+
+@pytest.mark.parametrize("case", INVALID_ASSEMBLIES)
+def test_invalid_mechanism_is_refused_in_one_sentence(case):
+    make, sentence = INVALID_ASSEMBLIES[case]
+    with pytest.raises(MechanismError, match=sentence) as error:
+        build(make())
+    assert "\n" not in str(error.value)
+
+
+def test_parameter_with_an_unknown_address_is_refused():
+    parameter = Parameter("a", Dimension.LENGTH, 0.0)
+    for address in (
+        Address("leg1", "knee", "x"),
+        Address("leg1", "rod", "pitch"),
+        Address("q1", "transmission", "tooth"),
+        Address("leg9", "base", "x"),
+    ):
+        wrong = replace(HEXAPOD, parameters=(parameter,), maps=(LinearMap("a", address),))
+        with pytest.raises(
+            MechanismError, match=f"mapped onto {address}, which this mechanism does not have"
+        ):
+            build(wrong)
+
+
+def test_serial_arm_is_a_valid_mechanism():
+    limb = Limb(
+        "arm", (Link("base", np.eye(4)), Link("upper", zoo.place((0.3, 0, 0))), Link("lower", zoo.place((0.2, 0, 0)))),  # noqa: E501
+        (Joint("a", "R", "q1", start=0.3), Joint("b", "R", "q2", start=0.8)), "ball", Link("hand", np.eye(4)),  # noqa: E501
+    )  # fmt: skip
+    robot = build(
+        zoo.assemble("arm", (limb,), ("x", "y"), ("x", "y"), zoo.place((0.35, 0.25, 0.0)))
+    )
+    assert robot.home_state.status[0, 0] == 0

@@ -125,7 +125,7 @@ def test_modes_are_those_of_complete_forward_solutions(name: str) -> None:
         for begin in (home, robot.home_state):  # a start of one pose allows proofs
             judged, is_other = judge_modes(robot, closed, begin)
             assert is_other[~expected].all()
-            # a few that return by a jump are refused, see test_pentapod
+            # a few that return by a jump are refused, see test_shipped_robots
             refused = (is_other & expected).sum()
             assert refused <= (0.1 * is_other.size if name == "pentapod" else 0)
             assert_array_equal(judged.closure_sign, closed.closure_sign)
