@@ -67,11 +67,14 @@ export run -o run.csv"""
 def test_no_module_can_start_a_program_open_an_address_or_run_text(root: Path) -> None:
     found = []
     wrong = FORBIDDEN_MODULES | FORBIDDEN_CALLS
-    written = re.compile(rf"\b({'|'.join(map(re.escape, sorted(wrong)))})\b")
+    written = re.compile(
+        rf"\b(import|from)\b.*\b({'|'.join(FORBIDDEN_MODULES)})\b"
+        rf"|(?<!re\.)\b({'|'.join(FORBIDDEN_CALLS)})\("
+    )
     for path in sorted((root / "src").rglob("*.py")):
         text = path.read_text("utf-8")
         if not written.search(text):
-            continue  # parsing takes a hundred times as long
+            continue  # parsing takes ten times as long
         for node in ast.walk(ast.parse(text)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []

@@ -18,7 +18,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 # Added to squared lengths before the square root: far below any square that matters, far above the
@@ -609,9 +609,18 @@ FLATNESS = 1e-6
 """Ratio of extents [1] below which points count as coplanar, or as collinear."""
 
 ROTATION_CHANGE = 1e-6
-"""Change of the entries of a rotation [1] that ends the alternation in `solve_directions`; a
-descent refines the result anyway.
+"""Change of a rotation [rad] that ends `solve_directions` and `minimize_over_rotations`; a descent
+refines the result anyway.
 """
+
+NEWTON_STEPS, FLATTEST, ROUNDING = 40, 1e-9, 1e-15
+"""Steps of Newton's method on rotations, of which a dozen are usual; the curvature, as a share of
+the trace of its form, below which a direction counts as flat; the rounding of values of the form.
+"""
+
+GENERATORS = np.stack([hat(axis) for axis in np.eye(3)])
+"""Matrices (3, 3, 3) of the cross products with the three axes."""
+GENERATORS.setflags(write=False)
 
 ALIGNMENT_TOLERANCE = 1e-9
 """Singular values below this share of the largest count as zero [1]."""
@@ -645,25 +654,50 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> Flo
     """Return the rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`, at most
     `count` different ones, for positive semidefinite H (9, 9).
 
-    The vector v holds the nine entries of R row by row. Damped Gauss-Newton on the rotation group
-    begins at the rotation nearest to the unconstrained minimum and at the 24 rotations of a cube.
+    The vector v holds the nine entries of R row by row. Newton's method on the rotation group, with
+    the absolute curvatures and a radius that a failed step quarters, begins at the rotation nearest
+    to the unconstrained minimum and at the 24 rotations of a cube. Near a minimum it converges
+    quadratically however large the residual is, where Gauss-Newton does not.
     """
-    from loopcal.numerics.gauss_newton import minimize_from_starts
-
     unconstrained = project_to_rotations(solve_least_squares(H, g).reshape(3, 3))
-    start = np.concatenate([unconstrained[None], OCTAHEDRAL_ROTATIONS])
-    root = _square_root(H)
-    root = root / max(float(np.linalg.norm(root)), TINY)  # residuals of order one
-    target = solve_least_squares(root.T, g / max(float(np.trace(H)), TINY))
+    R = np.concatenate([unconstrained[None], OCTAHEDRAL_ROTATIONS])
+    size = max(float(np.trace(H)), TINY)
+    H, g = H / size, g / size  # values and curvatures of order one
+    value = _evaluate_form(H, g, R)
+    radius, active = np.ones(len(R)), np.arange(len(R))
+    for _ in range(NEWTON_STEPS):
+        if not active.size:
+            break
+        step = _find_newton_step(H, g, R[active])
+        length = np.linalg.norm(step, axis=1)
+        longest = np.minimum(length, radius[active])
+        moved = exp_so3(step * (longest / np.maximum(length, TINY))[:, None]) @ R[active]
+        new_value = _evaluate_form(H, g, moved)
+        better = new_value < value[active] + ROUNDING
+        R[active[better]], value[active[better]] = moved[better], new_value[better]
+        radius[active] = np.where(better, np.minimum(1.0, 2.0 * radius[active]), 0.25 * longest)
+        active = active[longest > ROTATION_CHANGE]
+    return _select_distinct(R[np.argsort(value)])[:count]
 
-    def linearize(vector: FloatArray, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
-        R, turn = exp_so3(vector) @ start[numbers], left_jacobian_so3(vector)
-        # dR = hat(w) R for w along each axis
-        by_turn = np.stack([(hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1)
-        return R.reshape(-1, 9) @ root.T - target, root @ by_turn @ turn
 
-    vector, cost = minimize_from_starts(linearize, np.zeros((len(start), 3)))
-    return _select_distinct((exp_so3(vector) @ start)[np.argsort(cost)])[:count]
+def _evaluate_form(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:
+    """Return `v' H v - 2 g' v` (k,) of rotations R (k, 3, 3)."""
+    v = R.reshape(-1, 9)
+    return np.einsum("ki,ki->k", v @ H - 2.0 * g, v)
+
+
+def _find_newton_step(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:
+    """Return rotation vectors w (k, 3) from R (k, 3, 3): minus the gradient of half the form by w
+    in exp(w) R, over the absolute values of its curvatures.
+    """
+    slope = R.reshape(-1, 9) @ H - g
+    first = np.einsum("iab,kbc->kiac", GENERATORS, R).reshape(-1, 3, 9)
+    second = np.einsum("iab,jbd,kdc->kijac", GENERATORS, GENERATORS, R).reshape(-1, 3, 3, 9)
+    bend = np.einsum("kije,ke->kij", second, slope)
+    curvature = first @ H @ np.swapaxes(first, 1, 2) + 0.5 * (bend + np.swapaxes(bend, 1, 2))
+    size, axes = np.linalg.eigh(curvature)
+    along = np.einsum("kji,kje,ke->ki", axes, first, slope)
+    return -np.einsum("kij,kj->ki", axes, along / np.maximum(np.abs(size), FLATTEST))
 
 
 def _select_distinct(R: FloatArray) -> FloatArray:
@@ -841,12 +875,6 @@ def solve_directions(
     )
     order = np.argsort(error)
     return R[order][:6], a[order][:6]
-
-
-def _square_root(H: FloatArray) -> FloatArray:
-    """Return a matrix S with S'S = H."""
-    values, vectors = np.linalg.eigh(H)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
 def _column_space(C: FloatArray) -> FloatArray:
