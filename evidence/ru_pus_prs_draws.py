@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from loopcal.papers.tsvd_2016.results import to_document
+from evidence.three_prs_draws import to_document
 from loopcal.papers.tsvd_2016.steps import draw_machines
 
 DRAWS, SEED = 50, 0

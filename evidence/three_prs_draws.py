@@ -7,13 +7,45 @@ from __future__ import annotations
 
 from typing import Any
 
-from loopcal.papers.tsvd_2016.results import to_document
-from loopcal.papers.tsvd_2016.steps import draw_machines
+from loopcal.papers.tsvd_2016 import steps
+from loopcal.papers.tsvd_2016.results import make_median_curves, make_medians, make_ratios
+from loopcal.papers.tsvd_2016.steps import RE, SIZES, TSVD, Draws, draw_machines
 
 DRAWS, SEED = 100, 0
 
 
 QUICK = {"DRAWS": 3}
+
+
+def to_document(draws: Draws, seed: int) -> dict[str, Any]:
+    """Return the draws for evidence: tables by name, and which curves have an interior minimum."""
+    curves = map(make_median_curves, draws.sweeps)
+    tables = dict(
+        zip(
+            ("medians", "ratios", "curves", "curves_5"),
+            (make_medians(draws), make_ratios(draws), *curves),
+            strict=True,
+        )
+    )
+    gain, inside = SIZES.find("gain"), {}
+    for sweep in draws.sweeps:
+        of_sweep = inside[str(sweep.study.freedoms)] = {RE: {}, TSVD: {}}
+        for algorithm, measures in of_sweep.items():
+            for i, name in enumerate(steps.MEASURES[:2]):
+                median = steps.compute_rise(sweep.compute_median(algorithm)[:, i]) > gain
+                machines = int((sweep.compute_rises(algorithm, i) > gain).sum())
+                measures[name] = {"median": median, "machines": machines}
+    return {
+        "robot": draws.name,
+        "seed": seed,
+        "draws": len(draws),
+        "minimum_inside": inside,
+        "tables": {
+            name: {"columns": list(table.columns), "formats": list(table.formats),
+                   "rows": [list(row) for row in table.rows]}
+            for name, table in tables.items()
+        },
+    }  # fmt: skip
 
 
 def check(tables: dict[str, Any]) -> None:

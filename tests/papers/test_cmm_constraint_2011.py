@@ -72,7 +72,7 @@ def test_printed_quotients_are_compared_within_their_rounding() -> None:
 
 
 def test_nine_gauge_directions_are_motions_of_base_and_platform(study) -> None:
-    robot, at = study.robot, study.held_out.solution
+    robot, at = study.robot, study.held_out
     assert len(steps.GAUGE_NAMES) == 9
     step, x = 1e-6, at.T[:, :3, 3]
     for i, direction in enumerate(list_gauge_directions(robot)):
@@ -122,7 +122,7 @@ def test_alignment_removes_base_motions_and_platform_rotations_only(study) -> No
     def pose(w: list[float], x: list[float]) -> np.ndarray:
         return geometry.make_pose(geometry.exp_so3(np.array(w)), np.array(x))
 
-    true = study.held_out.solution.T[None]
+    true = study.held_out.T[None]
     base, turn = pose([0.1, -0.2, 0.3], [0.3, 0.1, -0.2]), pose([0.2, 0.1, -0.1], [0.0, 0.0, 0.0])
     np.testing.assert_allclose(steps.fit_motions(base @ true @ turn, true), true, atol=1e-12)
     shifted = steps.fit_motions(true @ pose([0.0, 0.0, 0.0], [1e-3, 0.0, 0.0]), true)
@@ -132,17 +132,17 @@ def test_alignment_removes_base_motions_and_platform_rotations_only(study) -> No
 
 def test_gauge_changes_absolute_errors_but_not_nominal_or_aligned_ones(study) -> None:
     truth, values = (draw_true_machines(study.robot, 0.1 * MM, 1, 0), study.robot.values[None])
-    true = study.held_out.solve(truth)
-    initial = study.held_out.compute_errors(values, truth, true)[0]
+    true = study.solve(truth)
+    initial = study.compute_errors(values, truth, true)[0]
     assert initial[NOMINAL] == pytest.approx(initial[ABSOLUTE], rel=1e-9)  # as designed
     directions, step = (list_gauge_directions(study.robot), 1e-5)  # of a direction of length one
     for direction in directions:
         changed = values + step * direction / np.linalg.norm(direction)
-        moved = study.held_out.compute_errors(changed, truth, true)[0]
+        moved = study.compute_errors(changed, truth, true)[0]
         # second order: some 1e-5 of the step, which is 0.01 mm
         assert moved[NOMINAL] == pytest.approx(initial[NOMINAL], abs=1e-6)
         assert moved[ALIGNED] == pytest.approx(initial[ALIGNED], abs=1e-6)
-    shifted = study.held_out.compute_errors(values + 1e-2 * directions[0], truth, true)[0]
+    shifted = study.compute_errors(values + 1e-2 * directions[0], truth, true)[0]
     assert shifted[ABSOLUTE] == pytest.approx(10.0, abs=initial[ABSOLUTE])  # [mm] along x
     assert shifted[ALIGNED] == pytest.approx(initial[ALIGNED], abs=1e-6)
 
@@ -163,8 +163,8 @@ def test_noise_free_data_give_the_true_machine_up_to_the_gauge(study) -> None:
     problem = PaperRows(study.layout, study.layout.solve_readings(truth, 0.0, 0), MM, 1e-9)
     run = identify_from_rows(problem, LeastSquares(), 1e-6)
     assert (run.decomposition.rank == 33).all()
-    values, true = problem.values(run.deviation), study.held_out.solve(truth)
-    errors = study.held_out.compute_errors(values, truth, true)
+    values, true = problem.values(run.deviation), study.solve(truth)
+    errors = study.compute_errors(values, truth, true)
     assert errors[:, ALIGNED].max() < 1e-7  # [mm], what the last step leaves of 0.1 mm
     assert errors[:, ABSOLUTE].min() > 1e-3  # the base is not determined
 

@@ -2,11 +2,10 @@
 """The papers that can be repeated, and their study files.
 
 A further paper is one more folder and its entry in PAPERS. The folder has `published.yaml` (the
-printed numbers and statements, with their place), `text.yaml` (claims, captions, sentences),
-`study.yaml` (its simulation as a study file), `steps.py` (what the paper does), `results.py` with
-
-    compute(seed, trials, progress) -> results
-    present(results) -> comparisons, tables, verdicts, figures
+printed numbers and statements, with their place), `sizes.yaml` (sizes that are ours), `text.yaml`
+(claims, captions, sentences), `study.yaml` (its simulation as a study file), `steps.py` (what the
+paper does), and `results.py` with compute(seed, trials, progress) -> results, of which
+compare_tables, make_tables, judge_claims and make_figures yield what a page shows.
 """
 
 from __future__ import annotations
@@ -35,9 +34,8 @@ ANY_ERRORS = "errors: [1]  # normal errors, in tolerances of the robot file"
 
 @dataclass(frozen=True)
 class Paper:
-    """A published study that can be repeated; name : on the command line.
-
-    studies : robot -> its study file in the folder; that of the first is adapted to other robots.
+    """A published study that can be repeated; name : on the command line. studies : robot -> its
+    study file in the folder; that of the first is adapted to other robots.
     """
 
     name: str
@@ -67,14 +65,24 @@ class Paper:
 
     def present(self, results: Any, seed: int, trials: int) -> Reproduction:
         """Return computed results as tables, verdicts and figures."""
-        from loopcal.papers.published import PaperFile, PaperText
-        from loopcal.papers.reproduction import Reproduction
+        from loopcal.papers.published import PaperText
+        from loopcal.papers.reproduction import Content, Reproduction
 
         module = import_module(f"{self.package}.results")
-        source = PaperFile(str(module.__file__), "published.yaml").find("source")
-        about = PaperText(str(module.__file__)).about(source=source)
-        settings, content = {"seed": seed, "trials": trials}, module.present(results)
-        return Reproduction(self.name, self.title, self.source, about, settings, content)
+        parts = (
+            module.compare_tables,
+            module.make_tables,
+            module.judge_claims,
+            module.make_figures,
+        )
+        return Reproduction(
+            self.name,
+            self.title,
+            self.source,
+            PaperText(str(module.__file__)).about(),
+            {"seed": seed, "trials": trials},
+            Content(*(tuple(part(results)) for part in parts)),
+        )
 
     def load_study(self, robot: str = "") -> Study:
         """Return the study of a robot of the paper; default: of the first."""
@@ -129,20 +137,20 @@ def find_paper(name: str) -> Paper:
 
 @dataclass(frozen=True)
 class PaperStudyFile:
-    """A study file to write."""
+    """A study file to write.
 
-    path: Path  # of the study file
-    text: str
-    poses: Path | None  # of the file of poses beside it
-    poses_text: str
-    robot: str  # that the study names
-    # keys of the study that belonged to the robot of the paper and were replaced, too
-    replaced: tuple[str, ...]
+    files : path -> text, of the study file and, beside it, of its poses. robot : that it names.
+    replaced : keys of the study that belonged to the robot of the paper and were replaced, too.
+    """
+
+    files: Mapping[Path, str]
+    robot: str
+    replaced: tuple[str, ...] = ()
 
     @property
     def outputs(self) -> tuple[Path, ...]:
         """Files that are written."""
-        return (self.path,) if self.poses is None else (self.path, self.poses)
+        return tuple(self.files)
 
     def write(self) -> None:
         """Write the files; FileError where that is impossible."""
@@ -150,9 +158,8 @@ class PaperStudyFile:
         from loopcal.io.core.text_file import write_text
 
         with restore_on_failure(self.outputs):
-            if self.poses is not None:
-                write_text(self.poses, self.poses_text)
-            write_text(self.path, self.text)
+            for path in reversed(self.outputs):
+                write_text(path, self.files[path])
 
 
 def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> PaperStudyFile:
@@ -170,22 +177,21 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
     poses = "" if file is None else paper.read_file(file[1])
     if wanted in paper.studies:
         if file is None:
-            return PaperStudyFile(path, text, None, "", wanted, ())
+            return PaperStudyFile({path: text}, wanted)
         beside = path.with_name(f"{path.stem}-poses.csv")
         is_plain = re.fullmatch(r"[\w.-]+", beside.name)
         name = beside.name if is_plain else json.dumps(beside.name, ensure_ascii=False)
         text = text.replace(f"{{file: {file[1]}}}", f"{{file: {name}}}")
-        return PaperStudyFile(path, text, beside, poses, wanted, ())
-    replaced = []
-    text = _replace_key(text, "robots", f"robots: [{quote_robot(path, wanted)}]")
+        return PaperStudyFile({path: text, beside: poses}, wanted)
+    changes = {"robots": f"robots: [{quote_robot(path, wanted)}]"}
     if file is not None:
         count = len(poses.splitlines()) - 1
-        text = _replace_key(text, "poses", f"poses: [{count}]  # drawn from the workspace")
-        replaced.append("poses")
+        changes["poses"] = f"poses: [{count}]  # drawn from the workspace"
     if re.search(r"^ +deviations:", text, re.MULTILINE):
-        text = _replace_key(text, "errors", ANY_ERRORS)
-        replaced.append("errors")
-    return PaperStudyFile(path, text, None, "", wanted, tuple(replaced))
+        changes["errors"] = ANY_ERRORS
+    for key, content in changes.items():
+        text = _replace_key(text, key, content)
+    return PaperStudyFile({path: text}, wanted, tuple(changes)[1:])
 
 
 def _replace_key(text: str, key: str, content: str) -> str:

@@ -153,11 +153,6 @@ class Comparison:
         return np.abs(numbers - self.published.values) <= self.step * (1.0 + ROUNDING)
 
     @property
-    def agreeing(self) -> int:
-        """How many numbers agree."""
-        return int(self.within.sum())
-
-    @property
     def largest(self) -> float:
         """Largest difference, in the units of the table (which must have one)."""
         return float(np.abs(self.difference).max())
@@ -281,9 +276,10 @@ class PaperText:
     def _find(self, *keys: str) -> Any:
         return PaperFile(self.module, "text.yaml").find(*keys)
 
-    def about(self, **data: Any) -> tuple[str, ...]:
+    def about(self) -> tuple[str, ...]:
         """Return the paragraphs at the beginning of the page."""
-        return tuple(fill_template(text, **data) for text in self._find("about"))
+        source = PaperFile(self.module, "published.yaml").find("source")
+        return tuple(fill_template(text, source=source) for text in self._find("about"))
 
     def judge(
         self, name: str, agrees: Decision | Sequence[Decision] | BoolArray, /, **data: Any

@@ -69,7 +69,7 @@ class Reproduction:
         columns = ("table", "numbers", "within one unit of the last digit",
                    "largest difference [units of the last digit]")  # fmt: skip
         rows = tuple(
-            (c.title, c.within.size, c.agreeing, float((abs(c.difference) / c.step).max()))
+            (c.title, c.within.size, int(c.within.sum()), float((abs(c.difference) / c.step).max()))
             for c in self.content.comparisons
         )
         return Table("summary", "Published beside computed", columns, rows, ("", "d", "d", ".2g"))

@@ -36,7 +36,6 @@ from loopcal.papers.published import (
     Verdict,
     decide,
 )
-from loopcal.papers.reproduction import Content
 from loopcal.typing import FloatArray
 
 TEXT = PaperText(__file__)
@@ -125,13 +124,7 @@ def compute(
     )
 
 
-def present(results: Results) -> Content:
-    """Return the results as tables, verdicts and figures."""
-    figures = (_draw_figure_4(results), _draw_figure_5(results), _draw_table_3(results))
-    return Content(_compare_tables(results), make_tables(results), judge_claims(results), figures)
-
-
-def _compare_tables(results: Results) -> tuple[Comparison, Comparison]:
+def compare_tables(results: Results) -> tuple[Comparison, Comparison]:
     """Return the stated counts beside the computed ones, and figure 5 beside the nearest
     interpretation.
     """
@@ -236,6 +229,11 @@ def _list_arithmetic(results: Results) -> Table:
     return TEXT.table("arithmetic", rows)
 
 
+def make_figures(results: Results) -> tuple[Figure, ...]:
+    """Return all figures."""
+    return _draw_figure_4(results), _draw_figure_5(results), _draw_table_3(results)
+
+
 def _draw_figure_4(results: Results) -> Figure:
     """Return pose error over parameter error, both after / before, so that growth has a place."""
     frames = {"": ("parameters [mm]", "position [mm]"), ", aligned": (NO_GAUGE, POSITION_ALIGNED)}
@@ -254,11 +252,11 @@ def _draw_figure_5(results: Results) -> Figure:
     """Return position errors of single poses of the first machine, before and after."""
     given, study = SIZES.find("figure_5"), results.study
     made = results.cells[f"{given['errors']:g}", f"{given['noise']:g}"]
-    true, sizes = study.held_out.solve(made.truth[:1]), {}
+    true, sizes = study.solve(made.truth[:1]), {}
     for name in (BEFORE, *METHODS):
-        T = study.held_out.solve(made.values.get(name, study.robot.parameters.nominal[None])[:1])
+        T = study.solve(made.values.get(name, study.robot.parameters.nominal[None])[:1])
         for frame in (ABSOLUTE, ALIGNED):
-            twists = study.held_out.compute_twists(T, true, frame)[0]
+            twists = study.compute_twists(T, true, frame)[0]
             label = name if frame == ABSOLUTE else f"{name}, {frame}"
             sizes[label] = np.linalg.norm(twists[:, 3:], axis=1) / MM
     order = np.argsort(sizes[BEFORE])
@@ -283,15 +281,9 @@ def _draw_table_3(results: Results) -> Figure:
 
 def judge_claims(results: Results) -> tuple[Verdict, ...]:
     """Return a verdict for each claim."""
-    return (
-        *_judge_equations(results),
-        *_judge_table_3(results),
-        *_judge_figure_5(results),
-        *_judge_points(results),
-        *_judge_arithmetic(results),
-        *_judge_methods(results),
-        *_judge_forms(results),
-    )
+    groups = (_judge_equations, _judge_table_3, _judge_figure_5, _judge_points, _judge_arithmetic,
+              _judge_methods, _judge_forms)  # fmt: skip
+    return tuple(verdict for judge in groups for verdict in judge(results))
 
 
 def _judge_equations(results: Results) -> tuple[Verdict, ...]:

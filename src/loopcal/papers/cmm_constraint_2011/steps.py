@@ -91,15 +91,40 @@ The first six move all points as one body, which changes no distance and no angl
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOutPoses:
-    """Poses that were not measured, at which identified machines are compared with true ones."""
+class Study:
+    """The robot, the points it is sent to, and the poses at which it is judged."""
 
-    robot: Mechanism  # as designed
-    solution: Solution  # 100 random poses of its workspace, as it is commanded to them
+    robot: Mechanism
+    planned: PlaneLineGroups  # how groups are written as designs
+    first: FloatArray  # design before coordinate exchange
+    optimized: MovedDesign  # design after it
+    seed: int  # of both
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The measured points."""
+        return Layout(self.robot, self.planned.place_points(self.optimized.design))
+
+    @cached_property
+    def held_out(self) -> Solution:
+        """Random poses with another seed than the points, as the robot is commanded to them."""
+        count = load_study().scores.held_out
+        return sample_workspace(self.robot, count, self.seed + 1).solution
+
+    @cached_property
+    def spreads(self) -> tuple[float, float]:
+        """Rms standard deviation of the identifiable directions [mm per mm of noise] before and
+        after coordinate exchange.
+        """
+        both = []
+        for rows in (self.planned.linearize(self.first), self.optimized.rows):  # noise of 1 mm
+            s = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), compute_uv=False)
+            both.append(float(np.sqrt(np.mean(1.0 / s[s > 1e-10 * s[0]] ** 2))))
+        return both[0], both[1]
 
     def solve(self, values: FloatArray) -> FloatArray:
-        """Return the poses (t, n, 4, 4) of machines (t, p) at the readings."""
-        return forward_trials(self.robot, values, self.solution.q[None], self.solution.state).T
+        """Return the held-out poses (t, n, 4, 4) of machines (t, p) at the nominal readings."""
+        return forward_trials(self.robot, values, self.held_out.q[None], self.held_out.state).T
 
     def compute_twists(self, T: FloatArray, true: FloatArray, frame: str) -> FloatArray:
         """Return differences (t, n, 6) [rad, m], rotation first, of poses (t | 1, n, 4, 4) from
@@ -107,7 +132,7 @@ class HeldOutPoses:
         """
         T = np.broadcast_to(T, true.shape)
         if frame != ABSOLUTE:
-            nominal = np.broadcast_to(self.solution.T, true.shape)
+            nominal = np.broadcast_to(self.held_out.T, true.shape)
             T = fit_motions(T, true if frame == ALIGNED else nominal)
         return geometry.pose_difference(T, true)
 
@@ -128,34 +153,6 @@ class HeldOutPoses:
         lengths = (np.linalg.norm(e, axis=1) / MM for e in (wrong, remove_gauge(self.robot, wrong)))
         columns = (*sizes[ABSOLUTE], *sizes[ALIGNED], *lengths, sizes[AT_NOMINAL][0])
         return np.stack([*columns, *statistics], axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Study:
-    """The robot, the points it is sent to, and the poses at which it is judged."""
-
-    robot: Mechanism
-    planned: PlaneLineGroups  # how groups are written as designs
-    first: FloatArray  # design before coordinate exchange
-    optimized: MovedDesign  # design after it
-    seed: int  # of both
-
-    @cached_property
-    def layout(self) -> Layout:
-        """The measured points."""
-        return Layout(self.robot, self.planned.place_points(self.optimized.design))
-
-    @cached_property
-    def held_out(self) -> HeldOutPoses:
-        """Held-out poses, drawn with another seed than the points."""
-        count = load_study().scores.held_out
-        return HeldOutPoses(self.robot, sample_workspace(self.robot, count, self.seed + 1).solution)
-
-    @cached_property
-    def spreads(self) -> tuple[float, float]:
-        """`compute_spread` of the points before and after coordinate exchange."""
-        drawn = self.planned.linearize(self.first)
-        return compute_spread(drawn), compute_spread(self.optimized.rows)
 
 
 def load_study() -> GridStudy:
@@ -179,15 +176,6 @@ def plan_points(
     first = planned.draw(groups, seed)
     improved = improve_groups(planned, first, level.sweeps if sweeps is None else sweeps)
     return Study(robot, planned, first, improved, seed)
-
-
-def compute_spread(rows: FloatArray) -> float:
-    """Return the rms standard deviation of the identifiable directions [mm per mm of noise].
-
-    The rows are those for a noise of 1 mm.
-    """
-    s = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), compute_uv=False)
-    return float(np.sqrt(np.mean(1.0 / s[s > 1e-10 * s[0]] ** 2)))
 
 
 def draw_true_machines(
@@ -353,9 +341,9 @@ def judge_cell(
     iterations: IntArray, converged: Mapping[str, BoolArray],
 ) -> Cell:  # fmt: skip
     """Return identified machines with their errors at the held-out poses."""
-    true, nominal = study.held_out.solve(truth), study.robot.parameters.nominal[None]
+    true, nominal = study.solve(truth), study.robot.parameters.nominal[None]
     errors = {
-        name: study.held_out.compute_errors(v, truth, true)
+        name: study.compute_errors(v, truth, true)
         for name, v in {BEFORE: nominal, **values}.items()
     }
     return Cell(sd, noise, errors, iterations, converged, truth, values)

@@ -21,7 +21,7 @@ from loopcal.papers.hexapod_42.steps import (
     TO_PRINTED,
     Setup,
     compute_rms,
-    to_table,
+    find_places,
 )
 from loopcal.papers.published import (
     Comparison,
@@ -34,7 +34,6 @@ from loopcal.papers.published import (
     Verdict,
     decide,
 )
-from loopcal.papers.reproduction import Content
 from loopcal.typing import BoolArray, FloatArray
 
 TEXT = PaperText(__file__)
@@ -53,7 +52,7 @@ class Results:
     orders: list[Row]  # the best first
     outliers: steps.Outliers
     rounding: list[Row]
-    comparisons: Mapping[str, Comparison]  # by name of the table
+    comparisons: Mapping[str, Comparison]  # of Tables 2 to 6, by name
     sizes: FloatArray  # (4,) of Tables 5 and 6, see `Level`
     explained: FloatArray  # (6,) share of the residuals of Table 6 that parameters explain
     noise: FloatArray  # (n, 6) [m, rad] that Tables 5 and 6 imply
@@ -94,7 +93,7 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
         orders=orders,
         outliers=outliers,
         rounding=rounding,
-        comparisons={c.name: c for c in compare_tables(setup, runs["exact"], runs["presumed"])},
+        comparisons={c.name: c for c in _compare(setup, runs["exact"], runs["presumed"])},
         sizes=np.array([*rms, steps.integrate_errors(residual[None])[0]]),
         explained=steps.linearize_truth(setup).explain(twists),
         noise=steps.recover_noise(setup),
@@ -106,23 +105,21 @@ def find_rule() -> tuple[float, int]:
     return PRINTED.number("threshold", "value"), int(PRINTED.find("iterations", "value"))
 
 
-def present(results: Results) -> Content:
-    """Return the results as tables, verdicts and figures."""
-    figures = (_draw_figure_4(results), _draw_noise(results))
-    verdicts = judge_claims(results)
-    return Content(tuple(results.comparisons.values()), make_tables(results), verdicts, figures)
+def compare_tables(results: Results) -> tuple[Comparison, ...]:
+    """Return Tables 2 to 6, printed beside computed."""
+    return tuple(results.comparisons.values())
 
 
-def compare_tables(
+def _compare(
     setup: Setup, exact: steps.Iterations, noisy: steps.Iterations
 ) -> tuple[Comparison, ...]:
-    """Return Tables 2 to 6, printed beside computed."""
     used = find_rule()[1]
     robot, measured = setup.robot, PRINTED.table("table_4", "PP")
     errors = setup.truth.values - noisy.values
-    before, after = to_table(robot, errors[0]) / MM, to_table(robot, errors[used]) / (1e-3 * MM)
+    places = find_places(robot)
+    before, after = errors[0][places] / MM, errors[used][places] / (1e-3 * MM)
     first = (setup.actual - setup.poses) * TO_PRINTED
-    identified = to_table(robot, exact.values[used + 1] - robot.values) / MM
+    identified = (exact.values[used + 1] - robot.values)[places] / MM
     odd = measured.labels.index(ODD_POSE)
     odd_row = steps.make_setup(leg_lengths=False).actual[odd : odd + 1] * TO_PRINTED
     printed_row = Printed({ODD_POSE: measured.rows[ODD_POSE]})
@@ -150,7 +147,7 @@ def make_symmetric(setup: Setup) -> FloatArray:
         for part in (slice(0, 3), slice(4, 7)):
             table[leg, part] = turn @ printed[source, part]
     place = steps.PARAMETERS.index("length")
-    length = to_table(robot, robot.values)[:, place] + inverse(robot, robot.home[None]).q[0]
+    length = robot.values[find_places(robot)[:, place]] + inverse(robot, robot.home[None]).q[0]
     table[:, place] = length / MM
     return table
 
@@ -209,6 +206,11 @@ def make_tables(results: Results) -> tuple[Table, ...]:
 def _describe_noise(instrument: str) -> str:
     length, angle = steps.list_noises()[instrument]
     return f"noise within +-{length:g} mm, +-{angle:g} rad"
+
+
+def make_figures(results: Results) -> tuple[Figure, ...]:
+    """Return all figures."""
+    return _draw_figure_4(results), _draw_noise(results)
 
 
 def _draw_figure_4(results: Results) -> Figure:
@@ -272,7 +274,8 @@ def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
     is_odd = np.array([label.startswith(f"{ODD_POSE} ") for label in labels])
     good, bad = fourth.within[is_actual & ~is_odd], fourth.within[is_actual & is_odd]
     without = next(fit for fit in results.outliers.first if fit["label"] == ODD_POSE)
-    noise = PRINTED.number("noise", "value") / np.sqrt(3.0)
+    odd, noise = results.comparisons["table_4_a2"].within, PRINTED.number("noise", "value")
+    rms = noise / np.sqrt(3.0)
     short = ("before", "as printed", "row corrected", "without row", "in full", "weighted", "prior")
     errors = {name: row["error"] for name, row in zip(short, results.rounding, strict=True)}
     return (
@@ -280,9 +283,9 @@ def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
               best=best, second=second, stated=stated),
         judge("table_4", good.all(), row=ODD_POSE, agreeing=_count(good), count=good.size),
         judge("odd_row", bad.all(), row=ODD_POSE, differing=_count(~bad), count=bad.size,
-              without=without, odd=results.comparisons["table_4_a2"],
+              without=without, agreeing_odd=_count(odd), size=odd.size,
               named=results.outliers.labels or ("no pose",)),
-        judge("table_4_noise", best["position"] > noise / 3.0, best=best, stated=noise),
+        judge("table_4_noise", best["position"] > rms / 3.0, best=best, stated=rms),
         judge("rounding", max(errors[n] for n in short[1:4]) < errors["before"], row=ODD_POSE,
               errors=errors),
     )  # fmt: skip

@@ -32,8 +32,7 @@ from loopcal.papers.paper import PAPERS
 from loopcal.papers.published import PaperFile, Printed, Row
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
 from loopcal.studies.specification.levels import PosesLevel
-from loopcal.studies.specification.study import Study
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 MM = 1e-3
 TO_SI, TO_PRINTED = np.array([MM] * 3 + [1.0] * 3), np.array([1.0 / MM] * 3 + [1.0] * 3)
@@ -86,10 +85,6 @@ class Setup:
         """Return the poses (n, 6) [m, rad] of a machine at the readings of the nominal one."""
         return to_coordinates(forward(machine, self.commanded.q, self.commanded).T)
 
-    def take(self, poses: FloatArray) -> Setup:
-        """Return the same machines at other poses."""
-        return replace(self, poses=poses)
-
 
 def make_setup(leg_lengths: bool = True) -> Setup:
     """Return the hexapod of Tables 2 and 3 at the nominal poses of Table 4.
@@ -102,24 +97,13 @@ def make_setup(leg_lengths: bool = True) -> Setup:
     errors[:, PARAMETERS.index("length")] *= leg_lengths
     poses = PRINTED.table("table_4", "PT").values / TO_PRINTED
     poses[:, 3:] = np.deg2rad(np.round(np.rad2deg(poses[:, 3:])))
-    return Setup(
-        robot, robot.with_values(robot.parameters.nominal + to_values(robot, errors)), poses
-    )
+    truth = robot.parameters.nominal.copy()
+    truth[find_places(robot)] += errors
+    return Setup(robot, robot.with_values(truth), poses)
 
 
-def to_values(robot: Mechanism, table: FloatArray) -> FloatArray:
-    """Return values (p,) in the robot's order of a table (6, 7) in the paper's layout."""
-    values = np.zeros(len(robot.parameters))
-    values[_find_places(robot)] = table
-    return values
-
-
-def to_table(robot: Mechanism, values: FloatArray) -> FloatArray:
-    """Return a table (6, 7) in the paper's layout of values (p,) in the robot's order."""
-    return values[_find_places(robot)]
-
-
-def _find_places(robot: Mechanism) -> np.ndarray:
+def find_places(robot: Mechanism) -> IntArray:
+    """Return the places (6, 7) of the parameters in the paper's layout in the robot's order."""
     index = robot.parameters.index
     return np.array([[index(f"leg{leg}.{name}") for name in PARAMETERS] for leg in range(1, 7)])
 
@@ -155,15 +139,11 @@ def to_measurements(
 
 def list_noises() -> dict[str, tuple[float, float]]:
     """Return the limits [mm, rad] of the uniform noise of each instrument of study.yaml."""
-    levels = PAPERS["hexapod-42"].load_study().instruments
-    root = np.sqrt(3.0)
-
-    def read(sigma: float) -> float:
-        return float(f"{root * sigma:.6g}")  # sigmas have nine digits
-
-    return {
-        name: (read(level.sigma_position / MM), read(level.sigma_angle))
-        for name, level in levels.items()
+    levels, root = PAPERS["hexapod-42"].load_study().instruments, np.sqrt(3.0)
+    sigmas = {name: (of.sigma_position / MM, of.sigma_angle) for name, of in levels.items()}
+    return {  # sigmas have nine digits
+        name: (float(f"{root * length:.6g}"), float(f"{root * angle:.6g}"))
+        for name, (length, angle) in sigmas.items()
     }
 
 
@@ -253,15 +233,12 @@ class Level:
         return (sizes >= self.sizes.min(axis=0)) & (sizes <= self.sizes.max(axis=0))
 
 
-def load_study(seed: int, trials: int) -> Study:
-    """Return study.yaml with so many draws."""
-    return set_size(PAPERS["hexapod-42"].load_study(), seed, trials)
-
-
 def calibrate_methods(
-    study: Study, instrument: str, methods: Sequence[str]
+    seed: int, trials: int, instrument: str, methods: Sequence[str], **poses: PosesLevel
 ) -> Iterator[CalibratedCell]:
-    """Yield the cells of a study with one level of noise, method by method."""
+    """Yield cells of study.yaml with so many draws, method by method; poses : in place of its."""
+    study = set_size(PAPERS["hexapod-42"].load_study(), seed, trials)
+    study = replace(study, poses=poses or study.poses)
     for method in methods:
         yield from calibrate_cells(study, find_cells(study, instrument=instrument, method=method))
 
@@ -270,10 +247,10 @@ def sweep_noise(
     setup: Setup, iterations: int, threshold: float, seed: int, trials: int
 ) -> dict[str, Level]:
     """Repeat the ten steps at every level of noise; sizes are those after `iterations`."""
-    levels, study, commanded = {}, load_study(seed, trials), setup.commanded
+    levels, commanded = {}, setup.commanded
     for instrument, limits in list_noises().items():
         integrated, sizes = [], np.zeros((trials, 4))
-        for i, cell in enumerate(calibrate_methods(study, instrument, PER_LEG)):
+        for i, cell in enumerate(calibrate_methods(seed, trials, instrument, PER_LEG)):
             T = forward_trials(setup.robot, cell.values, commanded.q[None], commanded.state).T
             measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
             residual = np.stack(
@@ -296,13 +273,13 @@ def sweep_noise(
 
 def compare_methods(setup: Setup, seed: int, trials: int) -> list[Row]:
     """Compare the paper's method, all legs weighted together, and MAP on the same stated noise."""
-    cells = calibrate_methods(load_study(seed, trials), STATED, (PER_LEG[-1], TOGETHER, PRIOR))
+    cells = calibrate_methods(seed, trials, STATED, (PER_LEG[-1], TOGETHER, PRIOR))
     names = ("leg by leg, unweighted (the paper)", "all legs, weighted by the noise",
              "the same with tolerances as prior (MAP)")  # fmt: skip
     values = {"not calibrated": setup.robot.values[None]}
     values |= {name: cell.values for name, cell in zip(names, cells, strict=True)}
     unmeasured = {
-        name: setup.take(draw_poses(name, SIZES.find("unmeasured"), seed))
+        name: replace(setup, poses=draw_poses(name, SIZES.find("unmeasured"), seed))
         for name in SIZES.find("ranges")
     }
     rows = []
@@ -326,12 +303,11 @@ def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> lis
     sets.append((PAPERS_TEN, setup.poses))
     for name, counts in SIZES.find("drawn").items():
         sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
-    study, rows = load_study(seed, trials), []
+    rows, methods = [], (PER_LEG[-1], TOGETHER)
     for name, poses in sets:
-        other = setup.take(poses)
+        other = replace(setup, poses=poses)
         exact = iterate(other, other.actual)
         level = PosesLevel(len(poses), coordinates=tuple(map(tuple, poses.tolist())))
-        study = replace(study, poses={name: level})
         row: Row = {
             "poses": name,
             "number": len(poses),
@@ -339,7 +315,7 @@ def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> lis
             "left": compute_rms((setup.truth.values - exact.values[-1]) / MM),
             "condition": float(exact.conditions.max()),
         }
-        for cell in calibrate_methods(study, STATED, (PER_LEG[-1], TOGETHER)):
+        for cell in calibrate_methods(seed, trials, STATED, methods, poses=level):
             row[cell.levels["method"]] = compute_rms((cell.values - setup.truth.values) / MM)
         rows.append(row)
     return rows
@@ -359,7 +335,8 @@ def recover_noise(setup: Setup) -> FloatArray:
     D = linearize_truth(setup).D
     rates = ANGLES.rates_inverse(setup.actual[:, 3:])
     by_coordinates = np.concatenate([D[:, 3:], rates @ D[:, :3]], axis=1)
-    errors = to_values(setup.robot, PRINTED.table("table_5", "after").values * 1e-3 * MM)
+    errors = np.zeros(len(setup.robot.parameters))
+    errors[find_places(setup.robot)] = PRINTED.table("table_5", "after").values * 1e-3 * MM
     return PRINTED.table("table_6", "after").values / TO_PRINTED - by_coordinates @ errors
 
 
@@ -468,7 +445,7 @@ def calibrate_from_print(setup: Setup, printed: Printed) -> list[Row]:
     repaired = measured.copy()
     repaired[odd] = np.round(actual[odd] / unit) * unit
     keep = np.arange(len(measured)) != odd
-    nine = setup.take(setup.poses[keep])
+    nine = replace(setup, poses=setup.poses[keep])
     made: list[tuple[str, int | None, FloatArray]] = [("not calibrated", None, setup.robot.values)]
     for name, other, poses in (
         ("Table 4 as printed", setup, measured),

@@ -9,14 +9,13 @@ situations it speaks of. Claims about medians are judged in groups of machines.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
 from loopcal.estimate.published_steps import LINEARIZATIONS
-from loopcal.mechanism.model import Mechanism
 from loopcal.papers.published import (
     Cell,
     Comparison,
@@ -27,7 +26,6 @@ from loopcal.papers.published import (
     Table,
     Verdict,
 )
-from loopcal.papers.reproduction import Content
 from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.steps import (
     BEFORE,
@@ -114,12 +112,6 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
     return Results(cases, draws, ridge_steps, steps.PRINTED.table("appendix_1"))
 
 
-def present(results: Results) -> Content:
-    """Return the results as tables, verdicts and figures."""
-    counts = _compare_counts(results)
-    return Content((counts,), make_tables(results), judge_claims(results), make_figures(results))
-
-
 def show_number(value: float) -> Cell:
     """Return a number as a cell: rounding as 0, and what is not finite as a fit that diverged."""
     if not np.isfinite(value):
@@ -132,37 +124,68 @@ def show_all(values: Iterable[float]) -> list[Cell]:
     return [show_number(value) for value in values]
 
 
-def _compare_counts(results: Results) -> Comparison:
-    """Return the numbers that the text states, beside the computed ranks."""
+def compare_tables(results: Results) -> Iterator[Comparison]:
+    """Yield the numbers that the text states, beside the computed ranks."""
     tripod = results.cases["3-PRS", 6]
     chain = sum("1" in name for name in tripod.study.robot.parameters.names)
     numbers = (results.cases["RU-PUS-PRS", 6].rank, tripod.rank, chain,
                len(tripod.study.trials.readings))  # fmt: skip
     computed = np.array(numbers, dtype=np.float64)[:, None]
-    return TEXT.compare("counts", steps.PRINTED.table("counts"), computed)
+    yield TEXT.compare("counts", steps.PRINTED.table("counts"), computed)
 
 
-def make_tables(results: Results) -> tuple[Table, ...]:
-    """Return all tables: the analogues of Tables 1 to 8, and the figures as numbers."""
+def make_tables(results: Results) -> Iterator[Table]:
+    """Yield all tables: the analogues of Tables 1 to 8, and the figures as numbers."""
     cases, draws, noise = results.cases.values(), results.draws, results.noise.values
-    ridge = [(n, lam, *show_all(errors[:2])) for n, lam, errors in results.ridge_steps]
+    yield TEXT.table("given", [row for name in ROBOTS for row in _list_machine(name)])
+
     limits = steps.list_limits() * np.array([1e3] * 3 + [1.0] * 3)
     largest, rms = np.abs(noise).max(axis=0), np.sqrt(np.mean(noise**2, axis=0))
     columns = (NOISE_COLUMNS, largest, limits, rms, limits / np.sqrt(3.0))
-    return (
-        TEXT.table("given", [row for name in ROBOTS for row in _list_machine(name)]),
-        TEXT.table("noise", zip(*columns, strict=True)),
-        _list_ranks(results),
-        *(_list_outputs(name, results) for name in ROBOTS),
-        *map(make_medians, draws),
-        *map(make_ratios, draws),
-        _list_convergence(results),
-        TEXT.table("ridge_steps", ridge),
-        *(_list_identified(name, results) for name in ROBOTS),
-        *map(_list_curves, cases),
-        *map(make_median_curves, results.sweeps.values()),
-        *map(_list_history, cases),
-    )
+    yield TEXT.table("noise", zip(*columns, strict=True))
+
+    ranks: list[tuple[Any, ...]] = []
+    for case in cases:
+        s, null = case.singular_values, "; ".join(map(str, case.known.unidentifiable)) or None
+        values = (s[0], s[-2], s[-1], s[0] / s[case.rank - 1], case.known.condition)
+        rank = f"{case.rank} of {len(s)}"
+        ranks.append((case.study.label, rank, *values, case.normal_equations, null))
+    yield TEXT.table("ranks", ranks)
+
+    yield from (_list_outputs(name, results) for name in ROBOTS)
+    yield from map(make_medians, draws)
+    yield from map(make_ratios, draws)
+
+    iterations = []
+    for case in cases:
+        ls = LS if case.study.freedoms == 6 else RANKED
+        counts = [describe_end(case, method)[0] for method in (ls, RE, TSVD, WHITENED, PRIOR)]
+        iterations.append((case.study.label, *counts))
+    yield TEXT.table("convergence", iterations)
+
+    ridge = [(n, lam, *show_all(errors[:2])) for n, lam, errors in results.ridge_steps]
+    yield TEXT.table("ridge_steps", ridge)
+
+    for name in ROBOTS:
+        study, number = results.cases[name, 6].study, TABLES[name][0]
+        found = [results.cases[name, f].answers[m].values[0] for m, f in IDENTIFIED]
+        values = to_paper_units(study, np.array([study.trials.truth[0], *found])).T
+        labels = list_labels(study)
+        rows = [(*label, *show_all(row)) for label, row in zip(labels, values, strict=True)]
+        yield TEXT.table("identified", rows, f"table_{number}", name=name, number=number)
+
+    yield from map(_list_curves, cases)
+    yield from map(make_median_curves, results.sweeps.values())
+
+    for case in cases:
+        study, name = case.study, f"history_{case.study.file}"
+        history = [
+            (algorithm, i, *show_all(values))
+            for algorithm in NAMES.values()
+            for i, values in zip(*collect_history(case, algorithm), strict=True)
+        ]
+        more = [(f"{parameter} [{unit}]", ".3g") for parameter, unit in list_labels(study)]
+        yield TEXT.table("history", history, name, more, case=study.label)
 
 
 def _list_machine(name: str) -> list[tuple[str, str, str]]:
@@ -177,17 +200,6 @@ def _list_machine(name: str) -> list[tuple[str, str, str]]:
     return [*rows, (name, "output range", f"{count} poses, tilts of {tilts} deg{z}")]
 
 
-def _list_ranks(results: Results) -> Table:
-    rows = []
-    for case in results.cases.values():
-        s = case.singular_values
-        null = "; ".join(map(str, case.known.unidentifiable)) or None
-        values = (s[0], s[-2], s[-1], s[0] / s[case.rank - 1])
-        tail = (case.known.condition, case.normal_equations, null)
-        rows.append((case.study.label, f"{case.rank} of {len(s)}", *values, *tail))
-    return TEXT.table("ranks", rows)
-
-
 def _list_outputs(name: str, results: Results) -> Table:
     study = results.cases[name, 6].study
     rows: list[tuple[Any, ...]] = []
@@ -199,35 +211,10 @@ def _list_outputs(name: str, results: Results) -> Table:
     for case in (results.cases[name, freedoms] for freedoms in (6, 5)):
         for method, answer in case.answers.items():
             numbers = show_all((*answer.errors[0, :4], *answer.commanded[0]))
-            end = "yes" if answer.is_converged[0] else "no"
-            end = DIVERGED if case.is_diverged(method) else end
             label = (f"{case.study.freedoms}-DOF", method, case.describe_setting(method))
-            rows.append((*label, *numbers, answer.iterations[0], end))
+            rows.append((*label, *numbers, answer.iterations[0], describe_end(case, method)[1]))
     number = TABLES[name][1]
     return TEXT.table("outputs", rows, f"table_{number}", name=name, number=number)
-
-
-def _list_identified(name: str, results: Results) -> Table:
-    study = results.cases[name, 6].study
-    columns = [study.trials.truth[0]]
-    columns += [results.cases[name, f].answers[m].values[0] for m, f in IDENTIFIED]
-    values = to_paper_units(study, np.array(columns)).T
-    labels = zip(study.robot.parameters.names, list_units(study.robot), strict=True)
-    rows = [(*label, *show_all(row)) for label, row in zip(labels, values, strict=True)]
-    number = TABLES[name][0]
-    return TEXT.table("identified", rows, f"table_{number}", name=name, number=number)
-
-
-def _list_convergence(results: Results) -> Table:
-    rows = []
-    for case in results.cases.values():
-        cells = []
-        for method in (LS if case.study.freedoms == 6 else RANKED, RE, TSVD, WHITENED, PRIOR):
-            answer = case.answers[method]
-            number = f"{'' if answer.is_converged[0] else 'more than '}{answer.iterations[0]:,}"
-            cells.append(DIVERGED if case.is_diverged(method) else number)
-        rows.append((case.study.label, *cells))
-    return TEXT.table("convergence", rows)
 
 
 def _list_curves(case: Case) -> Table:
@@ -243,18 +230,6 @@ def _list_curves(case: Case) -> Table:
     low, high = case.bracket
     name = f"curves_{case.study.file}"
     return TEXT.table("curves", rows, name, case=case.study.label, low=low, high=high)
-
-
-def _list_history(case: Case) -> Table:
-    robot = case.study.robot
-    rows = [
-        (algorithm, i, *show_all(values))
-        for algorithm in (LS, RE, TSVD)
-        for i, values in zip(*collect_history(case, algorithm), strict=True)
-    ]
-    labels = zip(robot.parameters.names, list_units(robot), strict=True)
-    more = [(f"{parameter} [{unit}]", ".3g") for parameter, unit in labels]
-    return TEXT.table("history", rows, f"history_{case.study.file}", more, case=case.study.label)
 
 
 def make_medians(draws: Draws) -> Table:
@@ -297,35 +272,13 @@ def make_median_curves(sweep: Sweep) -> Table:
     return TEXT.table("median_curves", rows, name, **data, trials=len(sweep))
 
 
-def to_document(draws: Draws, seed: int) -> dict[str, Any]:
-    """Return the draws for evidence: tables by name, and which curves have an interior minimum."""
-    curves = map(make_median_curves, draws.sweeps)
-    tables = dict(
-        zip(
-            ("medians", "ratios", "curves", "curves_5"),
-            (make_medians(draws), make_ratios(draws), *curves),
-            strict=True,
-        )
-    )
-    gain, inside = SIZES.find("gain"), {}
-    for sweep in draws.sweeps:
-        of_sweep = inside[str(sweep.study.freedoms)] = {RE: {}, TSVD: {}}
-        for algorithm, measures in of_sweep.items():
-            for i, name in enumerate(steps.MEASURES[:2]):
-                median = steps.compute_rise(sweep.compute_median(algorithm)[:, i]) > gain
-                machines = int((sweep.compute_rises(algorithm, i) > gain).sum())
-                measures[name] = {"median": median, "machines": machines}
-    return {
-        "robot": draws.name,
-        "seed": seed,
-        "draws": len(draws),
-        "minimum_inside": inside,
-        "tables": {
-            name: {"columns": list(table.columns), "formats": list(table.formats),
-                   "rows": [list(row) for row in table.rows]}
-            for name, table in tables.items()
-        },
-    }  # fmt: skip
+def describe_end(case: Case, method: str) -> tuple[str, str]:
+    """Return the iterations of a method, and whether it converged, as text."""
+    answer = case.answers[method]
+    if case.is_diverged(method):
+        return DIVERGED, DIVERGED
+    count = f"{answer.iterations[0]:,}"
+    return (count, "yes") if answer.is_converged[0] else (f"more than {count}", "no")
 
 
 def collect_history(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
@@ -343,21 +296,22 @@ def to_paper_units(study: steps.Study, values: FloatArray) -> FloatArray:
     return (values - study.robot.parameters.nominal) / steps.list_scales(study.robot)
 
 
-def list_units(robot: Mechanism) -> tuple[str, ...]:
-    """Return the unit of each of the paper's raw numbers (p,)."""
-    return tuple("mm" if d is Dimension.LENGTH else "rad" for d in robot.parameters.dimensions)
+def list_labels(study: steps.Study) -> list[tuple[str, str]]:
+    """Return the name of each parameter, and the unit of the paper's raw numbers."""
+    table = study.robot.parameters
+    units = ["mm" if d is Dimension.LENGTH else "rad" for d in table.dimensions]
+    return list(zip(table.names, units, strict=True))
 
 
-def make_figures(results: Results) -> tuple[Figure, ...]:
-    """Return all figures: the analogues of figures 6 to 11, and medians over many machines."""
-    figures = []
+def make_figures(results: Results) -> Iterator[Figure]:
+    """Yield all figures: the analogues of figures 6 to 11, and medians over many machines."""
     for draws in results.draws:
         for sweep, method in zip(draws.sweeps, (PRIOR, PRIOR_FIVE), strict=True):
             prior, data = draws.compute_median(method), {"name": sweep.study.label}
             for a, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 has no place on its axis
                 drawn = a, sweep.settings[a][first:], sweep.compute_median(a)[first:], prior
                 file = f"medians_{sweep.study.file}_{a.lower()}"
-                figures.append(_draw_curve("medians", file, *drawn, **data, trials=len(draws)))
+                yield _draw_curve("medians", file, *drawn, **data, trials=len(draws))
     for case in results.cases.values():
         number = FIGURES[case.study.name, case.study.freedoms]
         for a, first, part in ((RE, 1, "a"), (TSVD, 0, "b")):
@@ -366,11 +320,11 @@ def make_figures(results: Results) -> tuple[Figure, ...]:
             data = {"number": f"{number}({part})", "case": case.study.label,
                     "best": case.describe_setting(a),
                     "diverged": int(np.isinf(errors[:, 0]).sum())}  # fmt: skip
-            figures.append(_draw_curve("curve", f"figure_{number}{part}", *drawn, **data))
+            yield _draw_curve("curve", f"figure_{number}{part}", *drawn, **data)
     for freedoms, algorithms in ((6, (LS, RE, TSVD)), (5, (RE, TSVD))):
         case = results.cases["RU-PUS-PRS", freedoms]
-        figures += [_draw_history(case, a, unit) for a in algorithms for unit in ("mm", "rad")]
-    return (*figures, _draw_steps(results))
+        yield from (_draw_history(case, a, unit) for a in algorithms for unit in ("mm", "rad"))
+    yield _draw_steps(results)
 
 
 def _draw_curve(
@@ -394,8 +348,8 @@ def _draw_curve(
 
 def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
     """Return the parameters of one unit by iteration; those that RE changes most are named."""
-    names, units = case.study.robot.parameters.names, list_units(case.study.robot)
-    chosen = [i for i, u in enumerate(units) if u == unit]
+    labels, names = list_labels(case.study), case.study.robot.parameters.names
+    chosen = [i for i, (_, u) in enumerate(labels) if u == unit]
     reference = collect_history(case, RE)[1][-1]
     named = sorted(chosen, key=lambda i: -abs(reference[i]))[:NAMED]
     done, values = collect_history(case, algorithm)
