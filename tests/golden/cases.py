@@ -461,7 +461,7 @@ def run_cmm_constraint_2011() -> Report:
     cell = steps.calibrate_cell(study, 1e-3, 1e-5, 0, 3, weights="full")
     return {
         "design": study.optimized.design,
-        "value": study.optimized.value,
+        "value": study.optimized.history[-1],
         "failed": cell.failed,
         "errors": {name: errors[:, :7] for name, errors in cell.errors.items()},
     }
