@@ -16,8 +16,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.apply.height_errors import restore_heights
 from loopcal.apply.run_comparison import RunComparison
+from loopcal.apply.validation import restore_validation
 from loopcal.errors import FileError, LoopcalError
+from loopcal.estimate.posterior import posterior_from_arrays
+from loopcal.estimate.result import residuals_from_arrays
 from loopcal.findings import report_finding
 from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
 from loopcal.io.core.text_file import as_path, to_json, write_bytes, write_text
@@ -29,20 +33,16 @@ from loopcal.io.runs.run_folder import Run, build_document, refuse_changed_run
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
 from loopcal.report.document.calibration_document import build_calibration_document
-from loopcal.report.document.elements import (
-    CalibrationRecord,
-    ControllerValues,
-    build_record,
-    render_html,
-)
+from loopcal.report.document.elements import CalibrationRecord, ControllerValues, render_html
 from loopcal.report.document.other_documents import (
     build_calibration_view,
     build_comparison_document,
     build_robot_view,
 )
 from loopcal.report.validation_view import tabulate_comparison
+from loopcal.results.serialization import json_fields, restore_numbers
 
-# --- Records of calibrations from reports in memory and from run folders, with controllers'
+# Records of calibrations from reports in memory and from run folders, with controllers'
 # values.
 
 GENERAL = ("json", "csv")
@@ -66,8 +66,20 @@ def load_record(source: CalibrationReport | Run) -> CalibrationRecord:
         result, name = json.loads(to_json(build_document(source))), ""
         intervals = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}
         exported = ExportSource(robot, intervals)
-    exported = replace(exported, is_for_people=True)
-    return build_record(result, arrays, robot, initial, name, list_controllers(exported))
+    content = restore_numbers(result)
+    stored = content.get("validation")
+    return CalibrationRecord(
+        source=name,
+        result=content,
+        arrays=arrays,
+        robot=robot,
+        initial=initial,
+        posterior=posterior_from_arrays(robot, arrays) if "posterior_unit" in arrays else None,
+        validation=None if stored is None else restore_validation(stored, arrays, robot),
+        heights=restore_heights(arrays, robot),
+        residuals=residuals_from_arrays(arrays),
+        controllers=list_controllers(replace(exported, is_for_people=True)),
+    )
 
 
 def list_controllers(source: ExportSource) -> tuple[ControllerValues, ...]:
@@ -122,7 +134,7 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     _, data = name_files(path)
     refuse_outputs((path, data), (), force=True)
     document = build_calibration_document(load_record(report))
-    html, json_text = render_html(document), to_json({"format": 1, **document.to_dict()})
+    html, json_text = render_html(document), to_json({"format": 1, **json_fields(document)})
     with restore_on_failure((path, data)):
         write_text(path, html)
         write_text(data, json_text)
@@ -154,7 +166,7 @@ def check_ending(path: Path, what: str, endings: tuple[str, ...] = HTML) -> str:
     return ending
 
 
-# --- Write a comparison of calibrations: HTML for people, JSON and CSV for programs.
+# Write a comparison of calibrations: HTML for people, JSON and CSV for programs.
 
 ENDINGS = (*HTML, ".json", ".csv")
 """Endings of the files of a comparison."""
@@ -197,7 +209,7 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
     return path
 
 
-# --- Print an HTML file to PDF with an installed Chromium.
+# Print an HTML file to PDF with an installed Chromium.
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 """Names of programs that print, in the order in which they are tried."""
@@ -277,7 +289,7 @@ def _check_pdf(file: Path) -> None:
         raise FileError("this is not a complete PDF file", file)
 
 
-# --- Write the 3-D view of a robot or of a calibration as one HTML file, and open it.
+# Write the 3-D view of a robot or of a calibration as one HTML file, and open it.
 
 
 def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) -> Path:

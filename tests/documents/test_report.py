@@ -17,7 +17,7 @@ import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.documents import load_record
 from loopcal.errors import FileError
-from loopcal.report.document.calibration_document import SECTIONS, build_calibration_document
+from loopcal.report.document.calibration_document import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
 from loopcal.report.scene.scene import load_script
@@ -35,8 +35,7 @@ HOSTILE = "<script>alert(1)</script>=1+1\x1b[31m\u202e$\\frac{"
 
 def build(record, *names: str) -> Document:
     """Return the document of a record with some sections only."""
-    builders = [b for b in SECTIONS if any(name in b.__name__ for name in names)]
-    sections = tuple(builder(record) for builder in builders)
+    sections = build_sections(record, names)
     return Document("Report", record.verdict.name.lower(), "Summary", "loopcal", sections)
 
 
@@ -115,8 +114,8 @@ def test_pictures_have_descriptions_and_tables_have_scopes(page) -> None:
 
 def test_report_in_memory_and_run_folder_give_the_same_page(calibration, run) -> None:
     first, second = (load_record(source) for source in (calibration, run))
-    names = ("verdict", "open", "outlier", "budget", "finding")
-    assert build(first, *names).to_dict() == build(second, *names).to_dict()
+    names = ("verdict", "determined", "outliers", "budget", "findings")
+    assert build(first, *names) == build(second, *names)
     assert first.validation is not None
     assert second.validation is not None
     assert view_errors(first.validation, "held-out") == view_errors(second.validation, "held-out")
@@ -130,7 +129,7 @@ def test_hostile_names_are_text(run) -> None:
     labels = (HOSTILE, *rows.poses[1:])
     arrays = {**record.arrays, "poses": np.array([HOSTILE, "=1+1"], str)}
     record = replace(record, residuals=(replace(rows, poses=labels),), arrays=arrays)
-    text = render_html(build(record, "residual", "pose"))
+    text = render_html(build(record, "residuals", "poses"))
     assert "<script" not in text
     assert "\x1b" not in text
     assert "\u202e" not in text
@@ -208,7 +207,7 @@ def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
     arrays = {**record.arrays, "poses": np.array(many.poses)}
     arrays["frames_readings"] = np.tile(record.arrays["frames_readings"], (times, 1))
     lengthened = replace(record, residuals=(many,), arrays=arrays)
-    text = render_html(build(lengthened, "residual", "pose", "workspace"))
+    text = render_html(build(lengthened, "residuals", "poses", "workspace"))
     assert "The figure shows 3,000 of 120,000 fitted poses." in text
     assert "The 3-D view can show the robot at 1,129 of these poses, evenly spread." in text
     assert "than every measured pose of the 3,000 that are compared." in text
@@ -236,7 +235,7 @@ def test_report_of_a_cable_robot_names_its_repeatability_and_judges_no_sigma_by_
     limit = ["--hold-out", "0.25", "--limit-position", "0.05mm"]
     assert main(["calibrate", "cable-4", "data.csv", "-o", "run", *limit]) == 2
     record = load_record(lc.load_run("run"))
-    text = render_html(build(record, "verdict", "residual"))
+    text = render_html(build(record, "verdict", "residuals"))
     assert "no calibration reduces it" in text
     assert "better instrument" not in text
     assert "every pose is estimated too" in text
@@ -264,7 +263,7 @@ def test_report_of_a_printer_shows_the_heights_over_the_bed(root, tmp_path) -> N
     report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.4))
     lc.save_run(tmp_path / "run", report)
     for source in (report, lc.load_run(tmp_path / "run")):
-        section = build(load_record(source), "height").sections[0]
+        section = build(load_record(source), "heights").sections[0]
         assert section.title == "Height errors"
         sentence, summary, picture, by_point = section.elements
         assert isinstance(sentence, str)
@@ -289,5 +288,5 @@ def test_noise_floor_of_uncertain_readings_is_called_a_lower_bound(page, root) -
     data = lc.simulate(machine, poses, instrument, seed=3)
     report = lc.calibrate(machine, data, lc.CalibrationOptions(hold_out=0.4))
     assert report.reading_errors is not None
-    assert READING_NOISE in str(build(load_record(report), "error").to_dict())
+    assert READING_NOISE in build(load_record(report), "errors").sections[0].elements[0]
     assert READING_NOISE in report._repr_html_()

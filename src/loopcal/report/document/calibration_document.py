@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from loopcal.apply.verdict import Verdict
@@ -25,16 +26,7 @@ from loopcal.report.document.elements import (
     describe_call,
     list_options,
 )
-from loopcal.report.document.figures import (
-    compute_accuracy,
-    draw_accuracy_picture,
-    draw_correlation_picture,
-    draw_height_picture,
-    draw_parameter_picture,
-    draw_residual_picture,
-    draw_scene_picture,
-    draw_validation_picture,
-)
+from loopcal.report.document.figures import draw_figures
 from loopcal.report.validation_view import (
     READING_NOISE,
     describe_commanded,
@@ -42,9 +34,30 @@ from loopcal.report.validation_view import (
     view_error_statistics,
     view_errors,
 )
-from loopcal.results.tables import ABSENT, Table, format_number, word_column
+from loopcal.results.tables import ABSENT, format_number, make_table, word_column
 
-# --- Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
+Describe = Callable[[CalibrationRecord], Iterator[Element]]
+SECTIONS: dict[str, tuple[str, Describe]] = {}
+"""Name of a section -> its title, and the function that yields its elements; in their order."""
+
+
+def describes_section(name: str, title: str) -> Callable[[Describe], Describe]:
+    """Return a decorator of the function that yields the elements of the next section."""
+
+    def add(describe: Describe) -> Describe:
+        SECTIONS[name] = (title, describe)
+        return describe
+
+    return add
+
+
+def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Section, ...]:
+    """Return the sections of these names; one without content is left out."""
+    built = (Section(name, SECTIONS[name][0], tuple(SECTIONS[name][1](record))) for name in names)
+    return tuple(section for section in built if section.elements)
+
+
+# Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
 
 MEANING = {
     Verdict.CALIBRATED: "All quality gates are met, held-out poses were predicted, and there is no "
@@ -77,33 +90,28 @@ TOP = 3
 IMPORTANT = ("refusal", "failure", "warning")
 
 
-def build_verdict_section(record: CalibrationRecord) -> Section:
-    """Return verdict, scope, expected error with its sources, limits, findings and next step."""
+@describes_section("verdict", "Verdict and scope")
+def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield verdict, scope, expected error with its sources, limits, findings and next step."""
     result = record.result
     fitted, held_out = len(record.fitted_labels), len(record.held_out_labels)
-    scope = SCOPE.format(
+    yield MEANING[record.verdict]
+    yield SCOPE.format(
         robot=record.robot.name, fitted=fitted or "an unknown number", held_out=held_out
     )
-    elements: list[Element] = [MEANING[record.verdict], scope]
     budget = result.get("expected_error")
     if budget and result.get("states_expected_error"):
-        elements.append(budget["finding"]["text"])
-        elements.append(build_share_table(budget))
+        yield budget["finding"]["text"]
+        yield build_share_table(budget)
     judged = [f for f in record.findings if f["code"].startswith(CONFORMITY)]
-    if judged:
-        elements.append(list_findings(judged))
-        commanded = "" if record.validation is None else describe_commanded(record.validation)
-        elements += [commanded] if commanded else []
-    important = [f for f in select_important(record.findings) if f not in judged]
-    if important:
-        elements.append(list_findings(important))
-    recommendation = result.get("recommendation")  # absent in runs of earlier versions
-    if recommendation:
-        elements.append(f"Recommendation: {recommendation['text']}")
-    next_step = result.get("next_step")
-    if next_step:
-        elements.append(f"Next: {next_step['text']}")
-    return Section("verdict", "Verdict and scope", tuple(elements))
+    yield from list_findings(judged)
+    if judged and record.validation is not None:
+        yield from filter(None, [describe_commanded(record.validation)])
+    yield from list_findings(f for f in select_important(record.findings) if f not in judged)
+    if recommendation := result.get("recommendation"):  # absent in runs of earlier versions
+        yield f"Recommendation: {recommendation['text']}"
+    if next_step := result.get("next_step"):
+        yield f"Next: {next_step['text']}"
 
 
 def select_important(findings: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -117,12 +125,49 @@ def select_important(findings: Iterable[Mapping[str, Any]]) -> list[Mapping[str,
     return [*urgent, *others[: max(TOP - len(urgent), 0)]]
 
 
-def list_findings(findings: Iterable[Mapping[str, Any]]) -> Listing:
-    """Return findings with their severity."""
-    return Listing(tuple((finding["severity"], finding["text"]) for finding in findings))
+def list_findings(findings: Iterable[Mapping[str, Any]]) -> list[Element]:
+    """Return findings with their severity as an element; none without any."""
+    items = tuple((finding["severity"], finding["text"]) for finding in findings)
+    return [Listing(items)] if items else []
 
 
-# --- Errors at held-out poses, and the accuracy over the workspace.
+def select_findings(record: CalibrationRecord, codes: tuple[str, ...]) -> list[Element]:
+    """Return the findings whose codes begin so as an element."""
+    return list_findings(f for f in record.findings if f["code"].startswith(codes))
+
+
+def _describe_undetermined(record: CalibrationRecord) -> str:
+    """Return how much the data determine."""
+    fit = record.result["fit"]
+    count, rank = len(fit["parameters"]), fit["rank"]
+    if not record.converged:
+        return "The fit did not converge, so it does not state what the data determine."
+    if rank == count:
+        return f"The data determine all {count} parameters."
+    return f"The data determine {rank} of {count} combinations of the parameters."
+
+
+@describes_section("determined", "What the data do not determine")
+def describe_open_combinations(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield what the data do not determine, and which measurement would determine it."""
+    yield _describe_undetermined(record)
+    yield from select_findings(record, OPEN)
+    for suggestion in record.result.get("remedies") or ():
+        yield f"Suggested measurement: {suggestion['finding']['text']}"
+
+
+@describes_section("outliers", "Outlying rows")
+def describe_outliers(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield which rows do not fit, and which poses were excluded."""
+    stated = select_findings(record, OUTLYING)
+    yield from stated
+    if excluded := record.result["fit"].get("dropped"):
+        yield f"Excluded from the fit by its options: {', '.join(excluded)}."
+    elif not stated:
+        yield "Outlying rows were not searched for, because the fit did not converge."
+
+
+# Errors at held-out poses, and the accuracy over the workspace.
 
 BASELINE = (
     "Before: the geometry before calibration, with frames, targets, surfaces and offsets fitted to "
@@ -147,44 +192,55 @@ NOT_STORED = (
 )
 
 
-def build_error_section(record: CalibrationRecord) -> Section:
-    """Return the errors at held-out poses before and after, with the noise floor."""
+@describes_section("errors", "Errors at held-out poses")
+def describe_errors(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the errors at held-out poses before and after, with the noise floor."""
     errors = record.validation
     if errors is None:
-        stored = record.result.get("validation")
-        reason = NOT_HELD_OUT if not record.held_out_labels else NOT_STORED
-        if record.held_out_labels and stored is None:
-            reason = "The errors at the held-out poses could not be computed; see the findings."
-        return Section("errors", "Errors at held-out poses", (reason,))
+        if not record.held_out_labels:
+            yield NOT_HELD_OUT
+        elif record.result.get("validation") is None:
+            yield "The errors at the held-out poses could not be computed; see the findings."
+        else:
+            yield NOT_STORED
+        return
     explained = f"{BASELINE} {STATED_FRAME}" if "stated frame" in errors.frame else BASELINE
-    if record.result.get("reading_errors"):
-        explained = f"{explained} {READING_NOISE}"
-    elements: list[Element] = [explained, *view_errors(errors, "held-out")]
-    elements += [" ".join(describe_improvements(errors)), *draw_validation_picture(record)]
-    elements += [table for table in view_error_statistics(errors) if not isinstance(table, str)]
-    return Section("errors", "Errors at held-out poses", tuple(e for e in elements if e))
+    yield f"{explained} {READING_NOISE}" if record.result.get("reading_errors") else explained
+    yield from view_errors(errors, "held-out")
+    yield from filter(None, [" ".join(describe_improvements(errors))])
+    yield from draw_figures("errors", record)
+    yield from (table for table in view_error_statistics(errors) if not isinstance(table, str))
 
 
-def build_height_section(record: CalibrationRecord) -> Section:
-    """Return the errors of heights over x and y, where heights were measured."""
-    heights, title = record.heights, "Height errors"
-    if heights is None:
-        return Section("heights", title, ())
-    tables = (build_height_summary(heights), build_height_map(heights))
-    return Section("heights", title, (HEIGHTS, tables[0], *draw_height_picture(record), tables[1]))
+@describes_section("heights", "Height errors")
+def describe_heights(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the errors of heights over x and y, where heights were measured."""
+    if record.heights is not None:
+        yield HEIGHTS
+        yield build_height_summary(record.heights)
+        yield from draw_figures("heights", record)
+        yield build_height_map(record.heights)
 
 
-def build_workspace_section(record: CalibrationRecord) -> Section:
-    """Return the robot with its measured poses, and the uncertainty over its workspace."""
-    accuracy = compute_accuracy(record)
-    if isinstance(accuracy, str):
-        elements = (*draw_scene_picture(record, None), accuracy)
-    else:
-        elements = (*draw_scene_picture(record, accuracy), *draw_accuracy_picture(record, accuracy))
-    return Section("workspace", "Measured poses and accuracy over the workspace", elements)
+@describes_section("residuals", "Residuals of the fit")
+def describe_residuals(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the residuals against the noise, in words and as a figure."""
+    fit = record.result["fit"]
+    if record.converged and fit["degrees"]:
+        square, degrees = (format_number(fit[key], 4) for key in ("chi_square", "degrees"))
+        p_value = format_number(fit["p_value"], 2)
+        yield f"Chi-square is {square} with {degrees} degrees of freedom (p = {p_value})."
+    yield from draw_figures("residuals", record)
+    yield from select_findings(record, OF_RESIDUALS)
 
 
-# --- Parameters with their uncertainty, correlations, and the uncertainty budget.
+@describes_section("workspace", "Measured poses and accuracy over the workspace")
+def describe_workspace(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the robot with its measured poses, and the uncertainty over its workspace."""
+    yield from draw_figures("workspace", record)
+
+
+# Parameters with their uncertainty, correlations, and the uncertainty budget.
 
 TERMS = (
     "The terms are those of JCGM 100 (GUM) and JCGM 200 (VIM). The standard uncertainty u is one "
@@ -206,135 +262,47 @@ NOT_TRACEABLE = (
 NO_BUDGET = "This fit has no intervals, so there is no uncertainty budget."
 
 
-def build_parameter_section(record: CalibrationRecord) -> Section:
-    """Return the parameters, the setup parameters, and figures of shifts and correlations."""
+@describes_section("parameters", "Parameters")
+def describe_parameters(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the parameters, the setup parameters, and figures of shifts and correlations."""
     fit = record.result["fit"]
     if not record.converged:
-        table = build_last_value_table(fit["parameters"])
-        return Section("parameters", "Parameters", (table,))
-    elements: list[Element] = [
-        TERMS,
-        build_parameter_table("Identified parameters", fit["parameters"], is_complete=True),
-    ]
+        yield build_last_value_table(fit["parameters"])
+        return
+    yield TERMS
+    yield build_parameter_table("Identified parameters", fit["parameters"], is_complete=True)
     if fit.get("interval_note"):
-        elements.append(fit["interval_note"])
+        yield fit["interval_note"]
     if fit.get("local"):
-        elements.append(build_parameter_table("Setup parameters", fit["local"]))
-    elements += draw_parameter_picture(record)
-    elements += draw_correlation_picture(record)
-    return Section("parameters", "Parameters", tuple(elements))
+        yield build_parameter_table("Setup parameters", fit["local"])
+    yield from draw_figures("parameters", record)
 
 
-def build_budget_section(record: CalibrationRecord) -> Section:
-    """Return the uncertainty budget by source."""
+@describes_section("budget", "Uncertainty budget")
+def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the uncertainty budget by source, and the stated facts of each instrument."""
     budget = record.result.get("expected_error")
-    instruments = _list_instruments(record)
     if not budget or budget.get("sources") is None:
-        return Section("budget", "Uncertainty budget", (NO_BUDGET, *instruments))
-    elements: list[Element] = [BUDGET_TERMS]
-    if not record.result.get("states_expected_error"):
-        elements.append(
-            "The residuals exceed the stated noise, so these numbers are not the expected error of "
-            "the machine."
-        )
-    elements.append(build_budget_table(budget, record.robot))
-    return Section("budget", "Uncertainty budget", (*elements, *instruments))
-
-
-def _list_instruments(record: CalibrationRecord) -> list[Element]:
-    """Return the stated facts of each instrument, or that none are stated."""
+        yield NO_BUDGET
+    else:
+        yield BUDGET_TERMS
+        if not record.result.get("states_expected_error"):
+            yield (
+                "The residuals exceed the stated noise, so these numbers are not the expected "
+                "error of the machine."
+            )
+        yield build_budget_table(budget, record.robot)
     instruments = record.result.get("instruments") or ()
     if not instruments:
-        return [NOT_TRACEABLE]
+        yield NOT_TRACEABLE
+        return
     names = dict.fromkeys(name for facts in instruments for name in facts)
-    columns = tuple(word_column(name.replace("_", " "), wraps=True) for name in names)
-    rows = tuple(tuple(facts.get(name, ABSENT) for name in names) for facts in instruments)
-    return [Table("Instruments and their calibration, as stated with the data", columns, rows)]
+    columns = (word_column(name.replace("_", " "), wraps=True) for name in names)
+    rows = ((facts.get(name, ABSENT) for name in names) for facts in instruments)
+    yield make_table("Instruments and their calibration, as stated with the data", columns, rows)
 
 
-# --- What the data say of the fit: open combinations, outlying rows, residuals, other findings.
-
-NO_RESIDUALS = (
-    "This run folder was written by an earlier version and does not contain the labels of its "
-    "residuals. Repeat the calibration to see them."
-)
-
-
-def build_open_section(record: CalibrationRecord) -> Section:
-    """Return what the data do not determine, and which measurement would determine it."""
-    fit = record.result["fit"]
-    names = [row["name"] for row in fit["parameters"]]
-    elements: list[Element] = []
-    if not record.converged:
-        elements.append("The fit did not converge, so it does not state what the data determine.")
-    elif fit["rank"] == len(names):
-        elements.append(f"The data determine all {len(names)} parameters.")
-    else:
-        elements.append(
-            f"The data determine {fit['rank']} of {len(names)} combinations of the parameters."
-        )
-    stated = [f for f in record.findings if f["code"].startswith(OPEN)]
-    if stated:
-        elements.append(list_findings(stated))
-    elements += [
-        f"Suggested measurement: {suggestion['finding']['text']}"
-        for suggestion in record.result.get("remedies") or ()
-    ]
-    return Section("determined", "What the data do not determine", tuple(elements))
-
-
-def build_outlier_section(record: CalibrationRecord) -> Section:
-    """Return which rows do not fit, and which poses were excluded."""
-    stated = [f for f in record.findings if f["code"].startswith(OUTLYING)]
-    elements: list[Element] = [list_findings(stated)] if stated else []
-    excluded = record.result["fit"].get("dropped") or ()
-    if excluded:
-        elements.append(f"Excluded from the fit by its options: {', '.join(excluded)}.")
-    if not elements:
-        elements.append("Outlying rows were not searched for, because the fit did not converge.")
-    return Section("outliers", "Outlying rows", tuple(elements))
-
-
-def build_residual_section(record: CalibrationRecord) -> Section:
-    """Return the residuals against the noise, in words and as a figure."""
-    fit = record.result["fit"]
-    elements: list[Element] = []
-    if record.converged and fit["degrees"]:
-        elements.append(
-            f"Chi-square is {format_number(fit['chi_square'], 4)} with "
-            f"{format_number(fit['degrees'], 4)} degrees of freedom (p = "
-            f"{format_number(fit['p_value'], 2)})."
-        )
-    elements += _draw_residuals(record)
-    stated = [f for f in record.findings if f["code"].startswith(OF_RESIDUALS)]
-    if stated:
-        elements.append(list_findings(stated))
-    return Section("residuals", "Residuals of the fit", tuple(elements))
-
-
-def _draw_residuals(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield the figure of the residuals, and of how many it shows some."""
-    if not record.converged:
-        return
-    if not record.residuals:
-        yield NO_RESIDUALS
-        return
-    yield from draw_residual_picture(record)
-
-
-def build_finding_section(record: CalibrationRecord) -> Section:
-    """Return the findings that no other section shows."""
-    shown = (CONFORMITY, *OPEN, *OUTLYING, *OF_RESIDUALS)
-    top = [finding["text"] for finding in select_important(record.findings)]
-    rest = [
-        finding
-        for finding in record.findings
-        if not finding["code"].startswith(shown) and finding["text"] not in top
-    ]
-    return Section("findings", "Other findings", (list_findings(rest),) if rest else ())
-
-
-# --- Values for controllers, where the result comes from, and the poses that it uses.
+# Values for controllers, where the result comes from, and the poses that it uses.
 
 LINES = 40
 """Lines of a controller's file that the report shows."""
@@ -350,118 +318,93 @@ NO_CONTROLLER = "No format of a controller that loopcal writes can express this 
 FAILED = "The calibration failed, so the report states no values for a controller."
 
 
-def build_controller_section(record: CalibrationRecord) -> Section:
-    """Return what to write into which controller."""
-    title = "Values for the controller"
+@describes_section("controller", "Values for the controller")
+def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield what to write into which controller."""
     if record.verdict is Verdict.NOT_CALIBRATED:
-        return Section("controller", title, (FAILED,))
-    elements: list[Element] = [] if record.controllers else [NO_CONTROLLER]
+        yield FAILED
+        return
+    if not record.controllers:
+        yield NO_CONTROLLER
     for values in record.controllers:
         lines = values.text.strip("\n").splitlines()
         if len(lines) <= LINES:
-            elements.append(Code(f"{values.format}: {values.what}", "\n".join(lines)))
+            yield Code(f"{values.format}: {values.what}", "\n".join(lines))
         else:
-            sentence = (
-                f"{values.format} ({values.what}): {len(lines)} lines, too many for this page"
+            yield (
+                f"{values.format} ({values.what}): {len(lines)} lines, too many for this page; the "
+                "command loopcal export writes them to a file."
             )
-            elements.append(f"{sentence}; the command loopcal export writes them to a file.")
         if values.notes:
-            elements.append(Listing(tuple(("note", note) for note in values.notes)))
-    return Section("controller", title, (*elements, EVERYWHERE))
+            yield Listing(tuple(("note", note) for note in values.notes))
+    yield EVERYWHERE
 
 
-def build_provenance_section(record: CalibrationRecord) -> Section:
-    """Return command, versions, seeds, options and digests of the files."""
+@describes_section("findings", "Other findings")
+def describe_other_findings(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the findings that no other section shows."""
+    elsewhere = (CONFORMITY, *OPEN, *OUTLYING, *OF_RESIDUALS)
+    top = [finding["text"] for finding in select_important(record.findings)]
+    rest = (f for f in record.findings if not f["code"].startswith(elsewhere))
+    yield from list_findings(f for f in rest if f["text"] not in top)
+
+
+@describes_section("provenance", "Provenance")
+def describe_provenance(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield command, versions, seeds, options and digests of the files."""
     made_by = record.result.get("made_by") or {}
-    command = " ".join(made_by.get("command") or ()) or "called from Python"
+    versions = made_by.get("versions", {}).items()
     rows = [
-        ("command", command),
-        *((_label_version(name), value) for name, value in made_by.get("versions", {}).items()),
+        ("command", " ".join(made_by.get("command") or ()) or "called from Python"),
+        *((n if n == "engine" else f"version of {n}", value) for n, value in versions),
         *((f"seed: {name}", str(seed)) for name, seed in made_by.get("seeds", {}).items()),
         ("method", describe_call(str(record.result["fit"].get("method") or "unknown"))),
         *list_options(record.result.get("options")),
     ]
+    value, file, digest = (word_column(t, wraps=True) for t in ("value", "file", "SHA-256"))
+    yield make_table("Origin of this result", ("item", value), rows)
     files = [
         *((f"input: {i}", f["path"], f["sha256"]) for i, f in made_by.get("inputs", {}).items()),
-        *(("result", name, digest) for name, digest in record.result.get("files", {}).items()),
+        *(("result", *each) for each in record.result.get("files", {}).items()),
     ]
-    columns = (word_column("item"), word_column("value", wraps=True))
-    elements: list[Element] = [Table("Origin of this result", columns, tuple(rows))]
     if files:
-        columns = (
-            word_column("role"),
-            word_column("file", wraps=True),
-            word_column("SHA-256", wraps=True),
-        )
-        elements.append(Table("Files and their digests", columns, tuple(files)))
-    return Section("provenance", "Provenance", tuple(elements))
+        yield make_table("Files and their digests", ("role", file, digest), files)
 
 
-def _label_version(name: str) -> str:
-    """Return the label of an entry of `versions`; that of the engine states its name, too."""
-    return name if name == "engine" else f"version of {name}"
-
-
-def build_pose_section(record: CalibrationRecord) -> Section:
-    """Return the labels of the fitted and held-out poses."""
-    elements: list[Element] = []
-    fitted = record.fitted_labels
-    if fitted:
-        elements.append(_list_labels("fitted", fitted))
-    else:
-        elements.append(
-            "This run folder was written by an earlier version and does not name its fitted poses."
-        )
-    if record.held_out_labels:
-        elements.append(_list_labels("held-out", record.held_out_labels))
-    else:
-        elements.append("No pose was held out.")
-    return Section("poses", "Fitted and held-out poses", tuple(elements))
+@describes_section("poses", "Fitted and held-out poses")
+def describe_poses(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the labels of the fitted and held-out poses."""
+    unknown = (
+        "This run folder was written by an earlier version and does not name its fitted poses."
+    )
+    yield _list_labels("fitted", record.fitted_labels) or unknown
+    yield _list_labels("held-out", record.held_out_labels) or "No pose was held out."
 
 
 def _list_labels(what: str, labels: Sequence[str]) -> str:
-    """Return the labels in one sentence; of many the first."""
+    """Return the labels in one sentence; of many the first; empty without any."""
     count = len(labels)
     noun = "pose" if count == 1 else "poses"
     limit = f", of which the first {MOST:,} are listed" if count > MOST else ""
-    return f"{count:,} {what} {noun}{limit}: {', '.join(labels[:MOST])}."
-
-
-SECTIONS = (
-    build_verdict_section,
-    build_open_section,
-    build_outlier_section,
-    build_error_section,
-    build_height_section,
-    build_residual_section,
-    build_workspace_section,
-    build_parameter_section,
-    build_budget_section,
-    build_controller_section,
-    build_finding_section,
-    build_provenance_section,
-    build_pose_section,
-)
-"""Functions that build the sections, in order."""
+    return f"{count:,} {what} {noun}{limit}: {', '.join(labels[:MOST])}." if labels else ""
 
 
 def build_calibration_document(record: CalibrationRecord) -> Document:
-    """Return the report of a calibration; a section without content is left out."""
-    sections = (build(record) for build in SECTIONS)
+    """Return the report of a calibration."""
+    return replace(build_head(record), sections=build_sections(record, SECTIONS))
+
+
+def build_head(record: CalibrationRecord) -> Document:
+    """Return a document without sections; runs of earlier versions state no headline."""
+    verdict, robot = record.verdict.value, record.robot.name
+    sentence = f"{verdict[0].upper()}{verdict[1:]}: {robot}."
     return Document(
-        title=f"Calibration report: {record.robot.name}",
+        title=f"Calibration report: {robot}",
         verdict=record.verdict.name.lower(),
-        summary=summarize(record),
+        summary=str(record.result.get("headline") or sentence),
         made_by=describe_maker((record.result.get("made_by") or {}).get("versions", {})),
-        sections=tuple(section for section in sections if section.elements),
+        sections=(),
     )
-
-
-def summarize(record: CalibrationRecord) -> str:
-    """Return the headline of a calibration; of older runs, which state none, the verdict."""
-    verdict = record.verdict.value
-    sentence = f"{verdict[0].upper()}{verdict[1:]}: {record.robot.name}."
-    return str(record.result.get("headline") or sentence)
 
 
 def describe_maker(versions: Mapping[str, str]) -> str:

@@ -12,22 +12,22 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from loopcal.apply.height_errors import HeightErrors, restore_heights
-from loopcal.apply.validation import Validation, restore_validation
+from loopcal.apply.height_errors import HeightErrors
+from loopcal.apply.validation import Validation
 from loopcal.apply.verdict import Verdict
 from loopcal.estimate.options import OBJECT, FitOptions
-from loopcal.estimate.posterior import Posterior, posterior_from_arrays
-from loopcal.estimate.result import KindResiduals, residuals_from_arrays
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.result import KindResiduals
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import escape
 from loopcal.report.scene.scene import load_script
-from loopcal.results.serialization import restore_numbers
+from loopcal.results.description import Field, fields
 from loopcal.results.tables import Table
 
 if TYPE_CHECKING:
@@ -84,13 +84,9 @@ class Section:
     title: str
     elements: tuple[Element, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON; of pictures the caption and description."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "elements": [_describe(element) for element in self.elements],
-        }
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
+        "name", "title", elements=lambda section: [_describe(e) for e in section.elements]
+    )
 
 
 @dataclass(frozen=True)
@@ -110,16 +106,6 @@ class Document:
     made_by: str
     sections: tuple[Section, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON."""
-        return {
-            "title": self.title,
-            "verdict": self.verdict,
-            "summary": self.summary,
-            "made_by": self.made_by,
-            "sections": [section.to_dict() for section in self.sections],
-        }
-
 
 def _describe(element: Element) -> dict[str, Any]:
     """Return an element for JSON, under the word that says what it is."""
@@ -135,7 +121,7 @@ def _describe(element: Element) -> dict[str, Any]:
     return {"code": element.title, "text": element.text}
 
 
-# --- A document as one HTML file, which loads nothing.
+# A document as one HTML file, which loads nothing.
 
 TEMPLATE, STYLE = "report.html.j2", "report.css"
 FOLDER = Path(__file__).parent
@@ -166,6 +152,10 @@ def _digest(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
+def _is_of(kind: type, element: Element) -> bool:
+    return isinstance(element, kind)
+
+
 @cache
 def _load_template() -> Template:
     """Return the template, with its tests for elements; text is escaped."""
@@ -184,17 +174,12 @@ def _load_template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for name, kind in (
-        ("table", Table),
-        ("picture", Picture),
-        ("listing", Listing),
-        ("code", Code),
-    ):
-        environment.tests[name] = lambda value, kind=kind: isinstance(value, kind)
+    for kind in (Table, Picture, Listing, Code):
+        environment.tests[kind.__name__.lower()] = partial(_is_of, kind)
     return environment.get_template(TEMPLATE)
 
 
-# --- What the report of a calibration shows: the content of a run, as numbers and objects.
+# What the report of a calibration shows: the content of a run, as numbers and objects.
 
 
 @dataclass(frozen=True)
@@ -278,37 +263,7 @@ class CalibrationRecord:
         return self.arrays.get("frames_readings")
 
 
-def build_record(
-    result: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
-    robot: Mechanism,
-    initial: Mechanism,
-    source: str = "",
-    controllers: tuple[ControllerValues, ...] = (),
-) -> CalibrationRecord:
-    """Return the record of a run.
-
-    Parameters
-    ----------
-    result : content of result.json. arrays : of arrays.npz. robot : see `Run.identified_robot`.
-    """
-    content = restore_numbers(result)
-    stored = content.get("validation")
-    return CalibrationRecord(
-        source=source,
-        result=content,
-        arrays=arrays,
-        robot=robot,
-        initial=initial,
-        posterior=posterior_from_arrays(robot, arrays) if "posterior_unit" in arrays else None,
-        validation=None if stored is None else restore_validation(stored, arrays, robot),
-        heights=restore_heights(arrays, robot),
-        residuals=residuals_from_arrays(arrays),
-        controllers=controllers,
-    )
-
-
-# --- Options and method of a stored calibration in words.
+# Options and method of a stored calibration in words.
 
 UNITS = {"limit_position": "m", "limit_angle": "rad"}
 """Units of options that are numbers [SI]."""
@@ -353,33 +308,31 @@ def describe_value(value: Any) -> str:
 
 def describe_call(text: str) -> str:
     """Return a call in words, such as `Ridge (parameter 0.1)`; the text where it is no call."""
-    call = _parse_call(text)
-    return text if call is None else _describe_option(call)
-
-
-def _parse_call(text: str) -> ast.Call | None:
-    """Return the call that a text is; None for other text."""
     try:
         node = ast.parse(PYTHON_OBJECT.sub(r"\1()", text), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return None
-    return node if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else None
+        return text
+    is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    return _describe_expression(node) if is_call else text
 
 
-def _describe_option(node: ast.expr) -> str:
+def _describe_expression(node: ast.expr) -> str:
     """Return a value in words."""
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-        arguments = [
-            f"{(keyword.arg or '').replace('_', ' ')} {_describe_option(keyword.value)}"
-            for keyword in node.keywords
-            if ast.unparse(keyword.value) not in UNSTATED
-        ]
-        arguments = [*(_describe_option(value) for value in node.args), *arguments]
-        return f"{node.func.id} ({', '.join(arguments)})" if arguments else node.func.id
-    if isinstance(node, ast.Tuple | ast.List):
-        return ", ".join(_describe_option(item) for item in node.elts)
-    if isinstance(node, ast.Constant):
-        if isinstance(node.value, bool):
-            return "yes" if node.value else "no"
-        return str(node.value)
+    match node:
+        case ast.Call(func=ast.Name(id=name), args=values, keywords=named):
+            stated = [k for k in named if ast.unparse(k.value) not in UNSTATED]
+            arguments = [
+                *map(_describe_expression, values),
+                *(
+                    f"{(k.arg or '').replace('_', ' ')} {_describe_expression(k.value)}"
+                    for k in stated
+                ),
+            ]
+            return f"{name} ({', '.join(arguments)})" if arguments else name
+        case ast.Tuple(elts=items) | ast.List(elts=items):
+            return ", ".join(map(_describe_expression, items))
+        case ast.Constant(value=bool(is_true)):
+            return "yes" if is_true else "no"
+        case ast.Constant(value=value):
+            return str(value)
     return ast.unparse(node)

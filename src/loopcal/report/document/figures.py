@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
@@ -19,7 +20,12 @@ from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import escape
 from loopcal.report.document.elements import CalibrationRecord, Element, Picture
-from loopcal.report.figures.fit_figures import draw_correlation, draw_parameters, draw_residual_rows
+from loopcal.report.figures.fit_figures import (
+    StoredFit,
+    draw_correlation,
+    draw_parameters,
+    draw_residual_rows,
+)
 from loopcal.report.figures.result_figures import (
     draw_accuracy_map,
     draw_height_errors,
@@ -28,13 +34,13 @@ from loopcal.report.figures.result_figures import (
 from loopcal.report.figures.robot_figure import draw_scene
 from loopcal.report.pictures import render_svg_text
 from loopcal.report.scene.scene import Scene, choose_rows, compute_pose_errors, format_scene
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import IntArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- Figures of matplotlib as SVG elements inside of HTML, under a strict content security policy.
+# Figures of matplotlib as SVG elements inside of HTML, under a strict content security policy.
 
 SHAPES = ("path", "rect", "circle", "line", "polyline", "polygon", "text", "tspan", "image")
 DRAWING = frozenset((*SHAPES, "svg", "g", "defs", "use", "clipPath", "linearGradient", "stop"))
@@ -144,37 +150,11 @@ def _word(text: str | None) -> str | None:
     return None if text is None or not text.strip() else text
 
 
-# --- A stored fit with the attributes of an `Identification` that figures of parameters use.
-
-
-@dataclass(frozen=True, eq=False)
-class StoredFit:
-    """What figures use of a fit that converged; see `Identification` for the attributes."""
-
-    robot: Mechanism
-    free_parameters: FreeParameters
-    estimate: FloatArray
-    covariance: FloatArray
-    half_widths: FloatArray
-    converged: bool = True
-
-    @property
-    def standard_deviations(self) -> FloatArray:
-        """(p,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def interval(self) -> FloatArray:
-        """Return half-widths (p,) of the 95 % intervals."""
-        return self.half_widths
-
-
 def restore_fit(
     fit: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot: Mechanism
 ) -> StoredFit:
     """Return a stored fit for the functions that draw parameters.
 
-    Parameters
-    ----------
     fit : content of `fit` of a run, with numbers that are not finite. robot : of which the
         identified parameters are free.
     """
@@ -184,35 +164,63 @@ def restore_fit(
     factor, _ = free.display()
     tolerance = factor * np.array([row["tolerance"] for row in rows])
     assumed = np.array([bool(row["tolerance_assumed"]) for row in rows])
-    return StoredFit(
-        robot,
-        FreeParameters(robot, places, arrays["nominal"], tolerance, assumed),
-        arrays["estimate"],
-        arrays["covariance"],
-        factor * np.array([row["plus_minus"] for row in rows]),
-    )
+    half_widths = factor * np.array([row["plus_minus"] for row in rows])
+    free = FreeParameters(robot, places, arrays["nominal"], tolerance, assumed)
+    return StoredFit(robot, free, arrays["estimate"], arrays["covariance"], half_widths)
 
 
-MAP_SENTENCE = (
-    " Pale squares show the standard uncertainty of positions over the workspace by color."
-)
+# The figures of a calibration: each function yields a picture or sentences for its section.
 
-MOST_ROWS = 3000
-"""Rows that the figures of a report show."""
-
-MOST_PARAMETERS = 120
-"""Parameters up to which the report draws them."""
+MOST_ROWS, MOST_PARAMETERS = 3000, 120
+"""Rows that the figures of a report show, and parameters up to which it draws them."""
 
 MAP_POSES, SEED = 200, 0
 """Poses of the accuracy map, and the seed of their draw."""
 
+Draw = Callable[[CalibrationRecord], Iterator[Element]]
+FIGURES: dict[Draw, str] = {}
+"""Function -> name of the section that shows its figure."""
 
+
+def report_figure(section: str) -> Callable[[Draw], Draw]:
+    """Return a decorator of a function that yields a figure for a section of the report."""
+
+    def add(draw: Draw) -> Draw:
+        FIGURES[draw] = section
+        return draw
+
+    return add
+
+
+def draw_figures(section: str, record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the figures of a section."""
+    for draw, of_section in FIGURES.items():
+        if of_section == section:
+            yield from draw(record)
+
+
+@report_figure("residuals")
 def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the residuals, of many rows some, evenly spread over the order of measurement."""
+    if not record.converged:
+        return
+    if not record.residuals:
+        yield (
+            "This run folder was written by an earlier version and does not contain the labels of "
+            "its residuals. Repeat the calibration to see them."
+        )
+        return
     count = sum(len(rows.raw) for rows in record.residuals)
     residuals = [thin_rows(rows, count) for rows in record.residuals]
     if count > MOST_ROWS:
         yield f"The figure shows {sum(len(r.raw) for r in residuals):,} of {count:,} rows."
+    shrinkage = "The fit follows its data, so residuals of few rows are smaller than their errors."
+    if any(rows.kind == ActuatorReadings.name for rows in residuals):
+        shrinkage = (
+            "The actuator readings are uncertain, so every pose is estimated too and follows its "
+            "measured values: residuals far below one sigma do not show that sigma is too large. "
+            "Chi-square above allows for that."
+        )
     setup = [row["name"] for row in record.result["fit"].get("local") or ()]
     yield make_picture(
         draw_residual_rows(record.robot, residuals, setup),
@@ -221,32 +229,17 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
         "The panels show the residuals in the order of the poses, by component, as a histogram and "
         "normal plot, and against actuator readings and recorded quantities. Whitened residuals "
         "are divided by their sigma; of errors with the stated noise 95 % lie between the dashed "
-        f"lines. {_describe_shrinkage(record.residuals)}",
-    )
-
-
-def _describe_shrinkage(residuals: Sequence[KindResiduals]) -> str:
-    """Return why fitted residuals are smaller than the noise, and what to judge the noise by."""
-    if all(rows.kind != ActuatorReadings.name for rows in residuals):
-        return "The fit follows its data, so residuals of few rows are smaller than their errors."
-    return (
-        "The actuator readings are uncertain, so every pose is estimated too and follows its "
-        "measured values: residuals far below one sigma do not show that sigma is too large. "
-        "Chi-square above allows for that."
+        f"lines. {shrinkage}",
     )
 
 
 def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
-    """Return residuals with at most their share of MOST_ROWS rows, evenly spread.
-
-    Parameters
-    ----------
-    count : number of the rows of all kinds.
+    """Return residuals with at most their share of MOST_ROWS rows, evenly spread; count : number of
+    the rows of all kinds.
     """
     if count <= MOST_ROWS:
         return rows
-    share = max(1, MOST_ROWS * len(rows.raw) // count)
-    kept = np.unique(np.linspace(0, len(rows.raw) - 1, share).astype(np.intp))
+    kept = _spread_rows(len(rows.raw), max(1, MOST_ROWS * len(rows.raw) // count))
     return replace(
         rows,
         poses=tuple(rows.poses[i] for i in kept),
@@ -257,6 +250,12 @@ def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
     )
 
 
+def _spread_rows(count: int, most: int = MOST_ROWS) -> IntArray:
+    """Return at most so many of the rows, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, most).astype(np.intp))
+
+
+@report_figure("errors")
 def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the errors at held-out poses before and after; of many rows none."""
     errors = record.validation
@@ -274,6 +273,7 @@ def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
     )
 
 
+@report_figure("heights")
 def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the errors of heights over x and y before and after; of many heights none."""
     heights = record.heights
@@ -292,9 +292,8 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
     )
 
 
-def draw_scene_picture(
-    record: CalibrationRecord, accuracy: AccuracyMap | None
-) -> Iterator[Element]:
+@report_figure("workspace")
+def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the robot at home with the measured poses and the errors that calibration removes."""
     readings = record.readings
     if not record.converged:
@@ -303,15 +302,21 @@ def draw_scene_picture(
     if readings is None or not len(readings):
         yield "The run does not contain the readings of its poses, so they are not drawn."
         return
-    rows = _spread_rows(len(readings))
-    if len(rows) < len(readings):
-        yield f"The figure shows {len(rows):,} of {len(readings):,} fitted poses."
-    labels = _label_rows(record, rows)
-    poses = compute_pose_errors(record.robot, record.initial, readings[rows], labels)
+    accuracy = compute_accuracy(record)
+    accuracy = None if isinstance(accuracy, str) else accuracy
+    rows, count = _spread_rows(len(readings)), len(readings)
+    if len(rows) < count:
+        yield f"The figure shows {len(rows):,} of {count:,} fitted poses."
+    labels = record.fitted_labels
+    if len(labels) != count:  # an older version wrote the run
+        labels = tuple(str(i + 1) for i in range(count))
+    shown = tuple(labels[i] for i in rows)
+    poses = compute_pose_errors(record.robot, record.initial, readings[rows], shown)
     scene = Scene(record.robot, poses, accuracy)
-    shown = len(choose_rows(record.robot, len(poses.tool)))
-    if shown < len(poses.tool):
-        yield f"The 3-D view can show the robot at {shown:,} of these poses, evenly spread."
+    in_space = len(choose_rows(record.robot, len(poses.tool)))
+    if in_space < len(poses.tool):
+        yield f"The 3-D view can show the robot at {in_space:,} of these poses, evenly spread."
+    of_map = " Pale squares show the standard uncertainty of positions over the workspace by color."
     yield make_picture(
         draw_scene(scene),
         "scene-figure",
@@ -319,55 +324,25 @@ def draw_scene_picture(
         "A point is the tool at a fitted pose. The line from it is the position error of the "
         f"geometry before calibration there, {poses.magnification:g} times magnified: its "
         "predicted position minus that of the calibrated geometry at the same readings, in the "
-        f"base frame of the robot file.{MAP_SENTENCE if accuracy is not None else ''}",
+        f"base frame of the robot file.{'' if accuracy is None else of_map}",
         format_scene(scene),
     )
 
 
-def _label_rows(record: CalibrationRecord, rows: IntArray) -> tuple[str, ...]:
-    """Return the labels of fitted poses; their numbers where an older version wrote the run."""
-    labels, count = (
-        record.fitted_labels,
-        len(record.readings if record.readings is not None else ()),
-    )
-    return tuple(labels[i] if len(labels) == count else str(i + 1) for i in rows)
-
-
-def _spread_rows(count: int) -> IntArray:
-    """Return at most MOST_ROWS of so many rows, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, MOST_ROWS).astype(np.intp))
-
-
-def _describe_count(readings: FloatArray | None) -> str:
-    """Return how many of the measured poses are compared, where these are not all."""
-    count = 0 if readings is None else len(readings)
-    return f" of the {MOST_ROWS:,} that are compared" if count > MOST_ROWS else ""
-
-
-def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
-    """Return the uncertainty of poses over the workspace, or the sentence why it is not known."""
-    budget, readings = record.result.get("expected_error"), record.readings
-    if record.posterior is None or readings is None or not budget:
-        return "This run has no intervals, so the accuracy over the workspace is not known."
-    try:
-        return accuracy_map(
-            record.posterior,
-            readings[_spread_rows(len(readings))],
-            MAP_POSES,
-            SEED,
-            frame=budget.get("frame", "fitted"),
-        )
-    except LoopcalError as error:
-        return f"The accuracy over the workspace cannot be computed: {error}"
-
-
-def draw_accuracy_picture(record: CalibrationRecord, accuracy: AccuracyMap) -> Iterator[Element]:
+@report_figure("workspace")
+def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the uncertainty of poses over the workspace, and the sentence that sums it up."""
+    accuracy = compute_accuracy(record)
+    if isinstance(accuracy, str):
+        yield accuracy
+        return
     less = int(accuracy.extrapolated.sum())
+    is_part = record.readings is not None and len(record.readings) > MOST_ROWS
+    count = f" of the {MOST_ROWS:,} that are compared" if is_part else ""
     yield (
         f"The standard uncertainty of the pose was computed at {len(accuracy.coordinates)} poses "
         f"of the workspace, {accuracy.uncertainty.frame}. {less} of these poses are less certain "
-        f"than every measured pose{_describe_count(record.readings)}."
+        f"than every measured pose{count}."
     )
     yield make_picture(
         draw_accuracy_map(accuracy),
@@ -378,9 +353,26 @@ def draw_accuracy_picture(record: CalibrationRecord, accuracy: AccuracyMap) -> I
     )
 
 
+@lru_cache(maxsize=1)  # two figures use it
+def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
+    """Return the uncertainty of poses over the workspace, or the sentence why it is not known."""
+    budget, readings = record.result.get("expected_error"), record.readings
+    if record.posterior is None or readings is None or not budget:
+        return "This run has no intervals, so the accuracy over the workspace is not known."
+    measured, frame = readings[_spread_rows(len(readings))], budget.get("frame", "fitted")
+    try:
+        return accuracy_map(record.posterior, measured, MAP_POSES, SEED, frame=frame)
+    except LoopcalError as error:
+        return f"The accuracy over the workspace cannot be computed: {error}"
+
+
+@report_figure("parameters")
 def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield shifts and uncertainties of the parameters in tolerances."""
-    if (count := len(record.result["fit"]["parameters"])) > MOST_PARAMETERS:
+    """Yield shifts and uncertainties of the parameters in tolerances, and their correlations."""
+    count = len(record.result["fit"]["parameters"])
+    if not record.converged:
+        return
+    if count > MOST_PARAMETERS:
         yield f"{count} parameters are too many for a figure."
         return
     fit = restore_fit(record.result["fit"], record.arrays, record.robot)
@@ -391,17 +383,11 @@ def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
         "For each parameter the figure shows the estimate minus the nominal value with its 95 % "
         "interval, and the half-width of that interval.",
     )
-
-
-def draw_correlation_picture(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield the correlations of the parameters."""
-    if not 1 < len(record.result["fit"]["parameters"]) <= MOST_PARAMETERS:
-        return
-    fit = restore_fit(record.result["fit"], record.arrays, record.robot)
-    yield make_picture(
-        draw_correlation(fit),
-        "correlation-figure",
-        "Correlations of the parameters.",
-        "The matrix shows the correlation of each pair of parameters by color. The findings of the "
-        "residuals name the pairs that are strongly correlated.",
-    )
+    if count > 1:
+        yield make_picture(
+            draw_correlation(fit),
+            "correlation-figure",
+            "Correlations of the parameters.",
+            "The matrix shows the correlation of each pair of parameters by color. The findings of "
+            "the residuals name the pairs that are strongly correlated.",
+        )

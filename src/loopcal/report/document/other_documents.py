@@ -3,14 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.engine import collect_versions
 from loopcal.findings import sort_by_importance
 from loopcal.mechanism.model import Mechanism
-from loopcal.report.document.calibration_document import describe_maker, summarize
-from loopcal.report.document.elements import CalibrationRecord, Document, Element, Listing, Section
+from loopcal.report.document.calibration_document import build_head, describe_maker
+from loopcal.report.document.elements import (
+    CalibrationRecord,
+    Document,
+    Element,
+    Listing,
+    Picture,
+    Section,
+)
 from loopcal.report.document.figures import compute_accuracy, draw_scene_picture, make_picture
 from loopcal.report.figures.result_figures import (
     draw_run_errors,
@@ -46,56 +54,49 @@ NO_SHIFTS = (
 
 
 def build_comparison_document(comparison: RunComparison, made_by: str) -> Document:
-    """Return a comparison as a document.
-
-    Parameters
-    ----------
-    made_by : program and version.
-    """
+    """Return a comparison as a document; made_by : program and version."""
     names = ", ".join(run.name for run in comparison.runs)
-    summary = SUMMARIES[comparison.moved].format(first=comparison.runs[0].name)
-    sections = (
-        _build_result(comparison),
-        _build_parameters(comparison),
-        _build_shifts(comparison),
-        _build_errors(comparison),
-    )
+    sections: dict[tuple[str, str], Callable[[RunComparison], Iterator[Element]]] = {
+        ("result", "Whether and where the machine changed"): _describe_result,
+        ("parameters", "Parameters side by side"): _describe_parameters,
+        ("shifts", "Shifts in standard deviations"): _describe_shifts,
+        ("errors", "Held-out errors"): _describe_errors,
+    }
     return Document(
         title=f"Comparison of calibrations: {names}",
         verdict=HEADS[comparison.moved],
-        summary=summary,
+        summary=SUMMARIES[comparison.moved].format(first=comparison.runs[0].name),
         made_by=made_by,
-        sections=sections,
+        sections=tuple(Section(*n, tuple(each(comparison))) for n, each in sections.items()),
     )
 
 
-def _build_result(comparison: RunComparison) -> Section:
-    """Return the findings, the most important first, and the runs."""
-    findings = sort_by_importance(comparison.findings)
-    listed = Listing(tuple((finding.severity.value, str(finding)) for finding in findings))
-    elements: list[Element] = [MEANING, *([listed] if findings else []), build_runs(comparison)]
-    return Section("result", "Whether and where the machine changed", tuple(elements))
+def _describe_result(comparison: RunComparison) -> Iterator[Element]:
+    """Yield the findings, the most important first, and the runs."""
+    yield MEANING
+    if findings := sort_by_importance(comparison.findings):
+        yield Listing(tuple((finding.severity.value, str(finding)) for finding in findings))
+    yield build_runs(comparison)
 
 
-def _build_parameters(comparison: RunComparison) -> Section:
-    """Return estimates with intervals, side by side."""
-    picture = make_picture(
+def _describe_parameters(comparison: RunComparison) -> Iterator[Element]:
+    """Yield estimates with intervals, side by side."""
+    yield build_estimates(comparison)
+    yield make_picture(
         draw_run_parameters(comparison),
         "estimates-figure",
         "Estimates of all runs with their 95 % intervals.",
         "For each parameter the figure shows the estimate of each run minus that of the first run, "
         "with its interval, in half-widths of the first run's interval. The table has the numbers.",
     )
-    elements = (build_estimates(comparison), picture)
-    return Section("parameters", "Parameters side by side", elements)
 
 
-def _build_shifts(comparison: RunComparison) -> Section:
-    """Return the tested shifts in standard deviations."""
-    title = "Shifts in standard deviations"
+def _describe_shifts(comparison: RunComparison) -> Iterator[Element]:
+    """Yield the tested shifts in standard deviations."""
     if all(pair.moved is None for pair in comparison.pairs):
-        return Section("shifts", title, (NO_SHIFTS,))
-    picture = make_picture(
+        yield NO_SHIFTS
+        return
+    yield make_picture(
         draw_run_shifts(comparison),
         "shift-figure",
         "Shift of each parameter from the first run.",
@@ -103,27 +104,24 @@ def _build_shifts(comparison: RunComparison) -> Section:
         "have changed, too. Filled markers are significant at 5 % for all parameters and runs "
         "together. A parameter without a marker is not determined by both data sets.",
     )
-    return Section("shifts", title, (picture, build_shifts(comparison)))
+    yield build_shifts(comparison)
 
 
-def _build_errors(comparison: RunComparison) -> Section:
-    """Return the errors after calibration, at common poses or at those of each run."""
-    units = find_error_units(comparison)
-    table = build_errors(comparison, units.__getitem__)
-    elements: list[Element] = [table]
+def _describe_errors(comparison: RunComparison) -> Iterator[Element]:
+    """Yield the errors after calibration, at common poses or at those of each run."""
+    show_unit = find_error_units(comparison).__getitem__
+    yield build_errors(comparison, show_unit)
     if any(run.common or run.own for run in comparison.errors):
-        picture = make_picture(
-            draw_run_errors(comparison, units.__getitem__),
+        yield make_picture(
+            draw_run_errors(comparison, show_unit),
             "errors-figure",
             "Errors of each run after calibration.",
             "Bars are root mean squares and dots are the largest errors of each run. Errors at "
             "poses that are not common to all runs also differ because the poses do.",
         )
-        elements.append(picture)
-    return Section("errors", "Held-out errors", tuple(elements))
 
 
-# --- The page of `loopcal view`: a robot in space, of a calibration with its poses and errors.
+# The page of `loopcal view`: a robot in space, of a calibration with its poses and errors.
 
 
 def build_robot_view(robot: Mechanism) -> Document:
@@ -133,31 +131,26 @@ def build_robot_view(robot: Mechanism) -> Document:
         verdict="",
         summary=f"{robot.name} at its home pose.",
         made_by=describe_maker(collect_versions()),
-        sections=(Section("view", "The robot", tuple(_draw_home(robot))),),
+        sections=(Section("view", "The robot", (_draw_home(robot),)),),
     )
 
 
 def build_calibration_view(record: CalibrationRecord) -> Document:
     """Return the view of a calibration; of a fit that did not converge, the robot before it."""
-    accuracy = compute_accuracy(record)
-    reason = [accuracy] if isinstance(accuracy, str) and record.converged else []
-    scene = draw_scene_picture(record, None if isinstance(accuracy, str) else accuracy)
-    elements: list[Element] = [*scene, *reason]
+    elements = [*draw_scene_picture(record)]
+    if record.converged and isinstance(reason := compute_accuracy(record), str):
+        elements.append(reason)
     if all(isinstance(element, str) for element in elements):
-        elements += _draw_home(record.robot if record.converged else record.initial)
-    return Document(
-        title=f"3-D view: {record.robot.name}",
-        verdict=record.verdict.name.lower(),
-        summary=summarize(record),
-        made_by=describe_maker((record.result.get("made_by") or {}).get("versions", {})),
-        sections=(Section("view", "The robot and its measured poses", tuple(elements)),),
-    )
+        elements.append(_draw_home(record.robot if record.converged else record.initial))
+    section = Section("view", "The robot and its measured poses", tuple(elements))
+    title = f"3-D view: {record.robot.name}"
+    return replace(build_head(record), title=title, sections=(section,))
 
 
-def _draw_home(robot: Mechanism) -> Iterator[Element]:
-    """Yield a robot at home."""
+def _draw_home(robot: Mechanism) -> Picture:
+    """Return a robot at home."""
     scene = Scene(robot)
-    yield make_picture(
+    return make_picture(
         draw_scene(scene),
         "scene-figure",
         "The robot at home.",
