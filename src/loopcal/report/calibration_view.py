@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.apply.error_budget import Source
+from loopcal.apply.error_budget import LENGTHS, Source
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, report_finding
@@ -34,9 +33,10 @@ from loopcal.results.tables import (
     format_number,
     format_uncertainty,
     format_with_uncertainty,
+    make_table,
     word_column,
 )
-from loopcal.units import Dimension, find_unit
+from loopcal.units import Dimension
 
 if TYPE_CHECKING:
     from loopcal.apply.calibration_report import CalibrationReport
@@ -44,65 +44,53 @@ if TYPE_CHECKING:
     from loopcal.apply.height_errors import HeightErrors
     from loopcal.apply.inspection import IdentifiabilityReport
     from loopcal.diagnose.fit_examination import ReadingError
-    from loopcal.diagnose.identifiable_parameters import UsefulAccuracy
     from loopcal.estimate.prior_inflation import PriorConflict
     from loopcal.mechanism.model import Mechanism
     from loopcal.typing import FloatArray
 
 
-# --- Errors of measured heights, as tables.
-
 MOST_POINTS, MOST_LINES = 200, 25
-"""Points that a table lists, and up to which the page of a calibration has this table."""
+"""Heights that a table lists, and up to which the page of a calibration has this table."""
 
 
 def build_height_summary(heights: HeightErrors) -> Table:
     """Return rms and largest error of the fitted and of the held-out heights."""
-    unit = heights.unit
-    rows = []
+    unit, rows = heights.unit, []
     for name, is_held_out in heights.list_sets():
         before, after = (heights.statistics(e, is_held_out) for e in ("before", "after"))
         for key in SUMMARY:
             shown = (format_in(unit, s[key], 3) for s in (before, after))
             rows.append((name, METRICS[key].words, str(after.count), *shown, unit.symbol))
-    columns = (word_column("points"), word_column("metric"))
     numbers = (Column("count"), Column("before"), Column("after"))
     caption = "Height errors (predicted - measured)"
-    return Table(caption, (*columns, *numbers, word_column("unit")), tuple(rows))
+    return make_table(caption, ("points", "metric", *numbers, "unit"), rows)
 
 
 def build_height_map(heights: HeightErrors) -> Table | str:
-    """Return the error of each height with its place; of many heights a sentence."""
+    """Return the error of each height with its place, to the third digit of the largest error; of
+    many heights a sentence.
+    """
     unit, count = heights.unit, len(heights.poses)
     if count > MOST_POINTS:
         return f"The errors of {count:,} heights are too many for a table."
-
-    def place(value: float) -> str:
-        """Return a coordinate; 0.0 in place of -0.0."""
-        return f"{round(value / unit.factor_to_si, 1) + 0.0:.1f}"
-
-    rows = zip(
-        heights.poses, heights.points, heights.before, heights.after, heights.is_held_out,
-        strict=True,
-    )  # fmt: skip
-    return build_table(
-        "Height errors by point (predicted - measured); x, y in the base frame",
-        rows,
-        ("pose", lambda row: row[0]),
-        (Column("x", unit.symbol), lambda row: place(row[1][0])),
-        (Column("y", unit.symbol), lambda row: place(row[1][1])),
-        (Column("before", unit.symbol), lambda row: format_height(heights, row[2])),
-        (Column("after", unit.symbol), lambda row: format_height(heights, row[3])),
-        ("used", lambda row: "held out" if row[4] else "in the fit"),
-    )
-
-
-def format_height(heights: HeightErrors, error: float) -> str:
-    """Return an error to the third digit of the largest error before or after."""
-    largest = float(np.abs(np.concatenate([heights.before, heights.after])).max())
-    factor = heights.unit.factor_to_si
-    decimals = count_decimals(largest / factor) if largest > 0.0 else 0
-    return f"{round(float(error) / factor, decimals) + 0.0:.{decimals}f}"
+    errors = np.stack([heights.before, heights.after], axis=1) / unit.factor_to_si
+    largest = float(np.abs(errors).max())
+    decimals = count_decimals(largest) if largest > 0.0 else 0
+    places = np.round(heights.points / unit.factor_to_si, 1) + 0.0  # 0.0 in place of -0.0
+    rows = [
+        (
+            pose,
+            *(f"{x:.1f}" for x in place),
+            *(f"{round(x, decimals) + 0.0:.{decimals}f}" for x in of_pose),
+            "held out" if is_held_out else "in the fit",
+        )
+        for pose, place, of_pose, is_held_out in zip(
+            heights.poses, places.tolist(), errors.tolist(), heights.is_held_out, strict=True
+        )
+    ]
+    numbers = (Column(title, unit.symbol) for title in ("x", "y", "before", "after"))
+    caption = "Height errors by point (predicted - measured); x, y in the base frame"
+    return make_table(caption, ("pose", *numbers, "used"), rows)
 
 
 def view_heights(heights: HeightErrors | None, verbose: bool = False) -> list[Block]:
@@ -137,9 +125,17 @@ def view_calibration(
     finding and table.
     """
     fit = report.identification
-    rows = fit.to_dict()
+    stated = fit.to_dict()
     task = ["", str(report.budget)] if report.states_expected_error else []
-    blocks: list[Block] = [report.headline, *task, *_view_errors(report, verbose)]
+    blocks: list[Block] = [report.headline, *task]
+    if report.validation is not None:
+        blocks += view_errors(report.validation, "held-out")
+    elif report.fitted_errors is not None:
+        blocks += view_errors(report.fitted_errors, "fitted (optimistic)")
+    errors = report.validation or report.fitted_errors
+    if errors is not None and report.reading_errors is not None:
+        blocks.append(READING_NOISE)
+    blocks += view_heights(report.height_errors, verbose)
     selected = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, add_advice(f, hint(f))) for f in selected])]
     if more := len(report.findings) - len(selected):
@@ -152,50 +148,39 @@ def view_calibration(
     if advice := hint(report.next_step):
         blocks.append(f"Hint: {advice}")
     if fit.converged:
-        blocks.append(build_parameter_table("Parameters", rows["parameters"]))
-        blocks += _note_intervals(fit)
+        blocks += _view_parameters(fit, "Parameters", stated["parameters"])
     elif verbose:
-        blocks.append(build_last_value_table(rows["parameters"]))
-    if verbose:
-        blocks += _view_details(report, rows)
-    return blocks
+        blocks.append(build_last_value_table(stated["parameters"]))
+    return [*blocks, *_view_details(report, stated)] if verbose else blocks
 
 
-def _view_errors(report: CalibrationReport, verbose: bool) -> list[Block]:
-    """Return the tables of errors, at held-out poses or else at the fitted ones, and of heights."""
-    if report.validation is not None:
-        blocks = view_errors(report.validation, "held-out")
-    elif report.fitted_errors is not None:
-        blocks = view_errors(report.fitted_errors, "fitted (optimistic)")
-    else:
-        blocks = []
-    if blocks and report.reading_errors is not None:
-        blocks.append(READING_NOISE)
-    return [*blocks, *view_heights(report.height_errors, verbose)]
-
-
-def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Block]:
+def _view_details(report: CalibrationReport, stated: Mapping[str, Any]) -> list[Block]:
     """Return everything that the summary leaves out."""
-    fit = report.identification
+    fit, errors = report.identification, report.validation or report.fitted_errors
     blocks: list[Block] = []
-    if rows["local"] and fit.converged:
-        blocks.append(build_parameter_table("Setup parameters", rows["local"]))
-        blocks += _note_intervals(fit)
+    if stated["local"] and fit.converged:
+        blocks += _view_parameters(fit, "Setup parameters", stated["local"])
     blocks += ["", _describe_iteration(fit)]
     if fit.converged and fit.prior_conflict is not None:
         blocks.append(build_prior_table(fit.prior_conflict))
-    for suggestion in report.suggestions or ():
-        blocks.append(f"Suggested measurement: {suggestion}")
+    blocks += [f"Suggested measurement: {suggestion}" for suggestion in report.suggestions or ()]
     if report.budget is not None:
         blocks.append(build_budget_table(report.budget.to_dict(), report.robot))
     if report.model_choice is not None:
         blocks.append(report.model_choice.compare_sets())
     if report.reading_errors is not None:
         blocks.append(build_reading_table(report.robot, report.reading_errors))
-    errors = report.validation or report.fitted_errors
     if errors is not None:
         blocks += [*view_error_statistics(errors), *describe_improvements(errors)]
     return blocks
+
+
+def _view_parameters(
+    fit: Identification, caption: str, rows: Iterable[Mapping[str, Any]]
+) -> list[Block]:
+    """Return a table of parameters, and the sentence on intervals that use a prior."""
+    note = [] if fit.interval_note is None else [str(fit.interval_note)]
+    return [build_parameter_table(caption, rows), *note]
 
 
 def build_parameter_table(
@@ -208,46 +193,29 @@ def build_parameter_table(
     is_complete : whether standard uncertainty, degrees of freedom, coverage factor, and the shift
         in tolerances have columns, too.
     """
-    details = _list_details() if is_complete else []
-    expanded = "U (95 %)" if is_complete else "+/- (95 %)"
-    return build_table(
-        caption,
-        rows,
-        ("name", lambda row: row["name"]),
-        (Column("nominal"), lambda row: format_exact_beside(row["nominal"], row["plus_minus"])),
-        (
-            Column("estimate"),
-            lambda row: format_with_uncertainty(row["estimate"], row["plus_minus"]),
-        ),
-        *details,
-        (
-            Column(expanded),
-            lambda row: format_uncertainty(row["plus_minus"]) if row.get("free", True) else "fixed",
-        ),
-        ("unit", lambda row: row["unit"]),
-    )
-
-
-def _list_details() -> list[tuple[Column, Callable[[Mapping[str, Any]], str]]]:
-    """Return the columns of a complete table of parameters."""
-
-    def factor(row: Mapping[str, Any]) -> float:
-        return row["plus_minus"] / row["sd"] if row["sd"] > 0.0 else math.nan
-
-    def shift(row: Mapping[str, Any]) -> float:
-        return (row["estimate"] - row["nominal"]) / row["tolerance"]
-
-    return [
-        (Column("shift [tolerances]"), lambda row: f"{shift(row):+.2f}"),
-        (Column("u"), lambda row: format_uncertainty(row["sd"])),
-        (Column("degrees of freedom"), lambda row: _format_degrees(row["degrees"])),
-        (Column("k"), lambda row: _format_factor(factor(row))),
-    ]
-
-
-def _format_factor(factor: float) -> str:
-    """Return a coverage factor with two decimal places."""
-    return f"{factor:.2f}" if math.isfinite(factor) else format_number(factor, 3)
+    cells = []
+    for row in rows:
+        nominal, estimate, half = row["nominal"], row["estimate"], row["plus_minus"]
+        shown = [
+            row["name"],
+            format_exact_beside(nominal, half),
+            format_with_uncertainty(estimate, half),
+        ]
+        if is_complete:
+            sd = row["sd"]
+            factor = half / sd if sd > 0.0 else math.nan
+            shown += [
+                f"{(estimate - nominal) / row['tolerance']:+.2f}",
+                format_uncertainty(sd),
+                _format_degrees(row["degrees"]),
+                f"{factor:.2f}" if math.isfinite(factor) else ABSENT,
+            ]
+        interval = format_uncertainty(half) if row.get("free", True) else "fixed"
+        cells.append((*shown, interval, row["unit"]))
+    titles = ["nominal", "estimate", "+/- (95 %)"]
+    if is_complete:
+        titles[2:] = ["shift [tolerances]", "u", "degrees of freedom", "k", "U (95 %)"]
+    return make_table(caption, ("name", *map(Column, titles), "unit"), cells)
 
 
 def _format_degrees(degrees: float) -> str:
@@ -259,25 +227,21 @@ def _format_degrees(degrees: float) -> str:
     return f"{degrees:.0f}" if degrees >= WHOLE else format_number(degrees, 3)
 
 
-def _note_intervals(fit: Identification) -> list[Block]:
-    """Return the sentence below a table of intervals that use a prior."""
-    return [] if fit.interval_note is None else [str(fit.interval_note)]
-
-
 def build_prior_table(conflict: PriorConflict) -> Table:
     """Return the tests of the stated tolerances."""
     whole = ("all deviations", conflict.statistic, conflict.degrees, conflict.p_value, ())
     tests = (("worst direction", conflict.direction), ("worst parameter", conflict.parameter))
-    return build_table(
-        f"Stated tolerances against the data: p = {format_number(conflict.joint_p_value, 2)} "
-        "for the three tests together",
-        (whole, *((title, t.statistic, t.count, t.p_value, t.names) for title, t in tests)),
-        Field("test", itemgetter(0)),
-        Field("statistic [1]", itemgetter(1), digits=3),
-        Field("degrees or number", itemgetter(2), digits=3),
-        Field("p", itemgetter(3), digits=2),
-        ("parameters", lambda row: list_names(row[4])),
+    rows = (
+        (title, format_number(x, 3), f"{count:.3g}", format_number(p, 2), list_names(names))
+        for title, x, count, p, names in (
+            whole,
+            *((title, t.statistic, t.count, t.p_value, t.names) for title, t in tests),
+        )
     )
+    numbers = (Column(title) for title in ("statistic [1]", "degrees or number", "p"))
+    p_value = format_number(conflict.joint_p_value, 2)
+    caption = f"Stated tolerances against the data: p = {p_value} for the three tests together"
+    return make_table(caption, ("test", *numbers, "parameters"), rows)
 
 
 def build_last_value_table(rows: Iterable[Mapping[str, Any]]) -> Table:
@@ -311,11 +275,11 @@ def build_reading_table(robot: Mechanism, errors: Sequence[ReadingError]) -> Tab
 
 def view_fit(fit: Identification) -> list[Block]:
     """Return the parameters of a fit and how it ended."""
-    rows = fit.list_parameters()
+    rows, iteration = fit.list_parameters(), _describe_iteration(fit)
+    if not fit.converged:
+        return [build_last_value_table(rows), iteration]
     caption = f"{fit.robot.name}: {len(fit.names)} parameters"
-    table = build_parameter_table(caption, rows)
-    shown = [table, *_note_intervals(fit)] if fit.converged else [build_last_value_table(rows)]
-    return [*shown, _describe_iteration(fit)]
+    return [*_view_parameters(fit, caption, rows), iteration]
 
 
 def _describe_iteration(fit: Identification) -> str:
@@ -325,7 +289,7 @@ def _describe_iteration(fit: Identification) -> str:
     return f"{ending}\n{fit.describe_statistics()}\n{fit.describe_intervals()}".rstrip()
 
 
-# --- The uncertainty budget of a calibration on one screen.
+# The uncertainty budget of a calibration: `ErrorBudget.to_dict()`, or `expected_error` of a run.
 
 MEANING = (
     "Standard uncertainties (k = 1): root mean square over {poses} {over}, tool point, and the "
@@ -336,12 +300,7 @@ MEANING = (
 
 
 def view_budget(budget: Mapping[str, Any], robot: Mechanism) -> list[Block]:
-    """Return the page of a budget.
-
-    Parameters
-    ----------
-    budget : `ErrorBudget.to_dict()`, or `expected_error` of a run. robot : for its units.
-    """
+    """Return the page of a budget; robot : for its units."""
     return [str(budget["finding"]["text"]), "", build_budget_table(budget, robot)]
 
 
@@ -349,44 +308,59 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     """Return one line for each source of errors, and their sum; without orientation where the
     platform does not rotate.
     """
-    length, angle = (robot.shown_units[d] for d in (Dimension.LENGTH, Dimension.ANGLE))
-    worst = budget["worst_parameter"]
-    table = robot.parameters
-    dimension = table.entries[table.index(worst)].dimension if worst else Dimension.LENGTH
-    unit = find_unit(robot.get_unit(dimension).symbol)
-    lines = [*budget["sources"], _add(budget)]
-    rows = [_list_row(line, worst, (length, angle, unit)) for line in lines]
-    over = "poses of the workspace" if budget["over"] == "workspace" else "measured poses"
-    titles = [("position", length.symbol), ("orientation", angle.symbol)]
+    worst, table, units = budget["worst_parameter"], robot.parameters, robot.shown_units
+    shown = {kind: units[LENGTHS[kind]] for kind in _list_kinds(budget)}
     if worst:
-        titles.append((worst, unit.symbol))
-    columns = [word_column("source"), word_column("type"), Column("degrees of freedom")]
-    columns += [Column(title, symbol) for title, symbol in titles]
-    columns += [Column(f"halved: {title}", symbol) for title, symbol in titles]
-    orientations = (4, 4 + len(titles)) if budget["orientation"]["rms"] == 0.0 else ()
-    shown = [(i, column) for i, column in enumerate(columns) if i not in orientations]
-    return build_table(
-        MEANING.format(poses=budget["poses"], over=over),
-        rows,
-        *((column, lambda row, i=i: row[i]) for i, column in shown),
-    )
+        shown[worst] = robot.get_unit(table.entries[table.index(worst)].dimension)
+
+    def list_cells(
+        words: str, evaluation: str, degrees: float | None, *errors: Mapping[str, float | None]
+    ) -> list[str]:
+        numbers = [
+            ABSENT if (value := of.get(kind)) is None else format_in(unit, value, 3)
+            for of in errors
+            for kind, unit in shown.items()
+        ]
+        freedom = ABSENT if degrees is None else format_number(degrees, 3)
+        return [words, evaluation, freedom, *numbers]
+
+    rows = []
+    for line in budget["sources"]:
+        halved, left = line["halved"], {}
+        if halved is not None:
+            left = {kind: halved[f"{kind}_rms"] for kind in LENGTHS}
+            left[worst] = halved["worst_parameter_sd"]
+        squares = {**{kind: line[kind] for kind in LENGTHS}, **line["parameters"]}
+        errors = {k: None if square is None else math.sqrt(square) for k, square in squares.items()}
+        fixed = (_name_source(line), line["evaluation"], line["degrees"])
+        rows.append(list_cells(*fixed, errors, left))
+    total = {**{kind: budget[kind]["rms"] for kind in LENGTHS}, **budget["parameters"]}
+    rows.append(list_cells("all sources", "", None, total, {}))
+    columns = [
+        Column(f"{before}{kind}", unit.symbol)
+        for before in ("", "halved: ")
+        for kind, unit in shown.items()
+    ]
+    over = "poses of the workspace" if budget["over"] == "workspace" else "measured poses"
+    caption = MEANING.format(poses=budget["poses"], over=over)
+    return make_table(caption, ("source", "type", Column("degrees of freedom"), *columns), rows)
 
 
 def build_share_table(budget: Mapping[str, Any]) -> Table:
     """Return the share of each source in the variance of poses."""
-    kinds = ("position",) if budget["orientation"]["rms"] == 0.0 else ("position", "orientation")
-    totals = [sum(line[kind] or 0.0 for line in budget["sources"]) for kind in kinds]
-    shares: list[tuple[Column, Callable[[Mapping[str, Any]], str]]] = [
-        (Column(kind, "%"), lambda line, kind=kind, total=total: _show_share(line[kind], total))
-        for kind, total in zip(kinds, totals, strict=True)
-    ]
-    return build_table(
-        "Share of each source in the variance of the expected error",
-        budget["sources"],
-        ("source", _name_source),
-        ("type", lambda line: line["evaluation"]),
-        *shares,
+    kinds = _list_kinds(budget)
+    totals = {kind: sum(line[kind] or 0.0 for line in budget["sources"]) for kind in kinds}
+    rows = (
+        (_name_source(line), line["evaluation"], *(_show_share(line[k], totals[k]) for k in kinds))
+        for line in budget["sources"]
     )
+    caption = "Share of each source in the variance of the expected error"
+    return make_table(caption, ("source", "type", *(Column(kind, "%") for kind in kinds)), rows)
+
+
+def _list_kinds(budget: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the errors of poses: those of orientation only where the platform rotates."""
+    return tuple(LENGTHS)[: 1 if budget["orientation"]["rms"] == 0.0 else 2]
 
 
 def _show_share(variance: float | None, total: float) -> str:
@@ -401,114 +375,63 @@ def _name_source(line: Mapping[str, Any]) -> str:
     return Source(line["kind"], line["name"], "", 0.0).words
 
 
-def _add(budget: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the line of the sum."""
-    worst = budget["worst_parameter"]
-    return {
-        "kind": "all sources",
-        "name": "",
-        "evaluation": "",
-        "degrees": None,
-        "position": _square(budget["position"]["rms"]),
-        "orientation": _square(budget["orientation"]["rms"]),
-        "parameters": {worst: _square(budget["parameters"][worst])} if worst else {},
-        "halved": None,
-    }
-
-
-def _list_row(line: Mapping[str, Any], worst: str, units: Sequence[Any]) -> list[str]:
-    """Return the cells of a line; a dash where there is no number."""
-    values = [line["position"], line["orientation"]]
-    halved = line["halved"]
-    left = [None, None] if halved is None else [halved["position_rms"], halved["orientation_rms"]]
-    if worst:
-        values.append(line["parameters"][worst])
-        left.append(None if halved is None else halved["worst_parameter_sd"])
-    degrees = line["degrees"]
-    return [
-        _name_source(line),
-        line["evaluation"],
-        ABSENT if degrees is None else format_number(degrees, 3),
-        *(
-            _show(None if v is None else math.sqrt(v), u)
-            for v, u in zip(values, units, strict=False)
-        ),
-        *(_show(value, u) for value, u in zip(left, units, strict=False)),
-    ]
-
-
-def _square(value: float | None) -> float | None:
-    """Return the square of a number; None where it is infinite, as in files."""
-    return None if value is None else value**2
-
-
-def _show(value: float | None, unit: Any) -> str:
-    return ABSENT if value is None else format_in(unit, float(value), 3)
-
-
-# --- Compensation as people read it: the targets with their errors before and after.
-
-
 def view_compensation(result: Compensation) -> list[Block]:
-    """Return the table of targets, the convergence of shifted commands, and the frame."""
+    """Return the table of targets with their errors before and after, the convergence of shifted
+    commands, and the frame.
+    """
     from loopcal.apply.compensation import ROUNDING
 
-    units = result.robot.shown_units
+    robot, units, uncertainty = result.robot, result.robot.shown_units, result.uncertainty
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
-    columns = [word_column("target"), word_column("status")]
-    values = []
-    for rows, unit in ((slice(3, 6), length), (slice(0, 3), angle)):
+    values: list[tuple[Column, FloatArray]] = []
+    for part, unit, size in ((slice(3, 6), length, robot.size), (slice(0, 3), angle, 1.0)):
         for name, errors in (("before", result.before), ("after", result.remaining)):
-            columns.append(Column(name, unit.symbol))
-            size = np.linalg.norm(errors[:, rows], axis=1)
-            rounding = ROUNDING * (result.robot.size if unit is length else 1.0)
-            values.append(np.where(size < rounding, 0.0, size) / unit.factor_to_si)
-    if result.uncertainty is not None:
-        columns += [Column("U", length.symbol), Column("U", angle.symbol)]
-        values += [
-            result.uncertainty.expanded_position / length.factor_to_si,
-            result.uncertainty.expanded_orientation / angle.factor_to_si,
-        ]
-    cells = tuple(
-        (label, reach.value, *(format_number(float(column[i]), 3) for column in values))
+            error = np.linalg.norm(errors[:, part], axis=1)
+            shown = np.where(error < ROUNDING * size, 0.0, error)
+            values.append((Column(name, unit.symbol), shown / unit.factor_to_si))
+    if uncertainty is not None:
+        position, orientation = uncertainty.expanded_position, uncertainty.expanded_orientation
+        values.append((Column("U", length.symbol), position / length.factor_to_si))
+        values.append((Column("U", angle.symbol), orientation / angle.factor_to_si))
+    rows = [
+        (label, reach.value, *(format_number(float(numbers[i]), 3) for _, numbers in values))
         for i, (label, reach) in enumerate(zip(result.labels, result.reach, strict=True))
-    )
-    caption = f"{result.robot.name}: {len(cells)} targets, {result.mode}"
-    blocks: list[Block] = [Table(caption, tuple(columns), cells)]
+    ]
+    caption = f"{robot.name}: {len(rows)} targets, {result.mode}"
+    columns = ("target", "status", *(column for column, _ in values))
+    blocks: list[Block] = [make_table(caption, columns, rows)]
     usable = result.usable
     if result.commands is not None and usable.any():
         for step in range(1, len(result.residual_position)):
-            position = result.residual_position[step, usable].max() / length.factor_to_si
-            turn = result.residual_orientation[step, usable].max() / angle.factor_to_si
+            position = format_in(length, result.residual_position[step, usable].max(), 3)
+            turn = format_in(angle, result.residual_orientation[step, usable].max(), 3)
             blocks.append(
-                f"After step {step}: at most {format_number(position, 3)} {length} and "
-                f"{format_number(turn, 3)} {angle} from the best reachable poses."
+                f"After step {step}: at most {position} {length} and {turn} {angle} from the best "
+                "reachable poses."
             )
-    if result.uncertainty is not None:
-        is_of_all = result.uncertainty.reference.data["frame"] in ("fitted", "base")
+    if uncertainty is not None:
+        is_of_all = uncertainty.reference.data["frame"] in ("fitted", "base")
         others = "" if is_of_all else " Errors before and after are in the base frame."
         blocks.append(
             "Errors are distances and angles. 95 % of those of the machine after compensation are "
-            f"below U. Frame{'' if is_of_all else ' of U'}: {result.uncertainty.frame}.{others}"
+            f"below U. Frame{'' if is_of_all else ' of U'}: {uncertainty.frame}.{others}"
         )
     return blocks
 
 
-# --- Identifiability as people read it: what the data determine, then each parameter.
+# Identifiability as people read it: what the data determine, then each parameter.
 
 SD_MEANING = (
     "sd / tolerance: standard deviation with the tolerances as a prior; 1 means that the data add "
     "nothing."
 )
 
-
-MOST_COMBINATIONS = 8
-"""Combinations and suggestions that a page lists; the rest is counted."""
+MOST_COMBINATIONS, FEW_PARAMETERS = 8, 12
+"""Combinations and suggestions that a page lists, and parameters that a summary lists one by one;
+of more combinations the rest is counted.
+"""
 
 COMBINATIONS = ("fit.unidentifiable", "fit.hardly-observable")
-
-FEW_PARAMETERS = 12
-"""Parameters that a summary lists one by one."""
 
 
 def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -> list[Block]:
@@ -518,88 +441,54 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
     `verbose` also every combination, the singular values, the table of every robot and the
     observability indices.
     """
+    analysis, useful = report.analysis, report.useful
     blocks: list[Block] = [str(finding) for finding in report.summary]
     if report.suggestions:
         blocks.append(str(report_finding("identifiability.known-frames-assumed")))
     if verbose:
-        blocks += ["", *_view_findings(report)]
-    if report.useful is not None and verbose:
-        blocks += _view_useful(report.useful)
-    if verbose or report.analysis.n_parameters <= FEW_PARAMETERS:
-        blocks += _view_parameters(report)
+        said = {finding.code for finding in report.summary}
+        left = [f for f in analysis.findings if f.code not in said]
+        combinations = [str(f) for f in left if f.code in COMBINATIONS]
+        blocks += ["", *(str(f) for f in left if f.code not in COMBINATIONS)]
+        blocks += _shorten(combinations, "combinations")
+        blocks += _shorten([str(suggestion) for suggestion in report.suggestions], "suggestions")
+    if useful is not None and verbose:  # the best and the worst known ones about it
+        n = MOST_COMBINATIONS
+        table = build_table(
+            "Combinations next to the useful accuracy",
+            [*useful.determined[-n:], *useful.undetermined[:n]],
+            (
+                word_column("combination of length one", wraps=True),
+                lambda row: _name_terms(row.names, row.coefficients),
+            ),
+            Field("sd", title="sd / useful accuracy", digits=3),
+        )
+        blocks.append(table)
+    if verbose or analysis.n_parameters <= FEW_PARAMETERS:
+        states = {"determined": "yes", "not at all": "no"}
+        rows = []
+        for row in analysis.parameters:
+            others = f"only with {list_names(row.others, MOST_COMBINATIONS // 2)}"
+            rows.append((row.name, states.get(row.state) or others, f"{row.left:.2f}"))
+        determined = word_column("determined", wraps=True)
+        columns = ("name", determined, Column("sd / tolerance"))
+        blocks += [make_table("Parameters", columns, rows), SD_MEANING]
     if verbose:
-        blocks.append(_view_indices(report))
+        values = [(n, meaning, format_number(x, 3)) for n, x, meaning in analysis.indices.rows()]
+        meaning = word_column("meaning", wraps=True)
+        blocks.append(make_table("Observability", ("index", meaning, Column("value")), values))
     if report.subset is not None:
         blocks += ["", str(report.subset)]
     return blocks
 
 
-def _view_findings(report: IdentifiabilityReport) -> list[Block]:
-    """Return the findings that the summary leaves out, and the measurement for each combination."""
-    said = {finding.code for finding in report.summary}
-    findings = [f for f in report.analysis.findings if f.code not in said]
-    combinations = [f for f in findings if f.code in COMBINATIONS]
-    others = [str(f) for f in findings if f.code not in COMBINATIONS]
-    return [
-        *others,
-        *_shorten([str(f) for f in combinations], "combinations"),
-        *_shorten([str(suggestion) for suggestion in report.suggestions], "suggestions"),
-    ]
-
-
-def _shorten(lines: list[str], what: str) -> list[Block]:
+def _shorten(lines: Sequence[str], what: str) -> list[Block]:
     """Return the first lines and the number of the others."""
     left = len(lines) - MOST_COMBINATIONS
-    more = [f"and {left} more {what}"] if left > 0 else []
-    return [*lines[:MOST_COMBINATIONS], *more]
-
-
-def _view_useful(useful: UsefulAccuracy) -> list[Block]:
-    """Return the best and the worst known combinations about the useful accuracy."""
-    rows = [*useful.determined[-MOST_COMBINATIONS:], *useful.undetermined[:MOST_COMBINATIONS]]
-    table = build_table(
-        "Combinations next to the useful accuracy",
-        rows,
-        (
-            word_column("combination of length one", wraps=True),
-            lambda row: _name_terms(row.names, row.coefficients),
-        ),
-        Field("sd", title="sd / useful accuracy", digits=3),
-    )
-    return [table]
+    return [*lines[:MOST_COMBINATIONS], *([f"and {left} more {what}"] if left > 0 else [])]
 
 
 def _name_terms(names: Sequence[str], coefficients: FloatArray) -> str:
     """Return the strongest terms of a combination."""
     terms = [f"{c:+.2f} {name}" for name, c in zip(names, coefficients, strict=True)]
     return list_names(terms, 4).replace(" and ", ", ")
-
-
-def _view_parameters(report: IdentifiabilityReport) -> list[Block]:
-    """Return what the data determine of each parameter."""
-    states = {"determined": "yes", "not at all": "no"}
-    table = build_table(
-        "Parameters",
-        report.analysis.parameters,
-        Field("name"),
-        (
-            word_column("determined", wraps=True),
-            lambda row: (
-                states.get(row.state)
-                or f"only with {list_names(row.others, MOST_COMBINATIONS // 2)}"
-            ),
-        ),
-        (Column("sd / tolerance"), lambda row: f"{row.left:.2f}"),
-    )
-    return [table, SD_MEANING]
-
-
-def _view_indices(report: IdentifiabilityReport) -> Table:
-    """Return the observability indices."""
-    return build_table(
-        "Observability",
-        report.analysis.indices.rows(),
-        Field("index", itemgetter(0)),
-        (word_column("meaning", wraps=True), itemgetter(2)),
-        Field("value", itemgetter(1), digits=3),
-    )
