@@ -14,14 +14,12 @@ from loopcal.apply.validation import FEW_ROWS, ErrorChange, Validation
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.findings import Finding, Severity, sort_by_importance
 from loopcal.findings.wording import list_names
-from loopcal.results.description import Field
 from loopcal.results.tables import (
     ABSENT,
     ROUNDING,
     Block,
     Column,
     Table,
-    build_table,
     format_in,
     format_list,
     format_number,
@@ -33,12 +31,11 @@ from loopcal.results.tables import (
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
-    from loopcal.apply.run_comparison import RunComparison, RunSummary
+    from loopcal.apply.run_comparison import RunComparison
     from loopcal.diagnose.bootstrap import Bootstrap
     from loopcal.diagnose.cross_validation import RegularizationCurve, RegularizationCurves
     from loopcal.diagnose.intervals import Intervals, JointRegion, SimultaneousIntervals
     from loopcal.diagnose.posterior_sample import PosteriorSample
-    from loopcal.estimate.result import Identification
     from loopcal.mechanism.model import Mechanism
 
 CONFORMITY = "conformity."
@@ -136,37 +133,24 @@ def _build_kind_summary(validation: Validation, caption: str, with_before: bool)
     """Return the errors of each kind divided by sigma; no table where one quantity says it all."""
     if not validation.has_several_kinds and validation.quantities:
         return []
-    rows = [
-        [
-            "all kinds" if kind.kind == "all" else kind.kind,
-            "rms",
-            str(kind.count),
-            *(format_number(x, 3) for x in (kind.before, kind.after, kind.noise_floor)),
-            "sigma",
-        ]
-        for kind in validation.kinds
-        if kind.kind != "all" or validation.has_several_kinds
-    ]
+    rows = []
+    for kind in validation.kinds:
+        if kind.kind != "all" or validation.has_several_kinds:
+            name = "all kinds" if kind.kind == "all" else kind.kind
+            errors = (format_number(x, 3) for x in (kind.before, kind.after, kind.noise_floor))
+            rows.append([name, "rms", str(kind.count), *errors, "sigma"])
     return [_build_error_table(caption, "kind", rows, with_before)]
 
 
 def _build_error_table(
-    caption: str, subject: str, rows: list[list[str]], with_before: bool
+    caption: str, subject: str, rows: Sequence[list[str]], with_before: bool
 ) -> Table:
     """Return a table of errors, without those before where there is no such geometry."""
-    titles = [
-        subject,
-        "metric",
-        Column("count"),
-        Column("before"),
-        Column("after"),
-        Column("noise floor"),
-        "unit",
-    ]
+    titles = ["count", "before", "after", "noise floor"]
     if not with_before:
-        titles[3:5] = [Column("error")]
+        titles[1:3] = ["error"]
         rows = [row[:3] + row[4:] for row in rows]
-    return make_table(caption, titles, rows)
+    return make_table(caption, (subject, "metric", *map(Column, titles), "unit"), rows)
 
 
 def view_error_statistics(validation: Validation, with_before: bool = True) -> list[Block]:
@@ -185,8 +169,9 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
             statistics, unit = error.statistics(quantity), validation.units[quantity]
             cells = (format_in(unit, statistics[key], 3) for key in METRICS)
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
-    titles = ("error", "of", Column("count"), *(Column(m.words) for m in METRICS.values()), "unit")
-    table = make_table(f"Error statistics (rows x targets), {validation.frame}", titles, rows)
+    numbers = map(Column, ("count", *(metric.words for metric in METRICS.values())))
+    caption = f"Error statistics (rows x targets), {validation.frame}"
+    table = make_table(caption, ("error", "of", *numbers, "unit"), rows)
     if with_before and is_correctable:
         return [table, "The actuators can correct all of the measured error."]
     return [table]
@@ -260,17 +245,8 @@ def view_repeatability(result: Repeatability, robot: Mechanism | None = None) ->
             for name, *estimates in named:
                 numbers = (format_in(unit, x, 3) for estimate in estimates for x in estimate)
                 rows.append((*first, name, *numbers, unit.symbol))
-        titles = (
-            "pose",
-            "target",
-            "approach",
-            Column("visits"),
-            "of",
-            Column("AP"),
-            Column("from"),
-            Column("to"),
-        )
-        titles = (*titles, Column("RP"), Column("from"), Column("to"), "unit")
+        numbers = map(Column, ("AP", "from", "to", "RP", "from", "to"))
+        titles = ("pose", "target", "approach", Column("visits"), "of", *numbers, "unit")
         kept = [i for i in range(len(titles)) if any(row[i] for row in rows)]
         caption = f"{quantity.capitalize()} by ISO 9283 with intervals of 95 %, {result.frame}"
         cells = ([row[i] for i in kept] for row in rows)
@@ -305,27 +281,25 @@ def view_comparison(
     names = ", ".join(run.name for run in comparison.runs)
     findings = list_findings(sort_by_importance(comparison.findings))
     blocks: list[Block] = [f"Comparison of {names}.", "", *findings, ""]
-    runs = [(run.name, _describe_run(run)) for run in comparison.runs]
-    blocks += [*format_list(runs), "", build_estimates(comparison), ""]
+    blocks += [*format_list(_describe_runs(comparison)), "", build_estimates(comparison), ""]
     if any(pair.moved is not None for pair in comparison.pairs):
         blocks += [build_shifts(comparison), ""]
     show_unit = show_unit or find_error_units(comparison).__getitem__
     return [*blocks, build_errors(comparison, show_unit)]
 
 
-def _describe_run(run: RunSummary) -> str:
-    """Return the robot of a run, its verdict and its method."""
-    return f"{run.robot}: {run.verdict}, {run.method.partition('(')[0]}"
+def _describe_runs(comparison: RunComparison) -> list[tuple[str, str]]:
+    """Return each run with its robot, its verdict and its method."""
+    return [
+        (run.name, f"{run.robot}: {run.verdict}, {run.method.partition('(')[0]}")
+        for run in comparison.runs
+    ]
 
 
 def build_runs(comparison: RunComparison) -> Table:
     """Return robot, verdict and method of each run."""
-    rows = [(run.name, _describe_run(run)) for run in comparison.runs]
-    return make_table(
-        "The compared runs",
-        (word_column("run", wraps=True), word_column("robot, verdict, method", wraps=True)),
-        rows,
-    )
+    columns = (word_column(title, wraps=True) for title in ("run", "robot, verdict, method"))
+    return make_table("The compared runs", columns, _describe_runs(comparison))
 
 
 def build_estimates(comparison: RunComparison) -> Table:
@@ -343,7 +317,7 @@ def build_estimates(comparison: RunComparison) -> Table:
                 value, half = value / unit.factor_to_si, half / unit.factor_to_si
                 cells += [format_with_uncertainty(value, half), format_uncertainty(half)]
         rows.append((*cells, unit.symbol))
-    of_runs = (title for run in comparison.runs for title in (Column(run.name), Column("+/-")))
+    of_runs = (Column(title) for run in comparison.runs for title in (run.name, "+/-"))
     caption = "Estimates and half-widths of their 95 % intervals"
     return make_table(caption, ("parameter", *of_runs, "unit"), rows)
 
@@ -362,9 +336,7 @@ def build_shifts(comparison: RunComparison) -> Table:
             cells.append(format_with_uncertainty(shift / factor, sd / factor))
             cells.append(f"{shift / sd:.1f}{'*' if is_significant else ' '}")
         rows.append((*cells, unit.symbol))
-    of_pairs = (
-        title for pair in comparison.pairs for title in (Column(pair.second), Column("in sd"))
-    )
+    of_pairs = (Column(title) for pair in comparison.pairs for title in (pair.second, "in sd"))
     caption = SHIFTS.format(first=comparison.runs[0].name)
     return make_table(caption, ("parameter", *of_pairs, "unit"), rows)
 
@@ -416,14 +388,9 @@ def tabulate_comparison(comparison: RunComparison) -> Table:
 
 def find_error_units(comparison: RunComparison) -> dict[str, Unit]:
     """Return the unit of each quantity of errors: that in which the parameters are shown."""
-    symbols = {unit.dimension: unit for unit in comparison.units}
-    angle, length = find_unit("deg"), find_unit("mm")
-    lengths = symbols.get(length.dimension, length)
-    return {
-        "position": lengths,
-        "length": lengths,
-        "orientation": symbols.get(angle.dimension, angle),
-    }
+    shown = {unit.dimension: unit for unit in comparison.units}
+    length, angle = (shown.get(unit.dimension, unit) for unit in map(find_unit, ("mm", "deg")))
+    return {"position": length, "length": length, "orientation": angle}
 
 
 # Regularization curves as tables.
@@ -433,6 +400,9 @@ SCORE = (
 )
 WORDS = {"lam": ("Ridge", "lam"), "k": ("Truncated SVD", "k")}
 """Name of a curve -> the method in words, and its number."""
+
+SCORES = (Column("held-out error"), Column("standard error"))
+"""Columns of a score."""
 
 ROWS = 9
 """Values of a curve that the table contains beside those that rules choose."""
@@ -465,8 +435,7 @@ def view_regularization(curves: RegularizationCurves) -> list[Block]:
             (method, c.rule, f"{number} = {c.value:.4g}", *_format_score(*curve.score_at(c.value)))
             for c in curve.chosen
         ]
-    titles = ("method", "chosen by", "value", Column("held-out error"), Column("standard error"))
-    chosen = make_table("Chosen values", titles, rows)
+    chosen = make_table("Chosen values", ("method", "chosen by", "value", *SCORES), rows)
     return [*page, chosen, _tabulate_curve(curves.ridge), _tabulate_curve(curves.truncation)]
 
 
@@ -477,9 +446,7 @@ def _tabulate_curve(curve: RegularizationCurve) -> Table:
     score, error = curve.score.tolist(), curve.standard_error.tolist()
     places = np.unique(np.linspace(0, count - 1, min(ROWS, count)).round().astype(int))
     rows = ((f"{curve.values[i]:.4g}", *_format_score(score[i], error[i])) for i in places)
-    return make_table(
-        method, (Column(number), Column("held-out error"), Column("standard error")), rows
-    )
+    return make_table(method, (Column(number), *SCORES), rows)
 
 
 def tabulate_points(curves: RegularizationCurves) -> Table:
@@ -489,9 +456,7 @@ def tabulate_points(curves: RegularizationCurves) -> Table:
         for curve in (curves.ridge, curves.truncation)
         for point in zip(curve.values, curve.score, curve.standard_error, strict=True)
     )
-    return make_table(
-        "", ("parameter", Column("value"), Column("score"), Column("standard error")), rows
-    )
+    return make_table("", ("parameter", *map(Column, ("value", "score", "standard error"))), rows)
 
 
 def _format_score(score: float, error: float) -> tuple[str, str]:
@@ -510,50 +475,46 @@ def view_bootstrap(result: Bootstrap, intervals: Intervals | None = None) -> lis
     """Return the page of a bootstrap: what was drawn, findings, intervals."""
     blocks, count = result.blocks, len(result.draws)
     drawn = f"{count} resamples of {blocks.count} {blocks.unit}s, scheme {result.scheme}"
-    title = f"{result.fit.robot.name}: bootstrap, {drawn}, seed {result.seed}"
-    table = _build_interval_table(result.fit, intervals or result.intervals())
-    return [title, "", *list_findings(result.findings), table]
+    return _view_draws(f"bootstrap, {drawn}", result, intervals or result.intervals())
 
 
 def view_posterior(sample: PosteriorSample, intervals: Intervals | None = None) -> list[Block]:
     """Return the page of a sampled posterior: effective size, findings, intervals."""
-    size = f"{len(sample.draws)} weighted draws worth {sample.effective_size:.0f}"
-    title = f"{sample.fit.robot.name}: exact posterior, {size}, seed {sample.seed}"
-    table = _build_interval_table(sample.fit, intervals or sample.intervals())
-    return [title, "", *list_findings(sample.findings), table]
+    drawn = f"{len(sample.draws)} weighted draws worth {sample.effective_size:.0f}"
+    return _view_draws(f"exact posterior, {drawn}", sample, intervals or sample.intervals())
 
 
-def _build_interval_table(fit: Identification, intervals: Intervals) -> Table:
-    """Return the intervals beside the linear ones, in the units of the robot's file."""
+def _view_draws(
+    drawn: str, result: Bootstrap | PosteriorSample, intervals: Intervals
+) -> list[Block]:
+    """Return what was drawn, findings, and the intervals beside the linear ones, in the units of
+    the robot's file.
+    """
+    fit, level = result.fit, intervals.level
     factor, symbols = fit.free_parameters.display()
-    stated = fit.interval(intervals.level)
+    lower, upper, half, estimates, stated = (
+        (values / factor).tolist()
+        for values in (
+            intervals.lower,
+            intervals.upper,
+            0.5 * (intervals.upper - intervals.lower),
+            fit.estimate,
+            fit.interval(level),
+        )
+    )
     rows = []
     for i, name in enumerate(intervals.names):
-        lower, upper, half, value, own = (
-            float(array[i]) / factor[i]
-            for array in (
-                intervals.lower,
-                intervals.upper,
-                0.5 * (intervals.upper - intervals.lower),
-                fit.estimate,
-                stated,
-            )
-        )
-        cells = (format_with_uncertainty(x, half) for x in (value, lower, upper))
+        ends = (estimates[i], lower[i], upper[i])
+        cells = (format_with_uncertainty(x, half[i]) for x in ends)
         change = 100.0 * float(intervals.largest_shift[i])
-        shown = format_number(change, 2) if np.isfinite(lower) else ABSENT
+        shown = format_number(change, 2) if np.isfinite(lower[i]) else ABSENT
         mark = "yes" if intervals.is_off[i] else ""
-        rows.append((name, *cells, format_uncertainty(own), shown, mark, symbols[i]))
-    titles = (
-        "name",
-        Column("estimate"),
-        Column("from"),
-        Column("to"),
-        Column("stated +/-"),
-        Column("nonlinear", "%"),
-    )
-    caption = f"{100 * intervals.level:.4g} % intervals by {intervals.source}"
-    return make_table(caption, (*titles, "off", "unit"), rows)
+        rows.append((name, *cells, format_uncertainty(stated[i]), shown, mark, symbols[i]))
+    numbers = (*map(Column, ("estimate", "from", "to", "stated +/-")), Column("nonlinear", "%"))
+    caption = f"{100 * level:.4g} % intervals by {intervals.source}"
+    title = f"{fit.robot.name}: {drawn}, seed {result.seed}"
+    table = make_table(caption, ("name", *numbers, "off", "unit"), rows)
+    return [title, "", *list_findings(result.findings), table]
 
 
 def view_region(
@@ -562,42 +523,31 @@ def view_region(
     """Return the page of simultaneous intervals and, where there is one, of the joint region."""
     level, count = f"{100 * intervals.level:.4g} %", len(intervals.names)
     together = f"all {count} parameters at once" if count > 1 else "1 parameter"
+    numbers = (intervals.center, intervals.single, intervals.half_widths)
     rows = []
-    for i, name in enumerate(intervals.names):
+    for name, *of_name in zip(intervals.names, *(x.tolist() for x in numbers), strict=True):
         unit = robot.get_unit(robot.parameters.entries[robot.parameters.index(name)].dimension)
-        value, single, half = (
-            float(array[i]) / unit.factor_to_si
-            for array in (intervals.center, intervals.single, intervals.half_widths)
-        )
+        value, single, half = (x / unit.factor_to_si for x in of_name)
         cells = (format_uncertainty(single), format_uncertainty(half))
         rows.append((name, format_with_uncertainty(value, half), *cells, unit.symbol))
-    titles = (
-        "name",
-        Column("estimate"),
-        Column("+/- one at a time"),
-        Column("+/- all at once"),
-        "unit",
-    )
+    titles = map(Column, ("estimate", "+/- one at a time", "+/- all at once"))
     blocks: list[Block] = [
         f"{robot.name}: {level} intervals that hold for {together}",
         f"Rule: {intervals.rule}.",
-        make_table("Intervals", titles, rows),
+        make_table("Intervals", ("name", *titles, "unit"), rows),
     ]
     if region is None:
         return blocks
-    degrees = (
-        "known noise"
-        if np.isinf(region.degrees)
-        else f"noise with {region.degrees:.3g} degrees of freedom"
-    )
-    scaled = region.axes / region.standard_deviations
-    axes = build_table(
+    estimated = f"noise with {region.degrees:.3g} degrees of freedom"
+    noise = "known noise" if np.isinf(region.degrees) else estimated
+    scaled = (region.axes / region.standard_deviations).T.tolist()
+    axes = make_table(
         "Principal axes, in standard deviations",
-        zip(region.names, *scaled.tolist(), strict=True),
-        *(
-            Field("name" if j == 0 else f"axis {j}", lambda row, j=j: row[j], digits=3)
-            for j in range(len(scaled) + 1)
+        ("name", *(Column(f"axis {j}") for j in range(1, len(region.axes) + 1))),
+        (
+            (name, *(format_number(x, 3) for x in of_axes))
+            for name, of_axes in zip(region.names, scaled, strict=True)
         ),
     )
-    text = f"Joint {level} region: squared distance up to {region.square:.4g} ({degrees})."
+    text = f"Joint {level} region: squared distance up to {region.square:.4g} ({noise})."
     return [*blocks, text, axes]
