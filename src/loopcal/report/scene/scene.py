@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene: a robot at home with its measured poses, its errors there, and its accuracy map.
 
-One scene is drawn twice: as a picture by `draw_scene`, and by the script of
-the 3-D view, for which `scene_data.py` writes it.
+One scene is drawn twice: as a picture by `draw_scene`, and by the script of the 3-D view
+(tools/viewer), which reads it as JSON.
 """
 
 from __future__ import annotations
@@ -75,36 +75,20 @@ class Scene:
 def compute_pose_errors(
     robot: Mechanism, initial: Mechanism, readings: FloatArray, labels: tuple[str, ...]
 ) -> PoseErrors:
-    """Return the tool point at readings, and the errors of the initial geometry there.
+    """Return the tool point at readings (n, a) [m or rad] of poses with labels, and the errors of
+    the initial geometry there; without poses that one of the two geometries does not reach.
 
-    Parameters
-    ----------
-    robot : calibrated. initial : before calibration. readings : (n, a) of the poses [m or rad].
-    labels : of the poses.
-
-    Returns
-    -------
-    PoseErrors without the poses that one of the two geometries does not reach.
+    robot : calibrated. initial : before calibration.
     """
     after, before = (forward(machine, readings) for machine in (robot, initial))
     reached = np.flatnonzero(after.converged & before.converged)
     tool = (after.T[reached] @ robot.tool)[:, :3, 3]
     error = (before.T[reached] @ initial.tool)[:, :3, 3] - tool
-    return PoseErrors(
-        tuple(labels[i] for i in reached),
-        after.take(reached),
-        tool,
-        error,
-        _choose_magnification(error, robot.size),
-    )
-
-
-def _choose_magnification(error: FloatArray, size: float) -> float:
-    """Return 1, 2 or 5 times a power of ten with which the longest error is at most LONGEST."""
-    longest = float(np.sqrt((error**2).sum(axis=1)).max(initial=0.0))
-    if longest <= 1e-9 * size:
-        return 1.0
-    return round_down(LONGEST * size / longest)
+    longest, magnification = float(np.sqrt((error**2).sum(axis=1)).max(initial=0.0)), 1.0
+    if longest > 1e-9 * robot.size:
+        magnification = round_down(LONGEST * robot.size / longest)
+    named = tuple(labels[i] for i in reached)
+    return PoseErrors(named, after.take(reached), tool, error, magnification)
 
 
 def round_down(value: float) -> float:
@@ -113,8 +97,7 @@ def round_down(value: float) -> float:
     return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value)
 
 
-# --- The parts of a robot as points and lines in the base frame: limbs, joints, rods, platform,
-# tool.
+# The parts of a robot as points and lines in the base frame: limbs, joints, rods, platform, tool.
 
 AXIS, GUIDE = 0.06, 0.12
 """Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
@@ -287,7 +270,7 @@ def _order_outline(points: FloatArray) -> IntArray:
     return np.append(order, order[0])
 
 
-# --- A scene as JSON for the script of the 3-D view (tools/viewer).
+# A scene as JSON for the script of the 3-D view (tools/viewer).
 
 SCRIPT = Path(__file__).parent / "viewer.min.js"
 
@@ -362,11 +345,11 @@ def describe_part(part: Part) -> dict[str, Any]:
 
 def _list_names(robot: Mechanism, parts: tuple[Part, ...], unit: Unit) -> list[dict[str, Any]]:
     """Return names beside the feet of limbs, and of the axes of the base frame."""
-    feet = [(limb.name, part) for limb, part in zip(robot.assembly.limbs, parts, strict=False)]
-    marks = [(name, describe_part(part)["color"], part.points[0, 0]) for name, part in feet]
-    axes = [part for part in parts if part.role == "frame"]
-    axis_names = "xy" if is_planar(robot) else "xyz"
-    marks += [(name, FRAME_COLORS[i], axes[i].points[0, 1]) for i, name in enumerate(axis_names)]
+    feet = zip(robot.assembly.limbs, parts, strict=False)
+    marks = [(limb.name, describe_part(part)["color"], part.points[0, 0]) for limb, part in feet]
+    axes = (part.points[0, 1] for part in parts if part.role == "frame")
+    names = "xy" if is_planar(robot) else "xyz"
+    marks += zip(names, FRAME_COLORS, axes, strict=False)
     return [
         {"text": escape(name), "color": color, "point": (place / unit.factor_to_si).tolist()}
         for name, color, place in marks
@@ -375,20 +358,21 @@ def _list_names(robot: Mechanism, parts: tuple[Part, ...], unit: Unit) -> list[d
 
 def _describe_poses(scene: Scene, unit: Unit) -> dict[str, Any]:
     """Return measured poses with errors; those of a scene without are empty."""
-    robot, poses = scene.robot, scene.poses
-    rows = np.arange(0) if poses is None else choose_rows(robot, len(poses.tool))
-    nothing = np.zeros((0, 3))
-    tools, errors = (nothing, nothing) if poses is None else (poses.tool, poses.error)
-    robots = nothing
-    if poses is not None and len(rows):
-        robots = _join(list_parts(robot, poses.solution.take(rows).state))
+    robot, poses, rows = scene.robot, scene.poses, np.arange(0)
+    labels, magnification = (), 1.0
+    tools = errors = robots = np.zeros((0, 3))
+    if poses is not None:
+        rows, magnification = choose_rows(robot, len(poses.tool)), poses.magnification
+        labels, tools, errors = poses.labels, poses.tool, poses.error
+        if len(rows):
+            robots = _join(list_parts(robot, poses.solution.take(rows).state))
     return {
-        "labels": [] if poses is None else [escape(poses.labels[i]) for i in rows],
+        "labels": [escape(labels[i]) for i in rows],
         "rows": rows.tolist(),
         "robots": _encode(robots / unit.factor_to_si),
         "tools": _encode(tools / unit.factor_to_si),
         "errors": _encode(errors / unit.factor_to_si),
-        "magnification": 1.0 if poses is None else poses.magnification,
+        "magnification": magnification,
         "colors": {"pose": POSE, "error": ERROR},
     }
 
@@ -415,28 +399,22 @@ def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
 
 def _list_legend(scene: Scene, parts: tuple[Part, ...]) -> list[dict[str, str]]:
     """Return the colors of the scene and their meaning."""
-    roles = {part.role for part in parts}
+    robot, poses = scene.robot, scene.poses
+    platforms = (part.points[0] for part in parts if part.role == "platform")
+    has_platform = any(np.ptp(points, axis=0).max() > 1e-6 * robot.size for points in platforms)
+    has_axes = any(part.role == "axis" for part in parts) and not is_planar(robot)
     rows = [
-        (BODY, "platform", any(p.role == "platform" and _is_wide(p, scene.robot) for p in parts)),
+        (BODY, "platform", has_platform),
         (BLACK, "tool", True),
-        (BLACK, "axis of a revolute joint", "axis" in roles and not is_planar(scene.robot)),
+        (BLACK, "axis of a revolute joint", has_axes),
         (DRIVEN, "driven: larger, in the color of its limb", True),
-        *(_describe_errors(scene.poses) if scene.poses is not None else ()),
-        *_describe_scale(scene),
     ]
+    if poses is not None:
+        error = f"position error before calibration, {poses.magnification:g} times magnified"
+        rows += [(POSE, "tool at a measured pose", len(poses.tool) > 0)]
+        rows += [(ERROR, error, len(poses.tool) > 0)]
+    rows += _describe_scale(scene)
     return [{"color": color, "text": text} for color, text, is_drawn in rows if is_drawn]
-
-
-def _is_wide(part: Part, robot: Mechanism) -> bool:
-    """Return whether the points of a part differ."""
-    return bool(np.ptp(part.points[0], axis=0).max() > 1e-6 * robot.size)
-
-
-def _describe_errors(poses: PoseErrors) -> tuple[tuple[str, str, bool], ...]:
-    """Return the legend of poses and errors."""
-    text = f"position error before calibration, {poses.magnification:g} times magnified"
-    is_any = bool(len(poses.tool))
-    return ((POSE, "tool at a measured pose", is_any), (ERROR, text, is_any))
 
 
 def _describe_scale(scene: Scene) -> tuple[tuple[str, str, bool], ...]:
