@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
-from loopcal.apply.verdict import is_readings_alone, report_readings_gauge, sort_undetermined
+from loopcal.apply.verdict import is_readings_alone, report_undetermined
 from loopcal.diagnose.identifiable_parameters import (
     Identifiability,
     IdentifiableSubset,
@@ -62,20 +62,15 @@ class IdentifiabilityReport:
         analysis = self.analysis
         if not analysis.unidentifiable:
             return []
-        left = analysis.n_parameters - analysis.rank
-        freedoms = sort_undetermined(analysis.posterior, analysis.unidentifiable, left)
-        motions, changing = freedoms.motions, freedoms.changing
-        findings = []
-        if self.is_readings_alone:
-            findings.append(report_readings_gauge(motions, freedoms.count))
-        if motions.count:
-            moved: dict[str, Any] = {"count": motions.count, "frames": motions.frames}
-            findings.append(report_finding("identifiability.frames-only", **moved))
-        if (count := freedoms.changing_count) > 0:
-            changed: dict[str, Any] = {"count": count, "names": freedoms.names}
-            findings.append(report_finding("identifiability.changes-poses", **changed))
-            findings += [c.finding for c in changing] if len(changing) <= FEW else []
-        return findings
+        count = analysis.n_parameters - analysis.rank
+        findings, changing = report_undetermined(
+            analysis.posterior,
+            analysis.unidentifiable,
+            count,
+            self.is_readings_alone,
+            ("identifiability.frames-only", "identifiability.changes-poses"),
+        )
+        return [*findings, *(c.finding for c in changing if len(changing) <= FEW)]
 
     def _report_measurement(self) -> list[Finding]:
         """Return the further measurement that determines most combinations, the simplest of them;

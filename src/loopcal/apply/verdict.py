@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 from typing import Any
 
@@ -130,45 +130,39 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     """Return whether open combinations only move frames, or change poses."""
     if not fit.converged or not fit.unidentifiable:
         return []
-
-    freedoms = sort_undetermined(fit.posterior, fit.unidentifiable, len(fit.names) - fit.rank)
-    motions, count = freedoms.motions, freedoms.changing_count
-    findings = [report_readings_gauge(motions, freedoms.count)] if is_readings_alone(data) else []
-    if motions.count:
-        moved: dict[str, Any] = {"count": motions.count, "frames": tuple(motions.frames)}
-        findings.append(report_finding("workflow.frame-freedoms", **moved))
-    if count > 0:
-        changing: dict[str, Any] = {"count": count, "names": freedoms.names}
-        findings.append(report_finding("workflow.undetermined-combinations", **changing))
+    codes = ("workflow.frame-freedoms", "workflow.undetermined-combinations")
+    count, alone = len(fit.names) - fit.rank, is_readings_alone(data)
+    findings, _ = report_undetermined(fit.posterior, fit.unidentifiable, count, alone, codes)
     return findings
 
 
-@dataclass(frozen=True)
-class UndeterminedCombinations:
-    """The combinations that data do not determine."""
-
-    motions: GaugeFreedoms  # of frames by these combinations
-    count: int  # of all
-    changing: tuple[Combination, ...]  # combinations that may change poses
-    names: tuple[str, ...]  # of the parameters in these
-
-    @property
-    def changing_count(self) -> int:
-        """Number of combinations that change poses."""
-        return self.count - self.motions.count
-
-
-def sort_undetermined(
-    posterior: Posterior, unidentifiable: tuple[Combination, ...], count: int
-) -> UndeterminedCombinations:
-    """Separate the combinations that only move frames from those that change poses.
+def report_undetermined(
+    posterior: Posterior,
+    unidentifiable: tuple[Combination, ...],
+    count: int,
+    is_readings_alone: bool,
+    codes: tuple[str, str],
+) -> tuple[list[Finding], tuple[Combination, ...]]:
+    """Return how many of `count` undetermined combinations only move frames, and how many change
+    poses; and the combinations that do where there are any.
 
     A combination with a meaning, such as the place of a frame, changes no pose. Where all have one,
     but they are more than the motions of frames, the parameters of all are named.
+
+    codes : of the two findings.
     """
+    motions, findings = find_gauge_freedoms(posterior), []
     changing = tuple(c for c in unidentifiable if not c.meaning)
+    if is_readings_alone:
+        findings.append(report_readings_gauge(motions, count))
+    if motions.count:
+        moved: dict[str, Any] = {"count": motions.count, "frames": tuple(motions.frames)}
+        findings.append(report_finding(codes[0], **moved))
+    if (left := count - motions.count) <= 0:
+        return findings, ()
     names = dict.fromkeys(name for c in changing or unidentifiable for name in c.names)
-    return UndeterminedCombinations(find_gauge_freedoms(posterior), count, changing, tuple(names))
+    changed: dict[str, Any] = {"count": left, "names": tuple(names)}
+    return [*findings, report_finding(codes[1], **changed)], changing
 
 
 def is_readings_alone(data: Measurements) -> bool:
