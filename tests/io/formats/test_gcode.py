@@ -36,30 +36,6 @@ def get_value(robot: Mechanism, name: str) -> float:
     return math.degrees(found) if name.endswith("angle") else found * 1e3
 
 
-def test_reprap_stops_are_the_homed_height_plus_the_adjustments(tmp_path) -> None:
-    robot = import_robot(tmp_path, "reprap", REPRAP)
-    assert [get_value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
-        [302.0, 301.3, 301.2]
-    )
-    assert [get_value(robot, f"tower{k}.angle") for k in (1, 2, 3)] == pytest.approx(
-        [209.9, 330.2, 90.0]
-    )
-    assert [get_value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
-        [269.1, 269.2, 269.3]
-    )
-    assert get_value(robot, "radius") == pytest.approx(130.25)
-
-
-def test_marlin_stops_are_the_height_less_the_adjustments_and_the_probe(tmp_path) -> None:
-    robot = import_robot(tmp_path, "marlin", MARLIN)
-    assert [get_value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
-        [302.0, 301.5, 301.75]
-    )
-    assert [get_value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
-        [269.1, 269.2, 269.0]
-    )
-
-
 def test_marlin_and_reprap_state_adjustments_with_opposite_signs(tmp_path) -> None:
     robot = import_robot(tmp_path, "reprap", REPRAP)
     marlin = export_robot(robot, "marlin")
@@ -83,27 +59,6 @@ def test_missing_word_is_added_before_the_comment(tmp_path) -> None:
         export_robot(moved, "reprap", tmp_path / "reprap.g")
         == "M665 L250 R130 H300 X0.057296 ; ours\r\n"
     )
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "m665 l269.1 r130.25 h300\nm666 x0.5\n",
-        "N10 M665 L269.1 R130.25 H300*33\nN11 M666 X0.5 * 12 ; stops\n",
-        "M665L269.1R130.25H300\nM666X0.5\n",
-        'M665 L269.1 (10" rods) R130.25 H300 (height\nM666 X0.5\n',
-        "G21 M665 L269.1 R130.25 H300 M666 X0.5 G28\n",
-        'M117 M665 L1 R1 H1\nM550 P"M665 R7"\nM665 L 269.1 R 130.25 H 300\nM666 X.5\n',
-    ],
-)
-def test_commands_in_any_notation_are_read_completely(tmp_path, text) -> None:
-    robot = import_robot(tmp_path, "reprap", text)
-    assert [get_value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
-        [300.5, 300.0, 300.0]
-    )
-    assert [get_value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1] * 3)
-    assert get_value(robot, "radius") == pytest.approx(130.25)
-    assert export_robot(robot, "reprap", tmp_path / "reprap.g") == text
 
 
 def test_corrected_and_added_words_update_the_checksum(tmp_path) -> None:

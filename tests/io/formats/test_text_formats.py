@@ -83,6 +83,45 @@ def write(robot: Mechanism, name: str, into: Path | None = None) -> str:
     return writer(ExportSource(robot), into).text
 
 
+EQUAL = (130.25, (210.0, 330.0, 90.0), (269.1,) * 3, (300.5, 300.0, 300.0))
+DELTAS = [
+    # stops are the homed height plus the adjustments
+    ("reprap", REPRAP, 130.25, (209.9, 330.2, 90.0), (269.1, 269.2, 269.3), (302.0, 301.3, 301.2)),
+    # stops are the height less the adjustments and the probe
+    ("marlin", MARLIN, 130.25, (209.9, 330.2, 90.0), (269.1, 269.2, 269.0), (302.0, 301.5, 301.75)),
+    # the main part hides the saved block; others are defaults
+    ("klipper", PRINTER + SAVED, 130.0, (210.0, 330.5, 90.0), (250.0,) * 3, (300.0,) * 3),
+    # any notation of commands
+    ("reprap", "m665 l269.1 r130.25 h300\nm666 x0.5\n", *EQUAL),
+    ("reprap", "N10 M665 L269.1 R130.25 H300*33\nN11 M666 X0.5 * 12 ; stops\n", *EQUAL),
+    ("reprap", "M665L269.1R130.25H300\nM666X0.5\n", *EQUAL),
+    ("reprap", 'M665 L269.1 (10" rods) R130.25 H300 (height\nM666 X0.5\n', *EQUAL),
+    ("reprap", "G21 M665 L269.1 R130.25 H300 M666 X0.5 G28\n", *EQUAL),
+    (
+        "reprap",
+        'M117 M665 L1 R1 H1\nM550 P"M665 R7"\nM665 L 269.1 R 130.25 H 300\nM666 X.5\n',
+        *EQUAL,
+    ),
+]
+"""Format, text, and radius, tower angles, arms and stops that it states [mm, deg]."""
+
+
+@pytest.mark.parametrize(("name", "text", "radius", "angles", "arms", "stops"), DELTAS)
+def test_geometry_of_a_delta_is_read_completely(
+    tmp_path, name, text, radius, angles, arms, stops
+) -> None:
+    robot = read(tmp_path / "file", name, text)
+    values = dict(zip(robot.parameters.names, robot.values, strict=True))
+    assert 1e3 * values["radius"] == pytest.approx(radius)
+    for form, factor, expected in (
+        ("tower{}.angle", 180.0 / np.pi, angles),
+        ("arm{}.length", 1e3, arms),
+        ("tower{}.stop", 1e3, stops),
+    ):
+        assert [factor * values[form.format(k)] for k in (1, 2, 3)] == pytest.approx(expected)
+    assert write(robot, name, tmp_path / "file") == text
+
+
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_file_with_the_same_numbers_is_unchanged(tmp_path, case: Case) -> None:
     robot = read(tmp_path / "file", case.format, case.text)

@@ -9,44 +9,13 @@ from loopcal.io.formats import klipper
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.klipper import read_config
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
-
-SHORT = """\
-[printer]
-kinematics: delta
-delta_radius: 130
-[stepper_a]
-arm_length = 250 ; mm
-position_endstop: 300
-rotation_distance: 40
-microsteps: 16
-[stepper_b]
-[stepper_c]
-"""
-SAVED = """
-#*# <---------------------- SAVE_CONFIG ---------------------->
-#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.
-#*#
-#*# [stepper_b]
-#*# angle = 330.500000
-#*#
-#*# [printer]
-#*# delta_radius = 131.000000
-"""
+from tests.io.formats.test_text_formats import PRINTER as SHORT
 
 
 def read(folder, text: str):
     path = folder / "printer.cfg"
     path.write_text(text)
     return build_imported_robot(path, klipper.read(path, ImportOptions("printer")))
-
-
-def test_options_are_read_from_main_part_saved_block_and_defaults(tmp_path) -> None:
-    (tmp_path / "printer.cfg").write_text(SHORT + SAVED)
-    found = klipper.parse_geometry(read_config(tmp_path / "printer.cfg"))
-    assert found.radius == 130.0
-    assert found.angles == (210.0, 330.5, 90.0)
-    assert found.arms == (250.0, 250.0, 250.0)
-    assert found.stops == (300.0, 300.0, 300.0)
 
 
 def test_unchanged_arm_is_written_if_its_default_changed(tmp_path) -> None:
@@ -57,21 +26,16 @@ def test_unchanged_arm_is_written_if_its_default_changed(tmp_path) -> None:
     np.testing.assert_allclose(read(tmp_path, written).values, values, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("ratio", ["80", "80:0", "a:b", "1:2:3"])
-def test_invalid_gear_ratio_is_refused(tmp_path, ratio) -> None:
-    (tmp_path / "printer.cfg").write_text(
-        SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}")
-    )
+@pytest.mark.parametrize("ratio", ["80", "80:0", "a:b", "1:2:3", "57:11, 2:1"])
+def test_step_distance_includes_the_gear_ratio(tmp_path, ratio) -> None:
+    path = tmp_path / "printer.cfg"
+    path.write_text(SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}"))
+    if ratio == "57:11, 2:1":
+        found = klipper.get_step_distance(read_config(path), "stepper_a")
+        assert found == pytest.approx(40 / (200 * 16 * 57 / 11 * 2), rel=1e-15)
+        return
     with pytest.raises(FileError, match=":9: gear_ratio is"):
-        klipper.get_step_distance(read_config(tmp_path / "printer.cfg"), "stepper_a")
-
-
-def test_step_distance_includes_the_gear_ratio(tmp_path) -> None:
-    (tmp_path / "printer.cfg").write_text(
-        SHORT.replace("microsteps: 16", "microsteps: 16\ngear_ratio: 57:11, 2:1")
-    )
-    found = klipper.get_step_distance(read_config(tmp_path / "printer.cfg"), "stepper_a")
-    assert found == pytest.approx(40 / (200 * 16 * 57 / 11 * 2), rel=1e-15)
+        klipper.get_step_distance(read_config(path), "stepper_a")
 
 
 RECORDS = {
