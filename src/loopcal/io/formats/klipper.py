@@ -151,21 +151,14 @@ def read(path: Path, options: ImportOptions) -> Imported:
     from loopcal.measure.kinds.poses import Component
     from loopcal.measure.measurements import Measurements
 
-    cfg = read_config(path)
-    heights = [
-        (record, f"{record}_pos")
-        for name in ("height", "manual_height")
-        for record in _list_records(cfg, name, ("", "_pos"))
-    ]
-    distances = [
-        (record, f"{record}_pos1", f"{record}_pos2")
-        for record in _list_records(cfg, "distance", ("", "_pos1", "_pos2"))
-    ]
-    positions = {record: _parse_steps(cfg, position) for record, position in heights}
-    values = {record: cfg.number(PROBED, record) for record, _ in heights}
-    for record, *ends in distances:
-        positions |= {end: _parse_steps(cfg, end) for end in ends}
-        values[record] = cfg.number(PROBED, record)
+    cfg, ends = read_config(path), ("_pos1", "_pos2")
+    sorts = ("height", "manual_height")
+    heights = [record for sort in sorts for record in _list_records(cfg, sort, ("", "_pos"))]
+    distances = _list_records(cfg, "distance", ("", *ends))
+    positions = {record: _parse_steps(cfg, f"{record}_pos") for record in heights}
+    for option in (f"{record}{end}" for record in distances for end in ends):
+        positions[option] = _parse_steps(cfg, option)
+    values = {record: cfg.number(PROBED, record) * MM for record in (*heights, *distances)}
     program = "a printer.cfg of Klipper"
     text = format_robot(parse_geometry(cfg), options, path, program, bool(distances))
     if not positions:
@@ -178,18 +171,19 @@ def read(path: Path, options: ImportOptions) -> Imported:
         sigma_height=Quantity(options.choose_noise("height") / MM, "mm"),
         sigma_distance=Quantity(options.choose_noise("distance") / MM, "mm"),
     )
-    labels, observations = tuple(positions), []
-    if heights:
-        rows = [labels.index(record) for record, _ in heights]
-        measured = np.array([[values[record] * MM] for record, _ in heights])
-        kind = Component(components=("z",))
-        observations.append(options.observe(kind, rows, measured, "height"))
-    if distances:
-        pairs = [(labels.index(a), labels.index(b)) for _, a, b in distances]
-        measured = np.array([[values[record] * MM] for record, *_ in distances])
-        observations.append(options.observe(Separation(), pairs, measured, "distance"))
+    labels = tuple(positions)
+    rows = [labels.index(record) for record in heights]
+    pairs = [[labels.index(f"{record}{end}") for end in ends] for record in distances]
+    observations = tuple(
+        options.observe(kind, of, np.array([[values[record]] for record in records]), what)
+        for kind, of, records, what in (
+            (Component(components=("z",)), rows, heights, "height"),
+            (Separation(), pairs, distances, "distance"),
+        )
+        if records
+    )
     readings = np.array(list(positions.values())) * np.array(steps) * MM
-    measurements = Measurements(options.name, readings, tuple(observations), labels=labels)
+    measurements = Measurements(options.name, readings, observations, labels=labels)
     return Imported(text, measurements, (finding,))
 
 

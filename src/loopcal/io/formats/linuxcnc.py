@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,7 +36,6 @@ from loopcal.io.formats.program_format import (
     Imported,
     ImportOptions,
     Name,
-    Value,
     ValueFile,
     format_head,
     get_record,
@@ -46,7 +45,6 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
 COMPONENT = "genhexkins"
-SETP = re.compile(rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(\s*=\s*|\s+)([^\s#]+)")
 LEAD, OFFSETS = "screw-lead", ("spindle-offset", "tool-offset")
 SIDES, UP = ("base", "platform"), np.array([0.0, 0.0, 1.0])
 ROUNDING = 1e-12
@@ -81,17 +79,9 @@ class HalFile(ValueFile):
     what = "HAL file"
     title = phrase = "{0}.{1}"
     missing = "'setp {0}.{1} ..' is missing, and loopcal assumes no default; add it"
-
-    @classmethod
-    def parse(cls, lines: Sequence[str], path: Path) -> HalFile:
-        """Find the pins."""
-        matches = ((i, SETP.match(line)) for i, line in enumerate(lines))
-        pins = {(COMPONENT, m[1]): Value(m[3], i, m.start(3)) for i, m in matches if m is not None}
-        return cls(path, tuple(lines), pins)
-
-    def insert(self, lines: list[str], name: Name, text: str) -> None:
-        """Insert a line for a new pin at the end."""
-        lines.append(f"setp {'.'.join(name)} {text}{self.line_end}")
+    group = COMPONENT
+    entry = re.compile(rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(?:\s*=\s*|\s+)([^\s#]+)")
+    new = "setp {0}.{1} {2}"
 
     def format(self, number: float) -> str:
         """Return a number with the fewest digits that read back equal."""
@@ -251,33 +241,19 @@ OFFSET = "HOME_OFFSET"
 UNITS_NAME = ("TRAJ", "LINEAR_UNITS")
 LINEAR_UNITS = {"mm": "mm", "metric": "mm", "in": "in", "inch": "in", "imperial": "in"}
 
-_SECTION = re.compile(r"\s*\[(\w+)\]")
-_ENTRY = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
-
 
 @dataclass(frozen=True)
 class IniFile(ValueFile):
-    """An INI file, whose values are entries by section; of equal ones the first counts."""
+    """An INI file, whose values are entries by section."""
 
     what = "INI file"
     title = "[{0}]{1}"
     phrase = "{1} of [{0}]"
     missing = "[{0}] has no {1}; add the one of the machine"
-
-    @classmethod
-    def parse(cls, lines: Sequence[str], path: Path) -> IniFile:
-        """Find the entries."""
-        section, values = "", dict[Name, Value]()
-        for i, line in enumerate(lines):
-            if match := _SECTION.match(line):
-                section = match[1]
-            elif match := _ENTRY.match(line):
-                values.setdefault((section, match[1]), Value(match[2], i, match.start(2)))
-        return cls(path, tuple(lines), values)
-
-    def insert(self, lines: list[str], name: Name, text: str) -> None:
-        """Insert an entry with its section at the end."""
-        lines += [f"[{name[0]}]{self.line_end}", f"{name[1]} = {text}{self.line_end}"]
+    section = re.compile(r"\s*\[(\w+)\]")
+    entry = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
+    new = "[{0}]\n{1} = {2}"
+    does_first_count = True
 
 
 def write_ini(source: ExportSource, into: Path | None) -> Exported:

@@ -7,8 +7,8 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -239,12 +239,14 @@ class Value:
 
 
 @dataclass(frozen=True)
-class ValueFile(ABC):
+class ValueFile:
     """A text file of a controller: its lines with their ends, and the values that count, by group
     and name; nothing else in it is changed.
 
     `what` names the sort of file; `title` and `phrase` word a name in a list of changes and in
-    sentences, `missing` is the sentence about a value that does not exist.
+    sentences, `missing` is the sentence about a value that does not exist. Of a file with one value
+    in a line: `entry` matches its name and text, `section` the group of the lines below (`group`
+    above the first), and `new` are the lines of a new value.
     """
 
     path: Path
@@ -255,15 +257,28 @@ class ValueFile(ABC):
     title: ClassVar[str] = "{0} {1}"
     phrase: ClassVar[str] = "{1} of {0}"
     missing: ClassVar[str]
+    entry: ClassVar[re.Pattern[str]]
+    section: ClassVar[re.Pattern[str] | None] = None
+    group: ClassVar[str] = ""
+    new: ClassVar[str]
+    does_first_count: ClassVar[bool] = False
 
     @classmethod
-    @abstractmethod
     def parse(cls, lines: Sequence[str], path: Path) -> Self:
         """Find the values in complete lines."""
+        group, values = cls.group, dict[Name, Value]()
+        for i, line in enumerate(lines):
+            if cls.section is not None and (match := cls.section.match(line)):
+                group = match[1]
+            elif (match := cls.entry.match(line)) and not (
+                cls.does_first_count and (group, match[1]) in values
+            ):
+                values[group, match[1]] = Value(match[2], i, match.start(2))
+        return cls(path, tuple(lines), values)
 
-    @abstractmethod
     def insert(self, lines: list[str], name: Name, text: str) -> None:
-        """Insert a new value into complete lines."""
+        """Insert a new value into complete lines, at the end."""
+        lines += [line + self.line_end for line in self.new.format(*name, text).split("\n")]
 
     @classmethod
     def load(cls, path: Path) -> Self:
