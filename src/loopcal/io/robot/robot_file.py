@@ -96,8 +96,8 @@ def remove_mark(text: str) -> str:
 def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     """Return the robot's values (p,) [SI], with those of the file's table in place.
 
-    FileError
-        A bad row, an unknown or duplicate parameter, a value that is not a number, a wrong unit.
+    FileError : a bad row, an unknown or duplicate parameter, a value that is not a number, a wrong
+        unit.
     """
     values = robot.values.copy()
     for name, value in read_rows(file, robot).items():
@@ -105,20 +105,17 @@ def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     return values
 
 
-def read_possible_values(file: YamlFile, robot: Mechanism) -> FloatArray:
-    """Return the values as `read_identified_values`; refuse those that no machine has.
-
-    A file of a calibration that failed keeps such values, to be looked at.
+def refuse_impossible_values(file: YamlFile, robot: Mechanism, values: FloatArray) -> None:
+    """Refuse values of the file's table that no machine has. A file of a calibration that failed
+    keeps such values, to be looked at.
     """
-    values = read_identified_values(file, robot)
     if file.text.startswith(NOT_CALIBRATED):
-        return values
+        return
     for name, finding in find_impossible_values(robot, values)[:1]:
         rows = [row.get("name") for row in file.content[TABLE]]
         place: Location = (TABLE, rows.index(name)) if name in rows else (TABLE,)
         advice = "correct the value, or delete this table to restore the nominal robot"
         raise file.error(f"{finding}; {advice}", place)
-    return values
 
 
 def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
@@ -226,7 +223,9 @@ def build_robot(file: YamlFile) -> Mechanism:
                     raise file.error(fault, ("limbs", i))
     if TABLE not in file.content:
         return robot
-    return robot.with_values(read_possible_values(file, robot))
+    values = read_identified_values(file, robot)
+    refuse_impossible_values(file, robot, values)
+    return robot.with_values(values)
 
 
 def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None = None) -> None:
@@ -311,15 +310,14 @@ def check_format(file: YamlFile, newest: int) -> None:
 def _read_family(file: YamlFile, known: Sequence[str]) -> str:
     """Return the family that a robot file names."""
     family = file.content.get("family")
-    if "family" not in file.content and KEY in file.content:
-        return KEY
     if "family" not in file.content:
+        if KEY in file.content:
+            return KEY
         for key in file.content:
             if suggestion := suggest_names(key, ["family"]):
                 raise file.error(f"unknown key {key!r}{suggestion}; correct it", (key,))
-        raise file.error(
-            f"this file names no family; write 'family:' and one of {', '.join(known)}"
-        )
+        sentence = "this file names no family; write 'family:' and one of"
+        raise file.error(f"{sentence} {', '.join(known)}")
     if family not in known:
         sentence = f"{family!r} is not a family of robots{suggest_names(str(family), known)}"
         raise file.error(f"{sentence}; allowed: {', '.join(known)}", ("family",))
@@ -352,47 +350,37 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     return record.assembly(expanded)
 
 
-# The stages of a robot file: each one is a serial joint, or a robot of another family.
-
 OWN_KEYS = ("on", "mount", "joint", "family")
 """Keys of a stage that are not those of its family; both have a name."""
 
 
 def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> PlacedStages:
-    """Return a chain with the records of its stages.
-
-    FileError : a stage is neither a joint nor a robot, or a key of it does not fit; at its line.
+    """Return a chain with the records of its stages: each is a serial joint (None), or a robot of
+    another family. FileError : it is neither, or a key of it does not fit; at its line.
     """
     assert isinstance(chain, Stages)
-    robots = tuple(_read_stage(file, i, stage, units) for i, stage in enumerate(chain.stages))
-    own = {field.name: getattr(chain, field.name) for field in fields(chain)}
-    return PlacedStages(**own, robots=robots)
-
-
-def _read_stage(file: YamlFile, i: int, stage: StageRecord, units: Units) -> RobotRecord | None:
-    """Return the record of a stage of another family, None for a serial joint."""
-    content: dict[str, Any] = file.content[KEY][i]
-    if (stage.joint is None) == (stage.family is None):
-        both = stage.joint is not None
-        raise file.error(
-            f"stage {stage.name!r} states {'both' if both else 'neither'} 'joint' "
-            f"{'and' if both else 'nor'} 'family'; write 'joint:' for a serial joint, or 'family:' "
-            "with the keys of that family",
-            (KEY, i),
-        )
-    if stage.family is None:
-        refuse_unknown_keys(file, list(content), list(get_field_types(StageRecord)), (KEY, i))
-        return None
     families = {name: record for name, record in FAMILIES.items() if record is not Stages}
-    if stage.family not in families:
-        hint = suggest_names(stage.family, list(families))
-        raise file.error(
-            f"{stage.family!r} is not a family of a stage{hint}; allowed: "
-            f"{', '.join(sorted(families))}",
-            (KEY, i, "family"),
-        )
-    rest = {key: value for key, value in content.items() if key not in OWN_KEYS}
-    return read_record(file, rest, families[stage.family], units, (KEY, i))
+    robots: list[RobotRecord | None] = []
+    for i, stage in enumerate(chain.stages):
+        content: dict[str, Any] = file.content[KEY][i]
+        if (stage.joint is None) == (stage.family is None):
+            states = "neither 'joint' nor" if stage.joint is None else "both 'joint' and"
+            sentence = f"stage {stage.name!r} states {states} 'family'; write 'joint:' for a serial"
+            act = "joint, or 'family:' with the keys of that family"
+            raise file.error(f"{sentence} {act}", (KEY, i))
+        if stage.family is None:
+            refuse_unknown_keys(file, list(content), list(get_field_types(StageRecord)), (KEY, i))
+            robots.append(None)
+            continue
+        if stage.family not in families:
+            hint = suggest_names(stage.family, list(families))
+            sentence = f"{stage.family!r} is not a family of a stage{hint}"
+            allowed = ", ".join(sorted(families))
+            raise file.error(f"{sentence}; allowed: {allowed}", (KEY, i, "family"))
+        rest = {key: value for key, value in content.items() if key not in OWN_KEYS}
+        robots.append(read_record(file, rest, families[stage.family], units, (KEY, i)))
+    own = {field.name: getattr(chain, field.name) for field in fields(chain)}
+    return PlacedStages(**own, robots=tuple(robots))
 
 
 # Stored values of parameters to compare a fit with: published ones, or those of a firmware.
@@ -544,15 +532,12 @@ def format_new_robot(family: str, name: str) -> str:
     example = EXAMPLES.get(family, family)
     if example not in shipped:
         known = list(dict.fromkeys([*FAMILIES, *shipped]))
-        sentence = (
-            f"{family!r} is neither a family nor a shipped robot{suggest_names(family, known)}"
-        )
-        raise MechanismError(f"{sentence}; allowed: {', '.join(known)}")
+        sentence = f"{family!r} is neither a family nor a shipped robot"
+        hint = suggest_names(family, known)
+        raise MechanismError(f"{sentence}{hint}; allowed: {', '.join(known)}")
     text = shipped[example].read_text("utf-8")
     record = str(read_yaml(shipped[example], "robot file").content["family"])
-    new = {"name": quote_scalar(name)}
-    new["source"] = "where these numbers come from"
-    for key, value in new.items():
+    for key, value in (("name", quote_scalar(name)), ("source", "where these numbers come from")):
         line = f"{key}: {value}"
         text = re.sub(rf"^{key}: .*$", lambda _, line=line: line, text, count=1, flags=re.MULTILINE)
     lines = [
