@@ -218,12 +218,12 @@ PATTERNS, NO_PATTERN = "residuals.", "residuals.perhaps-correlated"
 class HeavyTails:
     """The test of the residuals for heavy tails."""
 
-    rows: int  # number of residuals that are tested
-    p_value: float  # probability of a smaller T for normal noise; NaN where there is no test
+    rows: int = 0  # number of residuals that are tested
+    p_value: float = np.nan  # of a smaller T for normal noise; NaN where there is no test
     # median, expected: of the absolute residuals in standard deviations, and that of normal noise
-    median: float
-    expected: float
-    largest: float  # the largest of them
+    median: float = np.nan
+    expected: float = np.nan
+    largest: float = np.nan  # the largest of them
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -253,17 +253,16 @@ def check_heavy_tails(
     on something, which makes some of them larger. `outliers` : labels of poses that are known to be
     wrong.
     """
-    nothing = HeavyTails(0, *[np.nan] * 4)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
-        return nothing
+        return HeavyTails()
     reported = (f for f in fit.findings if f.severity is Severity.WARNING)
     if any(f.code.startswith(PATTERNS) and f.code != NO_PATTERN for f in reported):
-        return nothing
+        return HeavyTails()
     data = prepare_fitted_data(fit, data)
     linear = linearize_fit(fit, data) if linear is None else linear
     rows = collect_residual_rows(fit, data, linear)
     if rows is None:
-        return nothing
+        return HeavyTails()
     is_named = np.isin(np.array(data.labels), list(outliers))
     is_wrong = np.zeros(len(rows.residual), dtype=bool)
     for number, o in enumerate(o for o in data.observations if len(o)):
@@ -283,7 +282,7 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
     testable = left > TESTABLE
     kept, basis, left = kept[testable], basis[testable], left[testable]
     if left.sum() < FEWEST:
-        return HeavyTails(len(kept), *[np.nan] * 4)
+        return HeavyTails(len(kept))
     member = rows.series[kept][:, None] == find_distinct(rows.series[kept])
     u = _standardize(rows.residual[kept, None], left, member)
     square, vectors = np.linalg.eigh(np.eye(basis.shape[1]) - basis.T @ basis)

@@ -280,8 +280,19 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
         the order of the column `time`, or else of the file. None takes the largest unit with at
         least `ENOUGH_BLOCKS` blocks, or else the smallest.
     """
-    if isinstance(unit, int):
-        return _consecutive(data, unit)
+    if isinstance(unit, int):  # runs of poses; blocks of linked poses stay together
+        if unit < 1:
+            raise EstimationError(f"blocks of {unit} poses: give a number of at least 1")
+        n, linked = data.n_poses, linked_blocks(data)
+        run = np.empty(n, dtype=np.int64)
+        run[order_by_time(data.context.get("time"), n)] = np.arange(n) // unit
+        links: IntArray = np.column_stack([run, run.max() + 1 + linked])
+        joined = find_connected_groups(links, int(links.max()) + 1)[run]
+        names, member = np.unique(joined, return_inverse=True)
+        runs = Clusters(f"{unit}-pose run", member, len(names))
+        if runs.count < FEWEST_CLUSTERS:
+            raise EstimationError(report_finding("sampling.too-few-blocks", unit=runs.unit))
+        return runs
     if unit is not None and unit not in UNITS:
         raise EstimationError(
             f"unit is {unit!r}; it must be one of {', '.join(UNITS)}, or a number of consecutive "
@@ -300,22 +311,6 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
             report_finding("sampling.unit-unknown", unit=unit, available=available)
         )
     return named[0]
-
-
-def _consecutive(data: Measurements, length: int) -> Clusters:
-    """Return runs of `length` consecutive poses; blocks of linked poses stay together."""
-    if length < 1:
-        raise EstimationError(f"blocks of {length} poses: give a number of at least 1")
-    n, linked = data.n_poses, linked_blocks(data)
-    run = np.empty(n, dtype=np.int64)
-    run[order_by_time(data.context.get("time"), n)] = np.arange(n) // length
-    links: IntArray = np.column_stack([run, run.max() + 1 + linked])
-    joined = find_connected_groups(links, int(links.max()) + 1)[run]
-    names, member = np.unique(joined, return_inverse=True)
-    name = f"{length}-pose run"
-    if len(names) < FEWEST_CLUSTERS:
-        raise EstimationError(report_finding("sampling.too-few-blocks", unit=name))
-    return Clusters(name, member, len(names))
 
 
 Scheme = Literal["wild", "pairs", "normal"]  # how resamples are drawn
@@ -497,8 +492,13 @@ def bootstrap(
     blocks, linear = choose_blocks(data, unit), linearize_fit(fit, data)
     rng, errors, batches = np.random.default_rng(np.random.SeedSequence(seed)), None, []
     if scheme != "pairs":
-        shift = _shift_truth(linear, fit.method.has_prior)
-        errors = compute_block_errors(linear, blocks, shift)
+        # the penalty of a ridge or a truncation is no observation and stays as it is: the truth is
+        # the least-squares solution, so that the resamples scatter about the estimate
+        d, z = linear.decomposition, linear.linearization.deviation
+        truth = z
+        if not fit.method.has_prior:
+            truth = d.deviation(d.solution(np.where(d.used, 0.0, np.inf)))
+        errors = compute_block_errors(linear, blocks, (truth - z)[0])
     for first in range(0, count, BATCH):
         progress(first, count, "fitting resamples")
         size = min(BATCH, count - first)
@@ -521,18 +521,6 @@ def bootstrap(
         failed=count - len(kept.deviation),
         scatter=describe_scatter(fit, blocks, linear),
     )
-
-
-def _shift_truth(linear: FitLinearization, is_prior: bool) -> FloatArray:
-    """Return the step (p,) from the estimate to the truth of the resamples.
-
-    The penalty of a ridge or a truncation is no observation and stays as it is. Then the truth is
-    the least-squares solution, so that the resamples scatter about the estimate.
-    """
-    d, z = linear.decomposition, linear.linearization.deviation
-    if is_prior:
-        return np.zeros(z.shape[1])
-    return (d.deviation(d.solution(np.where(d.used, 0.0, np.inf))) - z)[0]
 
 
 def _draw_resamples(

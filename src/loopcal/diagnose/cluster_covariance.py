@@ -8,17 +8,16 @@ fit, whose rows have variance sigma^2, the cluster-robust covariance is
     C_robust = C + B sum_g (u_g u_g' - sigma^2 A_g' A_g) B,     u_g = A_g' (I - H_gg)^(-1/2) r_g
 
 The factor (I - H_gg)^(-1/2) is the small-sample correction CR2 of Bell and McCaffrey (2002): for
-independent errors the expectation of C_robust is exactly C, however few clusters there are. Its
-scatter is that of a chi-square whose degrees of freedom have the moments of the quadratic form
-(Satterthwaite; Pustejovsky and Tipton, 2018). B is never formed: all is computed in the directions
-of the decomposition. What the residuals or a prior have added to C (`add_covariance`) belongs to
-the stated covariance with which C_robust is compared. See docs/theory/uncertainty.md.
+independent errors the expectation of C_robust is exactly C. Its scatter is that of a chi-square
+whose degrees of freedom have the moments of the quadratic form (Satterthwaite; Pustejovsky and
+Tipton, 2018). What the residuals or a prior have added to C (`add_covariance`) belongs to the
+stated covariance with which C_robust is compared. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -65,7 +64,12 @@ def divide_into_clusters(data: Measurements) -> tuple[Clusters, ...]:
     count = int(blocks.max()) + 1
     unit = "pose" if count == data.n_poses else "block"
     divisions = [Clusters(unit, blocks, count)]
-    for name, pairs in (("session", _pose_sessions(data)), ("day", _pose_days(data))):
+    time, days = data.context.get("time"), np.zeros((0, 2), dtype=np.int64)  # pose and day
+    if time is not None and not np.isnan(time).any():
+        order = np.argsort(time, kind="stable")
+        day = np.concatenate([[0], np.cumsum(np.diff(time[order]) > NIGHT)])
+        days = np.column_stack([order, day])
+    for name, pairs in (("session", _pose_sessions(data)), ("day", days)):
         if len(pairs):
             links = np.column_stack([blocks[pairs[:, 0]], count + pairs[:, 1]])
             joined = find_connected_groups(links, int(links.max()) + 1)[blocks]
@@ -93,17 +97,6 @@ def _pose_sessions(data: Measurements) -> IntArray:
     pose = np.concatenate([pose[is_named], unnamed])
     name = np.concatenate([name[is_named], np.full(len(unnamed), "")])
     return np.column_stack([pose, np.unique(name, return_inverse=True)[1]])
-
-
-def _pose_days(data: Measurements) -> IntArray:
-    """Return pairs (n, 2) of a pose and its day; none where a pose has no time."""
-    time = data.context.get("time")
-    if time is None or np.isnan(time).any():
-        return np.zeros((0, 2), dtype=np.int64)
-    order = np.argsort(time, kind="stable")
-    day = np.empty(len(time), dtype=np.int64)
-    day[order] = np.concatenate([[0], np.cumsum(np.diff(time[order]) > NIGHT)])
-    return np.column_stack([np.arange(len(time)), day])
 
 
 LIMIT = 1.5  # ratio of standard uncertainties above which the stated ones are too small
@@ -138,17 +131,13 @@ NO_RATIO = Ratio(np.nan, np.nan, np.nan, np.nan)
 class ClusterCheck:
     """The cluster-robust covariance of a fit against the stated one."""
 
-    # what is taken as independent: "day", "session", "block" or "pose"; empty where nothing could
-    # be compared
-    unit: str
-    clusters: int  # their number
-    # position, orientation: ratios for the measured poses, from the directions that the data
-    # determine
-    position: Ratio
-    orientation: Ratio
-    # the parameter with the largest ratio, and that ratio; empty and NaN without any
-    parameter: tuple[str, float]
     finding: Finding  # the result
+    unit: str = ""  # what is taken as independent: "day", "session", "block", "pose", or nothing
+    clusters: int = 0  # their number
+    # position, orientation: for the measured poses, in the directions that the data determine
+    position: Ratio = NO_RATIO
+    orientation: Ratio = NO_RATIO
+    parameter: tuple[str, float] = ("", np.nan)  # the one with the largest ratio, and that ratio
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("unit", "clusters", "position", "orientation"),
@@ -171,13 +160,14 @@ def check_clusters(
     data = prepare_fitted_data(fit, data)
     units = divide_into_clusters(data)
     if not units:
-        return _not_compared("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)
+        few = report_finding("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)
+        return ClusterCheck(few)
     if not fit.residual_test.intervals:
-        return _not_compared("residuals.clusters-without-intervals")
+        return ClusterCheck(report_finding("residuals.clusters-without-intervals"))
     linear = linearize_fit(fit, data) if linear is None else linear
     checks = (_compare(fit, data, clusters, frame, linear) for clusters in units)
     judged = (check for check in checks if check is not None)
-    return next(judged, _not_compared("residuals.clusters-not-judged"))
+    return next(judged, ClusterCheck(report_finding("residuals.clusters-not-judged")))
 
 
 class RobustSpread(NamedTuple):
@@ -222,7 +212,17 @@ class RobustSpread(NamedTuple):
             return NO_RATIO
         excess = self.times * (observed - mean)
         ratio = float(np.sqrt(max(total + excess, 0.0) / (total + added)))
-        degrees = self._degrees(tested_rows, mean)
+        # degrees of freedom 2 mean^2 / variance of Q = e' K e, whose variance is 2 tr (K K): with
+        # D the corrections, Z the columns and F_g = D_g rows_g' rows_g D_g, the blocks of two
+        # clusters give tr (F_g Z_g Z_h' F_h Z_h Z_g'), and those of one |rows_g' rows_g|^2
+        products = np.matmul(tested_rows.swapaxes(-1, -2), tested_rows)
+        F = products * self.correction[:, :, None] * self.correction[:, None, :]
+        width = self.columns.shape[-1]
+        joint = self.columns.reshape(-1, width).T @ np.matmul(F, self.columns).reshape(-1, width)
+        leveled = self.leverage[:, None, :]
+        single = (np.matmul(F * leveled, F) * leveled).trace(axis1=1, axis2=2)
+        trace = float((joint * joint.T).sum() - single.sum() + (products**2).sum())
+        degrees = mean**2 / trace if trace > 0.0 else np.inf
         p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
         return Ratio(ratio, degrees, mean / float((rows**2).sum()), p_value)
 
@@ -239,24 +239,6 @@ class RobustSpread(NamedTuple):
         nothing = np.full(len(own), np.nan)
         square = np.divide(robust, own + added, out=nothing, where=own > 0.0)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
-
-    def _degrees(self, tested_rows: FloatArray, mean: float) -> float:
-        """Return the degrees of freedom 2 mean^2 / variance of Q for independent normal errors.
-
-        `tested_rows` (G, r, h) are E' scaled_rows. Q = e' K e of all rows e has the variance
-        2 tr (K K). With rows_g those of cluster g, D the corrections, Z the columns and F_g =
-        D_g rows_g' rows_g D_g, the blocks of two clusters give tr (F_g Z_g Z_h' F_h Z_h Z_g'), and
-        those of one |rows_g' rows_g|^2.
-        """
-        products = np.matmul(tested_rows.swapaxes(-1, -2), tested_rows)
-        F = products * self.correction[:, :, None] * self.correction[:, None, :]
-        width = self.columns.shape[-1]
-        joint = self.columns.reshape(-1, width).T @ np.matmul(F, self.columns).reshape(-1, width)
-        single = (np.matmul(F * self.leverage[:, None, :], F) * self.leverage[:, None, :]).trace(
-            axis1=1, axis2=2
-        )
-        trace = float((joint * joint.T).sum() - single.sum() + (products**2).sum())
-        return mean**2 / trace if trace > 0.0 else np.inf
 
 
 def compute_robust_spread(
@@ -345,15 +327,10 @@ def _compare(
         parameter=parameter[0],
         parameter_ratio=parameter[1],
     )
-    return ClusterCheck(clusters.unit, clusters.count, position, angle, parameter, finding)
+    return ClusterCheck(finding, clusters.unit, clusters.count, position, angle, parameter)
 
 
 def _find_added_root(posterior: Posterior) -> FloatArray:
     """Return the root (p, k) [SI] of what was added to the covariance of a fit."""
     roots = [part.root for part in posterior.parts if part.is_added]
     return np.concatenate([np.zeros((len(posterior.unit), 0)), *roots], axis=1)
-
-
-def _not_compared(code: str, **data: Any) -> ClusterCheck:
-    """Return the reason why there is no comparison."""
-    return ClusterCheck("", 0, NO_RATIO, NO_RATIO, ("", np.nan), report_finding(code, **data))

@@ -2,13 +2,9 @@
 """Score fits on held-out poses: by folds that are fitted again, and by leaving out one block; the
 error against the ridge parameter lam and against the truncation k.
 
-Folds: every pose is predicted once by a fit that did not use it.
-
-Leave-one-out: many penalties are scored from one linearization. With the rows of block j in the
-coordinates of the decomposition, B_j = A_j V, the hat matrix of a penalty is H_jj = B_j diag(1 /
-(s^2 + penalty)) B_j', and the residual that the block would have without it r_(j) = (I - H_jj)^-1
-r_j. No fit is repeated. This holds to first order in the deviation from the linearization, and
-exactly for a linear problem.
+Leave-one-out scores many penalties from one linearization: with the rows of block j in the
+coordinates of the decomposition, B_j = A_j V, and H_jj = B_j diag(1 / (s^2 + penalty)) B_j', its
+residual without it is (I - H_jj)^-1 r_j, to first order; exactly for a linear problem.
 
 With unknown frames, targets or surfaces, curves are scored by folds on a coarse grid; these
 unknowns of the held-out poses are estimated from them, which lowers all scores alike. The simplest
@@ -489,35 +485,24 @@ def choose_model(
                 raise
             return None
 
-    conditions = _rate_conditioning(robot, data, [names for _, names in named], options)
-    candidates = tuple(
-        Candidate(name, names, validate_set(i, names), *conditions[i])
-        for i, (name, names) in enumerate(named)
-    )
+    columns: FloatArray = np.zeros((0, 0))  # of all free parameters, in tolerances
+    free = select_free_parameters(robot)
+    if len(free):
+        kept = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
+        columns = collect_information(free, kept)[0][0, :-1, :-1]
+    candidates = []
+    for i, (name, names) in enumerate(named):
+        rank, condition = 0, 1.0
+        if names:
+            places = [free.names.index(each) for each in names]
+            s = np.linalg.svd(columns[:, places], compute_uv=False)
+            rank = int(are_nonzero(s, options.rank_tolerance).sum())
+            condition = float(s[0] / s[-1]) if rank == len(names) else np.inf
+        candidates.append(Candidate(name, names, validate_set(i, names), rank, condition))
     best = min(candidates, key=lambda c: c.score)
     limit = best.score + best.standard_error if np.isfinite(best.score) else np.inf
     chosen = next(c for c in candidates if c.score <= limit)
-    return ModelChoice(candidates, chosen, best, free_only(robot, chosen.parameters))
-
-
-def _rate_conditioning(
-    robot: Mechanism, data: Measurements, sets: Sequence[Sequence[str]], options: FitOptions
-) -> list[tuple[int, float]]:
-    """Return rank and condition of the columns of each set, in tolerances."""
-    if not robot.parameters.free.any():
-        return [(0, 1.0) for _ in sets]
-    free = select_free_parameters(robot)
-    data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
-    columns: FloatArray = collect_information(free, data)[0][0, :-1, :-1]
-    rated = []
-    for names in sets:
-        if not names:
-            rated.append((0, 1.0))
-            continue
-        s = np.linalg.svd(columns[:, [free.names.index(name) for name in names]], compute_uv=False)
-        rank = int(are_nonzero(s, options.rank_tolerance).sum())
-        rated.append((rank, float(s[0] / s[-1]) if rank == len(names) else np.inf))
-    return rated
+    return ModelChoice(tuple(candidates), chosen, best, free_only(robot, chosen.parameters))
 
 
 PER_DECADE = 4  # values of lam per factor of ten where no fit is repeated

@@ -93,12 +93,12 @@ MOST_POSES = 200  # largest number of poses at which errors are predicted, evenl
 class CalibrationGain:
     """Expected errors of the platform at the measured poses."""
 
-    position_before: float  # root mean square over poses [m]
-    position_after: float
-    angle_before: float  # of the orientation [rad]
-    angle_after: float
-    is_worthwhile: bool | None  # whether either becomes smaller; None where it cannot be predicted
     finding: Finding  # the expected errors, or the reason why there are none
+    position_before: float = np.nan  # root mean square over poses [m]
+    position_after: float = np.nan
+    angle_before: float = np.nan  # of the orientation [rad]
+    angle_after: float = np.nan
+    is_worthwhile: bool | None = None  # whether either becomes smaller; None where it is not known
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("position_before", "position_after", "angle_before", "angle_after", "finding"),
@@ -113,23 +113,19 @@ def estimate_calibration_gain(
     data : the measurements that were fitted, or other readings. frame : in which the errors are
         stated, see `choose_error_frame`; "relative" means relative to the home pose.
     """
-
-    def predict_nothing(code: str, **data: Any) -> CalibrationGain:
-        nan = float("nan")
-        return CalibrationGain(nan, nan, nan, nan, None, report_finding(code, **data))
-
     free = fit.free_parameters
     if free.assumed.any():
-        return predict_nothing("model.gain-needs-tolerances", missing=int(free.assumed.sum()))
+        missing = int(free.assumed.sum())
+        return CalibrationGain(report_finding("model.gain-needs-tolerances", missing=missing))
     if fit.residual_test.failed:
-        return predict_nothing("model.gain-needs-consistent-noise")
+        return CalibrationGain(report_finding("model.gain-needs-consistent-noise"))
     solution = locate_measured_poses(fit, data, MOST_POSES)
     # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
     posterior = fit.posterior.without_discrepancy
     variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
     factor = posterior.directions * np.sqrt(variance)
     if not len(solution.q) or np.isnan(factor).any():
-        return predict_nothing("model.gain-without-intervals")
+        return CalibrationGain(report_finding("model.gain-without-intervals"))
     effects = linearize_tool_errors(fit.posterior, solution, frame)
     D, own = effects.by_parameters, (effects.by_frame, effects.by_discrepancy)
     expected = (D * (free.tolerance / posterior.unit)) @ free.correlation_root()
@@ -154,7 +150,7 @@ def estimate_calibration_gain(
         **effects.reference.data,
     )
     (before, after), (angle_before, angle_after) = positions, angles
-    return CalibrationGain(before, after, angle_before, angle_after, is_worthwhile, finding)
+    return CalibrationGain(finding, before, after, angle_before, angle_after, is_worthwhile)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,18 +4,11 @@
 A linear interval is off where one of its ends differs from that of the draws by more than 10 % of
 its half-width, beyond what the finite number of draws explains. The ends are compared draw by draw:
 with the same random numbers, the difference of a quantile from its linear counterpart is known far
-better than either. Its standard error follows from the influence of each draw,
-
-    d_i = w_i (1[x_i <= q] - a) / f - v_i (1[l_i <= r] - a) / f
-
-with the quantiles q and r at level a of draws x_i with weights w_i and of linear draws l_i with
-weights v_i, and the linear density f there.
+better than either, with the standard error of the influence of each draw.
 
 For q quantities with the covariance C, the region (x - estimate)' C^-1 (x - estimate) <= c contains
-the truth with the stated probability for c of the chi-square distribution with q degrees of
-freedom, or c = q F(q, nu) where the noise has nu of them. Intervals of single quantities each hold
-with their level; all q of them at once hold less often. Simultaneous ones have the half-width
-k sd with
+the truth with the stated probability for c = q F(q, nu), nu the degrees of freedom of the noise.
+Intervals of all q quantities at once have the half-width k sd with
 
     maximum      the quantile of max |t_j| for these correlations (simulated; the narrowest)
     sidak        single level 1 - (1 - level)^(1/q): exact for independent quantities

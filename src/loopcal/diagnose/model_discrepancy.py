@@ -5,21 +5,14 @@ uncertainty.
 With the whitened rows A of the parameters, the rows of the prior, and the rows Phi of slow errors
 of the poses (`SmoothErrors`), the elimination of the parameters leaves (y, S) of the residuals and
 Phi. If the model is right, y has the variance sigma^2; with errors of amplitude tau it has
-sigma^2 + tau^2 S S'. The test looks at the residuals that such errors can change, which differ by
-their weights alone: it needs no sigma, neither of positions nor of orientations, and does not
-depend on the order of the poses. Displacements and rotations of the tool are tested one after the
-other, the more significant first. Where repeats of a pose agree much better with each other than
-with the fit, and no slow errors are found, every pose may have an error of its own. See
-docs/theory/uncertainty.md.
+sigma^2 + tau^2 S S'. The test compares residuals by their weights alone: it needs no sigma, and
+does not depend on the order of the poses. Displacements and rotations of the tool are tested one
+after the other, the more significant first. See docs/theory/uncertainty.md.
 
-The lack of fit is tested against the pure error of repeated poses. Poses of equal readings have
-equal predictions, so with the whitened residuals r of a group of repeats
-
-    SS_pure = sum over groups min over mu of |W (r - mu)|^2,   SS_lack = RSS - SS_pure
-
-and SS_lack / dof_lack over SS_pure / dof_pure has an F distribution if the model is right, whatever
-the true sigma is (the stated one must be right up to a factor). Source: Draper and Smith, Applied
-Regression Analysis.
+The lack of fit is tested against the pure error of repeated poses, which have equal predictions:
+SS_pure = sum over groups min over mu of |W (r - mu)|^2, SS_lack = RSS - SS_pure, and SS_lack /
+dof_lack over SS_pure / dof_pure has an F distribution if the model is right, whatever the true
+sigma is. Source: Draper and Smith, Applied Regression Analysis.
 """
 
 from __future__ import annotations
@@ -274,16 +267,16 @@ REPEATS_LEVEL = 0.01  # probability below which the lack of fit exceeds the pure
 class LackOfFit:
     """Lack of fit against the pure error of repeated poses."""
 
-    groups: int  # number of poses that were repeated
-    pure: float  # sum of squares between repeats in units of the stated sigma
-    pure_degrees: int
-    lack: float  # the remaining sum of squares of the fit
-    lack_degrees: float
-    sigma_scale: float  # repeatability over the stated sigma
-    p_value: float  # probability of a larger F if the model is right; NaN where there is no test
-    is_explained: bool | None  # whether the model explains the data; None where there is no test
     # the result of the test, and the repeatability where it contradicts the stated sigma
     findings: tuple[Finding, ...]
+    groups: int = 0  # number of poses that were repeated
+    pure: float = 0.0  # sum of squares between repeats in units of the stated sigma
+    pure_degrees: int = 0
+    sigma_scale: float = np.nan  # repeatability over the stated sigma
+    lack: float = np.nan  # the remaining sum of squares of the fit
+    lack_degrees: float = np.nan
+    p_value: float = np.nan  # of a larger F if the model is right; NaN where there is no test
+    is_explained: bool | None = None  # whether the model explains the data; None without a test
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("groups", "pure", "pure_degrees", "lack", "lack_degrees", "sigma_scale", "p_value"),
@@ -296,20 +289,20 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     """Test a fit against the pure error of repeated poses."""
     data = prepare_fitted_data(fit, data)
     if data.reading_sigma is not None:
-        return _untested("residuals.repeats-with-uncertain-readings")
+        return LackOfFit((report_finding("residuals.repeats-with-uncertain-readings"),))
     member = data.repeats
     times = np.bincount(member)
     pure, degrees = _pure_error(fit, data, member)
     lack = float(fit.history.cost[-1]) - pure
     lack_degrees = fit.residual_test.dof - degrees
     if degrees == 0:
-        return _untested("residuals.no-repeats")
+        return LackOfFit((report_finding("residuals.no-repeats"),))
     scale = float(np.sqrt(pure / degrees))
-    groups = int((times > 1).sum())
+    known = (int((times > 1).sum()), pure, degrees, scale)
     if fit.pose_weights.min(initial=1.0) < 1.0:
-        return _untested("residuals.repeats-with-weights", groups, pure, degrees, scale)
+        return LackOfFit((report_finding("residuals.repeats-with-weights"),), *known)
     if lack_degrees < 1.0 or pure <= 0.0:
-        return _untested("residuals.repeats-only", groups, pure, degrees, scale)
+        return LackOfFit((report_finding("residuals.repeats-only"),), *known)
     ratio = max(lack, 0.0) / lack_degrees / (pure / degrees)
     p_value = float(compute_f_tail(lack_degrees, degrees, ratio))
     findings = [report_finding("residuals.explained")]
@@ -320,8 +313,8 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
         findings.append(report_finding("residuals.repeatability-larger", scale=scale))
     if tail > 1.0 - SIGNIFICANCE:
         findings.append(report_finding("residuals.repeatability-smaller", scale=scale))
-    numbers = (groups, pure, degrees, lack, lack_degrees, scale, p_value)
-    return LackOfFit(*numbers, p_value >= REPEATS_LEVEL, tuple(findings))
+    numbers = (*known, lack, lack_degrees, p_value, p_value >= REPEATS_LEVEL)
+    return LackOfFit(tuple(findings), *numbers)
 
 
 def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tuple[float, int]:
@@ -348,10 +341,3 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
             total += float(((b - A @ mean) ** 2).sum())
             degrees += int(present.sum()) - int(rank)
     return total, degrees
-
-
-def _untested(code: str, *numbers: float) -> LackOfFit:
-    """Return the reason why there is no test; groups, pure, degrees and scale may be known."""
-    groups, pure, degrees, scale = numbers or (0, 0.0, 0, np.nan)
-    untested = (np.nan, np.nan, scale, np.nan, None, (report_finding(code),))
-    return LackOfFit(int(groups), pure, int(degrees), *untested)

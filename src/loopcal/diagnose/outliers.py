@@ -2,27 +2,19 @@
 """Detect poses that do not fit the others, at a false-alarm rate for the whole data set.
 
 Rows that belong together form an observation block: a pose, or several poses that share rows. With
-the information M = sum_j w_j A_j'A_j + P (P the penalty), G = A_j M^-1 A_j' and the residual r_j of
-block j, the residual that it has with respect to a fit without it, and the squared Mahalanobis norm
-of that residual, are
-
-    r_(j) = (I - w_j G)^-1 r_j,    d^2 = r_(j)' (I + G_(j))^-1 r_(j),    G_(j) = (I - w_j G)^-1 G
-
-In the eigenvectors of G, eigenvalues g, d^2 = sum r^2 / ((1 - w g)(1 + (1 - w) g)): for a block
-inside the fit r^2 / (1 - g), for one outside r^2 / (1 + g). If block and model are right it has a
-chi-square distribution with as many degrees of freedom as there are directions with 1 - w g > 0.
-The leverage is the trace of w G. See docs/theory/uncertainty.md.
+the information M = sum_j w_j A_j'A_j + P (P the penalty) and G = A_j M^-1 A_j' of eigenvalues g,
+the squared Mahalanobis norm of the residual that block j has with respect to a fit without it is
+d^2 = sum r^2 / ((1 - w g)(1 + (1 - w) g)) in the eigenvectors of G. If block and model are right it
+is a chi-square with as many degrees of freedom as there are directions with 1 - w g > 0. The
+leverage is the trace of w G. See docs/theory/uncertainty.md.
 
 A block is an outlier where the probability of its distance is below 1 - (1 - level)^(1/u), u blocks
-tested (Sidak), so that data without a wrong block raise no alarm in 95 % of cases. Several wrong
-blocks hide each other: suspects are excluded until the same ones are suspected twice. With one
-degree of freedom every block explains the misfit of all, and none is named. Nothing is removed from
-the data: the result names the blocks for whoever decides.
+tested (Sidak). Several wrong blocks hide each other: suspects are excluded until the same ones are
+suspected twice. With one degree of freedom every block explains the misfit of all, and none is
+named. Nothing is removed from the data: the result names the blocks for whoever decides.
 
 The distance is judged by the noise that the other blocks show (an F ratio), not by the stated one.
 A wrong sigma therefore makes no outliers, and a misfit that is spread over all blocks names none.
-The stated noise counts only where the others leave fewer than five degrees of freedom.
-
 A fit that contradicts the stated noise is no good reference: one wrong row of a meter pulls the
 geometry so far that right poses seem wrong. Blocks are then compared at a robust fit (Tukey).
 """
@@ -222,12 +214,6 @@ class PartialFit(NamedTuple):
         left = np.inf if self.noise is None else self.noise[1]
         p_value = compute_f_tail(self.influence.degrees, left, self.ratio)
         return np.where(np.isnan(p_value), 1.0, p_value)
-
-    @property
-    def contradicts_noise(self) -> bool:
-        """Whether the fitted blocks exceed the stated noise beyond doubt."""
-        square = self.left * self.scale**2
-        return self.left > 0.0 and bool(compute_chi_square_tail(self.left, square) < SIGNIFICANCE)
 
     def determines_as_much(self, whole: PartialFit) -> bool:
         """Return whether the fitted blocks determine as many directions as all blocks do, and the
@@ -565,7 +551,9 @@ def find_outliers(
     shared = {"blocks": tested, "single_poses": all(len(poses) == 1 for poses in labels)}
     is_converged, suspected = search.is_converged, int(ambiguous.sum())
     summary = _summarize(fit, len(outliers), suspected, level, shared, is_converged=is_converged)
-    if noise == "given" and outliers and end.contradicts_noise:
+    # whether the fitted blocks exceed the stated noise beyond doubt
+    tail = compute_chi_square_tail(end.left, end.left * end.scale**2)
+    if noise == "given" and outliers and end.left > 0.0 and tail < SIGNIFICANCE:
         summary = (report_finding("outliers.larger-noise", times=end.scale, **shared), *summary)
     return OutlierCheck(
         outliers, conflicts, is_converged, level, tested, labels, end.influence, end.scale, summary

@@ -284,7 +284,10 @@ def sample_posterior(
         raise EstimationError(report_finding("sampling.without-intervals"))
     density = describe_density(fit, linearize_fit(fit, data))
     rng = np.random.default_rng(np.random.SeedSequence(seed))
-    proposal = _Proposal.of(density)
+    # the linear posterior with heavier tails
+    degrees = float(np.clip(density.size, SMALLEST_DEGREES, LARGEST_DEGREES))
+    degrees = min(degrees, density.degrees)
+    proposal = _Proposal(np.zeros(density.size), np.eye(density.size), degrees)
     rounds, best = 0, None
     while rounds < ROUNDS:
         rounds += 1
@@ -330,13 +333,6 @@ class _Proposal:
     mean: FloatArray
     root: FloatArray
     degrees: float
-
-    @classmethod
-    def of(cls, density: PosteriorDensity) -> _Proposal:
-        """Return the linear posterior with heavier tails."""
-        size = density.size
-        degrees = float(np.clip(size, SMALLEST_DEGREES, LARGEST_DEGREES))
-        return cls(np.zeros(size), np.eye(size), min(degrees, density.degrees))
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return draws (count, K) and the logarithm of their density (count,)."""

@@ -289,11 +289,8 @@ class EffectSizes(NamedTuple):
 class ResidualPatterns(NamedTuple):
     """What the residuals of a fit show."""
 
-    tests: int  # number of tests
     effects: tuple[EffectSizes, ...]  # that are significant, the first found first
-    correlation: float  # of neighboring residuals, less what a fit causes
-    # probability of a larger one for independent errors, in any of the tests (Sidak)
-    p_value: float
+    p_value: float  # of the correlation of neighbors for independent errors, in any of the tests
     is_correlated: bool  # whether it is significant
     order: str  # "time" or "order", that of the rows
     rows: ResidualRows  # the residuals, as if the fit had estimated the effects
@@ -308,7 +305,7 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     listed = list_effects(rows, data, robot)
     order = TIME if any(effect.source == TIME for effect in listed) else ORDER
     effects = _list_testable(rows, listed)
-    correlation, p_value = test_correlation(rows)
+    p_value = test_correlation(rows)[1]
     tests = len(effects) + int(np.isfinite(p_value))
     significant: list[EffectSizes] = []
     while effects:
@@ -322,12 +319,9 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
         rows = rows.with_effects(effect.columns)
         effects = _list_testable(rows, [other for other, _ in effects])
     if significant:
-        correlation, p_value = test_correlation(rows)
+        p_value = test_correlation(rows)[1]
     p_any = compute_any_probability(p_value, tests)
-    is_correlated = p_any < LEVEL
-    return ResidualPatterns(
-        tests, tuple(significant), correlation, p_any, is_correlated, order, rows
-    )
+    return ResidualPatterns(tuple(significant), p_any, p_any < LEVEL, order, rows)
 
 
 def test_effect(rows: ResidualRows, basis: FloatArray) -> float:

@@ -1,23 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of measured rows, by quantity and target, with their statistics and the noise floor.
 
-An error is the difference of one target (or of the tool) between prediction and measurement. With
-the components (d_1 .. d_c) of that difference that were measured:
-
-    size      sqrt(d_1^2 + .. + d_c^2)         [m] or [rad]
-    balance   largest minus smallest component, with two components or more
-
-A row with three targets has three position errors; statistics run over rows x targets. Which
-residuals belong together is what `list_error_groups` says.
+An error is the difference of one target (or of the tool) between prediction and measurement: its
+size is the root of the sum of squares of the measured components [m] or [rad], its balance their
+largest minus their smallest. A row with three targets has three position errors; statistics run
+over rows x targets. Which residuals belong together is what `list_error_groups` says.
 
 Kinds of measurement are compared in units of their sigma: the root mean square of W r over all
-measured components, r the residuals and W the inverse Cholesky factor of their covariance. It is 1
-where the geometry explains everything but the noise. Without this division the least accurate
-instrument would decide alone.
-
-The noise floor of a statistic is its value for an exact geometry, see `NoiseFloor`. Source of size
-and balance: "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism",
-section 4.
+measured components, r the residuals and W the inverse Cholesky factor of their covariance, so that
+the least accurate instrument does not decide alone. The noise floor of a statistic is its value for
+an exact geometry, see `NoiseFloor`. Source of size and balance: "Numerical simulation of the
+calibration algorithm for a 6-DOF parallel mechanism", section 4.
 """
 
 from __future__ import annotations
@@ -278,11 +271,6 @@ class KindErrors:
         if rest == 0.0:
             return 0.0 if self.gain > 0.0 else 1.0
         return float(stdtr(degrees, -self.gain / np.sqrt(rest / degrees)))
-
-    @property
-    def improvement(self) -> float:
-        """Factor by which the error became smaller."""
-        return self.before / self.after if self.after > 0.0 else np.inf
 
 
 def compute_statistics(values: FloatArray) -> Statistics:

@@ -4,19 +4,14 @@ directions that the data determine.
 
 The values are true ones in a simulation, or a stored answer: published anchors, the numbers of a
 firmware, an earlier result. Fits of one machine may differ by millimeters along unobservable
-directions without any effect on the measurements, so the plain difference means little. With the
-differences z in tolerances and an orthonormal basis N of the unobservable directions, the
-comparable part is, to first order,
+directions without any effect on the measurements. With the differences z in tolerances and an
+orthonormal basis N of these directions, the comparable part is to first order
+e = (1 - N N') (z_estimate - z_given).
 
-    e = (1 - N N') (z_estimate - z_given)
-
-The joint test takes all comparable directions at once. Let e = Q y with orthonormal Q, and let the
-posterior spread of y be Q' B, where B B' is the posterior covariance [tolerances] of the determined
-directions. The singular value decomposition Q' B = U S V' whitens the difference:
-
-    chi-square = |S^-1 U' y|^2,   as many degrees of freedom as there are directions.
-
-No matrix is inverted. See docs/theory/uncertainty.md.
+The joint test takes all comparable directions at once. Let e = Q y with orthonormal Q, and let Q' B
+be the posterior spread of y, B B' the posterior covariance of the determined directions. With the
+decomposition Q' B = U S V', chi-square = |S^-1 U' y|^2 has as many degrees of freedom as there are
+directions. No matrix is inverted. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations

@@ -194,7 +194,10 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     if not misfit > ALLOWED:
         return ConventionCheck(misfit, finding=report_equals(free, known, misfit))
 
-    thinned = _thin_out(known)
+    thinned, n = known, known.n_poses
+    if n > MOST_POSES and not shares_poses(known):  # runs of neighbors spread over the data
+        first = np.linspace(0, n - MOST_POSES // RUNS, RUNS).astype(np.intp)
+        thinned = known.take(find_distinct(first[:, None] + np.arange(MOST_POSES // RUNS)))
     fitted = compute_fitted_misfit(robot, thinned) if np.isinf(misfit) else np.inf
     if not fitted > ALLOWED:
         return ConventionCheck(fitted)
@@ -379,17 +382,6 @@ def _compare_interpretations(
         alternatives=tuple(other.describe() for other in listed),
     )
     return ConventionCheck(misfit, finding=finding)
-
-
-def _thin_out(data: Measurements) -> Measurements:
-    """Return at most `MOST_POSES` poses, in runs of neighbors spread over the data; all where rows
-    share more than their pose.
-    """
-    n = data.n_poses
-    if n <= MOST_POSES or shares_poses(data):
-        return data
-    first = np.linspace(0, n - MOST_POSES // RUNS, RUNS).astype(np.intp)
-    return data.take(find_distinct(first[:, None] + np.arange(MOST_POSES // RUNS)))
 
 
 def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:

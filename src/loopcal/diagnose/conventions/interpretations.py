@@ -45,11 +45,6 @@ class Interpretation:
     parts: tuple[Interpretation, ...] = ()  # the two of a combination
 
     @property
-    def shrinks(self) -> bool:
-        """Whether values become smaller, so that they might no longer carry information."""
-        return any(part.details.get("factor", 1.0) < 1.0 for part in self.parts or (self,))
-
-    @property
     def finding(self) -> Finding:
         """The interpretation as a finding."""
         return report_finding(**self.describe())

@@ -178,8 +178,19 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
     linearization, problem, data = comparison.linearization, comparison.problem, comparison.data
     if linearization is None or not np.isfinite(comparison.misfits).all():
         return comparison
+    # standard deviations (r, m) of whitened residuals by tolerances and noise; by noise alone for
+    # estimated poses, whose rows depend on each other
+    expected = [np.ones(rows.whitener.shape[1:3]) for rows in problem.rows]
+    first, p = np.arange(1), problem.parameters
+    if not problem.is_uncertain:
+        blocks = problem.take(first).leverage_rows(linearization.take(first))
+        for block, rows_of_block in zip(problem.poses.blocks, blocks, strict=True):
+            for rows in rows_of_block:
+                A = rows.rows[..., -p - 1 : -1]
+                chosen = block.row_numbers[rows.kind][rows.numbers]
+                expected[rows.kind][chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
     ratios = []
-    for r, sd in zip(comparison.residuals(), _expected_sd(problem, linearization), strict=True):
+    for r, sd in zip(comparison.residuals(), expected, strict=True):
         # root mean square (t, r) of the present residuals; NaN for absent rows
         present = (r.whitened != 0.0).sum(axis=-1)
         total = ((r.whitened / sd) ** 2).sum(axis=-1)
@@ -289,23 +300,6 @@ def _linearize(
         return None
 
 
-def _expected_sd(problem: Problem, linearization: Linearization) -> list[FloatArray]:
-    """Return the standard deviations (r, m) of whitened residuals by tolerances and noise; by noise
-    alone for estimated poses, whose rows depend on each other.
-    """
-    result = [np.ones(rows.whitener.shape[1:3]) for rows in problem.rows]
-    if problem.is_uncertain:
-        return result
-    first, p = np.arange(1), problem.parameters
-    blocks = problem.take(first).leverage_rows(linearization.take(first))
-    for block, rows_of_block in zip(problem.poses.blocks, blocks, strict=True):
-        for rows in rows_of_block:
-            A = rows.rows[..., -p - 1 : -1]
-            chosen = block.row_numbers[rows.kind][rows.numbers]
-            result[rows.kind][chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
-    return result
-
-
 def _compute_misfit(linearization: Linearization, cost: FloatArray | None = None) -> FloatArray:
     """Return the root mean square (t,) of a cost over the equations; NaN with too few.
 
@@ -389,7 +383,8 @@ def is_informative(
     """Return whether values that shrink fit far better than controls without information: random
     numbers of any size fit as well at any pose, and zeros in every unit.
     """
-    if not interpretation.shrinks:
+    parts = interpretation.parts or (interpretation,)
+    if not any(part.details.get("factor", 1.0) < 1.0 for part in parts):
         return True
     changed, rng = interpretation.apply(data), np.random.default_rng(0)
     shuffled = [o.measured[rng.permutation(len(o))] for o in changed.observations]
