@@ -117,28 +117,6 @@ class CrossValidation(TableResult):
         return f"<CrossValidation: {len(self.fold)} folds, {len(self.poses)} rows, {score}>"
 
 
-@dataclass(frozen=True, eq=False)
-class LeaveOneOut:
-    """Scores of k methods."""
-
-    methods: tuple[Method, ...]  # the methods
-    # (k,) mean square of whitened leave-one-block-out residuals (1: noise alone), infinite where
-    # a block cannot be left out
-    score: FloatArray
-    dof: FloatArray  # (k,) effective number of parameters
-    estimate: FloatArray  # (k, p) their estimates [SI]
-    standard_error: FloatArray  # (k,) of the score, from the scatter over blocks
-    blocks: int  # number of those with rows
-
-    @property
-    def best(self) -> Method:
-        """The method with the lowest score."""
-        return self.methods[int(np.argmin(self.score))]
-
-    def __repr__(self) -> str:
-        return f"<LeaveOneOut: {len(self.methods)} methods, best {self.best}>"
-
-
 def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
     """Draw the poses held out in each of `count` folds of nearly equal size: whole blocks, because
     otherwise no fold would have a row that compares poses, such as a distance.
@@ -222,9 +200,13 @@ def cross_validate(
 
 def score_leave_one_out(
     robot: Mechanism, data: Measurements, methods: tuple[Method, ...]
-) -> LeaveOneOut:
-    """Score methods that keep the columns as they are: ridge, truncation, least squares, MAP;
-    `robot` is the linearization point, best the robot of a fit.
+) -> tuple[FloatArray, FloatArray, int]:
+    """Score k methods that keep the columns as they are: ridge, truncation, least squares, MAP.
+
+    robot : linearization point; best the robot of a fit.
+    Returns the mean squares (k,) of whitened leave-one-block-out residuals (1: noise alone),
+    infinite where a block cannot be left out; their standard errors (k,) from the scatter over
+    blocks, NaN where they are infinite; and the number of blocks with rows.
     """
     free = select_free_parameters(robot)
     problem = problem_of(free, data)
@@ -261,8 +243,6 @@ def score_leave_one_out(
         square[numbers] = np.where(singular, np.inf, (deleted**2).sum(axis=2)).T
         equations[numbers] = ((A != 0.0).any(axis=2) | (r != 0.0)).sum(axis=1)
     score = square.sum(axis=0) / int(linearization.equations[0])
-    dof = d.filter_factors(penalty).sum(axis=1)
-    estimate = free.nominal + free.tolerance * (y @ d.directions[0].T)
     # standard error of a ratio of sums over b blocks; NaN of a score that is infinite
     b = int((equations > 0).sum())
     error = np.full(len(score), np.nan)
@@ -271,7 +251,7 @@ def score_leave_one_out(
             off = square - equations[:, None] * score
         off = np.where(np.isfinite(score), off, np.nan)
         error = np.sqrt(b / (b - 1) * (off**2).sum(axis=0)) / equations.sum()
-    return LeaveOneOut(tuple(methods), score, dof, estimate, error, b)
+    return score, error, b
 
 
 def _mean_square(robot: Mechanism, data: Measurements) -> float:
@@ -645,8 +625,7 @@ def compute_regularization_curves(
     methods = (*map(Ridge, lam.tolist()), *(TruncatedSVD(int(i)) for i in k))
     if problem.nuisance is None:
         scheme: Scheme = "leave-one-out"
-        result = score_leave_one_out(fit.robot, data, methods)
-        score, error, left_out = result.score, result.standard_error, result.blocks
+        score, error, left_out = score_leave_one_out(fit.robot, data, methods)
     else:
         scheme, left_out = "folds", folds
         score, error = np.zeros(len(methods)), np.full(len(methods), np.nan)
