@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.numerics.decomposition import NULL_COMPONENT
-from loopcal.numerics.statistics import compute_f_quantile, compute_single_level
+from loopcal.numerics.statistics import compute_f_quantile, compute_f_tail, compute_single_level
 from loopcal.results.description import OTHER, Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -303,12 +303,8 @@ class JointRegion(TableResult):
         """Return the probability (..,) of estimates as far from values (.., q) [SI], if these were
         true.
         """
-        from scipy.special import chdtrc, fdtrc
-
-        square, q = self.measure_distance(values), len(self.names)
-        if np.isinf(self.degrees):
-            return np.asarray(chdtrc(q, square))
-        return np.asarray(fdtrc(q, self.degrees, square / q))
+        q = len(self.names)
+        return compute_f_tail(q, self.degrees, self.measure_distance(values) / q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,13 +364,15 @@ def compute_joint_region(
     """
     chosen = _select(fit, names, level, combinations)
     q = len(chosen.names)
-    whitened = np.linalg.eigh(chosen.correlation)
-    if whitened[0][0] < SMALLEST:
+    value, vectors = np.linalg.eigh(chosen.correlation)
+    if value[0] < SMALLEST:
         raise EstimationError(report_finding("sampling.region-dependent", names=chosen.names))
-    white = (whitened[1] / np.sqrt(whitened[0])).T / chosen.sd
+    white = (vectors / np.sqrt(value)).T / chosen.sd
     degrees = float(chosen.posterior.count_degrees(white @ chosen.effect))
     square = _find_square(q, degrees, level)
-    return JointRegion(chosen.names, chosen.center, chosen.covariance, level, degrees, square)
+    return JointRegion(
+        chosen.names, chosen.center, chosen.root @ chosen.root.T, level, degrees, square
+    )
 
 
 def compute_simultaneous_intervals(
@@ -430,28 +428,16 @@ def compute_simultaneous_intervals(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Selection:
-    """Quantities of a posterior: effect (q, p) by its parameters, root (q, k) of the covariance."""
+class _Selection(NamedTuple):
+    """Quantities of a posterior."""
 
     posterior: Posterior
     names: tuple[str, ...]
     center: FloatArray
-    effect: FloatArray
-    root: FloatArray
-
-    @property
-    def covariance(self) -> FloatArray:
-        return self.root @ self.root.T
-
-    @property
-    def sd(self) -> FloatArray:
-        return np.sqrt((self.root**2).sum(axis=1))
-
-    @property
-    def correlation(self) -> FloatArray:
-        unit = self.root / self.sd[:, None]
-        return unit @ unit.T
+    effect: FloatArray  # (q, p) by the parameters
+    root: FloatArray  # (q, k) of the covariance
+    sd: FloatArray
+    correlation: FloatArray
 
 
 def _select(
@@ -493,8 +479,10 @@ def _select(
         length = np.linalg.norm(effect * posterior.unit, axis=1)
         if (np.abs(open_part).max(axis=1, initial=0.0) > NULL_COMPONENT * length).any():
             raise EstimationError(report_finding("sampling.region-undetermined", names=labels))
-    center = effect @ posterior.estimate
-    return _Selection(posterior, labels, center, effect, effect @ posterior.root)
+    center, root = effect @ posterior.estimate, effect @ posterior.root
+    sd = np.sqrt((root**2).sum(axis=1))
+    correlation = (root / sd[:, None]) @ (root / sd[:, None]).T
+    return _Selection(posterior, labels, center, effect, root, sd, correlation)
 
 
 def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntArray:
