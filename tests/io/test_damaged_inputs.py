@@ -96,9 +96,6 @@ def load(folder, settings: dict[str, str], columns: str = "", cells: str = "") -
         ("kind", "{a: 1}", "is not a kind of measurement"),
         ("targets", "null", "'targets' is empty"),
         ("unknown", "null", "'unknown' is empty"),
-        ("noise", "{x: 1e-30 um, y: 1 um, z: 1 um}", "from 1e-15"),
-        ("reading_noise", "1e-300 deg", "from 1e-15"),
-        ("session_bias", "{x: 1e-300 m}", "from 1e-15"),
     ],
 )
 def test_a_wrong_setting_is_refused_with_its_line(tmp_path, key, value, sentence) -> None:

@@ -37,12 +37,14 @@ def test_seventeen_digits_are_enough_for_every_double(factor) -> None:
         draw.normal(size=1500) * 10.0 ** draw.integers(-12, 4, 1500),
         np.nextafter(powers, 0.0),  # just below a power of two, where doubles are densest
         np.nextafter(powers, np.inf),
+        [0.0, 1.0, 1e-3, 5e-324],
     ]
     for value in np.concatenate(values).tolist():
         text = format_exact(value, factor)
         assert parse_exact(text, factor) == value
         assert count_digits(text) <= 17, text
         assert count_digits(format_scaled(value, factor)) <= 17
+    assert format_exact(0.2, 1e-3) == "200"
 
 
 def test_rounding_through_a_double_needs_no_further_digits() -> None:

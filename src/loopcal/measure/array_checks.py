@@ -15,8 +15,6 @@ def check_array(
 ) -> FloatArray:
     """Return a read-only float64 copy of an array of this shape, where None is any length.
 
-    Raises
-    ------
     DataError : the value, which messages call `what`, is not numeric, has another shape, or a
         number is infinite or, unless `allow_nan`, not measured.
     """

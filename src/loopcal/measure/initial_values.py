@@ -119,9 +119,6 @@ def guess_nuisance_values(
     T : (n, 4, 4) T_base_platform of each pose, usually of the nominal robot at the readings.
     nuisance : with priors and fixed values; default: `measurements.nuisance_parameters`.
     joints : name -> (1, n) of joints that kinds sense.
-
-    Raises
-    ------
     DataError : the poses are too few or too similar to determine a parameter.
     """
     collected = measurements.nuisance_parameters if nuisance is None else nuisance

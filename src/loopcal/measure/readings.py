@@ -168,8 +168,6 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
     """Return the standard deviations (n, a) [SI] of readings, or None where all are exact; those
     that are given win over those that the robot states.
 
-    Raises
-    ------
     DataError : a sigma is no standard deviation, or too large to mean anything; or a reading of a
         robot with redundant actuators is exact. The poses of such a robot are free and readings
         follow from them, see docs/theory/uncertain-readings.md.

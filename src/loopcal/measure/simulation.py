@@ -369,9 +369,6 @@ def simulate_contacts(
     sheet : rows of planes and lines; its readings are those of the commanded poses, its missing
         gaps are zero.
     instrument : a sensor for each of `sheet.observations`; its noise is that of the contacts.
-
-    Raises
-    ------
     DataError : another kind of rows, a machine that cannot move in x, y and z, or points that it
         cannot bring to their surfaces.
     """

@@ -75,13 +75,8 @@ class Line:
 
 
 def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[Line], int]:
-    """Return the lines of an export that may be rows, and the number of lines without data.
-
-    Headers and lines that the profile skips have no data.
-
-    Raises
-    ------
-    FileError : unreadable, empty, or without the header that the profile needs.
+    """Return the lines of an export that may be rows, and the number of lines without data: headers
+    and those that the profile skips. FileError : unreadable, empty, or without the header.
     """
     record = profile.record
     sources = [place for source in profile.columns.values() for place in source.places]
@@ -254,11 +249,8 @@ def _join_rows(
 
 
 def _split_row(row: Row, profile: Profile) -> tuple[Row, Row]:
-    """Return the cells of a line that belong to its pose, and those of one of several targets.
-
-    Raises
-    ------
-    Misfit : the target is unknown.
+    """Return the cells of a line that belong to its pose, and those of one of several targets;
+    raise Misfit for an unknown target.
     """
     targets = profile.targets
     if "target" not in row or not targets:
@@ -344,8 +336,6 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 class Conversion:
     """The result of converting an export.
 
-    Parameters
-    ----------
     text : the measurement file. table : its header and rows.
     passed : number of lines without data.
     misfits : lines that do not fit the profile, with the reason.
@@ -367,17 +357,9 @@ class Conversion:
 def convert_export(
     path: str | Path, profile: Profile, pattern_seconds: float = PATTERN_SECONDS.most
 ) -> Conversion:
-    """Convert an export by means of a profile.
+    """Convert an export; the patterns of the profile may take `pattern_seconds`, else FileError.
 
-    Parameters
-    ----------
-    path : the export. pattern_seconds : limit of the time of the profile's patterns.
-
-    Raises
-    ------
-    FileError
-        Unreadable, without the header that the profile needs, no line fits, or the patterns of the
-        profile take too long.
+    FileError : unreadable, without the header that the profile needs, or no line fits.
     """
     path = as_path(path, "export")
     clock = PatternClock(profile.file, pattern_seconds)

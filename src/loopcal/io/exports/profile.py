@@ -59,8 +59,6 @@ _COUNT = re.compile(r"\{\s*(\d*)\s*(?:,\s*(\d*)\s*)?\}")
 class PatternClock:
     """The time that the patterns of one profile may still take for one export.
 
-    Parameters
-    ----------
     file : the profile. seconds : at first; each match adds SECONDS_PER_LINE.
     """
 
@@ -307,13 +305,7 @@ ALIASES: Mapping[str, str] = {
 
 
 def read_profile(path: str | Path) -> Profile:
-    """Read a profile.
-
-    Raises
-    ------
-    FileError
-        A missing or unknown key, an unknown column, a bad unit, pattern or encoding; at its line.
-    """
+    """Read a profile; FileError for a wrong key, column, unit, pattern or encoding, at its line."""
     file = read_yaml(path, "profile of an export")
     record = read_record(file, file.content, ProfileRecord, None)
     if "format" in file.content:
@@ -529,12 +521,7 @@ def list_shipped_profiles() -> dict[str, Path]:
 
 
 def find_profile_file(source: str | Path) -> Path:
-    """Return the file of a profile that is given as a file or by the name of a shipped one.
-
-    Raises
-    ------
-    FileError : neither of them.
-    """
+    """Return the file of a profile that is given as a file or by the name of a shipped one."""
     path, shipped = as_path(source, "profile of an export"), list_shipped_profiles()
     if str(source) in shipped and not path.is_file():
         return shipped[str(source)]
@@ -549,13 +536,8 @@ def find_profile_file(source: str | Path) -> Path:
 def with_local_settings(
     profile: Profile, unit: str | None = None, has_decimal_comma: bool = False
 ) -> Profile:
-    """Return a profile with another unit of lengths, or with decimal commas.
-
-    A computer that writes decimal commas separates columns by semicolons in place of commas.
-
-    Raises
-    ------
-    FileError : the profile names its columns with another unit.
+    """Return a profile with another unit of lengths, or with decimal commas: then columns are
+    separated by semicolons in place of commas. FileError where its columns name another unit.
     """
     record = profile.record
     if unit is not None:

@@ -33,8 +33,6 @@ Row = dict[str, str]
 class FilledSheet:
     """A sheet with the points of an export.
 
-    Attributes
-    ----------
     text : the measurement file. table : its header and rows.
     misfits : export, line and reason of lines that do not match the profile.
     data : the measurements, for checks before the file is written. unit : of the points.
@@ -60,16 +58,11 @@ def fill_sheet(
 ) -> FilledSheet:
     """Fill in a sheet.
 
-    Parameters
-    ----------
     robot : whose poses the sheet lists. sheet : data file of a plan, without measured values.
     exports : of the instrument. Several are one session each, named after their files, unless
         `has_one_session` says that the instrument stood still.
     profile : how they are read; kind, targets and noise are those of the sheet.
     by_order : join points by their order, not by their names.
-
-    Raises
-    ------
     FileError : a file cannot be read, or no name or another number of points matches.
     """
     table, entry = _read_sheet(Path(sheet), robot)
