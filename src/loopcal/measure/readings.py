@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -26,10 +26,6 @@ if TYPE_CHECKING:
 
 # Largest finite standard deviation of a reading, in sizes of the robot or radians.
 LARGEST_SIGMA = 1e6
-NOT_A_SIGMA = (
-    "is not a standard deviation; give 0 (exact), a positive number from "
-    f"{SMALLEST_SD:g} on, or infinity (missing)"
-)
 
 
 def solve_commanded_poses(
@@ -141,6 +137,15 @@ def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArra
     return broadcast_array(sigma, readings.shape, "reading_sigma", wanted)
 
 
+def _refuse_wrong_sigma(sigma: FloatArray, name: Callable[[int, int], str]) -> None:
+    """Raise DataError for a sigma (n, a) that is none; `name` it by pose and actuator."""
+    act = f"give 0 (exact), a positive number from {SMALLEST_SD:g} on, or infinity (missing)"
+    refuse_first(
+        ~((sigma == 0.0) | (sigma >= SMALLEST_SD)),
+        lambda i, j: f"{name(i, j)} is not a standard deviation; {act}",
+    )
+
+
 def check_reading_sigma(
     sigma: ArrayLike, readings: FloatArray, labels: tuple[str, ...]
 ) -> FloatArray:
@@ -153,9 +158,7 @@ def check_reading_sigma(
         value = f"{checked[pose, column]:.6g}"
         return f"pose {labels[pose]!r}: the sigma {value} [m or rad] of reading {column + 1}"
 
-    refuse_first(
-        ~((checked == 0.0) | (checked >= SMALLEST_SD)), lambda i, j: f"{name(i, j)} {NOT_A_SIGMA}"
-    )
+    _refuse_wrong_sigma(checked, name)
     refuse_first(
         np.isnan(readings) & np.isfinite(checked),
         lambda i, j: f"{name(i, j)} belongs to a missing reading; give the reading, or infinity",
@@ -185,9 +188,7 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
         value = f"{given[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"
         return f"the sigma {value} of the reading of {actuator.name} in row {pose + 1}"
 
-    refuse_first(
-        ~((given == 0.0) | (given >= SMALLEST_SD)), lambda i, j: f"{name(i, j)} {NOT_A_SIGMA}"
-    )
+    _refuse_wrong_sigma(given, name)
     refuse_first(
         np.isfinite(given) & (given / size > LARGEST_SIGMA),
         lambda i, j: (

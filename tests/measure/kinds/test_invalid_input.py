@@ -228,23 +228,21 @@ def test_names_of_targets_may_contain_any_text(name):
 SIZE = 0.3  # [m]
 
 
+def collect(kind, values, sigma=1e-5):
+    """Return measurements of one row for each pose."""
+    n = len(values)
+    rows = Observations.from_sigma(kind, np.arange(n), values, sigma)
+    return Measurements("toy", np.arange(float(n))[:, None], (rows,))
+
+
 def test_target_that_never_moves_is_refused_by_name():
     T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     kind = Position(targets=("a", "b"), places=0.1 * np.eye(3)[:2])
     noise = 1e-5 * np.random.default_rng(1).normal(size=(1, 8, 6))
     measured = kind.measure(T[None], noise)[0]
-    readings = np.arange(8.0)[:, None]
-    check_targets_move(
-        Measurements(
-            "toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)
-        ),
-        T,
-        SIZE,
-    )
+    check_targets_move(collect(kind, measured), T, SIZE)
     measured[:, 3:] = measured[0, 3:] + noise[0, :, 3:]
-    data = Measurements(
-        "toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)
-    )
+    data = collect(kind, measured)
     with pytest.raises(DataError) as error:
         check_targets_move(data, T, SIZE)
     assert error.value.code == "conventions.target-never-moves"
@@ -270,16 +268,11 @@ def test_constant_values_are_refused_for_every_kind_that_follows_the_robot(kind)
     )
     noise = 1e-6 * np.random.default_rng(1).normal(size=(1, 8, len(kind.noise_columns)))
     true, still = (
-        kind.measure(T[None], noise)[0],
-        kind.measure(np.repeat(T[:1], 8, axis=0)[None], noise)[0],
+        kind.measure(poses[None], noise)[0] for poses in (T, np.repeat(T[:1], 8, axis=0))
     )
-    readings = np.arange(8.0)[:, None]
-    good, bad = (
-        Observations.from_sigma(kind, np.arange(8), values, 1e-6) for values in (true, still)
-    )
-    check_targets_move(Measurements("toy", readings, (good,)), T, SIZE)
+    check_targets_move(collect(kind, true, 1e-6), T, SIZE)
     with expect_refusal("conventions.target-never-moves", DataError, kind=kind.name):
-        check_targets_move(Measurements("toy", readings, (bad,)), T, SIZE)
+        check_targets_move(collect(kind, still, 1e-6), T, SIZE)
 
 
 BALL_BAR = Distance(targets=("ball",), places=np.zeros((1, 3)), anchor=np.array([0.3, 0.0, 0.0]))
@@ -307,8 +300,7 @@ def test_values_that_are_constant_by_design_are_accepted_and_frozen_ones_are_not
     true = zoo.make_poses(coordinates)
     values = kind.measure(true[None], np.zeros((1, n, len(kind.noise_columns))))[0]
     assert np.ptp(values) < 1e-9
-    rows = Observations.from_sigma(kind, np.arange(n), values, 1e-6)
-    data = Measurements("toy", np.arange(float(n))[:, None], (rows,))
+    data = collect(kind, values, 1e-6)
     error = np.zeros((n, 6))
     error[:, 3:] = 0.02 * coordinates[:, :3]  # [rad]: more than 1000 times the noise
     error[:, 2] = 0.03 * coordinates[:, 0]
@@ -327,8 +319,7 @@ def test_heights_of_a_tilted_bed_are_constant_by_design(tilt, is_accepted):
     rng = np.random.default_rng(3)
     coordinates = np.zeros((n, 6))
     coordinates[:, :2] = 0.07 * rng.uniform(-1.0, 1.0, (n, 2))
-    rows = Observations.from_sigma(kind, np.arange(n), np.zeros((n, 1)), 2e-5)
-    data = Measurements("toy", np.arange(float(n))[:, None], (rows,))
+    data = collect(kind, np.zeros((n, 1)), 2e-5)
     coordinates[:, 2] = 0.003 + tilt * coordinates[:, 0] + 0.5 * coordinates[:, 1] ** 2
     if is_accepted:
         check_targets_move(data, zoo.make_poses(coordinates), SIZE)
@@ -376,6 +367,5 @@ def test_poses_in_one_plane_give_unidentifiable_combinations_or_a_refusal(kind):
 @pytest.mark.parametrize("kind", [Plane(places=POINT), Line(places=POINT), JointSensor()])
 def test_constant_values_are_accepted_for_surfaces_and_joints(kind):
     T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
-    rows = Observations.from_sigma(kind, np.arange(8), np.zeros((8, len(kind.columns))), 1e-5)
-    data = Measurements("toy", np.arange(8.0)[:, None], (rows,))
+    data = collect(kind, np.zeros((8, len(kind.columns))))
     assert check_targets_move(data, T, SIZE) is None

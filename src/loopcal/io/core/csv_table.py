@@ -225,8 +225,7 @@ class Table:
 
     def places(self, rows: Iterable[int]) -> tuple[str, ...]:
         """Return file and line of rows; see `place`."""
-        file, lines = str(self.path), self.lines
-        return tuple([f"{file}:{lines[row]}" for row in rows])
+        return tuple(map(self.place, rows))
 
     def place(self, row: int) -> str:
         """Return file and line of a row, such as `data.csv:12`."""

@@ -22,6 +22,7 @@ import numpy as np
 from loopcal.errors import suggest_names
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import (
+    NAME_COLUMNS,
     Table,
     format_exact,
     format_scaled,
@@ -382,7 +383,7 @@ RULES: tuple[ColumnRule, ...] = (
 )
 """All columns, in the order of the file reference."""
 
-ROLES = ("pose", "use", "block", "kind", "session", "group", TIME, TEMPERATURE)
+ROLES = (*NAME_COLUMNS, TIME, TEMPERATURE)
 """Columns with the same meaning in every file."""
 
 

@@ -30,11 +30,12 @@ from loopcal.io.data.columns import (
     COVARIANCE,
     MEASURED,
     NOTE,
+    POSE_COLUMNS,
+    ROW_COLUMNS,
     SIGMA,
     TEMPERATURE_UNITS,
     TIME,
     TIME_UNITS,
-    USE_COLUMN,
     is_context,
 )
 from loopcal.io.data.kind_settings import POSE_SETTINGS, SETTINGS, list_kind_settings, read_kind
@@ -283,7 +284,7 @@ class Profile:
 
 
 FORMAT = 1
-TEXTS = ("pose", USE_COLUMN.name, "block", "session", "group")
+TEXTS = ("pose", *(column.name for column in POSE_COLUMNS), *ROW_COLUMNS)
 """Columns of text that an export may have."""
 
 SOME_TIME = datetime(2026, 5, 4, 10, 22, 31, tzinfo=UTC)
