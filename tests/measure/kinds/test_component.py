@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `component`: subsets, wrapped angles, the normal near zero tilt, covariances, refusals."""
+"""Kind `component`: subsets, wrapped angles, the normal near zero tilt and covariances."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
-from loopcal.errors import DataError
 from loopcal.measure.kinds.poses import SMALL_TILT, Component, Pose
 from loopcal.measure.observations import Observations
 from tests.jacobians import check_jacobian
@@ -126,38 +125,3 @@ def test_six_components_have_the_information_of_a_full_pose():
         found.append(np.swapaxes(white, -1, -2) @ white)
     assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-9 * found[0].max())
     assert_allclose(found[2], found[0], rtol=1e-9, atol=1e-9 * found[0].max())
-
-
-@pytest.mark.parametrize(
-    ("components", "orientation", "sentence"),
-    [
-        (("w",), None, "the component 'w' does not exist; use x, y, z; declare an orientation"),
-        (("phi", "theta"), None, "declare an orientation to measure angles"),
-        (("a",), "tilt-torsion", "use phi, theta, psi, x, y, z"),
-        (("z", "z"), None, "each once"),
-        ((), None, "name at least one"),
-        (("phi",), "tilt-torsion", "phi is measured without theta"),
-        (("x",), "rotation-vector", "single components of a rotation-vector cannot be measured"),
-        (("a",), "euler-xxy", "is not one of the 24"),
-        (
-            ("a",),
-            "rpy",
-            (
-                "unknown orientation form 'rpy'; use rotation-vector, quaternion, tilt-torsion, "
-                "or "
-                "euler-"
-            ),
-        ),
-    ],
-)
-def test_invalid_components_are_refused_with_the_allowed_ones(components, orientation, sentence):
-    with pytest.raises(DataError, match=sentence):
-        Component(components, orientation)
-
-
-def test_measured_gimbal_lock_is_refused():
-    kind = Component(("a", "b"), "euler-xyz", T_platform_tool=np.eye(4))
-    with pytest.raises(
-        DataError, match=r"row 2 .* b = 90 deg, where a and c of euler-xyz are the same rotation"
-    ):
-        Observations.from_sigma(kind, np.arange(2), np.array([[0.1, 0.2], [0.1, np.pi / 2]]), 1e-4)

@@ -80,6 +80,24 @@ REFUSED = {
         lambda: Position(unknown=("tracker",))
     ),
     "T_base_frame is not a pose": lambda: Position(T_base_frame=2.0 * np.eye(4)),
+    "rotation part deviates by 0 from a right-handed": (
+        lambda: Pose(T_base_frame=np.diag([1.0, 1.0, -1.0, 1.0]))
+    ),
+    r"T_platform_tool has shape \(3, 3\)": lambda: Pose(T_platform_tool=np.eye(3)),
+    "in the kind 'pose'; allowed are frame, tool, bias, drift": lambda: Pose(unknown=("offset",)),
+    "the component 'w' does not exist; use x, y, z; declare an orientation": (
+        lambda: Component(("w",))
+    ),
+    "declare an orientation to measure angles": lambda: Component(("phi", "theta")),
+    "use phi, theta, psi, x, y, z": lambda: Component(("a",), "tilt-torsion"),
+    "the components are z, z; name .* each once": lambda: Component(("z", "z")),
+    "the components are empty; name at least one": lambda: Component(()),
+    "phi is measured without theta": lambda: Component(("phi",), "tilt-torsion"),
+    "components of a rotation-vector cannot be": lambda: Component(("x",), "rotation-vector"),
+    "is not one of the 24": lambda: Component(("a",), "euler-xxy"),
+    "orientation form 'rpy'; use rotation-vector, quaternion, tilt-torsion, or euler-": (
+        lambda: Component(("a",), "rpy")
+    ),
     "the form of a bearing is 'telescope'; use theodolite or camera": (
         lambda: Bearing(form="telescope")
     ),
@@ -102,6 +120,17 @@ REFUSED = {
     ),
     "has a direction of length 0.921954; the length must be 1 to 1e-3": (
         lambda: observe([0.0, 0.6, 0.7], kind=Direction())
+    ),
+    "row 2 of kind 'pose' has an incomplete orientation": (
+        lambda: observe([0.0] * 6, [0.0, np.nan, 0.0, 1.0, 2.0, 3.0], kind=POSE)
+    ),
+    "has a quaternion of length 0; the length must be 1": (
+        lambda: observe([0.0] * 7, kind=Pose("quaternion", T_platform_tool=np.eye(4)))
+    ),
+    "row 2 .* b = 90 deg, where a and c of euler-xyz are the same rotation": lambda: observe(
+        [0.1, 0.2],
+        [0.1, np.pi / 2],
+        kind=Component(("a", "b"), "euler-xyz", T_platform_tool=np.eye(4)),
     ),
     "has an incomplete direction": lambda: observe([0.0, np.nan, 1.0], kind=Direction()),
     "has tilts of 51.5662 and 51.5662 deg, which are impossible": (

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `pose`: residual, forms of orientation, noise and refusals."""
+"""Kind `pose`: residual, forms of orientation, and noise."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
-from loopcal.errors import DataError
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.observations import Observations
 
@@ -56,31 +55,6 @@ def test_sigma_of_euler_angles_is_converted_to_that_of_the_rotation_error():
     assert_allclose(data.covariance[0, :3, :3], E @ np.diag(sigma[:3] ** 2) @ E.T, rtol=1e-12)
     assert_allclose(data.covariance[0, 3:, 3:], np.diag(sigma[3:] ** 2), rtol=1e-12)
     assert_allclose(data.covariance[0, :3, 3:], 0.0, atol=0.0)
-
-
-def test_incomplete_orientation_is_refused():
-    with pytest.raises(DataError, match="row 2 of kind 'pose' has an incomplete orientation"):
-        Observations.from_sigma(
-            Pose(T_platform_tool=np.eye(4)),
-            np.arange(2),
-            [[0.0] * 6, [0.0, np.nan, 0.0, 1.0, 2.0, 3.0]],
-            1e-3,
-        )
-
-
-def test_zero_quaternion_is_refused():
-    with pytest.raises(DataError, match="has a quaternion of length 0; the length must be 1"):
-        Observations.from_sigma(
-            Pose("quaternion", T_platform_tool=np.eye(4)), [0], np.zeros((1, 7)), 1e-3
-        )
-
-
-def test_frame_that_is_not_a_pose_is_refused():
-    mirrored = np.diag([1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(DataError, match="T_base_frame is not a pose"):
-        Pose(T_base_frame=mirrored)
-    with pytest.raises(DataError, match=r"T_platform_tool has shape \(3, 3\)"):
-        Pose(T_platform_tool=np.eye(3))
 
 
 @pytest.mark.parametrize("form", ["tilt-torsion", "euler-ZXZ"])

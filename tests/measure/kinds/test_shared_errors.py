@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal.errors import DataError
 from loopcal.measure.instrument import Gaussian, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.kind import measure_progress, update_setup_name
-from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.position import Bearing
 from loopcal.measure.nuisance import collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -55,11 +54,6 @@ def test_what_is_measured_with_a_bias_has_no_residual_and_right_derivatives(kind
         moved[..., i] += 1e-3
         change = kind.evaluate(T, measured, moved, joints).residual - evaluated.residual
         assert_allclose(evaluated.nuisance[..., i], change / 1e-3, atol=1e-9)
-
-
-def test_only_known_setup_items_are_allowed_and_the_message_names_the_errors():
-    with pytest.raises(DataError, match="bias, drift"):
-        Pose(unknown=("offset",))
 
 
 def test_progress_is_that_in_time_within_each_session():
