@@ -34,26 +34,12 @@ pm,300.03,-250,0,200,350,50,,,
 """
 
 
-@pytest.fixture
-def write(tmp_path):
-    """Return a function that writes files and returns their paths."""
-
-    def write_files(**texts):
-        paths = []
-        for name, text in texts.items():
-            paths.append(tmp_path / f"{name}.csv")
-            paths[-1].write_text(text)
-        return paths
-
-    return write_files
-
-
 def read(paths):
     return lc.load_measurements(paths, ROBOT)
 
 
-def test_a_file_of_the_base_has_neither_poses_nor_readings(write):
-    for files in (write(points=POSES, base=BASE), write(base=BASE, points=POSES)):
+def test_a_file_of_the_base_has_neither_poses_nor_readings(write_files):
+    for files in (write_files(points=POSES, base=BASE), write_files(base=BASE, points=POSES)):
         data = read(files)
         assert data.labels == ("1", "2", "3")
         (rows,) = data.base_observations
@@ -63,8 +49,8 @@ def test_a_file_of_the_base_has_neither_poses_nor_readings(write):
         assert data.n_rows == 9
 
 
-def test_both_kinds_share_a_file(write, tmp_path):
-    data = read(write(points=POSES, base=BASE))
+def test_both_kinds_share_a_file(write_files, tmp_path):
+    data = read(write_files(points=POSES, base=BASE))
     path = tmp_path / "both.csv"
     lc.save_measurements(data, path, ROBOT)
     again = lc.load_measurements(path, ROBOT)
@@ -76,9 +62,9 @@ def test_both_kinds_share_a_file(write, tmp_path):
     assert tuple(after.kind.target_columns) == ("N1", "N2", "N3")
 
 
-def test_unknown_places_may_have_a_prior(write):
+def test_unknown_places_may_have_a_prior(write_files):
     text = BASE.replace("[frame]", '[frame, targets]\n# unknowns: {"N?.*": {sd: 20 um}}')
-    table = read(write(points=POSES, base=text)).nuisance_parameters.table
+    table = read(write_files(points=POSES, base=text)).nuisance_parameters.table
     stated = dict(zip(table.names, table.tolerance, strict=True))
     # one place holds in both sessions, the frame does not
     assert stated["N1.x"] == pytest.approx(20e-6)
@@ -125,7 +111,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_named_with_its_line(write, mistake):
+def test_a_mistake_is_named_with_its_line(write_files, mistake):
     changes, expected = MISTAKES[mistake]
     text = BASE
     for old, new in zip(changes[::2], changes[1::2], strict=True):
@@ -134,20 +120,11 @@ def test_a_mistake_is_named_with_its_line(write, mistake):
     if mistake in ("a pose in a row", "a reading in a row", "a held-out row"):
         text = text.replace("\nam,300.02", "\n,am,300.02").replace("\npm", "\n,pm")
     with pytest.raises((FileError, DataError)) as caught:
-        read(write(points=POSES, base=text))
+        read(write_files(points=POSES, base=text))
     assert expected in str(caught.value)
 
 
-def test_a_target_on_two_bodies_is_refused(write):
-    text = POSES.replace("[tip]", "[N2]")
-    with pytest.raises(FileError) as caught:
-        read(write(points=text, base=BASE))
-    assert caught.value.code == "data.target-on-two-bodies"
-    assert "base.csv:3" in str(caught.value)
-
-
-def test_one_target_is_refused(write):
-    text = """\
+ONE = """\
 # kind: position
 # of: base
 # targets: [N1]
@@ -157,19 +134,26 @@ def test_one_target_is_refused(write):
 session,x [mm],y [mm],z [mm]
 am,300,-250,0
 """
-    with pytest.raises(FileError) as caught:
-        read(write(points=POSES, base=text))
-    assert caught.value.code == "data.single-base-target"
-    assert "base.csv:3" in str(caught.value)
+PLANE = POSES.replace("# targets: [tip]\n# places: [[0 mm, 0 mm, 0 mm]]\n", "# of: base\n")
+WRONG_SETS = {
+    "a target on two bodies": (
+        {"points": POSES.replace("[tip]", "[N2]"), "base": BASE},
+        r"base.csv:3: .*N2",
+        "data.target-on-two-bodies",
+    ),
+    "one target": ({"points": POSES, "base": ONE}, "base.csv:3", "data.single-base-target"),
+    "the base alone": ({"base": BASE}, "give the file of the poses", None),
+    "a kind that measures no points": (
+        {"points": PLANE.replace("kind: position", "kind: plane")},
+        "position, bearing or distance",
+        None,
+    ),
+}
 
 
-def test_a_file_of_the_base_alone_asks_for_the_poses(write):
-    with pytest.raises(FileError, match="give the file of the poses"):
-        read(write(base=BASE))
-
-
-def test_kinds_that_measure_no_points_have_no_base(write):
-    text = POSES.replace("# targets: [tip]\n# places: [[0 mm, 0 mm, 0 mm]]\n", "# of: base\n")
-    plane = text.replace("kind: position", "kind: plane")
-    with pytest.raises(FileError, match="position, bearing or distance"):
-        read(write(points=plane))
+@pytest.mark.parametrize("case", WRONG_SETS)
+def test_files_that_do_not_belong_together_are_refused(write_files, case):
+    texts, message, code = WRONG_SETS[case]
+    with pytest.raises(FileError, match=message) as caught:
+        read(write_files(**texts))
+    assert caught.value.code == code

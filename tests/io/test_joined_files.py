@@ -36,17 +36,6 @@ d,.004,.004,.004,.004,.004,.004,20,0.2
 """
 
 
-@pytest.fixture
-def write_files(tmp_path):
-    def write(**texts: str):
-        paths = [tmp_path / f"{name}.csv" for name in texts]
-        for path, text in zip(paths, texts.values(), strict=True):
-            path.write_text(text, encoding="utf-8")
-        return paths
-
-    return write
-
-
 def test_table_of_poses_and_files_of_two_instruments_are_joined(write_files, robot) -> None:
     data = load_measurements(write_files(poses=POSES, heights=HEIGHTS, tilts=TILTS), robot)
     assert data.labels == ("a", "b", 'c, "third" #1', "λ1", "d")
