@@ -254,10 +254,10 @@ def test_a_replayed_trial_gives_the_scores_of_its_block():
     _, task = list_tasks(study)
     column = [c.name for c in study.columns].index("parameters")
     expected = compute_block(task)[2, column]
-    trial = replay_trial(study, 0, 8)
-    fit = identify(trial.robot, trial.data, options=trial.options)
+    prepared, truth, data = replay_trial(study, 0, 8)
+    fit = identify(prepared.robot, data, options=prepared.fit_options)
     places = fit.free_parameters.places
-    off = (fit.robot.values - trial.truth.values)[places] / fit.free_parameters.tolerance
+    off = (fit.robot.values - truth.values)[places] / fit.free_parameters.tolerance
     assert_allclose(np.sqrt(np.mean(off**2)), expected, rtol=1e-6)
     for cell, number in ((1, 0), (0, 12), (0, -1)):
         with pytest.raises(DataError, match="numbered from 0"):

@@ -118,10 +118,10 @@ def test_per_leg_trials_are_those_of_identify_per_leg():
         block=2,
     )
     two, rule = calibrate_cells(study)
-    trial = replay_trial(study, 0, 1)
-    fit = identify_per_leg(trial.robot, trial.data, 2)
+    prepared, truth, data = replay_trial(study, 0, 1)
+    fit = identify_per_leg(prepared.robot, data, 2)
     assert_allclose(two.values[1], fit.robot.values, rtol=0, atol=1e-15)
-    assert_array_equal(two.truth[1], trial.truth.values)
+    assert_array_equal(two.truth[1], truth.values)
     assert rule.is_converged.all()
     assert (rule.iterations > 1).all()
     delta = {"delta": read_robot("linear-delta")}

@@ -495,21 +495,23 @@ def calibrate_trial(
     LoopcalError: the calibration is refused; the text says why.
     """
     study = read_study(folder)
-    simulated = replay_trial(study, cell, trial)
-    if simulated.method.method == PER_LEG:  # the reason for which such a fit is refused
-        rule = choose_rule(simulated.method)
-        identify_per_leg(simulated.robot, simulated.data, rule.limit, rule.epsilon)
+    prepared, truth, data = replay_trial(study, cell, trial)
+    robot, method = prepared.robot, prepared.content.method
+    if method.method == PER_LEG:  # the reason for which such a fit is refused
+        rule = choose_rule(method)
+        identify_per_leg(robot, data, rule.limit, rule.epsilon)
     levels, limits = study.cells[cell].levels, study.scores
     options = CalibrationOptions(
-        fit=simulated.options, limit_position=limits.limit_position, limit_angle=limits.limit_angle
+        fit=prepared.fit_options,
+        limit_position=limits.limit_position,
+        limit_angle=limits.limit_angle,
     )
     place = output.with_name(f"{output.name}-input")
     refuse_run_folder(output, force)
     refuse_folder(place, INPUTS, force)
-    robot, data = simulated.robot, simulated.data
     contents = {
         ROBOT: format_robot(robot),
-        TRUTH: format_robot(simulated.truth),
+        TRUTH: format_robot(truth),
         DATA: format_measurements(data, robot, states_use=bool(data.is_held_out.any())),
     }
     document = {"study": study.title, "cell": dict(levels), "trial": trial}
@@ -521,7 +523,7 @@ def calibrate_trial(
     errors = study.errors[levels[FACTORS["errors"]]]
     is_changed = errors.tolerance_factor != 1.0 or bool(errors.tolerances)
     findings = [report_finding("store.replay-tolerances", file=ROBOT)] if is_changed else []
-    if simulated.method.is_published:
+    if method.is_published:
         level = levels[FACTORS["methods"]]
         findings.append(report_finding("store.replay-method", method=level))
     return Replay(report, build_document(report, paths, command), place, tuple(findings))

@@ -16,7 +16,6 @@ from loopcal import geometry
 from loopcal.diagnose.error_frames import fit_frames
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.options import FitOptions
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.instrument import BlockStream, make_random_stream
 from loopcal.measure.measurements import Measurements
@@ -43,7 +42,6 @@ from loopcal.studies.simulation.machines import (
     measure_held_points,
     prepare_cell,
 )
-from loopcal.studies.specification.levels import MethodLevel
 from loopcal.studies.specification.study import (
     Study,
     compute_key,
@@ -341,26 +339,11 @@ def set_size(study: Study, seed: int, trials: int) -> Study:
     return replace(study, seed=seed, replicates=trials, block=min(trials, study.block))
 
 
-@dataclass(frozen=True, eq=False)
-class ReplayedTrial:
-    """A trial of a study.
-
-    Attributes
-    ----------
-    robot : nominal, with the tolerances of its cell. truth : the true machine.
-    data : its measurements. options : with which they are fitted. method : of its cell.
-    """
-
-    robot: Mechanism
-    truth: Mechanism
-    data: Measurements
-    options: FitOptions
-    method: MethodLevel
-
-
-def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
-    """Return a trial of a cell, to the last bit; trials of a cell are numbered from 0, over all of
-    its blocks.
+def replay_trial(
+    study: Study, cell: int, trial: int
+) -> tuple[PreparedCell, Mechanism, Measurements]:
+    """Return the cell, the true machine and the measurements of a trial, to the last bit; trials of
+    a cell are numbered from 0, over all of its blocks.
 
     Raises DataError: the study has no such cell or trial.
     """
@@ -380,5 +363,4 @@ def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
     data = state_times(trials.trial(place))
     if prepared.content.scores.verdict:
         data = prepared.hold_out(data)
-    truth = prepared.robot.with_values(trials.truth[place])
-    return ReplayedTrial(prepared.robot, truth, data, prepared.fit_options, prepared.content.method)
+    return prepared, prepared.robot.with_values(trials.truth[place]), data
