@@ -381,46 +381,41 @@ def test_impossible_stages_are_refused_at_their_line(tmp_path, old, new, line, s
     assert "\n" not in str(error.value)
 
 
-def test_a_stage_is_listed_behind_the_one_that_carries_it(tmp_path: Path) -> None:
-    text = ARM.replace("name: shoulder", "name: shoulder\n    on: elbow")
-    with pytest.raises(FileError, match="list 'elbow' first"):
-        load_text(tmp_path, text.replace("name: elbow", "name: elbow\n    on: base"))
-
-
-def test_a_stage_without_actuators_is_refused(tmp_path: Path) -> None:
-    stage = """  - name: link
+PIN = """  - name: link
     family: limbs
     controlled: [yaw]
     limbs:
       - {name: pin, ending: rigid, chain: [{joint: R, name: pin}], errors: [{of: pin, shift: [x]}]}
 """
-    with pytest.raises(FileError, match="stage 'link' has no actuators") as error:
-        load_text(tmp_path, ARM + stage)
-    assert error.value.line == 12
+IMPOSSIBLE_CHAINS = {
+    "listed before its carrier": (
+        ARM.replace("name: shoulder", "name: shoulder\n    on: elbow").replace(
+            "name: elbow", "name: elbow\n    on: base"
+        ),
+        "list 'elbow' first",
+    ),
+    "no actuators": (ARM + PIN, ":12: .*stage 'link' has no actuators"),
+    "no stages": ("controlled: [x]\n", "there are no stages"),
+    "more actuators than coordinates": (
+        ARM + "  - {name: wrist, joint: {kind: R, tip: [50, 0, 0]}}\n",
+        r"3 actuators .* 2 controlled coordinates",
+    ),
+    "stretched home": (
+        ARM.replace("start: 60", "start: 0"),
+        "at home its actuators set only 1 of the coordinates",
+    ),
+    "no family of a stage": (
+        ARM + "  - name: loop\n    family: five-bar\n",
+        "'five-bar' is not a family of a stage",
+    ),
+}
 
 
-def test_a_chain_without_stages_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="there are no stages"):
-        load_text(tmp_path, "controlled: [x]\n")
-
-
-def test_more_actuators_than_coordinates_are_refused(tmp_path: Path) -> None:
-    more = ARM + "  - {name: wrist, joint: {kind: R, tip: [50, 0, 0]}}\n"
-    with pytest.raises(MechanismError, match=r"3 actuators .* 2 controlled coordinates"):
-        load_text(tmp_path, more)
-
-
-def test_a_stretched_home_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MechanismError, match="at home its actuators set only 1 of the coordinates"):
-        load_text(tmp_path, ARM.replace("start: 60", "start: 0"))
-
-
-def test_an_error_of_a_stage_names_it(tmp_path: Path) -> None:
-    stage = """  - name: loop
-    family: five-bar
-"""
-    with pytest.raises(FileError, match="'five-bar' is not a family of a stage"):
-        load_text(tmp_path, ARM + stage)
+@pytest.mark.parametrize("case", IMPOSSIBLE_CHAINS)
+def test_impossible_chains_are_refused(case: str, tmp_path: Path) -> None:
+    text, sentence = IMPOSSIBLE_CHAINS[case]
+    with pytest.raises((FileError, MechanismError), match=sentence):
+        load_text(tmp_path, text)
 
 
 LEG = """format: 1

@@ -334,19 +334,18 @@ def test_impossible_triangles_are_refused_in_one_sentence(tmp_path, old, new, se
     assert "\n" not in str(error.value)
 
 
-def test_a_triangle_at_its_dead_point_is_refused(tmp_path: Path) -> None:
-    text = LINK.replace("foot: [0.6, 0.1, -0.4]", "foot: [1, 0, 0]").replace(
-        "head: [2.3, -0.2, 0.35]", "head: [1.2, 0, 0]"
-    )
-    text = text.replace("skew: {rx: 2, rz: -3}", "skew: {}").replace("start: -45", "start: 180")
-    with pytest.raises((FileError, MechanismError), match="180 deg, a dead point"):
-        load_text(tmp_path, text)
+DEAD_POINT = LINK.replace(TRIANGLE, "triangle: {foot: [1, 0, 0], head: [1.2, 0, 0]}").replace(
+    "start: -45", "start: 180"
+)
+SLIDE = PLANAR.replace("joint: R, name: motor", "joint: P, name: motor").replace(
+    "axis: z, actuated: ram", "axis: y, actuated: ram"
+)
 
 
-def test_a_slide_has_no_triangle(tmp_path: Path) -> None:
-    text = PLANAR.replace(
-        "{joint: R, name: motor, at: [300, 0, 0], axis: z, actuated: ram, start: 60}",
-        "{joint: P, name: motor, at: [300, 0, 0], axis: y, actuated: ram, start: 60}",
-    )
-    with pytest.raises((FileError, MechanismError), match="drives a joint that slides"):
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [(DEAD_POINT, "180 deg, a dead point"), (SLIDE, "drives a joint that slides")],
+)
+def test_triangles_at_dead_points_and_of_slides_are_refused(tmp_path, text, sentence) -> None:
+    with pytest.raises((FileError, MechanismError), match=sentence):
         load_text(tmp_path, text)
