@@ -38,8 +38,6 @@ R = TypeVar("R")
 class Answer(Generic[T, R]):
     """What became of one task.
 
-    Attributes
-    ----------
     result : of the function; None where the task was given up. seconds : of computation by the
         worker. losses : workers that were lost while they had this task, as far as is known.
     """
@@ -62,16 +60,12 @@ class Executor(Protocol):
         only the tasks that it had; these are computed again. An iteration that is closed stops the
         work.
 
-        Parameters
-        ----------
         function : pure, and importable by the workers: f(task) -> result.
         tasks : see `Task`. None instead of a task says that the next one depends on an answer that
             was not yielded yet; workers that are free wait for it.
 
-        Raises
-        ------
-        StudyError : no worker can be reached, or none can start.
-        Exception : of the function, as it was raised in the worker.
+        Raises StudyError: no worker can be reached, or none can start. Exception: of the function,
+        as it was raised in the worker.
         """
         ...
 

@@ -148,8 +148,6 @@ class Share:
     A study with at least as many cells as jobs is divided by cells, others by the blocks of each
     cell.
 
-    Parameters
-    ----------
     part : from 1. of : their number.
     """
 
@@ -173,8 +171,6 @@ class Share:
 class RunReport:
     """What a driver did.
 
-    Attributes
-    ----------
     total : blocks that were asked for. before : of these, stored when it began. computed, trials :
         stored by it. given_up : blocks that stopped every worker, and cells whose poses did.
     losses : workers that were lost, as far as is known. worker_seconds : sum over all workers.
@@ -295,8 +291,6 @@ LONGEST = 30.0
 class TimeEstimate:
     """How long a study takes, by a block of some of its cells.
 
-    Attributes
-    ----------
     measured : cells of which a block was computed. plans : sets of poses to draw or to plan, which
         cells have in common. worker_seconds, seconds : by one worker, and by as many `workers`.
     bytes : of the store. failed : share of the computed trials that failed, and by their code.

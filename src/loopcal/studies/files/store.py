@@ -119,8 +119,6 @@ OF_CELL = "FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?)"
 class StoreHeader:
     """What a store says about its study.
 
-    Attributes
-    ----------
     specification : the study as JSON. columns : names of the scores. versions : program or part ->
         version that made the store.
     """
@@ -403,8 +401,6 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
     A folder that was made is removed where the body raises a LoopcalError before it stored a block,
     as where no worker can be reached.
 
-    Parameters
-    ----------
     resume : a folder of the same study is continued. The study may have more replicates or further
         levels than there.
 

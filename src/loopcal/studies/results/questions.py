@@ -48,8 +48,6 @@ State = Literal["yes", "no", "open"]
 class LevelShare:
     """How many machines of one level are within the limit.
 
-    Attributes
-    ----------
     level : its name. value : its number [SI], None without one.
     reached, trials : machines within the limit, and all; 0 where none has the score.
     share : of the machines within the limit. state : whether this share is at least the demanded
@@ -68,8 +66,6 @@ class LevelShare:
 class Answer:
     """The answer to a question, for one combination of the levels of the other factors.
 
-    Attributes
-    ----------
     levels : the other varied factors -> level. chain : what distinguishes the levels that were
         compared; empty where all were. quantity, unit : of the numbers of the levels.
     certainty : "certain": `best` is the answer. "between": it is one of `candidates`. "none": no

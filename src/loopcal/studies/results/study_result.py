@@ -257,8 +257,6 @@ class Interval:
 class ScoreSummary:
     """One score of the converged trials of a cell [SI].
 
-    Attributes
-    ----------
     median, high : quantiles 0.5 and 0.95. mean : also of shares. What does not exist is None.
     """
 
@@ -484,8 +482,6 @@ def export_trials(
     Columns are all factors, the trial, and the scores in SI. A CSV file has their units in its
     header; a Parquet file has them in the metadata of its columns.
 
-    Parameters
-    ----------
     path : its ending decides the format. It is written whole or not at all.
 
     Raises DataError: another ending. FileError: it cannot be written. StudyError: pyarrow is

@@ -64,8 +64,6 @@ IN_FRAME = ("position", "orientation", "covered_position", "covered_orientation"
 class Layout:
     """Which factor is along the axis, has colors, and has panels.
 
-    Attributes
-    ----------
     axis : factor along the axis. label : with its unit. places : level -> place, in the unit of the
         label or as a count. is_numeric : whether places are numbers of the levels.
     chains : level -> words in which it differs from other levels with the same number, which are
@@ -148,8 +146,6 @@ def draw_score(
     bound. The second varied factor has colors, and all others have panels. A line is the limit of a
     question of the study.
 
-    Parameters
-    ----------
     factor : along the axis; default: the varied one with the most levels that have an order.
 
     Raises DataError: an unknown score or factor, or more than `MOST_PANELS` panels.

@@ -71,8 +71,6 @@ class PosesTask:
 class BlockTask:
     """A block to compute.
 
-    Attributes
-    ----------
     key : hash of everything that determines its numbers. cell : number of its cell.
     block : number of the block in its cell. content : all that `compute_block` needs, as JSON.
     """
@@ -276,8 +274,6 @@ def _fit_motions(
 class CalibratedCell:
     """t calibrated machines, which are not scored.
 
-    Attributes
-    ----------
     levels : factor -> level. robot : nominal. readings : (n, a) [SI] of the controller.
     truth, values : (t, p) [SI] true and estimated parameters; values are NaN where there are none.
     measured : of each sensor (t, r, c) [SI]. outcome : (t,) numbers of OUTCOMES before held-out

@@ -84,8 +84,6 @@ LEVEL_95 = 1.959963984540054
 class FittedTrials:
     """The calibrations of t trials; NaN in those that have none.
 
-    Attributes
-    ----------
     values : (t, p of the robot) [SI]. outcome : (t,) numbers of OUTCOMES.
     half_width : (t, p free) of 95 % intervals [SI]. expanded : (t, h, 2) position and rotation
         errors that 95 % of the errors of held-out poses do not exceed [m], [rad].

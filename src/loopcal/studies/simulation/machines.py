@@ -427,8 +427,6 @@ def draw_motion(effects: EffectsLevel, trials: int, n: int, seed: Seed) -> Float
 class PreparedCell:
     """What the blocks of a cell compute with.
 
-    Attributes
-    ----------
     content : of its tasks. robot : nominal, with the tolerances of the cell.
     instrument : with its true noise. fit_options : of the cell.
     layout : points that are held on planes and lines; None for other poses.

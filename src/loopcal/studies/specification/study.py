@@ -142,8 +142,6 @@ def check_question(study: Study, question: Question) -> float:
 class Cell:
     """One combination of levels.
 
-    Attributes
-    ----------
     number : from 0, in the order of the study. levels : factor -> name of its level, for every
         factor, such as {"robot": "linear-delta", "poses": "20"}.
     """
