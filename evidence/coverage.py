@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.estimate.descent import penalize
+from loopcal.estimate.descent import SpectralModel
 from loopcal.estimate.identification import IdentifiedTrials, identify_trials
 from loopcal.estimate.penalties import MAP, LeastSquares, Method
 from loopcal.io.robot.robot_file import load_robot
@@ -118,7 +118,7 @@ def simulate_fits(case: Case, count: int) -> Iterator[Outcome]:
         decided = np.isfinite(sd)
         inside = np.abs(error) <= NORMAL_95 * np.where(decided, sd, np.inf)
         z = result.free_parameters.deviation(result.values)
-        chi_square = result.cost + penalize(result.decomposition, result.penalty, z)
+        chi_square = result.cost + SpectralModel(result.decomposition, result.penalty).penalize(z)
         # a prior counts as one equation for each penalized direction
         dof = (
             case.poses * (3 if case.kind == "component" else 6)

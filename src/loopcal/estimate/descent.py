@@ -55,52 +55,6 @@ class FilteredStep(TrialBatch):
     change: FloatArray
 
 
-def propose_step(
-    deviation: FloatArray, decomposition: Decomposition, penalty: FloatArray, damping: FloatArray
-) -> FilteredStep:
-    """Return the step from `deviation` (a, p) to the filtered solution, damped by mu (a,)."""
-    s, c = decomposition.singular_values, decomposition.projections
-    current = decomposition.coordinates(deviation)
-    solution = decomposition.solution(penalty)
-    full = solution - current
-    # a direction that is not used is as stiff as the weakest one that is
-    used, stiffness = np.isfinite(penalty), s**2 + _finite(penalty)
-    weakest = np.where(used, stiffness, np.inf).min(axis=1, initial=np.inf)
-    others = np.where(np.isfinite(weakest), weakest, 1.0)[:, None]
-    curvature = np.where(used, stiffness, others)
-    new = current + curvature / (curvature + damping[:, None]) * full
-    # differences of squares as products, so that a small decrease is not lost in a large sum
-    data = s * (current - new) * (s * (current + new) - 2.0 * c)
-    prior = _finite(penalty) * (current - new) * (current + new)
-    reached = decomposition.deviation(new)
-    return FilteredStep(
-        deviation=reached,
-        target=decomposition.deviation(solution),
-        length=np.linalg.norm(reached - deviation, axis=1),
-        full_length=np.linalg.norm(decomposition.deviation(full), axis=1),
-        predicted=(data + prior).sum(axis=1),
-        change=(curvature * full**2).sum(axis=1),
-    )
-
-
-def penalize(
-    decomposition: Decomposition, penalty: FloatArray, deviation: FloatArray
-) -> FloatArray:
-    """Return what the penalty adds to the sum of squares at `deviation` (a, p).
-
-    It is the sum of penalty_i (v_i'z)^2, (a,), without directions that are not used.
-    """
-    weight = _finite(penalty)
-    if not weight.any():
-        return np.zeros(len(deviation))
-    return (weight * decomposition.coordinates(deviation) ** 2).sum(axis=1)
-
-
-def _finite(penalty: FloatArray) -> FloatArray:
-    """Return the penalty with zero for directions that are not used."""
-    return np.where(np.isfinite(penalty), penalty, 0.0)
-
-
 @dataclass(frozen=True, eq=False)
 class SpectralModel(TrialBatch):
     """The decomposition of the rows, and the penalty (t, p) that the method chose from it."""
@@ -108,13 +62,45 @@ class SpectralModel(TrialBatch):
     decomposition: Decomposition
     penalty: FloatArray
 
+    @property
+    def finite_penalty(self) -> FloatArray:
+        """(t, p) with zero for directions that are not used."""
+        return np.where(np.isfinite(self.penalty), self.penalty, 0.0)
+
     def propose(self, deviation: FloatArray, damping: FloatArray) -> FilteredStep:
-        """Return the steps from deviations (t, p), damped by (t,)."""
-        return propose_step(deviation, self.decomposition, self.penalty, damping)
+        """Return the steps from deviations (t, p) to the filtered solutions, damped by mu (t,)."""
+        decomposition, penalty, finite = self.decomposition, self.penalty, self.finite_penalty
+        s, c = decomposition.singular_values, decomposition.projections
+        current = decomposition.coordinates(deviation)
+        solution = decomposition.solution(penalty)
+        full = solution - current
+        # a direction that is not used is as stiff as the weakest one that is
+        used, stiffness = np.isfinite(penalty), s**2 + finite
+        weakest = np.where(used, stiffness, np.inf).min(axis=1, initial=np.inf)
+        others = np.where(np.isfinite(weakest), weakest, 1.0)[:, None]
+        curvature = np.where(used, stiffness, others)
+        new = current + curvature / (curvature + damping[:, None]) * full
+        # differences of squares as products, so that a small decrease is not lost in a large sum
+        data = s * (current - new) * (s * (current + new) - 2.0 * c)
+        prior = finite * (current - new) * (current + new)
+        reached = decomposition.deviation(new)
+        return FilteredStep(
+            deviation=reached,
+            target=decomposition.deviation(solution),
+            length=np.linalg.norm(reached - deviation, axis=1),
+            full_length=np.linalg.norm(decomposition.deviation(full), axis=1),
+            predicted=(data + prior).sum(axis=1),
+            change=(curvature * full**2).sum(axis=1),
+        )
 
     def penalize(self, deviation: FloatArray) -> FloatArray:
-        """Return what the penalty adds to the sum of squares (t,) at deviations (t, p)."""
-        return penalize(self.decomposition, self.penalty, deviation)
+        """Return what the penalty adds to the sum of squares at deviations (t, p): the sum of
+        penalty_i (v_i'z)^2, (t,), without directions that are not used.
+        """
+        weight = self.finite_penalty
+        if not weight.any():
+            return np.zeros(len(deviation))
+        return (weight * self.decomposition.coordinates(deviation) ** 2).sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +144,7 @@ class TriangularModel(TrialBatch):
         """Return the steps from deviations (t, p), damped by (t,)."""
         is_simple = self.is_regular & (damping == 0.0)
         if not is_simple.any():
-            return propose_step(deviation, self.decomposition, self.penalty, damping)
+            return SpectralModel(self.decomposition, self.penalty).propose(deviation, damping)
         target = deviation + self.step
         length = np.linalg.norm(self.step, axis=1)
         full = FilteredStep(target, target, length, length, self.gain, self.gain)

@@ -581,21 +581,6 @@ class SharedFactor:
     by_deviation: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class ChordStart:
-    """Where chords lead.
-
-    Attributes
-    ----------
-    deviation : (t, p). length : (t,) by which the chords changed the whitened residuals, to first
-        order; infinite in trials that begin where they were. start : for the linearization there.
-    """
-
-    deviation: FloatArray
-    length: FloatArray
-    start: Start
-
-
 def share_factor(
     problem: Problem, deviation: FloatArray, method: Method, tolerance: float
 ) -> SharedFactor | None:
@@ -637,8 +622,13 @@ def share_factor(
     )
 
 
-def take_chords(problem: Problem, shared: SharedFactor, deviation: FloatArray) -> ChordStart:
-    """Return where one chord leads from deviations (t, p), which are equal in all trials."""
+def take_chords(
+    problem: Problem, shared: SharedFactor, deviation: FloatArray
+) -> tuple[FloatArray, FloatArray, Start]:
+    """Return where one chord leads from deviations (t, p), which are equal in all trials; by how
+    much it changes the whitened residuals, to first order, infinite in trials that begin where they
+    were; and the start for the linearization there.
+    """
     t = len(deviation)
     kinds = problem.residuals(deviation, shared.solution)
     residual = np.concatenate([kind.whitened.reshape(t, -1) for kind in kinds], axis=1)
@@ -647,11 +637,9 @@ def take_chords(problem: Problem, shared: SharedFactor, deviation: FloatArray) -
     step = -(step + np.matmul(shared.by_deviation, deviation[:, :, None]))[:, :, 0]
     length = np.linalg.norm(np.matmul(shared.triangle, step[:, :, None])[:, :, 0], axis=1)
     good = np.isfinite(length)
-    return ChordStart(
-        np.where(good[:, None], deviation + step, deviation),
-        np.where(good, length, np.inf),
-        shared.start.take(np.zeros(t, dtype=np.int64)),
-    )
+    moved = np.where(good[:, None], deviation + step, deviation)
+    start = shared.start.take(np.zeros(t, dtype=np.int64))
+    return moved, np.where(good, length, np.inf), start
 
 
 def identify_trials(
@@ -756,18 +744,18 @@ def _descend_from_chords(
     problem: Problem, z: FloatArray, options: FitOptions, shared: SharedFactor
 ) -> Descent:
     """Return the descents that begin with chords; without them in trials that do not converge."""
-    begin, method = take_chords(problem, shared, z), get_method(options)
+    begin, length, start = take_chords(problem, shared, z)
     fit = descend(
         problem,
-        begin.deviation,
-        method,
+        begin,
+        get_method(options),
         options.control,
         options.rank_tolerance,
-        begin.start,
-        arrival=begin.length,
+        start,
+        arrival=length,
         sufficient=ACCEPTED_STEP,
     )
-    fit = replace(fit, iterations=fit.iterations + np.isfinite(begin.length))
+    fit = replace(fit, iterations=fit.iterations + np.isfinite(length))
     again = np.flatnonzero(fit.status != DescentStatus.CONVERGED)
     if not again.size:
         return fit

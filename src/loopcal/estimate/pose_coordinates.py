@@ -63,11 +63,14 @@ class PoseCoordinates:
     count : number k of each pose.
     are_shared : whether trials of equal parameters have equal poses.
     rows_of_readings : number of kinds, the last ones, whose rows depend on coordinates alone.
+    scale, longest : unit of the coordinates [SI], and their longest step (k,) that is about linear.
     """
 
     count = 0
     are_shared = True
     rows_of_readings = 0
+    scale: FloatArray = np.ones(0)
+    longest: FloatArray = np.ones(0)
 
     def __init__(self, free: FreeParameters, names: tuple[str, ...], readings: FloatArray) -> None:
         self.free: FreeParameters = free
@@ -108,7 +111,7 @@ class PoseCoordinates:
 
     def limit_step(self, u: FloatArray) -> FloatArray:
         """Return the largest share (a, n), at most 1, of steps u (a, n, k) that is about linear."""
-        return np.ones(u.shape[:2])
+        return 1.0 / np.maximum(np.abs(u * self.scale) / self.longest, 1.0).max(2, initial=1.0)
 
     def move(self, states: PoseStates, u: FloatArray) -> PoseStates:
         """Move all poses by u (a, n, k), without solving closure."""
@@ -208,10 +211,6 @@ class ReadingCoordinates(PoseCoordinates):
         state = forward_trials(self.free.robot, values, begin.q, begin.state, follow)
         return PoseStates(state, begin.q)
 
-    def limit_step(self, u: FloatArray) -> FloatArray:
-        """Return the share by which no reading moves more than `LONGEST_STEP` of its stroke."""
-        return _largest_share(u * self.scale, self.longest)
-
     def move(self, states: PoseStates, u: FloatArray) -> PoseStates:
         """Move the readings."""
         return replace(states, q=states.q + self.scale * u)
@@ -263,12 +262,6 @@ class TwistCoordinates(PoseCoordinates):
         assert begin is not None
         return PoseStates(*solve_at_pose(self.free.robot, values, begin.state.T, begin.state))
 
-    def limit_step(self, u: FloatArray) -> FloatArray:
-        """Return the share by which no shift exceeds `LONGEST_STEP` of the robot's size, and no
-        turn as many radians.
-        """
-        return _largest_share(u * self.scale, self.longest)
-
     def move(self, states: PoseStates, u: FloatArray) -> PoseStates:
         """Move the platform."""
         twist = np.zeros((*u.shape[:2], 6))
@@ -311,11 +304,6 @@ def stroke_of(robot: Mechanism, actuator: Actuator) -> float:
     if actuator.stroke is None:
         return robot.size if actuator.dimension is Dimension.LENGTH else 1.0
     return actuator.stroke[1] - actuator.stroke[0]
-
-
-def _largest_share(step: FloatArray, longest: FloatArray) -> FloatArray:
-    """Return the share (a, n) of steps (a, n, k) that leaves each number within `longest` (k,)."""
-    return 1.0 / np.maximum(np.abs(step) / longest, 1.0).max(axis=2, initial=1.0)
 
 
 # Poses that rows measure in full, without readings.

@@ -40,7 +40,6 @@ from loopcal.estimate.posterior import TOLERANCES, CovariancePart, find_variance
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.tolerance_components import (
     LARGEST_FACTOR,
-    WIDEST,
     InflatedTolerances,
     Kind,
     ToleranceComponent,
@@ -48,7 +47,6 @@ from loopcal.estimate.tolerance_components import (
     compute_prior_covariance,
     compute_symmetric_root,
     estimate_excess_noise,
-    estimate_factor_spread,
     find_most_probable_factor,
     list_components,
     list_shifts,
@@ -76,6 +74,9 @@ MOST_COMPONENTS = 8
 
 CYCLES = 4
 """Cycles in which the variances of the chosen components are optimized in turn."""
+
+WIDEST = 30.0
+"""Factor on an estimated factor up to which its distribution is integrated."""
 
 VARIANCES = np.expm1(2.0 * np.linspace(0.0, np.log(WIDEST), 41)[1:])
 """Variances over which the evidence is integrated: factors uniform in their logarithm."""
@@ -165,16 +166,12 @@ def optimize_variance(size: FloatArray, square: FloatArray) -> tuple[float, floa
     return best, largest
 
 
-def estimate_variance_spread(
-    data: PredictedData, component: ToleranceComponent, variance: float
-) -> float:
-    """Return the root mean square deviation of a component's log factor from that of `variance`,
-    for data predicted without the component (t = 1).
+def estimate_log_spread(size: FloatArray, square: FloatArray, center: float) -> float:
+    """Return the root mean square deviation of the log factor of a component from `center`, for l
+    and u^2 (k,): that of the distribution exp(g) over factors from 1 to WIDEST times this one.
     """
-    size, square = data.project(np.array([component.places]), component.kind == "shift")
-    center = 0.5 * np.log1p(variance)
     grid = np.linspace(0.0, center + np.log(WIDEST), 200)
-    gain = _gain(size[0], square[0], np.expm1(2.0 * grid))[0]
+    gain = _gain(size[None], square[None], np.expm1(2.0 * grid))[0]
     weight = np.exp(gain - gain.max())
     return float(np.sqrt((weight * (grid - center) ** 2).sum() / weight.sum()))
 
@@ -429,7 +426,13 @@ def _estimate_factor_error(
     of the variance tau_i^2 cause the error (1 - f_i) tau_i.
     """
     d, penalty = fit.decomposition, np.where(np.isfinite(fit.penalty), fit.penalty, 0.0)
-    spread = float(estimate_factor_spread(_divide(d, method), np.array([factor]))[0])
+    rows = _divide(d, method)  # a factor is one component of all tolerances
+    s, c = (
+        np.where(are_penalized(rows), x, 0.0)[0] for x in (rows.singular_values, rows.projections)
+    )
+    spread = estimate_log_spread(
+        s**2 / (1.0 + s**2), (s * c / (1.0 + s**2)) ** 2, float(np.log(factor))
+    )
     change = 2.0 * (1.0 - d.filter_factors(penalty)) * d.solution(fit.penalty)
     change = np.where(penalty > 0.0, change, 0.0)
     test, free = result.residual_test, result.free_parameters
@@ -460,7 +463,9 @@ def _estimate_component_errors(fit: Descent, method: MAP, factor: float) -> list
         stated = compute_prior_covariance(p, method.correlation, others)
         alone = restate(rows, stated, method.unpenalized(p))
         variance = factor**2 * component.variance
-        spread = estimate_variance_spread(predict(alone, np.array([factor])), component, variance)
+        places, is_shift = np.array([component.places]), component.kind == "shift"
+        size, square = predict(alone, np.array([factor])).project(places, is_shift)
+        spread = estimate_log_spread(size[0, 0], square[0, 0], 0.5 * np.log1p(variance))
         E = component.columns(p)
         left = E - S @ (Q @ E)
         left = rows.deviation(np.where(penalized, rows.coordinates(left.T), 0.0)).T

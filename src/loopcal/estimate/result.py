@@ -589,20 +589,19 @@ class Identification(TableResult):
     def list_parameters(self) -> list[dict[str, Any]]:
         """Return one row for each parameter, in the units of the robot's file."""
         factor, symbols = self.free_parameters.display()
-        half = self.interval()
+        numbers = {
+            "nominal": self.nominal,
+            "estimate": self.estimate,
+            "sd": self.standard_deviations,
+            "plus_minus": self.interval(),
+        }
+        units = zip(factor, symbols, strict=True)
+        further = zip(self.tolerance / factor, self.free_parameters.assumed.tolist(), strict=True)
         return [
-            {
-                "name": parameter.name,
-                "unit": symbols[i],
-                "nominal": self.nominal[i] / factor[i],
-                "estimate": self.estimate[i] / factor[i],
-                "sd": self.standard_deviations[i] / factor[i],
-                "plus_minus": half[i] / factor[i],
-                "degrees": self.degrees[i],
-                "tolerance": self.tolerance[i] / factor[i],
-                "tolerance_assumed": bool(self.free_parameters.assumed[i]),
-            }
-            for i, parameter in enumerate(self.free_parameters.parameters)
+            row | {"tolerance": tolerance, "tolerance_assumed": is_assumed}
+            for row, (tolerance, is_assumed) in zip(
+                _list_rows(self.names, units, numbers, self.degrees), further, strict=True
+            )
         ]
 
     def arrays(self) -> dict[str, FloatArray]:
@@ -828,28 +827,17 @@ class NuisanceEstimate(TableResult):
         """Return one entry for each, in its unit, ready for JSON; `coverage` (U,) is the number of
         standard deviations in `plus_minus`, `degrees` (U,) is theirs.
         """
-        shown = []
-        for i, entry in enumerate(self.table.entries):
-            factor, symbol = self.display[i]
-            numbers = {
-                "nominal": entry.nominal,
-                "estimate": self.estimate[i],
-                "sd": self.sd[i],
-                "plus_minus": coverage[i] * self.sd[i],
-            }
-            tolerance = None if entry.tolerance is None else entry.tolerance / factor
-            scaled = {name: float(value) / factor for name, value in numbers.items()}
-            shown.append(
-                {
-                    "name": entry.name,
-                    "unit": symbol,
-                    **scaled,
-                    "degrees": float(degrees[i]),
-                    "tolerance": tolerance,
-                    "free": entry.free,
-                }
-            )
-        return shown
+        numbers = {
+            "nominal": self.table.nominal,
+            "estimate": self.estimate,
+            "sd": self.sd,
+            "plus_minus": coverage * self.sd,
+        }
+        rows = _list_rows(self.names, self.display, numbers, degrees)
+        for row, entry, (factor, _) in zip(rows, self.table.entries, self.display, strict=True):
+            row["tolerance"] = None if entry.tolerance is None else entry.tolerance / factor
+            row["free"] = entry.free
+        return rows
 
     def report_unobservable(self) -> tuple[Finding, ...]:
         """Return which frames, targets, surfaces and offsets cannot be determined."""
@@ -858,6 +846,24 @@ class NuisanceEstimate(TableResult):
         )
         code = "setup.common-displacement" if self.is_harmless else "setup.unobservable"
         return (report_finding(code, names=owners),) if owners else ()
+
+
+def _list_rows(
+    names: Sequence[str],
+    units: Iterable[tuple[float, str]],
+    numbers: Mapping[str, FloatArray],
+    degrees: FloatArray,
+) -> list[dict[str, Any]]:
+    """Return one row for each parameter, `numbers` (p,) [SI] in units of this factor and symbol."""
+    return [
+        {
+            "name": name,
+            "unit": symbol,
+            **{key: float(values[i]) / factor for key, values in numbers.items()},
+            "degrees": float(degrees[i]),
+        }
+        for i, (name, (factor, symbol)) in enumerate(zip(names, units, strict=True))
+    ]
 
 
 def estimate_nuisance(

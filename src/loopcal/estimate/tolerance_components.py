@@ -32,9 +32,6 @@ from loopcal.typing import BoolArray, FloatArray
 LARGEST_FACTOR = 1e6
 """Factor on tolerances up to which the most probable one is searched."""
 
-WIDEST = 30.0
-"""Factor on an estimated factor up to which its distribution is integrated."""
-
 GRID = np.log(LARGEST_FACTOR) * np.linspace(0.0, 1.0, 20) ** 1.5
 """Logarithms of factors among which the minimum is bracketed."""
 
@@ -110,22 +107,6 @@ def find_most_probable_factor(decomposition: Decomposition) -> FloatArray:
         if np.abs(x - before).max() < 1e-6:  # the error is the square of this
             break
     return np.asarray(np.exp(0.5 * x))
-
-
-def estimate_factor_spread(decomposition: Decomposition, factor: FloatArray) -> FloatArray:
-    """Return the root mean square deviation (t,) of the log factor from that of `factor` (t,).
-
-    It is that of the distribution exp(-L/2) over factors from 1 to WIDEST times `factor`, which is
-    cut off at 1.
-    """
-    square, projected = _count_penalized(decomposition)
-    spread = np.empty(len(factor))
-    for i, center in enumerate(np.log(factor)):
-        grid = np.linspace(0.0, center + np.log(WIDEST), 200)
-        score = _score(square[[i]], projected[[i]], grid)[0]
-        weight = np.exp(-0.5 * (score - score.min()))
-        spread[i] = np.sqrt((weight * (grid - center) ** 2).sum() / weight.sum())
-    return spread
 
 
 def estimate_excess_noise(decomposition: Decomposition) -> FloatArray:
