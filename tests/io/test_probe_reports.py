@@ -53,15 +53,11 @@ def probe(robot, truth, points, offset=(0.0, 0.0)) -> list[float]:
     """Return the heights [mm] that a firmware reports: it lowers the nozzle by its own geometry
     until the nozzle truly touches the bed.
     """
-    heights = []
-    for x, y in points:
-        height = 0.0
-        for _ in range(30):
-            place = [[1e-3 * (x - offset[0]), 1e-3 * (y - offset[1]), height]]
-            touched = forward(truth, inverse(robot, place).q)
-            height -= float(touched.T[0, 2, 3])
-        heights.append(1e3 * height)
-    return heights
+    places = np.zeros((len(points), 3))
+    places[:, :2] = 1e-3 * (np.array(points) - offset)
+    for _ in range(30):
+        places[:, 2] -= forward(truth, inverse(robot, places).q).T[:, 2, 3]
+    return (1e3 * places[:, 2]).tolist()
 
 
 G30 = ("{}", "Bed X:{x:.2f} Y:{y:.2f} Z:{h:.3f}\nok\nX:{x:.2f} Y:{y:.2f} Z:10.00 E:0 Count X:1\n")
@@ -148,14 +144,12 @@ def test_a_height_entered_as_z_would_move_the_radius_in_the_wrong_direction() ->
 
 def test_a_dry_run_of_g33_leads_to_the_truth() -> None:
     robot, truth = make_truth("m503.gcode")
-    angles = {"c": None, "x": 210, "y": 330, "z": 90, "yz": 30, "zx": 150, "xy": 270}
+    angles = {"x": 210, "y": 330, "z": 90, "yz": 30, "zx": 150, "xy": 270}
     lines = []
     for radius in (50.0, 80.0):
-        h = {}
-        for name, angle in angles.items():
-            r = 0.0 if angle is None else radius
-            a = math.radians(angle or 0)
-            h[name] = probe(robot, truth, [(r * math.cos(a), r * math.sin(a))])[0]
+        turns = [math.radians(angle) for angle in angles.values()]
+        points = [(0.0, 0.0), *((radius * math.cos(a), radius * math.sin(a)) for a in turns)]
+        h = dict(zip(("c", *angles), probe(robot, truth, points), strict=True))
         h["c"] += 0.001 * (radius > 60.0)  # repeated to the last digit, it needs --allow-duplicates
         lines += [
             "G33 Auto Calibrate",
