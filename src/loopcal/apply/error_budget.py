@@ -31,8 +31,8 @@ from loopcal.errors import MechanismError
 from loopcal.estimate.fit_linearization import (
     FitLinearization,
     fold_sources,
+    linearize_at_estimate,
     linearize_fit,
-    linearize_rows_of,
 )
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import Linearization
@@ -186,7 +186,7 @@ def _halve_sigma(
         other = replace(fit, options=replace(fit.options, nuisance=setup))
     else:
         return None
-    problem, linearization = linearize_rows_of(other, changed)
+    problem, _, linearization = linearize_at_estimate(other, changed)
     p = len(fit.names)
     own, _ = _propagate(linear, [linearization.factor[0, :p, :p]], 0, weight)
     return fit.tolerance[:, None] * np.concatenate(own, axis=1), linearization, problem

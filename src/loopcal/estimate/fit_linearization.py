@@ -21,7 +21,7 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.elimination import NodeRows, divide_among_nodes
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.linearization import KindRows, Linearization, PoseSolution, Start
+from loopcal.estimate.linearization import KindRows, Linearization, PoseSolution
 from loopcal.estimate.penalties import decompose_for
 from loopcal.estimate.pose_rows import PoseBlock, PoseRows, stack_rows
 from loopcal.estimate.posterior import (
@@ -93,7 +93,7 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
 
     `data` are its measurements, with the sigma of their readings, without excluded poses.
     """
-    problem, solution, linearization = _linearize(fit, data)
+    problem, solution, linearization = linearize_at_estimate(fit, data)
     method = fit.method
     d = decompose_for(
         method,
@@ -107,14 +107,6 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
     return FitLinearization(problem, solution, linearization, d, penalty, sources)
 
 
-def linearize_rows_of(fit: Identification, data: Measurements) -> tuple[Problem, Linearization]:
-    """Linearize the rows of other measurements of the poses of a fit at its estimate, such as those
-    of another sigma, with an earlier calibration; arguments as of `linearize_fit`.
-    """
-    problem, _, linearization = _linearize(fit, data)
-    return problem, linearization
-
-
 def linearize_smooth_errors(
     fit: Identification, data: Measurements, errors: SmoothErrors, linear: FitLinearization
 ) -> Linearization:
@@ -124,46 +116,37 @@ def linearize_smooth_errors(
     solution, free = linear.solution, replace(fit.free_parameters, errors=errors)
     if solution.linearized is not None:
         solution = replace(solution, linearized=solution.linearized.with_errors(errors))
-    problem = _state_problem(fit, data, free)
-    # the columns of the errors have no part in the rank of the machine
-    problem = replace(problem, consistent=None)
-    z, start = _start_at_estimate(fit, problem)
-    return _add_prior(fit, problem, problem.linearize_at(z, start, solution))
+    return linearize_at_estimate(fit, data, free, solution)[2]
 
 
-def _linearize(
-    fit: Identification, data: Measurements
+def linearize_at_estimate(
+    fit: Identification,
+    data: Measurements,
+    free: FreeParameters | None = None,
+    solution: PoseSolution | None = None,
 ) -> tuple[Problem, PoseSolution, Linearization]:
     """Return the weighted problem of a fit, its solution at the estimate, and its linearization
     there with an earlier calibration.
+
+    `data` are of the same poses, such as with another sigma. Where `free` has columns of errors,
+    they have no part in the rank of the machine, and the solution is given.
     """
-    problem = _state_problem(fit, data, fit.free_parameters)
-    z, start = _start_at_estimate(fit, problem)
-    solution = problem.solve(z, start, derivatives=True)
-    linearization = problem.linearize_at(z, start, solution)
-    return problem, solution, _add_prior(fit, problem, linearization)
-
-
-def _state_problem(fit: Identification, data: Measurements, free: FreeParameters) -> Problem:
-    """Return the weighted problem of a fit."""
     setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
-    return problem_of(free, data, setup).weighted(fit.pose_weights)
-
-
-def _start_at_estimate(fit: Identification, problem: Problem) -> tuple[FloatArray, Start]:
-    """Return the deviation (1, p) of a fit, and a start with its nuisance parameters."""
+    problem = problem_of(fit.free_parameters if free is None else free, data, setup).weighted(
+        fit.pose_weights
+    )
     z = problem.free.deviation(fit.robot.values[None])
     start = problem.start(z, seek=False)
-    values = fit.nuisance.estimate
-    return z, start.with_nuisance(values[None]) if problem.nuisance is not None else start
-
-
-def _add_prior(
-    fit: Identification, problem: Problem, linearization: Linearization
-) -> Linearization:
-    """Return a linearization with the rows of the earlier calibration of a fit, if any."""
-    prior = fit.options.prior
-    return linearization if prior is None else prior.added(problem).append(linearization)
+    if problem.nuisance is not None:
+        start = start.with_nuisance(fit.nuisance.estimate[None])
+    if solution is None:
+        solution = problem.solve(z, start, derivatives=True)
+    else:
+        problem = replace(problem, consistent=None)
+    linearization = problem.linearize_at(z, start, solution)
+    if fit.options.prior is not None:
+        linearization = fit.options.prior.added(problem).append(linearization)
+    return problem, solution, linearization
 
 
 # What a fit knows of machine and nuisance parameters together, to predict other measurements.
