@@ -46,9 +46,10 @@ def difference_poses(function, at, steps):
 def test_posterior_has_the_covariance_of_its_fit(fit):
     known = fit.posterior
     spread = known.unit[:, None] * known.directions * np.sqrt(known.variance)
+    # the rest is rounding
     np.testing.assert_allclose(
         spread @ spread.T, fit.covariance, rtol=0, atol=1e-12 * fit.covariance.max()
-    )  # rounding
+    )
 
 
 def test_pose_covariance_agrees_with_finite_differences(fit):
@@ -58,9 +59,8 @@ def test_pose_covariance_agrees_with_finite_differences(fit):
     )
     expected = D @ fit.covariance @ D.swapaxes(1, 2)
     result = pose_uncertainty(fit, TEST_POSES, point="platform").covariance
-    np.testing.assert_allclose(
-        result, expected, rtol=0, atol=1e-6 * np.abs(expected).max()
-    )  # differences of 1 um steps
+    # differences of 1 um steps
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
 def test_reading_noise_adds_to_the_pose_covariance(fit):
@@ -114,9 +114,8 @@ def test_uncertainty_without_torsion_is_infinite_about_the_normal_only(fit_5):
         np.isinf(result.sd), np.tile([False, False, True, False, False, False], (5, 1))
     )
     in_base = pose_uncertainty(fit_5, TEST_POSES, "base", frame="base", point="platform")
-    assert np.isinf(
-        in_base.sd[:, :3]
-    ).all()  # tilted poses: the normal has a part along each axis of the base
+    # tilted poses: the normal has a part along each axis of the base
+    assert np.isinf(in_base.sd[:, :3]).all()
     np.testing.assert_allclose(in_base.position, result.position, rtol=1e-9)
 
 

@@ -113,9 +113,10 @@ def test_estimate_and_covariance_agree_with_the_reference(fit, reference_fit):
     expected = reference_fit.covariance / np.outer(reference_fit.sd, reference_fit.sd)
     np.testing.assert_allclose(correlation, expected, rtol=0, atol=1e-5)
     assert fit.poses is not None
+    # tolerances [mm]
     np.testing.assert_allclose(
         fit.poses.poses[:, :3, 3] * 1e3, reference_fit.poses, rtol=0, atol=1e-4
-    )  # [mm]
+    )
 
 
 def compare_with_published(fit: Identification) -> tuple[np.ndarray, float]:
@@ -151,9 +152,8 @@ def test_published_anchors_agree_individually_but_not_jointly(fit, printer):
     model of the spools.
     """
     each, together = compare_with_published(fit)
-    assert (
-        np.abs(each).max() < 2.0
-    )  # the largest of 12 standard normal numbers is below 2.9 in 95 % of cases
+    # the largest of 12 standard normal numbers is below 2.9 in 95 % of cases
+    assert np.abs(each).max() < 2.0
     assert together == pytest.approx(64.0, abs=0.5)
     # the same without linearisation: anchors held at the published values, all else fitted
     robot, data = printer
@@ -187,9 +187,8 @@ def test_residuals_agree_with_the_stated_sigmas_and_the_reference(fit, reference
     assert [error.name for error in errors] == ["a", "b", "c", "d"]
     for i, error in enumerate(errors):
         assert error.count == 44
-        assert error.reading == pytest.approx(
-            np.sqrt((readings.raw[:, i] ** 2).mean()), rel=1e-6
-        )  # [rad]
+        # sizes [rad]
+        assert error.reading == pytest.approx(np.sqrt((readings.raw[:, i] ** 2).mean()), rel=1e-6)
         # the reference's are of a line at the slope of its spool, ours of the whole difference
         assert error.joint * 1e3 == pytest.approx(rms[i], rel=1e-4)
         assert abs(error.largest) * 1e3 == pytest.approx(
@@ -258,9 +257,8 @@ def test_start_values_60_mm_off_give_the_same_estimate(printer, fit):
         off = rng.uniform(-60e-3, 60e-3, 21) * np.isin(np.arange(21), ANCHORS)
         again = identify(robot, data, LeastSquares(), options=FitOptions(start=robot.values + off))
         assert again.converged
-        np.testing.assert_allclose(
-            again.estimate, fit.estimate, rtol=0, atol=1e-6
-        )  # [m], sd are 1e-5 and more
+        # [m], sd are 1e-5 and more
+        np.testing.assert_allclose(again.estimate, fit.estimate, rtol=0, atol=1e-6)
 
 
 MODELS = (
@@ -298,9 +296,8 @@ def test_fits_of_the_spool_models_give_the_numbers_of_the_page(fits, root):
     for (count, chi_square, height, half, joint), fit in zip(rows, fits.values(), strict=True):
         D = fit.names.index("D.anchor.z")
         assert len(fit.names) == int(count)
-        assert fit.chi_square == pytest.approx(
-            float(chi_square), abs=0.06
-        )  # one decimal is printed
+        # one decimal is printed
+        assert fit.chi_square == pytest.approx(float(chi_square), abs=0.06)
         assert fit.estimate[D] * 1e3 == pytest.approx(float(height), abs=0.6)  # no decimal [mm]
         assert 1.96e3 * fit.standard_deviations[D] == pytest.approx(float(half), abs=0.6)
         if fit.residual_test.failed:
@@ -328,20 +325,17 @@ def test_data_support_a_separate_build_up_for_line_d_only(fits):
     assert compare_chi_square(((), 1), (("ABCD",), 1)) > 200.0
     assert compare_chi_square((("ABCD",), 1), (("ABC", "D"), 1)) > 50.0  # D differs
     assert compare_chi_square((("ABC", "D"), 1), (tuple("ABCD"), 1)) < 5.99  # A, B and C do not
-    assert (
-        compare_chi_square((("ABC", "D"), 1), (("ABC", "D"), 4)) < 7.81
-    )  # nor is a radius for each asked for
-    assert (
-        compare_chi_square((("ABCD",), 4), (("ABC", "D"), 4)) > 10.0
-    )  # with a radius for each D differs, too
+    # nor is a radius for each asked for
+    assert compare_chi_square((("ABC", "D"), 1), (("ABC", "D"), 4)) < 7.81
+    # with a radius for each D differs, too
+    assert compare_chi_square((("ABCD",), 4), (("ABC", "D"), 4)) > 10.0
     shared, own = fits[("ABC", "D"), 1], fits[tuple("ABCD"), 1]
     values, half = (
         {n: v * 1e3 for n, v in zip(shared.names, x, strict=True)}
         for x in (shared.estimate, 1.96 * shared.standard_deviations)
     )
-    assert (values["ABC.buildup"], half["ABC.buildup"]) == pytest.approx(
-        (0.120, 0.014), abs=6e-4
-    )  # [mm]
+    # tolerances [mm]
+    assert (values["ABC.buildup"], half["ABC.buildup"]) == pytest.approx((0.120, 0.014), abs=6e-4)
     assert (values["D.buildup"], half["D.buildup"]) == pytest.approx((0.053, 0.008), abs=6e-4)
     narrower = {
         n: shared.standard_deviations[shared.names.index(n)] / own.standard_deviations[i]
@@ -397,9 +391,8 @@ def build_machine_with_spools(
     samples: dict[str, Any], folder: Path, buildups: tuple[str, ...], radii: int
 ) -> tuple[Mechanism, Measurements]:
     """Return the machine with a build-up for each group of lines, and one spool radius or four."""
-    guess = [
-        75.0 + (1e-3 * i if radii == 4 else 0.0) for i in range(4)
-    ]  # radii that differ are parameters of their own
+    # radii that differ are parameters of their own
+    guess = [75.0 + (1e-3 * i if radii == 4 else 0.0) for i in range(4)]
     read = import_samples(folder, samples | {"spool_r_in_origin_first_guess": guess}, SIGMA)
     lines = read.robot_text.splitlines(keepends=True)
     own = {line.split("name: ")[1][0]: line for line in lines if ".buildup" in line}
@@ -492,9 +485,8 @@ def test_truth_of_the_example_lies_within_its_intervals(tmp_path, root):
     fit = identify(robot, data, options=EXACT)
     assert not fit.residual_test.failed
     off = (fit.estimate * 1e3 - TRUTH) / (fit.standard_deviations * 1e3)
-    assert (
-        np.abs(off).max() < 3.1
-    )  # the largest of 21 standard normal numbers is below 3.1 in 96 % of cases
+    # the largest of 21 standard normal numbers is below 3.1 in 96 % of cases
+    assert np.abs(off).max() < 3.1
     reference_fit = solve_reference(found, 0.5, 0.5, get_start(robot))
     np.testing.assert_allclose(fit.estimate * 1e3, reference_fit.values, rtol=0, atol=1e-4)  # [mm]
 

@@ -49,9 +49,8 @@ def test_compensated_commands_give_the_compensated_readings(name):
     targets = sample_workspace(robot, 20, 2).coordinates
     best, result = compensate(robot, targets), compensate(robot, targets, "commands", steps=6)
     assert result.commands is not None
-    np.testing.assert_allclose(
-        result.readings, best.readings, rtol=0, atol=1e-10
-    )  # [m, rad] six steps of a hundredth each
+    # [m, rad] six steps of a hundredth each
+    np.testing.assert_allclose(result.readings, best.readings, rtol=0, atol=1e-10)
     np.testing.assert_allclose(
         inverse(robot.nominal, result.commands).q, best.readings, rtol=0, atol=1e-10
     )

@@ -65,9 +65,8 @@ def test_subset_of_fitted_rows_is_refused_in_another_order_and_after_rounding() 
 def test_repeated_and_new_measurements_are_accepted() -> None:
     rows = FITTED.observations[0]
     sigma = np.sqrt(np.einsum("rii->ri", rows.covariance))
-    noise = (
-        0.1 * sigma * np.random.default_rng(0).standard_normal(rows.measured.shape)
-    )  # a tenth of what a repeat has
+    # a tenth of what a repeat has
+    noise = 0.1 * sigma * np.random.default_rng(0).standard_normal(rows.measured.shape)
     assert (
         report_reused_rows(
             STORED, replace(FITTED, observations=(replace(rows, measured=rows.measured + noise),))

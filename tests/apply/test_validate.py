@@ -127,9 +127,8 @@ def test_every_residual_of_a_kind_belongs_to_one_error(kind_class):
 def test_errors_of_held_out_poses_are_at_the_noise_after_calibration(validation):
     assert len(validation.poses) == 10
     assert validation.before.statistics("position").rms > 0.02 * MM
-    assert (
-        validation.after.statistics("position").rms < 4e-6
-    )  # [m] sqrt(3) um of noise and as much of the fit
+    # [m] sqrt(3) um of noise and as much of the fit
+    assert validation.after.statistics("position").rms < 4e-6
     assert validation.improvement() > 10.0
 
 
