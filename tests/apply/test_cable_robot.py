@@ -113,7 +113,7 @@ def test_estimate_and_covariance_agree_with_the_reference(fit, reference_fit):
     expected = reference_fit.covariance / np.outer(reference_fit.sd, reference_fit.sd)
     np.testing.assert_allclose(correlation, expected, rtol=0, atol=1e-5)
     assert fit.poses is not None
-    # tolerances [mm]
+    # in millimeters
     np.testing.assert_allclose(
         fit.poses.poses[:, :3, 3] * 1e3, reference_fit.poses, rtol=0, atol=1e-4
     )
@@ -187,7 +187,7 @@ def test_residuals_agree_with_the_stated_sigmas_and_the_reference(fit, reference
     assert [error.name for error in errors] == ["a", "b", "c", "d"]
     for i, error in enumerate(errors):
         assert error.count == 44
-        # sizes [rad]
+        # in radians
         assert error.reading == pytest.approx(np.sqrt((readings.raw[:, i] ** 2).mean()), rel=1e-6)
         # the reference's are of a line at the slope of its spool, ours of the whole difference
         assert error.joint * 1e3 == pytest.approx(rms[i], rel=1e-4)
@@ -334,7 +334,7 @@ def test_data_support_a_separate_build_up_for_line_d_only(fits):
         {n: v * 1e3 for n, v in zip(shared.names, x, strict=True)}
         for x in (shared.estimate, 1.96 * shared.standard_deviations)
     )
-    # tolerances [mm]
+    # in millimeters
     assert (values["ABC.buildup"], half["ABC.buildup"]) == pytest.approx((0.120, 0.014), abs=6e-4)
     assert (values["D.buildup"], half["D.buildup"]) == pytest.approx((0.053, 0.008), abs=6e-4)
     narrower = {
