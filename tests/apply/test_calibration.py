@@ -85,9 +85,6 @@ def test_json_document_contains_the_verdict_and_every_finding(report):
     assert all(set(f) == {"code", "severity", "data", "text"} for f in document["findings"])
     assert len(document["split"]["held_out"]) == 10
     assert document["passed"] is True
-
-
-def test_dictionary_of_a_report_has_only_json_values(report):
     assert json.loads(json.dumps(report.to_dict(), allow_nan=False)) == report.to_dict()
 
 
@@ -136,6 +133,9 @@ def test_without_held_out_poses_the_verdict_is_undecided(robot, data, unvalidate
     assert (few.verdict, few.next_step.code) == (Verdict.UNDECIDED, "workflow.next-hold-out-more")
     assert report.validation is None
     assert report.fitted_errors is not None
+    text = str(report)
+    assert "Errors at the fitted poses, which are optimistic:\n  position (rms): " in text
+    assert "Validation" not in text
 
 
 def test_too_few_held_out_poses_give_an_undecided_verdict(robot, data):
@@ -231,45 +231,75 @@ def test_wrong_or_contradictory_arguments_are_refused(expected):
     assert expected == refused.value.code or re.search(expected, str(refused.value))
 
 
+SMALL = Quantity(0.003, "mm")
+JUDGED = ("estimate", "expanded", "low", "high", "limit", "guard_band", "acceptance_limit")
+UNDETERMINED = report_finding("workflow.undetermined-combinations", count=1, names=("leg1.length",))
+NOISE = report_finding(
+    "noise.residuals-too-large", Severity.FAILURE, ratio=3.9, degrees=81.0, p_value=1e-9
+)
+SESSIONS = report_finding(
+    "residuals.sessions-differ", component="x", size=SMALL, error=SMALL, ratio=1.8
+)
+MISSING = report_finding("gates.limit-not-measured", quantity="orientation")
+EXCEEDED = report_finding(
+    "gates.limit-exceeded", quantity="position", pose="32", target="", error=SMALL, limit=SMALL
+)
+CONFORMS = report_finding(
+    "conformity.conforms", quantity="position", count=12, probability=0.98, level=0.95,
+    **dict.fromkeys(JUDGED, SMALL),
+)  # fmt: skip
+GROWN = report_finding("gates.errors-grew", quantity="position", times=1.4)
+
+
 def test_most_severe_finding_decides_the_verdict():
-    failure = report_finding("gates.limit-not-measured", quantity="position")
     undecided = report_finding("workflow.no-held-out-poses")
-    warning = report_finding("workflow.undetermined-combinations", count=1, names=("leg1.length",))
     info = report_finding("workflow.frame-freedoms", count=6, frames=("base",))
-    assert decide_verdict((info, warning, undecided, failure)) is Verdict.NOT_CALIBRATED
-    assert decide_verdict((info, warning, undecided)) is Verdict.UNDECIDED
-    assert decide_verdict((info, warning)) is Verdict.RESERVATIONS
-    assert decide_verdict((info,)) is Verdict.CALIBRATED
+    findings = (info, UNDETERMINED, undecided, MISSING)
+    verdicts = [decide_verdict(findings[:count]).name for count in (4, 3, 2, 1)]
+    assert verdicts == ["NOT_CALIBRATED", "UNDECIDED", "RESERVATIONS", "CALIBRATED"]
     assert [v.exit_code for v in Verdict] == [0, 0, 2, 0]
-    step = choose_next_step(Verdict.RESERVATIONS, (warning,), (), APPLY)
-    assert step.code == "workflow.next-resolve-warnings"
-    data = {"ratio": 3.9, "degrees": 81.0, "p_value": 1e-9}
-    noise = report_finding("noise.residuals-too-large", Severity.FAILURE, **data)
-    data = {"component": "x", "size": Quantity(0.03, "mm"), "error": Quantity(0.002, "mm")}
-    sessions = report_finding("residuals.sessions-differ", **data, ratio=1.8)
-    for findings, code in (
-        ((noise,), "workflow.next-check-noise"),
-        ((noise, sessions), "workflow.next-check-residuals"),
-    ):
-        assert choose_next_step(Verdict.NOT_CALIBRATED, findings, (), APPLY).code == code
 
 
 @pytest.mark.parametrize(
     ("recommendation", "code"),
     [
-        ("values.apply", "workflow.next-use-result"),
-        ("values.apply-held-out", "workflow.next-use-result"),
-        ("values.keep-within-noise", "workflow.next-keep-values"),
-        ("values.keep-not-confirmed", "workflow.next-keep-values"),
-        ("values.keep-undecided", "workflow.next-state-noise"),
+        ("apply", "use-result"),
+        ("apply-held-out", "use-result"),
+        ("keep-within-noise", "keep-values"),
+        ("keep-not-confirmed", "keep-values"),
+        ("keep-undecided", "state-noise"),
     ],
 )
 def test_next_step_of_a_good_calibration_agrees_with_the_recommendation(
     recommendation, code
 ) -> None:
-    step = choose_next_step(Verdict.CALIBRATED, (), (), recommendation)
-    assert step.code == code
+    step = choose_next_step(Verdict.CALIBRATED, (), (), f"values.{recommendation}")
+    assert step.code == f"workflow.next-{code}"
     assert str(step).startswith("Use the calibrated geometry") == ("apply" in recommendation)
+
+
+@pytest.mark.parametrize(
+    ("findings", "repeatability", "expected"),
+    [
+        ((UNDETERMINED,), {}, "resolve-warnings"),
+        ((NOISE,), {}, "check-noise"),
+        ((NOISE, SESSIONS), {}, "check-residuals"),
+        ((MISSING,), {}, "Measure orientation as well, or omit its limit."),
+        ((EXCEEDED,), {}, "measure-more"),
+        ((EXCEEDED, CONFORMS), {}, "less-noise"),
+        ((EXCEEDED, MISSING, CONFORMS), {}, "measure-more"),
+        # what no calibration reduces
+        ((EXCEEDED,), {"position": 0.83, "orientation": 0.0}, "improve-machine"),
+        ((EXCEEDED,), {"position": 0.83}, "83 % of the variance of the expected position error"),
+        ((EXCEEDED,), {"position": 0.4, "orientation": 0.9}, "measure-more"),
+        ((EXCEEDED, GROWN), {"position": 0.83}, "measure-more"),
+    ],
+)
+def test_next_step_is_what_would_help(findings, repeatability, expected):
+    is_failed = findings != (UNDETERMINED,)
+    verdict = Verdict.NOT_CALIBRATED if is_failed else Verdict.RESERVATIONS
+    step = choose_next_step(verdict, findings, (), APPLY, repeatability)
+    assert step.code == f"workflow.next-{expected}" or expected in str(step)
 
 
 def test_measurements_made_in_python_are_checked_for_wrong_conventions(
@@ -297,12 +327,6 @@ def test_unreachable_poses_are_reported_without_held_out_poses(robot, data) -> N
     (finding,) = [f for f in report.findings if f.code == "validation.unreachable-poses"]
     assert finding.data["names"] == (f"pose {data.labels[3]}",)
     assert report.verdict is Verdict.UNDECIDED
-
-
-def test_errors_on_fitted_poses_are_not_called_a_validation(unvalidated) -> None:
-    text = str(unvalidated[0])
-    assert "Errors at the fitted poses, which are optimistic:\n  position (rms): " in text
-    assert "Validation" not in text
 
 
 def test_readings_without_a_finite_sigma_leave_no_equation(robot, data) -> None:
@@ -337,50 +361,6 @@ def test_suggestions_use_the_rank_tolerance_of_the_fit(robot, data) -> None:
 def test_unknown_frame_of_errors_is_refused_before_the_fit(robot, data):
     with pytest.raises(EstimationError, match=r"frame is 'laser'.*'fitted', 'base', 'relative'"):
         calibrate(robot, data, CalibrationOptions(frame="laser"))
-
-
-def test_next_step_after_a_limit_is_what_would_help():
-    missing = report_finding("gates.limit-not-measured", quantity="orientation")
-    step = choose_next_step(Verdict.NOT_CALIBRATED, (missing,), (), APPLY)
-    assert str(step) == "Measure orientation as well, or omit its limit."
-    sizes = {"error": Quantity(0.024, "mm"), "limit": Quantity(0.02, "mm")}
-    exceeded = report_finding(
-        "gates.limit-exceeded", quantity="position", pose="32", target="", **sizes
-    )
-    sizes = dict.fromkeys(
-        ("estimate", "expanded", "low", "high", "limit", "guard_band", "acceptance_limit"),
-        Quantity(0.003, "mm"),
-    )
-    conforms = report_finding(
-        "conformity.conforms", quantity="position", count=12, probability=0.98, level=0.95, **sizes
-    )
-    step = choose_next_step(Verdict.NOT_CALIBRATED, (exceeded, conforms), (), APPLY)
-    assert step.code == "workflow.next-less-noise"
-    both = (exceeded, missing, conforms)
-    assert (
-        choose_next_step(Verdict.NOT_CALIBRATED, both, (), APPLY).code
-        == "workflow.next-measure-more"
-    )
-    step = choose_next_step(Verdict.NOT_CALIBRATED, (exceeded,), (), APPLY)
-    assert step.code == "workflow.next-measure-more"
-
-
-def test_next_step_after_an_exceeded_limit_names_repeatability_that_no_calibration_reduces():
-    sizes = {"error": Quantity(0.24, "mm"), "limit": Quantity(0.05, "mm")}
-    failure = report_finding(
-        "gates.limit-exceeded", quantity="position", pose="32", target="", **sizes
-    )
-
-    def step(findings, shares):
-        return choose_next_step(Verdict.NOT_CALIBRATED, findings, (), APPLY, shares)
-
-    chosen = step((failure,), {"position": 0.83, "orientation": 0.0})
-    assert chosen.code == "workflow.next-improve-machine"
-    assert "83 % of the variance of the expected position error" in str(chosen)
-    for shares in ({"position": 0.4, "orientation": 0.9}, {}):
-        assert step((failure,), shares).code == "workflow.next-measure-more"
-    grown = report_finding("gates.errors-grew", quantity="position", times=1.4)
-    assert step((failure, grown), {"position": 0.83}).code == "workflow.next-measure-more"
 
 
 @pytest.mark.slow
