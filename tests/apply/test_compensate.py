@@ -32,45 +32,27 @@ def make_identified_robot(name, seed=1):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_compensated_readings_reach_the_controlled_coordinates(name):
-    robot = make_identified_robot(name)
-    targets = sample_workspace(robot, 20, 2).coordinates
-    result = compensate(robot, targets)
-    reached = forward(robot, result.readings).T
-    demanded = compare_coordinates(reached, targets, robot.controlled, robot.size)[0]
-    assert np.abs(demanded).max() < 1e-12  # [m], closure solved to rounding
-    assert result.usable.all()
-    assert result.uncertainty is None
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_compensated_commands_give_the_compensated_readings(name):
+def test_readings_reach_the_controlled_coordinates_and_commands_give_these_readings(name):
     robot = make_identified_robot(name)
     targets = sample_workspace(robot, 20, 2).coordinates
     best, result = compensate(robot, targets), compensate(robot, targets, "commands", steps=6)
+    reached = forward(robot, best.readings).T
+    demanded = compare_coordinates(reached, targets, robot.controlled, robot.size)[0]
+    assert np.abs(demanded).max() < 1e-12  # [m], closure solved to rounding
+    assert best.usable.all()
+    assert best.uncertainty is None
     assert result.commands is not None
-    # [m, rad] six steps of a hundredth each
-    np.testing.assert_allclose(result.readings, best.readings, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(
-        inverse(robot.nominal, result.commands).q, best.readings, rtol=0, atol=1e-10
-    )
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_each_fixed_point_step_reduces_the_error_tenfold(name):
-    robot = make_identified_robot(name)
-    result = compensate(robot, sample_workspace(robot, 20, 2).coordinates, "commands", steps=3)
-    left = result.residual_position + robot.size * result.residual_orientation
-    assert left.shape == (4, 20)
-    assert (left[1:] < 0.1 * left[:-1] + 1e-12).all()  # [m]
+    commanded = inverse(robot.nominal, result.commands).q
+    for readings in (result.readings, commanded):  # [m, rad] six steps of a hundredth each
+        np.testing.assert_allclose(readings, best.readings, rtol=0, atol=1e-10)
+    left = (result.residual_position + robot.size * result.residual_orientation)[:4]
+    assert result.residual_position.shape == (7, 20)
+    assert (left[1:] < 0.1 * left[:-1] + 1e-12).all()  # [m], each step reduces it tenfold
 
 
 def test_hexapod_is_compensated_in_full():
-    robot, targets = (
-        make_identified_robot("hexapod-42"),
-        sample_workspace(load_robot("hexapod-42"), 10, 3).solution.T,
-    )
-    result = compensate(robot, targets)
+    targets = sample_workspace(load_robot("hexapod-42"), 10, 3).solution.T
+    result = compensate(make_identified_robot("hexapod-42"), targets)
     assert set(result.reach) == {Reach.REACHED}
     assert np.linalg.norm(result.before[:, 3:], axis=1).min() > 1e-6
     np.testing.assert_allclose(result.remaining, 0, atol=1e-12)

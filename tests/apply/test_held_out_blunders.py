@@ -61,57 +61,43 @@ def fit(robot, split):
     return identify(robot, split[0])
 
 
-def change(data: Measurements, wrong: Callable[[np.ndarray, int], None], row: int) -> Measurements:
-    """Return measurements whose row is changed by a function of all values and its number."""
+WRONG_VALUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "targets swapped": lambda row: np.r_[row[3:6], row[:3], row[6:]],
+    "targets in turn": lambda row: np.r_[row[3:], row[:3]],
+    "m as mm": lambda row: 1e-3 * row,
+    "coordinate moved": lambda row: row + 5 * MM * (np.arange(9) == 4),
+    "target moved": lambda row: row + 5 * MM * (np.arange(9) // 3 == 1),
+    "disturbed": lambda row: row + np.random.default_rng(0).normal(size=9) * 10 * MM,
+}
+"""What is wrong -> function of the right values (9,) of a row."""
+SWAPPED = WRONG_VALUES["targets swapped"]
+
+
+def change(
+    data: Measurements, wrong: Callable[[np.ndarray], np.ndarray], row: int | list[int]
+) -> Measurements:
+    """Return measurements in which a row, or several, is a function of the right values."""
     rows = data.observations[0]
     measured = np.array(rows.measured)
-    wrong(measured, row)
+    measured[row] = wrong(measured[row])
     return replace(data, observations=(replace(rows, measured=measured),))
-
-
-def swap_targets(measured: np.ndarray, i: int) -> None:
-    measured[i] = np.r_[measured[i, 3:6], measured[i, :3], measured[i, 6:]]
-
-
-def turn_targets(measured: np.ndarray, i: int) -> None:
-    measured[i] = np.r_[measured[i, 3:], measured[i, :3]]
-
-
-def write_meters_as_millimeters(measured: np.ndarray, i: int) -> None:
-    measured[i] *= 1e-3
-
-
-def move_coordinate(measured: np.ndarray, i: int) -> None:
-    measured[i, 4] += 5 * MM
-
-
-def move_target(measured: np.ndarray, i: int) -> None:
-    measured[i, 3:6] += 5 * MM
-
-
-def swap_poses(measured: np.ndarray, i: int) -> None:
-    measured[[i, i + 2]] = measured[[i + 2, i]]
-
-
-def disturb(measured: np.ndarray, i: int) -> None:
-    measured[i] += np.random.default_rng(0).normal(size=9) * 10 * MM
 
 
 @pytest.mark.parametrize(
     ("wrong", "explanation", "key", "value"),
     [
-        (swap_targets, "targets", "pairs", [("a", "b"), ("b", "a")]),
-        (turn_targets, "targets", "pairs", [("a", "c"), ("b", "a"), ("c", "b")]),
-        (write_meters_as_millimeters, "unit", "factor", 1e3),
-        (move_coordinate, "column", "column", "b.y"),
-        (move_target, "target", "left_out", "b"),
-        (disturb, "none", "left_out", ""),
+        ("targets swapped", "targets", "pairs", [("a", "b"), ("b", "a")]),
+        ("targets in turn", "targets", "pairs", [("a", "c"), ("b", "a"), ("c", "b")]),
+        ("m as mm", "unit", "factor", 1e3),
+        ("coordinate moved", "column", "column", "b.y"),
+        ("target moved", "target", "left_out", "b"),
+        ("disturbed", "none", "left_out", ""),
     ],
 )
 def test_wrong_held_out_row_is_named_with_its_explanation(
     fit, split, wrong, explanation, key, value
 ):
-    result = validate(fit, change(split[1], wrong, WRONG))
+    result = validate(fit, change(split[1], WRONG_VALUES[wrong], WRONG))
     (blunder,) = result.blunders
     assert blunder.poses == (split[1].labels[WRONG],)
     found = get_finding(result.findings, "validation.blunder")
@@ -138,7 +124,7 @@ def test_where_no_other_pose_is_left_no_error_without_them_is_stated():
 
 
 def test_interchanged_poses_are_both_named(fit, split):
-    result = validate(fit, change(split[1], swap_poses, WRONG))
+    result = validate(fit, change(split[1], lambda rows: rows[::-1], [WRONG, WRONG + 2]))
     first, second = split[1].labels[WRONG], split[1].labels[WRONG + 2]
     findings = [f for f in result.findings if f.code == "validation.blunder"]
     assert {(f.data["poses"], f.data["other"]) for f in findings} == {
@@ -153,7 +139,7 @@ def test_error_of_a_millimeter_is_found_by_the_calibrated_robot_in_a_run_folder(
     options = CalibrationOptions(held_out=split[1].labels)
     report = calibrate(robot, data, options)
     run = load_run(save_run(tmp_path / "run", report))
-    wrong = change(split[1], move_target, WRONG)
+    wrong = change(split[1], WRONG_VALUES["target moved"], WRONG)
     result = validate(
         run.robot,
         wrong,
@@ -214,21 +200,21 @@ def test_new_session_is_checked_with_a_frame_of_its_own(fit, split):
     tuesday = replace(rows, session=np.array(["tuesday"] * len(rows)))
     held_out = replace(split[1], observations=(tuesday,))
     assert validate(fit, held_out).blunders == ()
-    (blunder,) = validate(fit, change(held_out, swap_targets, WRONG)).blunders
+    (blunder,) = validate(fit, change(held_out, SWAPPED, WRONG)).blunders
     assert (blunder.poses, blunder.explanation.what) == ((split[1].labels[WRONG],), "targets")
 
 
 def test_single_held_out_pose_is_compared_with_the_fit_alone(fit, split):
     one = split[1].take([WRONG])
     assert validate(fit, one).blunders == ()
-    (blunder,) = validate(fit, change(one, swap_targets, 0)).blunders
+    (blunder,) = validate(fit, change(one, SWAPPED, 0)).blunders
     assert blunder.explanation.what == "targets"
 
 
 def test_dominating_blunder_leaves_the_verdict_undecided_and_is_the_next_step(robot, data, split):
     row = data.labels.index(split[1].labels[WRONG])
     options = CalibrationOptions(held_out=split[1].labels)
-    report = calibrate(robot, change(data, swap_targets, row), options)
+    report = calibrate(robot, change(data, SWAPPED, row), options)
     assert report.verdict is Verdict.UNDECIDED
     assert report.top_findings[0].code == "validation.blunder"
     assert report.next_step.code == "workflow.next-check-held-out"
@@ -237,11 +223,8 @@ def test_dominating_blunder_leaves_the_verdict_undecided_and_is_the_next_step(ro
 
 
 def test_small_blunder_is_a_reservation_and_exceeded_limits_fail_with_it(robot, data, split):
-    def move(measured: np.ndarray, i: int) -> None:
-        measured[i, 0] += 50 * UM
-
     row = data.labels.index(split[1].labels[WRONG])
-    wrong = change(data, move, row)
+    wrong = change(data, lambda values: values + 50 * UM * (np.arange(9) == 0), row)
     options = CalibrationOptions(held_out=split[1].labels)
     assert calibrate(robot, wrong, options).verdict is Verdict.RESERVATIONS
     strict = calibrate(robot, wrong, replace(options, limit_position=30 * UM))
