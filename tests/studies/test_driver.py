@@ -35,7 +35,6 @@ from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.running import (
     KEPT_POSES,
     MOST_WAITING,
-    MissingBlock,
     Schedule,
     Share,
     count_blocks,
@@ -56,7 +55,7 @@ from loopcal.studies.specification.levels import (
     NoiseLevel,
     PosesLevel,
 )
-from loopcal.studies.specification.study import Study, compute_key, describe_cell
+from loopcal.studies.specification.study import Study, describe_cell
 from loopcal.typing import FloatArray
 from tests.findings.expectations import expect_refusal, list_codes
 from tests.studies.small_study import CELLS, write_study
@@ -399,10 +398,10 @@ POSES = CellPoses([[0.1, 0.2]], [[0.3, 0.4]])
 METHODS = {"LS": MethodLevel("least-squares"), "MAP": MethodLevel("map")}
 
 
-def list_missing(study: Study) -> Iterator[Iterator[MissingBlock]]:
+def list_missing(study: Study) -> Iterator[Iterator[tuple[int, dict[str, Any]]]]:
     for cell in study.cells:
         contents = [describe_cell(study, cell) | {"block": block} for block in range(study.blocks)]
-        yield iter([MissingBlock(compute_key(c), cell.number, c) for c in contents])
+        yield iter([(cell.number, content) for content in contents])
 
 
 def make_poses(count: int) -> dict[str, PosesLevel]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
@@ -57,16 +57,8 @@ MOST_WAITING = 64
 """Cells that may wait for poses which they have in common."""
 
 
-class MissingBlock(NamedTuple):
-    """A block to compute, the number of its cell, and what determines its numbers."""
-
-    key: str
-    cell: int
-    content: dict[str, Any]
-
-
-Blocks = Iterator[MissingBlock]
-"""The missing blocks of one cell."""
+Blocks = Iterator[tuple[int, dict[str, Any]]]
+"""The missing blocks of one cell: its number, and what determines the numbers of each."""
 
 
 class Schedule(Iterator["BlockTask | PosesTask | None"]):
@@ -123,12 +115,13 @@ class Schedule(Iterator["BlockTask | PosesTask | None"]):
             first = next(blocks, None)
             if first is None:
                 continue
-            blocks, task = chain((first,), blocks), make_poses_task(first.content)
+            cell, content = first
+            blocks, task = chain((first,), blocks), make_poses_task(content)
             if (poses := self._poses.get(task.key)) is not None:
                 self._next.append((blocks, poses))
                 return None
             waiting = self._waiting.setdefault(task.key, [])
-            waiting.append((first.cell, blocks))
+            waiting.append((cell, blocks))
             if len(waiting) == 1:
                 return task
         return None
@@ -270,10 +263,9 @@ def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blo
         for first in range(0, len(blocks), LISTED):
             listed = blocks[first : first + LISTED]
             stored = store.list_keys(cell.levels, listed)
-            contents = (of_cell | {"block": block} for block in listed)
-            for key, content in ((compute_key(content), content) for content in contents):
-                if key not in stored:
-                    yield MissingBlock(key, cell.number, content)
+            for content in (of_cell | {"block": block} for block in listed):
+                if compute_key(content) not in stored:
+                    yield cell.number, content
 
     for cell in share.select_cells(study):
         if store.count_blocks(cell.levels, blocks) < len(blocks):
@@ -334,7 +326,7 @@ def estimate_time(
             begin = time.perf_counter()
             poses[plan.key] = compute_poses(json.loads(plan.content))
             planning += time.perf_counter() - begin
-        task = make_block_task(compute_key(content), number, content, poses[plan.key])
+        task = make_block_task(number, content, poses[plan.key])
         begin = time.perf_counter()
         outcomes = compute_block(task)[:, 0]
         seconds.append(time.perf_counter() - begin)

@@ -116,10 +116,10 @@ def make_poses_task(content: Mapping[str, Any]) -> PosesTask:
     return PosesTask(compute_key(description), format_json(description))
 
 
-def make_block_task(key: str, cell: int, content: Mapping[str, Any], poses: CellPoses) -> BlockTask:
-    """Return the task of a block, from its description and its poses."""
-    complete = {**content, **vars(poses)}
-    return BlockTask(key, cell, content["block"], format_json(complete))
+def make_block_task(cell: int, content: Mapping[str, Any], poses: CellPoses) -> BlockTask:
+    """Return the task of a block of a cell, from its description and its poses."""
+    complete = format_json({**content, **vars(poses)})
+    return BlockTask(compute_key(content), cell, content["block"], complete)
 
 
 def list_tasks(
@@ -132,8 +132,7 @@ def list_tasks(
         of_cell = describe_cell(study, study.cells[number])
         poses = compute_poses(describe_poses(of_cell))
         for block in range(study.blocks) if blocks is None else blocks:
-            content = of_cell | {"block": block}
-            yield make_block_task(compute_key(content), number, content, poses)
+            yield make_block_task(number, of_cell | {"block": block}, poses)
 
 
 def calibrate_block(

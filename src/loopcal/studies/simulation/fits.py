@@ -295,10 +295,11 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
         except (EstimationError, DataError):
             single.append(nothing)
     names = ("values", "outcome", "half_width", "expanded")
-    arrays = {name: np.stack([getattr(fit, name) for fit in single]) for name in names}
+    arrays = [np.stack([getattr(fit, name) for fit in single]) for name in names]
     known = dict.fromkeys(name for fit in single for name in fit.scores)
     scores = {name: np.array([f.scores.get(name, np.nan) for f in single]) for name in known}
-    return FittedTrials(**arrays, scores=scores)
+    values, outcome, half_width, expanded = arrays
+    return FittedTrials(values, outcome, half_width, expanded, scores)
 
 
 def state_times(data: Measurements) -> Measurements:
