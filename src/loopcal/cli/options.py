@@ -616,11 +616,7 @@ def make_instrument(stated: Mapping[str, Any], robot: Mechanism | None = None) -
 
     `robot` : gives targets of unknown place an assumed one; only needed where there are targets.
     """
-    from loopcal.apply.simulated_measurements import (
-        InstrumentDescription,
-        build_instrument,
-        place_targets,
-    )
+    from loopcal.apply import simulated_measurements
 
     kind, components = stated["kind"], stated["components"]
     orientation, measure = stated["orientation"], stated.get("measure")
@@ -633,8 +629,8 @@ def make_instrument(stated: Mapping[str, Any], robot: Mechanism | None = None) -
         if orientation is None and {"phi", "theta", "psi"} & set(measure.split(",")):
             orientation = "tilt-torsion"
     frames, targets = stated.get("frames"), stated.get("targets")
-    instrument = build_instrument(
-        InstrumentDescription(
+    instrument = simulated_measurements.build_instrument(
+        simulated_measurements.InstrumentDescription(
             kinds=tuple(kind.split(",")),
             components=tuple(components.split(",")) if components else (),
             orientation=orientation,
@@ -645,7 +641,7 @@ def make_instrument(stated: Mapping[str, Any], robot: Mechanism | None = None) -
             distribution=stated.get("distribution", "normal"),
         )
     )
-    return instrument if robot is None else place_targets(instrument, robot)
+    return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)
 
 
 def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None:

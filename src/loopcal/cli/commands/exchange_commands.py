@@ -60,24 +60,20 @@ def gcode(
       loopcal gcode hexapod.yaml plan -o poses.ngc --feed 600 --pause 5
     """
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.formats.gcode_program import (
-        DEFAULT_FEED,
-        GcodeSettings,
-        format_gcode,
-        read_stops,
-        refuse_coordinates,
-    )
+    from loopcal.io.formats import gcode_program
     from loopcal.planning.path import check_route
 
     machine = opt.open_robot(robot, (output,), (plan,), force)
     is_in_inches = machine.units[Dimension.LENGTH] == "in"
     program_unit: Literal["mm", "in"] = unit or ("in" if is_in_inches else "mm")
     feed_unit = find_unit(program_unit).factor_to_si / 60.0  # [m/s]
-    speed = DEFAULT_FEED if feed is None else feed * feed_unit
-    stops = read_stops(plan, machine)
-    refuse_coordinates(machine)
+    speed = gcode_program.DEFAULT_FEED if feed is None else feed * feed_unit
+    stops = gcode_program.read_stops(plan, machine)
+    gcode_program.refuse_coordinates(machine)
     home = check_route(machine, stops.labels, stops.coordinates)
-    text = format_gcode(machine, stops, home, GcodeSettings(speed, pause, program_unit))
+    text = gcode_program.format_gcode(
+        machine, stops, home, gcode_program.GcodeSettings(speed, pause, program_unit)
+    )
     write_text(output, text)
     counts = {"stops": len(stops.labels), "unit": program_unit}
     page = [f"{output}: {counts['stops']} stops, lengths in {program_unit}"]

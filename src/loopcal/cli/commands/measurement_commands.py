@@ -217,21 +217,17 @@ def _fill_in(
 ) -> SimulatedMeasurements:
     """Return the filled-in data of a plan."""
     from loopcal.apply.simulated_measurements import fill_in_measurements
-    from loopcal.io.data.measurement_file import (
-        has_empty_readings,
-        load_contact_sheet,
-        load_instrument,
-    )
+    from loopcal.io.data import measurement_file
     from loopcal.io.runs.plan_folder import find_plan_sheet
 
     others = ("poses", "draw", "distribution", "sigma_reading", "skip_unreachable")
     opt.refuse_given(
         (*others, *opt.INSTRUMENT.members), f"because --fill {sheet} states poses and instrument"
     )
-    instrument = load_instrument(sheet, robot)
+    instrument = measurement_file.load_instrument(sheet, robot)
     how = {"draw_errors": draw_errors, "seed": seed}
-    if has_empty_readings(sheet, robot):
-        planned = load_contact_sheet(sheet, find_plan_sheet(sheet), robot)
+    if measurement_file.has_empty_readings(sheet, robot):
+        planned = measurement_file.load_contact_sheet(sheet, find_plan_sheet(sheet), robot)
         is_closure = any(isinstance(rows.kind, lc.Closure) for rows in planned.observations)
         how["are_contacts"] = not is_closure
     else:

@@ -204,16 +204,7 @@ def _write_plan(
 ) -> str:
     """Write the folder of a plan; return its files in words."""
     from loopcal.io.core.outputs import write_result_folder
-    from loopcal.io.runs.plan_folder import (
-        DATA,
-        FORMAT,
-        PLAN,
-        SHEET,
-        format_plan_data,
-        format_sheet,
-        format_surface_data,
-        format_surface_sheet,
-    )
+    from loopcal.io.runs import plan_folder
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning.pose_planning import list_stops
     from loopcal.report.figures.plan_figures import draw_curve, draw_plan
@@ -221,16 +212,22 @@ def _write_plan(
 
     figures = {}
     if isinstance(result, lc.Plan):
-        texts = {SHEET: format_sheet(result, list_stops(result)), DATA: format_plan_data(result)}
+        texts = {
+            plan_folder.SHEET: plan_folder.format_sheet(result, list_stops(result)),
+            plan_folder.DATA: plan_folder.format_plan_data(result),
+        }
         figures["plan.png"] = draw_plan(result)
         if result.curve is not None:
             figures["curve.png"] = draw_curve(result.robot, result.curve)
     else:
-        texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
-    document = {"format": FORMAT, **result.to_dict()}
+        texts = {
+            plan_folder.SHEET: plan_folder.format_surface_sheet(result),
+            plan_folder.DATA: plan_folder.format_surface_data(result),
+        }
+    document = {"format": plan_folder.FORMAT, **result.to_dict()}
     document["made_by"] = collect_provenance(sys.argv, inputs, {"plan": seed})
     pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
     contents = {name: text.encode() for name, text in texts.items()} | pictures
-    write_result_folder(output, PLAN, document, contents, force)
+    write_result_folder(output, plan_folder.PLAN, document, contents, force)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
     return f"{files}, pictures" if pictures else files

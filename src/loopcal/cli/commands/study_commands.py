@@ -277,13 +277,7 @@ def summary(
       loopcal study summary results --score position_max --score condition
       loopcal study summary results --score position --against instrument
     """
-    from loopcal.studies.results.questions import (
-        build_document,
-        list_shown,
-        view_answers,
-        view_summary,
-        write_summary,
-    )
+    from loopcal.studies.results import questions
     from loopcal.studies.results.study_result import StudyResult
     from loopcal.studies.results.summary_drawing import render_figures
 
@@ -291,13 +285,14 @@ def summary(
     with terminal.ProgressBar() as progress:
         progress(0, 1, "summarizing trials")
         summarized, answered = result.summarize(), result.answer_questions()
-        shown = list_shown(result.study, summarized, scores)
-        page = view_summary(result.study, summarized, shown)
+        shown = questions.list_shown(result.study, summarized, scores)
+        page = questions.view_summary(result.study, summarized, shown)
         figures = render_figures(result.study, summarized, shown, against)
-        write_summary(folder, result.study, summarized, answered, figures)
+        questions.write_summary(folder, result.study, summarized, answered, figures)
     written = f"Written to {folder}: {', '.join(('summary.json', 'summary.csv', *figures))}"
     return Output(
-        build_document(summarized, answered), lambda: [*page, "", *view_answers(answered), written]
+        questions.build_document(summarized, answered),
+        lambda: [*page, "", *questions.view_answers(answered), written],
     )
 
 
