@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands build their figures, but write a placeholder for each picture: drawing takes a third of
-the time of a plan, and tests/report draws every figure.
+"""How tests run commands. Commands build their figures, but write a placeholder for each picture:
+drawing takes a third of the time of a plan, and tests/report draws every figure.
 """
 
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
+
+from loopcal.cli.entry_point import main
 
 PLACEHOLDER = b"\x89PNG\r\n\x1a\n"
 
@@ -22,3 +27,51 @@ def do_not_draw(monkeypatch) -> None:
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
     monkeypatch.setattr("matplotlib.figure.Figure.draw_without_rendering", lambda _: None)
+
+
+class Printed(NamedTuple):
+    """What a command printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def words(self) -> str:
+        """Standard output as one line."""
+        return " ".join(self.out.split())
+
+    @property
+    def json(self) -> Any:
+        """The document on standard output."""
+        return json.loads(self.out, parse_constant=pytest.fail)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Work in an empty folder and return it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def loopcal(tmp_path, monkeypatch, capsys) -> Callable[..., Printed]:
+    """Run a command line in an empty folder, or where a later fixture went."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str | Sequence[str], *said: str, code: int | tuple[int, ...] = 0) -> Printed:
+        """Check the exit code, and that texts are printed: of a refusal in its one sentence."""
+        capsys.readouterr()
+        found = main(words.split() if isinstance(words, str) else list(words))
+        printed = Printed(found, *capsys.readouterr())
+        assert found == code if isinstance(code, int) else found in code, printed.err
+        text = printed.err if found == 1 else printed.out + printed.err
+        for part in said:
+            assert part in text or part in " ".join(text.split())
+        if found == 1:
+            notes = ("loopcal: note: ", "Hint: ")
+            refusals = [line for line in printed.err.splitlines() if not line.startswith(notes)]
+            assert (printed.out, len(refusals)) == ("", 1), printed.err
+        return printed
+
+    return run

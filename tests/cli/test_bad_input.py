@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
+import loopcal as lc
 from loopcal.cli.entry_point import main
-from loopcal.errors import MechanismError
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.measure.kinds import KINDS
 from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,
@@ -63,53 +62,24 @@ def run_refused(tmp_path, monkeypatch, capsys):
     return run
 
 
-ROBOT_CASES = {
-    "missing unit": (UNITS, "", "states no units, which every number needs; write for example"),
-    "unit of the wrong kind": (
-        "length: mm",
-        "length: deg",
-        "'deg' is not a unit of length; allowed: m, mm",
-    ),
-    "unknown key": ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
-    "duplicate key": (UNITS, UNITS * 2, "duplicate key 'units'; remove one"),
-    "number typed as text": (
-        BASE,
-        "[120, '-140', 0]",
-        "is the text '-140', but a number is needed",
-    ),
-    "two numbers where three are needed": (
-        BASE,
-        "[120, -140]",
-        "has 2 values, but 3 are needed; add the missing ones",
-    ),
-    "NaN": (BASE, "[120, .nan, 0]", "is nan; write a finite number"),
-    "a comma in a number": (
-        "lengths: 233.238076",
-        "lengths: 233,238",
-        "write a decimal point, not a comma",
-    ),
-    "a list too long": (
-        "[-75, 75]",
-        "[-75, 75, 3]",
-        "'stroke' has 3 values, but 2 are needed; remove the others",
-    ),
-    "not YAML": (BASE, "[120, -140, 0", "not valid YAML"),
-    "newer format": (
-        "format: 1",
-        "format: 2",
-        "has format 2, but this loopcal reads formats up to 1",
-    ),
-    "unknown family": (
-        "family: gough",
-        "family: gouhg",
-        "is not a family of robots (did you mean 'gough'?)",
-    ),
-}
+ROBOT_CASES = [
+    (UNITS, "", "states no units, which every number needs; write for example"),
+    ("length: mm", "length: deg", "'deg' is not a unit of length; allowed: m, mm"),
+    ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
+    (UNITS, UNITS * 2, "duplicate key 'units'; remove one"),
+    (BASE, "[120, '-140', 0]", "is the text '-140', but a number is needed"),
+    (BASE, "[120, -140]", "has 2 values, but 3 are needed; add the missing ones"),
+    (BASE, "[120, .nan, 0]", "is nan; write a finite number"),
+    ("lengths: 233.238076", "lengths: 233,238", "write a decimal point, not a comma"),
+    ("[-75, 75]", "[-75, 75, 3]", "'stroke' has 3 values, but 2 are needed; remove the others"),
+    (BASE, "[120, -140, 0", "not valid YAML"),
+    ("format: 1", "format: 2", "has format 2, but this loopcal reads formats up to 1"),
+    ("family: gough", "family: gouhg", "is not a family of robots (did you mean 'gough'?)"),
+]
 
 
-@pytest.mark.parametrize("case", ROBOT_CASES)
-def test_invalid_robot_file_is_refused_with_its_line(run_refused, case) -> None:
-    old, new, sentence = ROBOT_CASES[case]
+@pytest.mark.parametrize(("old", "new", "sentence"), ROBOT_CASES)
+def test_invalid_robot_file_is_refused_with_its_line(run_refused, old, new, sentence) -> None:
     assert old in ROBOT
     found = run_refused("check robot.yaml", robot_yaml=ROBOT.replace(old, new, 1))
     assert sentence in found
@@ -152,26 +122,25 @@ def test_missing_freedom_is_named(run_refused) -> None:
     assert "translation along y" in found
 
 
-def test_home_pose_outside_the_strokes_gives_a_warning(tmp_path, capsys) -> None:
+def test_home_pose_outside_the_strokes_gives_a_warning(loopcal, tmp_path) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(ROBOT.replace("lengths: 233.238076", "lengths: 500"))
-    assert main(["check", str(path)]) == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "warning The home pose exceeds stroke of q1, stroke of q2" in out
+    loopcal(f"check {path}", "warning The home pose exceeds stroke of q1, stroke of q2")
 
 
-FILE_CASES = {
-    "empty file": (b"", "is empty"),
-    "empty but for blanks": (b" \n\n", "is empty"),
-    "a folder for a file": (None, "is a folder, but a"),
-    "not UTF-8": ("# Länge\n".encode("latin-1"), "is not UTF-8 text (byte 0xe4); save it as UTF-8"),
-    "a zero byte": (b"format: 1\0\n", "contains a zero byte"),
-}
+FILE_CASES = [
+    (b"", "is empty"),
+    (b" \n\n", "is empty"),
+    (None, "is a folder, but a"),
+    ("# Länge\n".encode("latin-1"), "is not UTF-8 text (byte 0xe4); save it as UTF-8"),
+    (b"format: 1\0\n", "contains a zero byte"),
+]
 
 
-@pytest.mark.parametrize("case", FILE_CASES)
-def test_file_that_is_not_text_is_refused_as_robot_and_as_data(run_refused, case) -> None:
-    content, sentence = FILE_CASES[case]
+@pytest.mark.parametrize(("content", "sentence"), FILE_CASES)
+def test_file_that_is_not_text_is_refused_as_robot_and_as_data(
+    run_refused, content, sentence
+) -> None:
     assert sentence in run_refused("check robot.yaml", robot_yaml=content)
     assert sentence in run_refused("calibrate hexapod-42 data.csv -o run", data_csv=content)
 
@@ -184,105 +153,59 @@ def test_missing_file_is_refused(run_refused) -> None:
     assert "this run folder does not exist" in run_refused("validate run data.csv", data_csv=DATA)
 
 
-DATA_CASES = {
-    "missing unit": (
-        "z [mm]",
-        "z",
-        "data.csv:4: column 'z' has no unit; write it in brackets, such as 'z [mm]'",
-    ),
-    "unknown unit": (
-        "z [mm]",
-        "z [mmm]",
-        "data.csv:4: column 'z': unknown unit 'mmm' (did you mean 'mm'?)",
-    ),
-    "unknown column": (
-        "q1 [mm]",
-        "qq1 [mm]",
-        "data.csv:4: column 'qq1' is unknown (did you mean 'q1'?",
-    ),
-    "unknown setting": (
-        "# noise",
-        "# nois",
-        "data.csv:3: unknown key 'nois' (did you mean 'noise'?)",
-    ),
-    "duplicate setting": ("# noise", "# kind: pose\n# noise", "data.csv:3: duplicate key 'kind'"),
-    "duplicate column": ("q2 [mm]", "q1 [mm]", "data.csv:4: duplicate column 'q1'"),
-    "text for a number": (
-        "b,1,",
-        "b,one,",
-        "data.csv:6: column 'q1' is 'one', but a number is needed",
-    ),
-    "a cell too few": (
-        "b,1,",
-        "b,",
-        "data.csv:6: this row has 7 cells, but the header has 8 columns",
-    ),
-    "NaN": ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not finite"),
-    "a reading outside the stroke": (
-        "b,1,",
-        "b,80,",
-        "data.csv:6): q1 reads 80 mm, 5 mm outside its stroke of -75 to 75 mm",
-    ),
-    "no noise": ("# noise: {z: 1 um}\n", "", "no noise is stated for 'z'"),
-    "noise without a unit": ("1 um", "1", "'1' has no unit; add one of m, mm"),
-    "a comma in a number": ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
-    "a controller of readings": (
-        "# noise",
-        "# controller: no.yaml\n# noise",
-        "data.csv:3: a controller is named, but",
-    ),
-    "the same row twice": (
-        "c,2,2,2,2,2,2,202.2",
-        "c,1,1,1,1,1,1,201.1",
-        ") have the same readings and the same",
-    ),
-}
+DATA_CASES = [
+    ("z [mm]", "z", "data.csv:4: column 'z' has no unit; write it in brackets, such as 'z [mm]'"),
+    ("z [mm]", "z [mmm]", "data.csv:4: column 'z': unknown unit 'mmm' (did you mean 'mm'?)"),
+    ("q1 [mm]", "qq1 [mm]", "data.csv:4: column 'qq1' is unknown (did you mean 'q1'?"),
+    ("# noise", "# nois", "data.csv:3: unknown key 'nois' (did you mean 'noise'?)"),
+    ("# noise", "# kind: pose\n# noise", "data.csv:3: duplicate key 'kind'"),
+    ("q2 [mm]", "q1 [mm]", "data.csv:4: duplicate column 'q1'"),
+    ("b,1,", "b,one,", "data.csv:6: column 'q1' is 'one', but a number is needed"),
+    ("b,1,", "b,", "data.csv:6: this row has 7 cells, but the header has 8 columns"),
+    ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not finite"),
+    ("b,1,", "b,80,", "data.csv:6): q1 reads 80 mm, 5 mm outside its stroke of -75 to 75 mm"),
+    ("# noise: {z: 1 um}\n", "", "no noise is stated for 'z'"),
+    ("1 um", "1", "'1' has no unit; add one of m, mm"),
+    ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
+    ("# noise", "# controller: no.yaml\n# noise", "data.csv:3: a controller is named, but"),
+    ("c,2,2,2,2,2,2,202.2", "c,1,1,1,1,1,1,201.1", ") have the same readings and the same"),
+]
 
 
 @pytest.mark.parametrize(
     "command", ["calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"]
 )
-@pytest.mark.parametrize("case", DATA_CASES)
-def test_invalid_measurement_file_is_refused_with_its_line(run_refused, case, command) -> None:
-    old, new, sentence = DATA_CASES[case]
+@pytest.mark.parametrize(("old", "new", "sentence"), DATA_CASES)
+def test_invalid_measurement_file_is_refused_with_its_line(
+    run_refused, old, new, sentence, command
+) -> None:
     assert sentence in run_refused(command, data_csv=DATA.replace(old, new, 1))
 
 
 POSES = "\n".join(line.rpartition(",")[0] for line in DATA.split("\n")[3:-1])
 HEIGHTS = "# kind: component\n# components: [z]\n# noise: {z: 1 um}\npose,z [mm]\na,200\nb,201.1\n"
-SEVERAL_CASES = {
-    "a missing pose": (POSES, HEIGHTS + "d,203\n", "heights.csv:7: unknown pose 'd'"),
-    "other readings": (
+SEVERAL_CASES = [
+    (POSES, HEIGHTS + "d,203\n", "heights.csv:7: unknown pose 'd'"),
+    (
         POSES,
         DATA.replace("b,1,1", "b,1,2"),
         "heights.csv:6: pose 'b' has other readings here than in poses.csv:3",
     ),
-    "values without a kind": (
-        POSES,
-        HEIGHTS.split("\n", 3)[3],
-        "heights.csv:1: column 'z' is unknown",
-    ),
-    "a unit of the wrong kind": (
-        POSES.replace("q2 [mm]", "q2 [deg]"),
-        HEIGHTS,
-        "poses.csv:1: column 'q2': 'deg' is a unit",
-    ),
-    "an empty file": ("", HEIGHTS, "poses.csv: this measurement file is empty"),
-    "no readings": (
-        POSES.replace("b,1,1,1,1,1,1", "b,,,,,,"),
-        HEIGHTS,
-        "poses.csv:3: pose 'b' has no readings",
-    ),
-}
+    (POSES, HEIGHTS.split("\n", 3)[3], "heights.csv:1: column 'z' is unknown"),
+    (POSES.replace("q2 [mm]", "q2 [deg]"), HEIGHTS, "poses.csv:1: column 'q2': 'deg' is a unit"),
+    ("", HEIGHTS, "poses.csv: this measurement file is empty"),
+    (POSES.replace("b,1,1,1,1,1,1", "b,,,,,,"), HEIGHTS, "poses.csv:3: pose 'b' has no readings"),
+]
 
 
 @pytest.mark.parametrize(
     "command",
     ["calibrate hexapod-42 {} -o run", "identifiability hexapod-42 {}", "validate hexapod-42 {}"],
 )
-@pytest.mark.parametrize("case", SEVERAL_CASES)
-def test_inconsistent_files_are_refused_by_every_command(run_refused, case, command) -> None:
-    poses, heights, sentence = SEVERAL_CASES[case]
+@pytest.mark.parametrize(("poses", "heights", "sentence"), SEVERAL_CASES)
+def test_inconsistent_files_are_refused_by_every_command(
+    run_refused, poses, heights, sentence, command
+) -> None:
     assert sentence in run_refused(
         command.format("poses.csv heights.csv"), poses_csv=poses, heights_csv=heights
     )
@@ -316,7 +239,7 @@ def test_too_few_equations_are_refused_by_default_with_a_hint_to_method_map(run_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", sorted(KINDS))
+@pytest.mark.parametrize("kind", sorted(lc.KINDS))
 def test_every_kind_is_calibrated_or_refused_with_a_message(
     tmp_path, monkeypatch, capsys, kind
 ) -> None:
@@ -332,43 +255,32 @@ def test_every_kind_is_calibrated_or_refused_with_a_message(
     assert all(line.startswith("loopcal: ") for line in err.splitlines())
 
 
-def test_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
+def test_byte_order_mark_is_accepted(loopcal, tmp_path) -> None:
     path = tmp_path / "robot.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + ROBOT.encode())
-    assert main(["check", str(path)]) == 0
-    assert capsys.readouterr().err == ""
+    assert loopcal(f"check {path}").err == ""
     data = tmp_path / "data.csv"
     data.write_bytes(b"\xef\xbb\xbf" + DATA.encode())
-    assert main(["identifiability", str(path), str(data)]) == 0
+    loopcal(f"identifiability {path} {data}")
 
 
-USAGE_CASES = {
-    "unknown command": (
-        "calibrat hexapod-42",
-        "'calibrat' is not a command (did you mean 'calibrate'",
-    ),
-    "unknown option": ("check hexapod-42 --jsn", "No such option"),
-    "missing argument": ("check", "Missing argument 'ROBOT'"),
-    "limit without a unit": (
-        "calibrate hexapod-42 d.csv -o r --limit-position 0.1",
-        "'0.1' has no unit; add one of m",
-    ),
-    "limit of the wrong kind": (
-        "calibrate hexapod-42 d.csv -o r --limit-angle 1mm",
-        "'mm' is a unit of length",
-    ),
-    "a robot file as data": ("calibrate hexapod-42 robot.yaml -o r", "robot.yaml is a YAML file"),
-    "a robot file as instrument": ("plan hexapod-42 -o p --like r.yaml", "r.yaml is a YAML file"),
-    "an unknown file to write": ("export run -o run.txt", "reprap, linuxcnc, linuxcnc-ini, urdf"),
-    "hold out everything": ("calibrate hexapod-42 d.csv -o r --hold-out 1", "--hold-out"),
-    "unknown method": ("calibrate hexapod-42 d.csv -o r --method best", "--method"),
-    "negative seed": ("simulate hexapod-42 --poses p.csv -o m.csv --seed -1", "--seed"),
-}
+USAGE_CASES = [
+    ("calibrat hexapod-42", "'calibrat' is not a command (did you mean 'calibrate'"),
+    ("check hexapod-42 --jsn", "No such option"),
+    ("check", "Missing argument 'ROBOT'"),
+    ("calibrate hexapod-42 d.csv -o r --limit-position 0.1", "'0.1' has no unit; add one of m"),
+    ("calibrate hexapod-42 d.csv -o r --limit-angle 1mm", "'mm' is a unit of length"),
+    ("calibrate hexapod-42 robot.yaml -o r", "robot.yaml is a YAML file"),
+    ("plan hexapod-42 -o p --like r.yaml", "r.yaml is a YAML file"),
+    ("export run -o run.txt", "reprap, linuxcnc, linuxcnc-ini, urdf"),
+    ("calibrate hexapod-42 d.csv -o r --hold-out 1", "--hold-out"),
+    ("calibrate hexapod-42 d.csv -o r --method best", "--method"),
+    ("simulate hexapod-42 --poses p.csv -o m.csv --seed -1", "--seed"),
+]
 
 
-@pytest.mark.parametrize("case", USAGE_CASES)
-def test_invalid_command_line_is_refused(run_refused, case) -> None:
-    words, sentence = USAGE_CASES[case]
+@pytest.mark.parametrize(("words", "sentence"), USAGE_CASES)
+def test_invalid_command_line_is_refused(run_refused, words, sentence) -> None:
     assert sentence in run_refused(words)
 
 
@@ -398,16 +310,16 @@ def test_missing_controller_file_is_refused(run_refused) -> None:
 
 @pytest.mark.parametrize("number", [LengthTolerance(sd=-2.9e-5), LengthTolerance(limits=-2.9e-5)])
 def test_invalid_tolerance_or_workspace_is_reported_with_its_unit(number) -> None:
-    with pytest.raises(MechanismError, match=r"the tolerance of base is -2.9e-05 m; it must"):
+    with pytest.raises(lc.MechanismError, match=r"the tolerance of base is -2.9e-05 m; it must"):
         standard_deviation(number, "base")
-    with pytest.raises(MechanismError, match=r"the tolerance of tilt is 0 rad; it must"):
+    with pytest.raises(lc.MechanismError, match=r"the tolerance of tilt is 0 rad; it must"):
         standard_deviation(AngleTolerance(sd=0.0), "tilt")
     with pytest.raises(
-        MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first"
+        lc.MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first"
     ):
         _ = Workspace(z=(0.3, 0.2)).ranges
     with pytest.raises(
-        MechanismError, match=r"the workspace of yaw runs from 1 rad to -1 rad; the first"
+        lc.MechanismError, match=r"the workspace of yaw runs from 1 rad to -1 rad; the first"
     ):
         _ = Workspace(yaw=(1.0, -1.0)).ranges
 

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli.entry_point import main
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.robot.robot_file import load_robot
+import loopcal as lc
 from tests.cable_robot import NAMES, TRUTH, format_samples, load_real_samples
 from tests.cli.printed_tables import read_report, read_table_rows
 
@@ -39,13 +37,15 @@ def folder(data_folder, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, capsys) -> None:
+def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(
+    loopcal, page, capsys
+) -> None:
     commands = re.findall(r"^loopcal (.*)$", page, re.MULTILINE)
     assert [command.split()[0] for command in commands] == ["import", "calibrate"]
+    out = ""
     for command in commands:
-        capsys.readouterr()
-        assert main([*command.split(), *["--verbose"] * command.startswith("calibrate")]) == 0
-    printed = read_table_rows(capsys.readouterr().out)
+        out = loopcal([*command.split(), *["--verbose"] * command.startswith("calibrate")]).out
+    printed = read_table_rows(out)
     # 2 errors, 3 kinds, 21 parameters, 3 tests of tolerances, 5 sources, 4 motors, 2 statistics
     assert len(printed) == 40
     assert [
@@ -53,8 +53,7 @@ def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, cap
         for block in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
         for row in read_table_rows(block)
     ] == printed
-    assert main([*commands[1].split(), "--force"]) == 0
-    assert read_report(page) == read_report(capsys.readouterr().out)
+    assert read_report(page) == read_report(loopcal([*commands[1].split(), "--force"]).out)
     result = json.loads(Path("run/result.json").read_text())
     assert result["verdict"] == "undecided"
     codes = {finding["code"] for finding in result["findings"]}
@@ -62,8 +61,8 @@ def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, cap
     chi_square, degrees = result["fit"]["chi_square"], result["fit"]["degrees"]
     assert f"chi-square ({chi_square:.2f} with {degrees:.0f} degrees of freedom)" in page
     kept = np.load("run/arrays.npz")
-    found = load_robot("run/robot.yaml")
-    off = (found.values - load_robot("truth.yaml").values) / kept["sd"]
+    found = lc.load_robot("run/robot.yaml")
+    off = (found.values - lc.load_robot("truth.yaml").values) / kept["sd"]
     assert np.abs(off).max() < 1.5
     # the run folder has the estimated poses and motor angles
     assert kept["pose_estimate"].shape == (45, 4, 4)
@@ -71,20 +70,21 @@ def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, cap
 
 
 def test_truth_file_of_the_example_equals_the_simulated_machine(root) -> None:
-    robot = load_robot(root / "examples" / "cable-robot" / "truth.yaml")
+    robot = lc.load_robot(root / "examples" / "cable-robot" / "truth.yaml")
     assert robot.parameters.names == NAMES
     np.testing.assert_allclose(robot.values * 1e3, TRUTH, rtol=0, atol=1e-9)  # [mm]
 
 
-def test_import_writes_all_poses_and_reports_ignored_rows(folder, capsys) -> None:
-    assert main(REAL.split()) == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "robot.yaml: 4 actuators, 21 parameters, 21 free" in out
-    assert "44 poses of 4 motor angles, 9 of them known" in out
-    assert "0.6 mm" in out
-    assert "41 rows of line forces" in out
-    assert "Next: loopcal calibrate robot.yaml samples.csv -o run" in out
-    data = load_measurements("samples.csv", load_robot("robot.yaml"))
+def test_import_writes_all_poses_and_reports_ignored_rows(loopcal, folder) -> None:
+    loopcal(
+        REAL,
+        "robot.yaml: 4 actuators, 21 parameters, 21 free",
+        "44 poses of 4 motor angles, 9 of them known",
+        "0.6 mm",
+        "41 rows of line forces",
+        "Next: loopcal calibrate robot.yaml samples.csv -o run",
+    )
+    data = lc.load_measurements("samples.csv", lc.load_robot("robot.yaml"))
     assert data.n_poses == 44
     assert data.n_rows == 27
     (seen,) = data.observations
@@ -94,11 +94,10 @@ def test_import_writes_all_poses_and_reports_ignored_rows(folder, capsys) -> Non
 
 
 def test_import_and_calibrate_give_the_page_numbers_for_a_real_machine(
-    folder, capsys, root
+    loopcal, folder, root
 ) -> None:
-    assert main(REAL.split()) == 0
-    assert main(CALIBRATE.split()) == 0
-    capsys.readouterr()
+    loopcal(REAL)
+    loopcal(CALIBRATE)
     result = json.loads((folder / "run" / "result.json").read_text())
     assert result["fit"]["chi_square"] == pytest.approx(52.584, abs=5e-4)
     assert result["fit"]["degrees"] == pytest.approx(50.0, abs=1e-6)
@@ -125,11 +124,11 @@ def test_import_and_calibrate_give_the_page_numbers_for_a_real_machine(
             assert abs(row["estimate"] - other) < 1.05 * half
 
 
-def test_import_from_json_needs_the_option_format(folder, capsys) -> None:
-    assert main(["import", "hp.json", "-o", "robot.yaml"]) == 1
-    error = capsys.readouterr().err
-    assert "cannot read it" in error
-    assert "hangprinter" in error
-    assert main([*REAL.split(), "--sigma-height", "1mm"]) == 1
-    assert "--sigma-height does not belong to the format hangprinter" in capsys.readouterr().err
+def test_import_from_json_needs_the_option_format(loopcal, folder) -> None:
+    loopcal("import hp.json -o robot.yaml", "cannot read it", "hangprinter", code=1)
+    loopcal(
+        [*REAL.split(), "--sigma-height", "1mm"],
+        "--sigma-height does not belong to the format hangprinter",
+        code=1,
+    )
     assert not (folder / "robot.yaml").exists()

@@ -47,26 +47,21 @@ def call(words: str) -> None:
 
 
 @pytest.fixture
-def compare(runs, monkeypatch, capsys):
-    """Compare runs; return exit code, output and errors, each as one line of words."""
+def loopcal(loopcal, runs, monkeypatch):
+    """Compare runs in their folder."""
     monkeypatch.chdir(runs)
-    capsys.readouterr()
-
-    def compare(words: str) -> tuple[int, str, str]:
-        code = main(["compare", *words.split()])
-        captured = capsys.readouterr()
-        return code, " ".join(captured.out.split()), " ".join(captured.err.split())
-
-    return compare
+    return lambda words, *said, **code: loopcal(f"compare {words}", *said, **code)
 
 
-def test_sessions_of_one_machine_and_of_a_moved_one(compare) -> None:
-    code, out, err = compare("may june july")
-    assert (code, err) == (0, "")
-    assert "The machines of may and june do not differ beyond the noise" in out
-    assert "The machine of july differs from that of may" in out
-    assert "A change of tower2.stop alone explains it: +0.0" in out
-    assert "No held-out pose is common to all runs" in out
+def test_sessions_of_one_machine_and_of_a_moved_one(loopcal) -> None:
+    printed = loopcal(
+        "may june july",
+        "The machines of may and june do not differ beyond the noise",
+        "The machine of july differs from that of may",
+        "A change of tower2.stop alone explains it: +0.0",
+        "No held-out pose is common to all runs",
+    )
+    assert printed.err == ""
     comparison = lc.compare_runs([lc.load_run(name) for name in ("may", "june", "july")])
     assert comparison.moved is True
     assert [pair.moved for pair in comparison.pairs] == [False, True]
@@ -77,39 +72,29 @@ def test_sessions_of_one_machine_and_of_a_moved_one(compare) -> None:
     assert "july differs" in str(comparison)
 
 
-def test_methods_of_the_same_rows_are_not_tested(compare) -> None:
-    code, out, _ = compare("may plain")
-    assert code == 0
-    assert "may and plain were fitted to the same rows (12 rows)" in out
+def test_methods_of_the_same_rows_are_not_tested(loopcal) -> None:
+    out = loopcal("may plain", "may and plain were fitted to the same rows (12 rows)").out
     assert "differs from" not in out
     assert "Errors after calibration at 4 poses that are common to all runs" in out
     assert "Shifts from" not in out
 
 
-def test_a_run_that_is_the_prior_of_another_shares_its_rows(compare) -> None:
-    code, out, _ = compare("may joint")
-    assert code == 0
-    assert "have 12 of 28 fitted rows in common" in out
+def test_a_run_that_is_the_prior_of_another_shares_its_rows(loopcal) -> None:
+    loopcal("may joint", "have 12 of 28 fitted rows in common")
 
 
-def test_errors_at_other_measurements(compare) -> None:
-    code, out, err = compare("may july --data new.csv")
-    assert (code, err) == (0, "")
-    assert "Errors after calibration at 16 poses that are common to all runs" in out
-    code, _, err = compare("may june --data may.csv")
-    assert code == 1
-    assert "not an independent validation" in err
+def test_errors_at_other_measurements(loopcal) -> None:
+    words = "Errors after calibration at 16 poses that are common to all runs"
+    assert loopcal("may july --data new.csv", words).err == ""
+    loopcal("may june --data may.csv", "not an independent validation", code=1)
 
 
-def test_json_and_csv(compare, tmp_path, runs) -> None:
-    code, out, _ = compare("may july --json")
-    document = json.loads(out)
-    assert code == 0
+def test_json_and_csv(loopcal, tmp_path, runs) -> None:
+    document = loopcal("may july --json").json
     assert document["moved"] is True
     assert document["pairs"][0]["cause"]["names"] == ["tower2.stop"]
     path = tmp_path / "table.csv"
-    code, out, _ = compare(f"may july -o {path}")
-    assert out.endswith(f"Written to {path}")
+    assert loopcal(f"may july -o {path}").words.endswith(f"Written to {path}")
     rows = list(csv.DictReader(path.open()))
     assert len(rows) == 2 * 9
     (moved,) = [r for r in rows if r["run"] == "july" and r["parameter"] == "tower2.stop"]
@@ -118,20 +103,20 @@ def test_json_and_csv(compare, tmp_path, runs) -> None:
     assert float(moved["estimate"]) == pytest.approx(
         lc.load_run(runs / "july").robot.values[6] * 1e3, abs=1e-6
     )
-    assert compare(f"may july -o {path}")[0] == 1
+    loopcal(f"may july -o {path}", code=1)
 
 
-def test_a_hostile_name_is_text(compare, runs, tmp_path) -> None:
+def test_a_hostile_name_is_text(loopcal, runs, tmp_path) -> None:
     shutil.copytree(runs / "june", runs / "=1+1", dirs_exist_ok=True)
     path = tmp_path / "table.csv"
-    assert compare(f"may =1+1 -o {path}")[0] == 0
+    loopcal(f"may =1+1 -o {path}")
     assert not any(line.startswith("=") for line in path.read_text().splitlines())
 
 
-def test_what_is_no_comparison_is_refused(compare, runs) -> None:
-    assert "1 run given" in compare("may")[2]
-    assert "is given twice" in compare("may ./may")[2]
-    assert compare("may linear-delta")[0] == 1
+def test_what_is_no_comparison_is_refused(loopcal, runs) -> None:
+    loopcal("may", "1 run given", code=1)
+    loopcal("may ./may", "is given twice", code=1)
+    loopcal("may linear-delta", code=1)
     with pytest.raises(lc.DataError, match="give a list of runs"):
         lc.compare_runs(["may", "june"])  # type: ignore[list-item]
 
@@ -152,19 +137,15 @@ def rewrite_robot(runs: Path, name: str, old: str, new: str) -> None:
         ("turned", "angles: [210, 330, 90]", "angles: [211, 331, 91]", "tower3.angle is fixed at"),
     ],
 )
-def test_runs_that_mean_something_else_are_refused(compare, runs, name, old, new, words) -> None:
+def test_runs_that_mean_something_else_are_refused(loopcal, runs, name, old, new, words) -> None:
     rewrite_robot(runs, name, old, new)
-    code, _, err = compare(f"may {name}")
-    assert code == 1
-    assert words in err
+    loopcal(f"may {name}", words, code=1)
 
 
-def test_another_mechanism_is_refused(compare, runs) -> None:
+def test_another_mechanism_is_refused(loopcal, runs) -> None:
     call("simulate five-bar --draw 16 --kind position --draw-errors -o bars.csv --force")
     call("calibrate five-bar bars.csv -o bars --force")
-    code, _, err = compare("may bars")
-    assert code == 1
-    assert "may and bars are calibrations of different mechanisms" in err
+    loopcal("may bars", "may and bars are calibrations of different mechanisms", code=1)
 
 
 def test_a_run_of_an_older_version_is_shown_without_a_test(runs) -> None:
@@ -177,15 +158,14 @@ def test_a_run_of_an_older_version_is_shown_without_a_test(runs) -> None:
     assert np.isnan(comparison.pairs[0].p_value)
 
 
-def test_a_run_that_states_no_units_is_shown_without_intervals(compare, runs, tmp_path) -> None:
+def test_a_run_that_states_no_units_is_shown_without_intervals(loopcal, runs, tmp_path) -> None:
     older = tmp_path / "older"
     shutil.copytree(runs / "june", older)
     result = json.loads((older / "result.json").read_text("utf-8"))
     for row in result["fit"]["parameters"]:
         del row["unit"]
     (older / "result.json").write_text(json.dumps(result), "utf-8")
-    code, _, err = compare(f"may {older}")
-    assert (code, err) == (0, "")
+    assert loopcal(f"may {older}").err == ""
     summary = lc.compare_runs([lc.load_run(runs / "may"), lc.load_run(older)]).runs[1]
     assert set(summary.plus_minus.values()) == {None}
 
@@ -216,10 +196,8 @@ def read_policy(text: str) -> str:
     return policy[1].replace("&#39;", "'")
 
 
-def test_page_shows_the_comparison_without_programs_and_requests(compare) -> None:
-    code, out, err = compare("may june july -o page.html")
-    assert (code, err) == (0, "")
-    assert "Written to page.html" in out
+def test_page_shows_the_comparison_without_programs_and_requests(loopcal) -> None:
+    assert loopcal("may june july -o page.html", "Written to page.html").err == ""
     text = Path("page.html").read_text("utf-8")
     headings = re.findall(r'<h2 id="([a-z]+)">', text)
     assert headings == ["result", "parameters", "shifts", "errors"]
@@ -235,26 +213,24 @@ def test_page_shows_the_comparison_without_programs_and_requests(compare) -> Non
     assert "<script" not in text
     assert re.search(r"\sstyle=|\son[a-z]+=|https?://", text) is None
     assert read_policy(text).startswith("default-src 'none'; style-src 'sha256-")
-    compare("may plain -o methods.html")
+    loopcal("may plain -o methods.html")
     text = Path("methods.html").read_text("utf-8")
     assert "Whether a machine has changed was not tested." in text
     assert "so no shift was tested" in text
     assert "4 common poses" in text
 
 
-def test_ending_of_the_file_chooses_its_format(compare) -> None:
-    assert compare("may june -o both.json")[0] == 0
-    printed = json.loads(compare("may june --json")[1])
+def test_ending_of_the_file_chooses_its_format(loopcal) -> None:
+    loopcal("may june -o both.json")
+    printed = loopcal("may june --json").json
     assert json.loads(Path("both.json").read_text("utf-8")) == printed
-    assert compare("may june -o both.csv")[0] == 0
+    loopcal("may june -o both.csv")
     assert Path("both.csv").read_text("utf-8").startswith("run,parameter,")
-    code, _, err = compare("may june -o both.xlsx")
-    assert code == 1
-    assert "ends in .html or .json or .csv, but this one has '.xlsx'" in err
+    loopcal(
+        "may june -o both.xlsx", "ends in .html or .json or .csv, but this one has '.xlsx'", code=1
+    )
     assert not Path("both.xlsx").exists()
-    code, _, err = compare("may june -o both.csv")
-    assert code == 1
-    assert "--force" in err
+    loopcal("may june -o both.csv", "--force", code=1)
 
 
 def test_hostile_names_are_text_in_all_formats(runs, monkeypatch, tmp_path) -> None:

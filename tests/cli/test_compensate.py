@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.io.core.csv_table import read_table
-from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism.solutions import forward, inverse
-from loopcal.units import Dimension
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 TARGETS = """pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]
@@ -35,73 +33,70 @@ def example_folder(tmp_path_factory):
 
 
 @pytest.fixture
-def run(example_folder, monkeypatch, capsys):
-    """Run a command line in the example folder; return exit code, standard output and error."""
+def loopcal(loopcal, example_folder, monkeypatch):
+    """Run a command line in the example folder."""
     monkeypatch.chdir(example_folder)
     (example_folder / "targets.csv").write_text(TARGETS)
-
-    def run(words: str) -> tuple[int, str, str]:
-        code = main(words.split())
-        return code, *capsys.readouterr()
-
-    return run
+    return loopcal
 
 
-def test_written_readings_move_the_calibrated_robot_to_the_targets(run, example_folder) -> None:
-    code, out, err = run("compensate run targets.csv -o readings.csv")
-    assert code == 0, err
-    assert "home" in out
-    assert "Frame: tool point, base axes, absolute in the base frame of the robot file" in " ".join(
-        out.split()
+def test_written_readings_move_the_calibrated_robot_to_the_targets(loopcal, example_folder) -> None:
+    loopcal(
+        "compensate run targets.csv -o readings.csv",
+        "home",
+        "Frame: tool point, base axes, absolute in the base frame of the robot file",
     )
     table = read_table(example_folder / "readings.csv")
-    q = np.column_stack([table.numbers(f"q{i}", Dimension.LENGTH) for i in range(1, 7)])
+    q = np.column_stack([table.numbers(f"q{i}", lc.Dimension.LENGTH) for i in range(1, 7)])
     np.testing.assert_allclose(
-        q, inverse(load_robot("run/robot.yaml"), WANTED).q, rtol=0, atol=1e-15
+        q, lc.inverse(lc.load_robot("run/robot.yaml"), WANTED).q, rtol=0, atol=1e-15
     )
     assert table.text("note status") == ("reached in full",) * 2
-    assert (table.numbers("note U x", Dimension.LENGTH) < 3e-6).all()  # [m], instrument 1 um
+    assert (table.numbers("note U x", lc.Dimension.LENGTH) < 3e-6).all()  # [m], instrument 1 um
 
 
 def test_written_commands_reach_the_targets_through_the_nominal_controller(
-    run, example_folder
+    loopcal, example_folder
 ) -> None:
-    code, out, err = run("compensate run targets.csv --mode commands --steps 4 -o commands.csv")
-    assert code == 0, err
-    assert "After step 4: at most" in out
+    loopcal(
+        "compensate run targets.csv --mode commands --steps 4 -o commands.csv",
+        "After step 4: at most",
+    )
     table = read_table(example_folder / "commands.csv")
-    commanded = [table.numbers(f"commanded.{n}", Dimension.LENGTH) for n in "xyz"]
+    commanded = [table.numbers(f"commanded.{n}", lc.Dimension.LENGTH) for n in "xyz"]
     commanded += [
-        table.numbers(f"commanded.{n}", Dimension.ANGLE) for n in ("roll", "pitch", "yaw")
+        table.numbers(f"commanded.{n}", lc.Dimension.ANGLE) for n in ("roll", "pitch", "yaw")
     ]
-    readings = inverse(load_robot("hexapod-42"), np.column_stack(commanded)).q
-    calibrated = load_robot("run/robot.yaml")
-    wanted = inverse(calibrated, WANTED).T
-    np.testing.assert_allclose(forward(calibrated, readings).T, wanted, rtol=0, atol=1e-12)
+    readings = lc.inverse(lc.load_robot("hexapod-42"), np.column_stack(commanded)).q
+    calibrated = lc.load_robot("run/robot.yaml")
+    wanted = lc.inverse(calibrated, WANTED).T
+    np.testing.assert_allclose(lc.forward(calibrated, readings).T, wanted, rtol=0, atol=1e-12)
 
 
-def test_compensate_without_an_output_file_prints_csv_or_json(run) -> None:
-    code, out, _ = run("compensate run targets.csv")
-    assert code == 0
+def test_compensate_without_an_output_file_prints_csv_or_json(loopcal) -> None:
+    out = loopcal("compensate run targets.csv").out
     assert out.startswith("pose,q1 [mm],q2 [mm]")
-    code, out, err = run("compensate run targets.csv --json")
-    assert (code, err) == (0, "")
-    document = json.loads(out, parse_constant=pytest.fail)
+    printed = loopcal("compensate run targets.csv --json")
+    assert printed.err == ""
+    document = printed.json
     assert document["labels"] == ["home", "left"]
     assert np.shape(document["uncertainty"]["expanded"]) == (2, 6)
 
 
-def test_compensation_from_a_robot_file_has_no_uncertainty(run) -> None:
-    code, out, _ = run("compensate truth.yaml targets.csv --json")
-    assert code == 0
-    assert json.loads(out)["uncertainty"] is None
+def test_compensation_from_a_robot_file_has_no_uncertainty(loopcal) -> None:
+    document = loopcal("compensate truth.yaml targets.csv --json").json
+    assert document["uncertainty"] is None
 
 
-def test_target_outside_the_limits_gives_exit_code_2_and_no_reading(run, example_folder) -> None:
+def test_target_outside_the_limits_gives_exit_code_2_and_no_reading(
+    loopcal, example_folder
+) -> None:
     (example_folder / "targets.csv").write_text(TARGETS + UNREACHABLE)
-    code, out, err = run("compensate run targets.csv")
-    assert code == 2
-    assert "target 'high': outside the machine's limits: stroke of q1" in err
+    out = loopcal(
+        "compensate run targets.csv",
+        "target 'high': outside the machine's limits: stroke of q1",
+        code=2,
+    ).out
     assert out.split("\n")[3].startswith("high,,,,,,,")
 
 
@@ -121,13 +116,10 @@ def test_target_outside_the_limits_gives_exit_code_2_and_no_reading(run, example
     ],
 )
 def test_invalid_target_file_is_refused_in_one_sentence(
-    run, example_folder, text, sentence
+    loopcal, example_folder, text, sentence
 ) -> None:
     (example_folder / "targets.csv").write_text(text)
-    code, out, err = run("compensate run targets.csv")
-    assert (code, out) == (1, "")
-    assert sentence in err
-    assert err.count("\n") == 1
+    loopcal("compensate run targets.csv", sentence, code=1)
 
 
 @pytest.mark.parametrize(
@@ -149,12 +141,9 @@ def test_invalid_target_file_is_refused_in_one_sentence(
     ],
 )
 def test_invalid_command_line_is_refused_in_one_sentence(
-    run, example_folder, later_data, words, sentence
+    loopcal, example_folder, later_data, words, sentence
 ) -> None:
-    code, _, err = run(words)
-    assert code == 1
-    assert sentence in err
-    assert err.count("\n") == 1 + err.count("\nHint: ")
+    loopcal(words, sentence, code=1)
     assert not (example_folder / "new").exists()
 
 
@@ -162,27 +151,17 @@ def test_invalid_command_line_is_refused_in_one_sentence(
 def later_data(example_folder):
     """Measurements of the same machine on another day."""
     words = "--sigma-position 0.001mm --sigma-angle 5urad --seed 7"
-    main(
-        [
-            "simulate",
-            str(example_folder / "truth.yaml"),
-            "--poses",
-            str(example_folder / "poses.csv"),
-            *words.split(),
-            "-o",
-            str(example_folder / "later.csv"),
-        ]
-    )
-    return example_folder / "later.csv"
+    truth, poses, later = (example_folder / n for n in ("truth.yaml", "poses.csv", "later.csv"))
+    main(f"simulate {truth} --poses {poses} {words} -o {later}".split())
+    return later
 
 
 def test_calibrate_with_a_prior_reports_whether_the_freed_limb_changed(
-    run, later_data, example_folder
+    loopcal, later_data, example_folder
 ) -> None:
-    code, out, err = run(
+    out = loopcal(
         "calibrate hexapod-42 later.csv -o second --prior run --free-limb leg3 --force"
-    )
-    assert code == 0, err
+    ).out
     assert out.startswith("Undecided: hexapod-42")
     result = json.loads((example_folder / "second" / "result.json").read_text())
     assert result["change"]["subject"] == "leg3"

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.apply.validation import ErrorChange
 from loopcal.cli.entry_point import main
 from loopcal.findings.wording import fill_template
-from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.validation_view import _compare
 
 NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(nan|inf|infinity)(?!\w)", re.IGNORECASE)
@@ -23,7 +22,7 @@ HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],x [mm],y [mm],z [mm]\n"
 
 def write_data(path: Path, rows: list[int], noise: str, error: float) -> None:
     """Write positions of a linear delta at some of twenty poses, with errors [m]."""
-    solution = sample_workspace(load_robot("linear-delta"), 20, seed=2).solution
+    solution = lc.sample_workspace(lc.load_robot("linear-delta"), 20, seed=2).solution
     rng = np.random.default_rng(0)
     text = "# kind: component\n# components: [x, y, z]\n"
     text += f"# noise: {{x: {noise}, y: {noise}, z: {noise}}}\n" + HEADER

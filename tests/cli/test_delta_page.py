@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli.entry_point import main
-from loopcal.io.robot.robot_file import load_robot
+import loopcal as lc
 from tests.cli.printed_tables import read_report, read_table_rows
 
 
@@ -23,13 +22,12 @@ def page(root, tmp_path, monkeypatch) -> str:
     return (root / "docs" / "delta-printers.md").read_text("utf-8")
 
 
-def test_calibrate_prints_the_numbers_of_the_page(page, capsys) -> None:
+def test_calibrate_prints_the_numbers_of_the_page(loopcal, page) -> None:
     command = re.search(r"^loopcal (calibrate .*)$", page, re.MULTILINE)
     printed = re.search(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert command
     assert printed
-    assert main(command[1].split()) == 0
-    out = capsys.readouterr().out
+    out = loopcal(command[1]).out
     assert read_report(printed[1]) == read_report(out)
     rows = read_table_rows(out)  # rms and largest error, 13 heights, and six parameters
     assert len(rows) == 2 + 13 + 6
@@ -46,46 +44,44 @@ def test_robot_file_of_the_page_equals_that_of_the_example(page, tmp_path) -> No
     text = re.search(r"^```yaml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert text
     (tmp_path / "page.yaml").write_text(text[1])
-    ours, shipped = load_robot("page.yaml"), load_robot("printer.yaml")
+    ours, shipped = lc.load_robot("page.yaml"), lc.load_robot("printer.yaml")
     assert ours.parameters.names == shipped.parameters.names
     np.testing.assert_array_equal(ours.values, shipped.values)
     np.testing.assert_array_equal(ours.parameters.free, shipped.parameters.free)
 
 
-def test_truth_lies_within_3_5_standard_deviations_of_the_estimate(page) -> None:
-    assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 0
+def test_truth_lies_within_3_5_standard_deviations_of_the_estimate(loopcal, page) -> None:
+    loopcal("calibrate printer.yaml heights.csv -o run")
     sd = np.load("run/arrays.npz")["sd"]
-    free = load_robot("printer.yaml").parameters.free
-    errors = (load_robot("run/robot.yaml").values - load_robot("truth.yaml").values)[free] / sd
+    free = lc.load_robot("printer.yaml").parameters.free
+    errors = (lc.load_robot("run/robot.yaml").values - lc.load_robot("truth.yaml").values)[
+        free
+    ] / sd
     assert np.abs(errors).max() < 3.5  # six values, in standard deviations
 
 
-def test_robot_file_beyond_the_limit_of_the_page_gives_exit_code_2(page, capsys) -> None:
+def test_robot_file_beyond_the_limit_of_the_page_gives_exit_code_2(loopcal, page) -> None:
     command = re.search(r"^loopcal (validate .* --limit-position .*)$", page, re.MULTILINE)
     assert command
-    assert main(command[1].split()) == 2
-    assert "quality gate not met" in capsys.readouterr().err
+    loopcal(command[1], "quality gate not met", code=2)
 
 
-def test_identifiability_of_a_list_of_points_gives_the_values_of_the_page(page, capsys) -> None:
+def test_identifiability_of_a_list_of_points_gives_the_values_of_the_page(loopcal, page) -> None:
     command = re.search(r"^loopcal (identifiability .*)$", page, re.MULTILINE)
     assert command
-    assert main(command[1].split()) == 0
-    left = _read_relative_uncertainties(capsys.readouterr().out)
+    left = _read_relative_uncertainties(loopcal(command[1]).out)
     assert {name: value for name, value in left.items() if "tower" in name} == {
         "tower1.angle": 0.26, "tower2.angle": 0.26,
         "tower1.stop": 0.05, "tower2.stop": 0.05, "tower3.stop": 0.05,
     }  # fmt: skip
 
 
-def test_13_heights_hardly_determine_the_arm_lengths(page, tmp_path, capsys) -> None:
+def test_13_heights_hardly_determine_the_arm_lengths(loopcal, page, tmp_path) -> None:
     lines = (tmp_path / "printer.yaml").read_text().splitlines(keepends=True)
     (tmp_path / "nine.yaml").write_text(
         "".join(line for line in lines if not line.startswith("fixed"))
     )
-    assert main(["identifiability", "nine.yaml", "heights.csv"]) == 0
-    out = capsys.readouterr().out
-    assert "9 of 9 parameter combinations" in out
+    out = loopcal("identifiability nine.yaml heights.csv", "9 of 9 parameter combinations").out
     assert "0.92 to 0.94 of their tolerance" in " ".join(page.split())
     assert {
         value for name, value in _read_relative_uncertainties(out).items() if "arm" in name

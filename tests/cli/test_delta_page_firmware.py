@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli.entry_point import main
 from loopcal.io.formats.delta_gcode import read_reports
 from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_points
 
@@ -44,30 +43,30 @@ def check_recommendation(truth, code: str, accuracy: float = 0.2e-3) -> None:
     assert fit.values[place] == pytest.approx(truth.values[place], abs=accuracy)
 
 
-def test_commands_for_marlin_lead_to_a_recommendation(commands) -> None:
+def test_commands_for_marlin_lead_to_a_recommendation(loopcal, commands) -> None:
     Path("m503.gcode").write_text(MARLIN)
     robot, truth = make_truth("m503.gcode")
     write_points(POINTS, add_noise(probe(robot, truth, POINTS)), "g30.txt")
     importing, calibrating = commands[:2]
     assert importing.startswith("import m503.gcode")
-    assert main(importing.split()) == 0
-    assert main(calibrating.split()) == 0
+    loopcal(importing)
+    loopcal(calibrating)
     check_recommendation(truth, "values.apply")  # five of 13 points are held out
 
 
-def test_commands_for_reprapfirmware_lead_to_a_recommendation(commands) -> None:
+def test_commands_for_reprapfirmware_lead_to_a_recommendation(loopcal, commands) -> None:
     Path("config-override.g").write_text(REPRAP)
     robot, truth = make_truth("config-override.g")
     cells = " ".join(f"{h:.3f}" for h in add_noise(probe(robot, truth, POINTS)))
     Path("g32.txt").write_text(f"G32 bed probe heights: {cells}, mean 0, deviation 0")
     bed = [f"G30 P{i} X{x:.3f} Y{y:.3f} Z-99999" for i, (x, y) in enumerate(POINTS)]
     Path("bed.g").write_text("\n".join(bed) + " S-1\n")
-    assert main(commands[2].split()) == 0
-    assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 0
+    loopcal(commands[2])
+    loopcal("calibrate printer.yaml heights.csv -o run")
     check_recommendation(truth, "values.apply-fitted")
     # nobody stated the noise, and eight fitted points do not leave enough to estimate it
     words = ["calibrate", "printer.yaml", "heights.csv", "-o", "run", "--hold-out", "0.4"]
-    assert main([*words, "--force"]) == 0
+    loopcal([*words, "--force"])
     check_recommendation(truth, "values.apply-held-out", 0.4e-3)
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+import loopcal as lc
 from loopcal.cli.entry_point import main
-from loopcal.io.runs.run_folder import load_run
 from tests.cli.delta_printers import (
     list_stored_geometry,
     read_records,
@@ -95,15 +95,18 @@ def test_calibrate_runs_as_a_shell_command(tmp_path, data_folder) -> None:
     ]
 
 
-def test_factory_default_is_reported_as_not_calibrated(calibrate, capsys) -> None:
+def test_factory_default_is_reported_as_not_calibrated(loopcal, calibrate) -> None:
     _, result = calibrate(FACTORY_DEFAULT)
     assert result["start"]["verdict"] == "not calibrated"
     assert result["start"]["before"] / result["start"]["after"] > 5.0
     # a robot file can be judged without a fit, and the corrected one passes where the factory
     # default does not
-    assert main(["validate", "robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 2
-    assert "The position error at pose point5 is 0.262 mm" in capsys.readouterr().err
-    assert main(["validate", "run/robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 0
+    loopcal(
+        "validate robot.yaml heights.csv --limit-position 0.1mm",
+        "The position error at pose point5 is 0.262 mm",
+        code=2,
+    )
+    loopcal("validate run/robot.yaml heights.csv --limit-position 0.1mm")
 
 
 def test_unknown_sigma_gives_no_verdict_on_the_nominal_geometry(calibrate) -> None:
@@ -163,10 +166,9 @@ def test_import_reports_a_stored_geometry_that_is_not_optimal(import_record) -> 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("factor", [1 / 25.4, 0.1])
 def test_import_of_distances_in_another_unit_shows_no_warnings_of_numpy(
-    tmp_path, data_folder, monkeypatch, factor
+    loopcal, data_folder, factor
 ) -> None:
     """The fit to such distances passes radii that are longer than the arms."""
-    monkeypatch.chdir(tmp_path)
     text = format_printer_cfg(read_records(data_folder)[WITH_DISTANCES])
     lines = [
         f"{line.split(' = ')[0]} = {factor * float(line.split(' = ')[1])}"
@@ -175,10 +177,10 @@ def test_import_of_distances_in_another_unit_shows_no_warnings_of_numpy(
         for line in text.splitlines()
     ]
     Path("printer.cfg").write_text("\n".join(lines) + "\n")
-    assert main(IMPORT.split()) == 0
+    loopcal(IMPORT)
 
 
-def test_page_shows_the_numbers_of_the_real_printer(import_record, capsys, root) -> None:
+def test_page_shows_the_numbers_of_the_real_printer(loopcal, import_record, root) -> None:
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
     quoted = page.split("compares the numbers of these lines -->\n```text\n")[1].split("```")[0]
     printed = import_record(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
@@ -186,8 +188,7 @@ def test_page_shows_the_numbers_of_the_real_printer(import_record, capsys, root)
     assert len(numbers) == 6
     assert re.findall(r"\d+\.\d{4}", printed) == numbers
     words = "calibrate printer.yaml probes.csv -o run --method ls --sigma-uncertainty 0 --verbose"
-    assert main(words.split()) == 0
-    out = capsys.readouterr().out
+    out = loopcal(words).out
     # heights and distances mixed in millimeters increase, though chi-square decreases from 18.9
     assert "larger after calibration" not in out
     assert "Error divided by sigma (rms): within the noise before and after calibration" in out
@@ -224,7 +225,7 @@ def test_import_reports_a_factory_default_but_not_a_calibrated_printer(import_re
     ],
 )
 def test_seven_contradictory_heights_fail_without_naming_an_outlier(
-    import_record, capsys, name, height, times
+    loopcal, import_record, name, height, times
 ) -> None:
     """Two printers as probed, and one with an error of 0.3 mm (15 sigma) in one height."""
     import_record(name, " --sigma-height 0.02mm")
@@ -234,8 +235,9 @@ def test_seven_contradictory_heights_fail_without_naming_an_outlier(
             *cells, z = line.split(",")
             lines[i] = ",".join([*cells, str(float(z) + 0.3)])
     Path("probes.csv").write_text("\n".join(lines))
-    assert main(["calibrate", "printer.yaml", "probes.csv", "-o", "run"]) == 2
-    assert capsys.readouterr().out.startswith("Not calibrated: ")
+    assert loopcal("calibrate printer.yaml probes.csv -o run", code=2).out.startswith(
+        "Not calibrated: "
+    )
     checked = json.loads(Path("run/result.json").read_text())["examination"]["outliers"]
     assert checked["outliers"] == []
     (conflict,) = checked["undecided"]
@@ -247,13 +249,12 @@ def test_seven_contradictory_heights_fail_without_naming_an_outlier(
     ("name", "times"), [(CALIBRATED[0], 10.0), (CALIBRATED[1], 4.39), (CALIBRATED[2], 0.838)]
 )
 def test_assumed_sigma_of_few_heights_is_a_note_that_asks_for_it(
-    import_record, capsys, name, times
+    loopcal, import_record, name, times
 ) -> None:
     """With one degree of freedom the noise cannot be estimated, and no gate depends on it."""
     import_record(name)
     assert "# noise_source: assumed" in Path("probes.csv").read_text()
-    assert main(["calibrate", "printer.yaml", "probes.csv", "-o", "run"]) == 0
-    assert capsys.readouterr().out.startswith("Undecided: ")
+    assert loopcal("calibrate printer.yaml probes.csv -o run").out.startswith("Undecided: ")
     result = json.loads(Path("run/result.json").read_text())
     (noise,) = [f for f in result["findings"] if f["code"].startswith("noise.")]
     assert (noise["code"], noise["severity"]) == ("noise.assumed", "warning")
@@ -263,11 +264,11 @@ def test_assumed_sigma_of_few_heights_is_a_note_that_asks_for_it(
     assert sigma["estimated"]["value"] == pytest.approx(0.02 * times, rel=5e-3)
 
 
-def test_assumed_sigma_is_estimated_where_the_data_can(import_record, capsys) -> None:
+def test_assumed_sigma_is_estimated_where_the_data_can(loopcal, import_record) -> None:
     """Ten degrees of freedom: heights and distances are 3.2 times as bad as assumed."""
     import_record(WITH_DISTANCES)
     words = "calibrate printer.yaml probes.csv -o run --method ls"
-    assert main(words.split()) == 0
+    loopcal(words)
     result = json.loads(Path("run/result.json").read_text())
     assert result["fit"]["noise"] == "estimated"
     assert result["fit"]["sigma_scale"] == pytest.approx(3.18, rel=5e-3)
@@ -276,7 +277,7 @@ def test_assumed_sigma_is_estimated_where_the_data_can(import_record, capsys) ->
     assert [s["kind"] for s in noise["data"]["sigmas"]] == ["component", "separation"]
     # a stated sigma is tested: the gate is not met
     import_record(WITH_DISTANCES, " --sigma-height 0.02mm --sigma-distance 0.1mm")
-    assert main([*words.split(), "--force"]) == 2
+    loopcal([*words.split(), "--force"], code=2)
 
 
 @pytest.mark.slow
@@ -290,7 +291,7 @@ def test_assumed_sigma_is_estimated_where_the_data_can(import_record, capsys) ->
     ],
 )
 def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
-    import_record, capsys, tmp_path, data_folder, name
+    loopcal, import_record, tmp_path, data_folder, name
 ) -> None:
     import_record(name)
     text = (tmp_path / "printer.yaml").read_text()
@@ -298,34 +299,39 @@ def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
         "".join(s for s in text.splitlines(keepends=True) if not s.startswith("fixed"))
     )
     write_files(read_records(data_folder)[name], tmp_path)
-    assert main(["identifiability", "nine.yaml", "heights.csv", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = loopcal("identifiability nine.yaml heights.csv --json").json
     assert (document["rank"], document["n_parameters"], document["n_equations"]) == (7, 9, 7)
     suggestion = "distances between two poses (ball bar; calipers on a printed part)"
     assert len(document["unidentifiable"]) == 2
     assert [cure["cures"][0]["words"] for cure in document["remedies"]] == [suggestion, suggestion]
     # calibrate refuses by default, and says the same
-    assert main(["calibrate", "nine.yaml", "heights.csv", "-o", "run"]) == 1
-    error = capsys.readouterr().err
-    assert "7 equations cannot determine 9 parameters" in error
-    assert suggestion in error
-    assert "Hint: use --method map" in error
+    loopcal(
+        "calibrate nine.yaml heights.csv -o run",
+        "7 equations cannot determine 9 parameters",
+        suggestion,
+        "Hint: use --method map",
+        code=1,
+    )
     # where stated tolerances fill the gap, the note is printed and kept in the run
     (tmp_path / "nine.yaml").write_text((tmp_path / "nine.yaml").read_text() + TOLERANCES)
-    assert main(["calibrate", "nine.yaml", "heights.csv", "-o", "run", "--method", "map"]) in (0, 2)
-    assert "Suggested measurement" not in capsys.readouterr().out  # only with --verbose
+    assert (
+        "Suggested measurement"
+        not in loopcal("calibrate nine.yaml heights.csv -o run --method map", code=(0, 2)).out
+    )  # only with --verbose
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["fit"]["rank"] == 7
     assert [cure["cures"][0]["words"] for cure in result["remedies"]] == [suggestion, suggestion]
 
 
-def test_run_of_a_chosen_set_of_parameters_is_read_back_and_exported(tmp_path, root) -> None:
+def test_run_of_a_chosen_set_of_parameters_is_read_back_and_exported(
+    loopcal, tmp_path, root
+) -> None:
     heights, run = root / "examples" / "delta-printer" / "heights.csv", tmp_path / "run"
-    assert main(f"calibrate linear-delta {heights} -o {run} --choose-model".split()) == 0
+    loopcal(f"calibrate linear-delta {heights} -o {run} --choose-model")
     stated = json.loads((run / "result.json").read_text("utf-8"))["fit"]["parameters"]
-    assert len(stated) < sum(load_run(run).robot.parameters.free)
-    posterior = load_run(run).load_posterior()
+    assert len(stated) < sum(lc.load_run(run).robot.parameters.free)
+    posterior = lc.load_run(run).load_posterior()
     table = posterior.robot.parameters
     assert [table.names[i] for i in posterior.places] == [row["name"] for row in stated]
-    assert main(f"sample {run} --region".split()) == 0
-    assert main(f"export {run} -o {tmp_path / 'printer.cfg'}".split()) == 0
+    loopcal(f"sample {run} --region")
+    loopcal(f"export {run} -o {tmp_path / 'printer.cfg'}")

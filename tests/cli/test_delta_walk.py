@@ -14,9 +14,6 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli.entry_point import main
-from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import forward, inverse
 from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, TRUE, probe, write_points
 
 NOISE = 0.02
@@ -51,12 +48,12 @@ IMPORT = {
 }
 
 
-def probe_marlin(robot: Mechanism, truth: Mechanism, noise: np.ndarray) -> None:
+def probe_marlin(robot: lc.Mechanism, truth: lc.Mechanism, noise: np.ndarray) -> None:
     Path("m503.gcode").write_text(MARLIN)
     write_points(POINTS, np.add(probe(robot, truth, POINTS), noise))
 
 
-def probe_reprap(robot: Mechanism, truth: Mechanism, noise: np.ndarray) -> None:
+def probe_reprap(robot: lc.Mechanism, truth: lc.Mechanism, noise: np.ndarray) -> None:
     heights = np.add(probe(robot, truth, POINTS), noise)
     cells = " ".join(f"{height:.3f}" for height in heights)
     Path("report.txt").write_text(f"G32 bed probe heights: {cells}, mean 0, deviation 0")
@@ -64,11 +61,11 @@ def probe_reprap(robot: Mechanism, truth: Mechanism, noise: np.ndarray) -> None:
     Path("bed.g").write_text("\n".join(lines) + " S-1\n")
 
 
-def probe_klipper(robot: Mechanism, truth: Mechanism, noise: np.ndarray) -> None:
+def probe_klipper(robot: lc.Mechanism, truth: lc.Mechanism, noise: np.ndarray) -> None:
     """Write what DELTA_CALIBRATE METHOD=manual saves: steps where the nozzle touches z = 0."""
     heights = np.add(probe(robot, truth, POINTS), noise)
     touched = [[1e-3 * x, 1e-3 * y, 1e-3 * h] for (x, y), h in zip(POINTS, heights, strict=True)]
-    steps = 1e3 * inverse(robot, touched).q / STEP
+    steps = 1e3 * lc.inverse(robot, touched).q / STEP
     lines = [
         f"height{i} = 0.0\nheight{i}_pos = {','.join(f'{s:.3f}' for s in row)}"
         for i, row in enumerate(steps)
@@ -83,11 +80,11 @@ PRINTERS: dict[str, tuple[str, str, Callable]] = {
 }
 
 
-def compute_bed(robot: Mechanism, truth: Mechanism) -> np.ndarray:
+def compute_bed(robot: lc.Mechanism, truth: lc.Mechanism) -> np.ndarray:
     """Return the true heights [mm] of the nozzle where the firmware believes it at z = 0."""
     axis = 1e-3 * np.linspace(-70.0, 70.0, 9)
     grid = np.array([(x, y, 0.0) for x in axis for y in axis if np.hypot(x, y) < 0.075])
-    return 1e3 * forward(truth, inverse(robot, grid).q).T[:, 2, 3]
+    return 1e3 * lc.forward(truth, lc.inverse(robot, grid).q).T[:, 2, 3]
 
 
 def type_in(name: str, text: str) -> None:
@@ -110,24 +107,21 @@ def type_in(name: str, text: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRINTERS)
-def test_typing_what_is_printed_makes_the_real_bed_flat(name, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_typing_what_is_printed_makes_the_real_bed_flat(loopcal, name):
     file, text, write_report = PRINTERS[name]
     Path(file).write_text(text)
-    assert main(f"import {file} --format {name} -o firmware.yaml".split()) == 0
+    loopcal(f"import {file} --format {name} -o firmware.yaml")
     robot = lc.load_robot("firmware.yaml")
     change = np.array([TRUE.get(parameter, 0.0) for parameter in robot.parameters.names])
     truth = robot.with_values(robot.values + change)
     write_report(robot, truth, NOISE * np.random.default_rng(11).standard_normal(len(POINTS)))
     words = f"import {IMPORT[name]} --format {name} -o printer.yaml --data heights.csv"
-    assert main([*words.split(), "--sigma-height", "0.02mm"]) == 0
-    assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run", "--hold-out", "0.4"]) == 0
-    page = capsys.readouterr()
+    loopcal([*words.split(), "--sigma-height", "0.02mm"])
+    page = loopcal("calibrate printer.yaml heights.csv -o run --hold-out 0.4")
     assert "Recommendation: Apply the identified values." in page.out
     assert "opposite sign" not in page.err  # the import knows the sign
-    assert main(["export", "run", "--format", name]) == 0
-    type_in(name, capsys.readouterr().out)
-    assert main(f"import {file} --format {name} -o typed.yaml".split()) == 0
+    type_in(name, loopcal(["export", "run", "--format", name]).out)
+    loopcal(f"import {file} --format {name} -o typed.yaml")
     before, after = compute_bed(robot, truth), compute_bed(lc.load_robot("typed.yaml"), truth)
     assert np.sqrt(np.mean(before**2)) > 0.1  # [mm]
     assert np.sqrt(np.mean(after**2)) < 0.03  # [mm], from eight points with 0.02 mm of noise

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers of a calibration that failed are written for no machine, unless that is demanded."""
 
-import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.io.formats.import_export import list_formats
-from loopcal.io.robot.robot_file import load_robot, save_robot
-from loopcal.io.runs.run_folder import FAILED_ROBOT, ROBOT, find_run_failure, load_run
-from loopcal.mechanism.solutions import inverse
+from loopcal.io.runs.run_folder import FAILED_ROBOT, ROBOT, find_run_failure
 
 STEP = 0.0125
 """Length of a motor step [mm]."""
@@ -22,21 +20,16 @@ TRUE_STOPS = (250.4, 249.7, 250.1)
 """[mm]."""
 
 
-def run(command: str) -> int:
-    """Run a command line; return its exit code."""
-    return main(command.split())
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> Path:
     """Write the run of a calibration whose limit is below its noise, and one that passes."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "targets.csv").write_text("x [mm],y [mm],z [mm]\n10,20,30\n")
     words = f"simulate linear-delta --kind position --draw-errors -o {folder}/data.csv --seed 3"
-    assert run(words) == 0
+    assert main(words.split()) == 0
     words = f"calibrate linear-delta {folder}/data.csv --hold-out 0.25 --limit-position"
-    assert run(f"{words} 0.1um -o {folder}/failed") == 2
-    assert run(f"{words} 1mm -o {folder}/good") == 0
+    assert main(f"{words} 0.1um -o {folder}/failed".split()) == 2
+    assert main(f"{words} 1mm -o {folder}/good".split()) == 0
     return folder
 
 
@@ -49,93 +42,88 @@ def folder(runs, tmp_path, monkeypatch, capsys) -> Path:
     return tmp_path
 
 
-def test_robot_of_a_failed_calibration_has_another_name(folder, capsys) -> None:
+def test_robot_of_a_failed_calibration_has_another_name(loopcal, folder) -> None:
     assert sorted(p.name for p in Path("failed").iterdir()) == sorted(
         ["arrays.npz", "result.json", FAILED_ROBOT]
     )
     assert Path("failed", FAILED_ROBOT).read_text().startswith("# NOT CALIBRATED")
     assert Path("good", ROBOT).is_file()
-    failed, good = load_run("failed"), load_run("good")
+    failed, good = lc.load_run("failed"), lc.load_run("good")
     np.testing.assert_array_equal(failed.robot.values, good.robot.values)
     assert good.failure is None
     assert failed.failure is not None
     assert failed.failure.code == "gates.run-not-calibrated"
-    assert run("validate failed data.csv --allow-fitted-data") == 0  # to look at it is allowed
-    capsys.readouterr()
+    loopcal("validate failed data.csv --allow-fitted-data")
     words = "calibrate linear-delta data.csv --hold-out 0.25 --limit-position 0.1um -o failed"
-    assert run(f"{words} --force") == 2
-    assert "arrays.npz, robot.yaml" in capsys.readouterr().out
+    loopcal(f"{words} --force", "arrays.npz, robot.yaml", code=2)
     assert Path("failed", ROBOT).is_file()
     assert not Path("failed", FAILED_ROBOT).exists()
-    assert run("export failed -o c.json") == 2  # the verdict stays
+    loopcal("export failed -o c.json", code=2)  # the verdict stays
 
 
 @pytest.mark.parametrize("name", list_formats("write"))
-def test_no_format_is_written_from_a_failed_calibration(folder, capsys, name) -> None:
+def test_no_format_is_written_from_a_failed_calibration(loopcal, folder, name) -> None:
     for source in ("failed", f"failed/{FAILED_ROBOT}", "./failed/"):
-        assert run(f"export {source} --format {name} -o out.txt") == 2
-        err = capsys.readouterr().err
-        assert "quality gate not met: failed is not calibrated: The position error" in err
-        assert "use --force to write them" in err
+        loopcal(
+            f"export {source} --format {name} -o out.txt",
+            "quality gate not met: failed is not calibrated: The position error",
+            "use --force to write them",
+            code=2,
+        )
         assert not Path("out.txt").exists()
     if name in ("linuxcnc", "linuxcnc-ini", "urdf"):
         return  # of other machines
-    assert run(f"export failed --format {name} -o out.txt --force") == 2
-    assert "failed is not calibrated" in capsys.readouterr().err
-    assert run(f"export good --format {name} -o good.txt") == 0
+    loopcal(f"export failed --format {name} -o out.txt --force", "failed is not calibrated", code=2)
+    loopcal(f"export good --format {name} -o good.txt")
     assert Path("out.txt").read_text() == Path("good.txt").read_text()
 
 
-def test_refused_export_is_one_json_document(folder, capsys) -> None:
-    assert run("export failed -o out.json --json") == 2
-    document = json.loads(capsys.readouterr().out)
+def test_refused_export_is_one_json_document(loopcal, folder) -> None:
+    document = loopcal("export failed -o out.json --json", code=2).json
     assert document["output"] is None
     assert [r["code"] for r in document["reasons"]] == ["gates.run-not-calibrated"]
 
 
-def test_failed_calibration_computes_no_commands(folder, capsys) -> None:
+def test_failed_calibration_computes_no_commands(loopcal, folder) -> None:
     for words in ("", "-o new.csv", "--mode commands -o new.csv"):
-        assert run(f"compensate failed targets.csv {words}") == 2
-        out, err = capsys.readouterr()
+        _, out, err = loopcal(f"compensate failed targets.csv {words}", code=2)
         assert out == ""
         assert "failed is not calibrated" in err
         assert not Path("new.csv").exists()
-    assert run("compensate failed targets.csv -o new.csv --force") == 2
-    assert run("compensate good targets.csv -o good.csv") == 0
+    loopcal("compensate failed targets.csv -o new.csv --force", code=2)
+    loopcal("compensate good targets.csv -o good.csv")
     assert Path("new.csv").read_text() == Path("good.csv").read_text()
 
 
-def test_robot_file_states_elsewhere_that_its_calibration_failed(folder, capsys) -> None:
+def test_robot_file_states_elsewhere_that_its_calibration_failed(loopcal, folder) -> None:
     shutil.copy(Path("failed", FAILED_ROBOT), "taken.yaml")
     for words in ("compensate taken.yaml targets.csv", "export taken.yaml -o taken.json"):
-        assert run(words) == 2
-        out, err = capsys.readouterr()
+        _, out, err = loopcal(words, code=2)
         assert "taken.yaml is not calibrated. Its numbers must not be used on a machine" in err
         assert "pose" not in out
-        assert run(f"{words} --force") == 2
-        capsys.readouterr()
+        loopcal(f"{words} --force", code=2)
 
 
-def test_forced_name_does_not_hide_that_the_calibration_failed(folder, capsys) -> None:
+def test_forced_name_does_not_hide_that_the_calibration_failed(loopcal, folder) -> None:
     words = "calibrate linear-delta data.csv --hold-out 0.25 --limit-position 0.1um -o failed"
-    assert run(f"{words} --force") == 2
+    loopcal(f"{words} --force", code=2)
     assert Path("failed", ROBOT).read_text().startswith("# NOT CALIBRATED")
     shutil.copy(Path("failed", ROBOT), "taken.yaml")
-    assert run("compensate taken.yaml targets.csv") == 2
+    loopcal("compensate taken.yaml targets.csv", code=2)
 
 
-def test_good_calibration_of_a_failed_robot_file_is_good(folder, capsys) -> None:
+def test_good_calibration_of_a_failed_robot_file_is_good(loopcal, folder) -> None:
     shutil.copy(Path("failed", FAILED_ROBOT), "start.yaml")
     words = "calibrate start.yaml data.csv --hold-out 0.25 --limit-position 1mm -o again"
-    assert run(words) == 0
+    loopcal(words)
     assert "NOT CALIBRATED" not in Path("again", ROBOT).read_text()
-    assert run("compensate again/robot.yaml targets.csv") == 0
-    assert run(f"{words.replace('1mm', '0.1um')} --force") == 2
+    loopcal("compensate again/robot.yaml targets.csv")
+    loopcal(f"{words.replace('1mm', '0.1um')} --force", code=2)
     assert Path("again", ROBOT).read_text().count("NOT CALIBRATED") == 1
-    robot = load_robot("start.yaml")
-    save_robot(robot, "same.yaml")
+    robot = lc.load_robot("start.yaml")
+    lc.save_robot(robot, "same.yaml")
     assert Path("same.yaml").read_text().startswith("# NOT CALIBRATED")
-    save_robot(robot.with_values(robot.values + 1e-6), "other.yaml")
+    lc.save_robot(robot.with_values(robot.values + 1e-6), "other.yaml")
     assert "NOT CALIBRATED" not in Path("other.yaml").read_text()
 
 
@@ -173,8 +161,8 @@ def write_printer(wrong: float = 0.0) -> None:
         "[stepper_b]", f"step_distance: {STEP}", "[stepper_c]", f"step_distance: {STEP}",
     ]  # fmt: skip
     Path("printer.cfg").write_text("\n".join(lines) + "\n")
-    assert run("import printer.cfg -o nominal.yaml --force") == 0
-    nominal = load_robot("nominal.yaml")
+    assert main(["import", "printer.cfg", "-o", "nominal.yaml", "--force"]) == 0
+    nominal = lc.load_robot("nominal.yaml")
     values = nominal.values.copy()
     for k, stop in enumerate(TRUE_STOPS, 1):
         values[nominal.parameters.index(f"tower{k}.stop")] = stop * 1e-3
@@ -183,7 +171,7 @@ def write_printer(wrong: float = 0.0) -> None:
     points = [(0, 0), *((r * np.cos(a), r * np.sin(a)) for r in (0.04, 0.08) for a in turns)]
     heights = rng.normal(0, 1e-5, len(points))
     at = np.column_stack([points, heights])
-    steps = np.round(inverse(nominal.with_values(values), at).q * 1e3 / STEP, 3)
+    steps = np.round(lc.inverse(nominal.with_values(values), at).q * 1e3 / STEP, 3)
     probed = heights * 1e3 + rng.normal(0, 0.01, len(points))  # [mm]
     probed[4] += wrong
     lines += ["#*# <---------------------- SAVE_CONFIG ---------------------->"]
@@ -200,25 +188,20 @@ IMPORT = (
 )
 
 
-def test_import_corrects_a_file_where_the_calibration_passes(tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_import_corrects_a_file_where_the_calibration_passes(loopcal) -> None:
     write_printer()
-    assert run(IMPORT) == 0
-    assert run("import corrected.cfg -o again.yaml") == 0
-    again = load_robot("again.yaml")
+    loopcal(IMPORT)
+    loopcal("import corrected.cfg -o again.yaml")
+    again = lc.load_robot("again.yaml")
     for k, stop in enumerate(TRUE_STOPS, 1):
         # [m]: ten times the noise of the probe
         assert abs(again.values[again.parameters.index(f"tower{k}.stop")] - stop * 1e-3) < 1e-4
 
 
-def test_import_does_not_correct_a_file_where_the_calibration_failed(
-    tmp_path, monkeypatch, capsys
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_import_does_not_correct_a_file_where_the_calibration_failed(loopcal, capsys) -> None:
     write_printer(wrong=3.0)
     capsys.readouterr()
-    assert run(IMPORT) == 2
-    out, err = capsys.readouterr()
+    _, out, err = loopcal(IMPORT, code=2)
     assert "corrected.cfg was not written" in err
     assert "residuals exceed the stated noise" in err
     assert "use --force" in err
@@ -226,8 +209,7 @@ def test_import_does_not_correct_a_file_where_the_calibration_failed(
     assert not Path("corrected.cfg").exists()
     assert Path("p.yaml").is_file()
     assert Path("heights.csv").is_file()
-    assert run(f"{IMPORT} --force --json") == 2
-    document = json.loads(capsys.readouterr().out)
+    document = loopcal(f"{IMPORT} --force --json", code=2).json
     assert document["corrected"] == "corrected.cfg"
     assert document["verdict"] == "not_calibrated"
     assert [r["code"] for r in document["reasons"]] == ["noise.residuals-too-large"]

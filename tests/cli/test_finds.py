@@ -6,16 +6,14 @@ smallest that shows it, and the right answer.
 import subprocess
 import sys
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from loopcal.cli.entry_point import main
+import loopcal as lc
 from loopcal.diagnose.error_frames import fit_frames
-from loopcal.io.robot.robot_file import find_robot_file, load_robot
+from loopcal.io.robot.robot_file import find_robot_file
 
 DATA = """\
 # kind: {kind}
@@ -34,119 +32,103 @@ LIMB = '<link name="{0}"/><joint name="{0}j" type="revolute"><parent link="base"
 URDF = f"<robot name='r'><link name='base'/>{LIMB.format('a')}{LIMB.format('b')}</robot>"
 
 
-@dataclass(frozen=True)
-class Find:
-    """A command line, the files that it reads, its exit code, and what it says."""
-
-    command: str
-    files: Mapping[str, str] = field(default_factory=dict)
-    code: int = 1
-    says: str = ""
-
-
 FINDS = {
-    "study of a robot file that cannot be read": Find(
+    "study of a robot file that cannot be read": (
         "study new study.yaml --robot mine.yaml",
         {"mine.yaml": "format: 1\nfamily: none\n"},
-        says="loopcal: mine.yaml",
+        "loopcal: mine.yaml",
     ),
-    "kind that is a list": Find(
+    "kind that is a list": (
         "identifiability linear-delta d.csv",
         {"d.csv": POSITION.replace("kind: position", "kind: [position]") + ROWS},
-        says="d.csv:1: ['position'] is not a kind of measurement",
+        "d.csv:1: ['position'] is not a kind of measurement",
     ),
-    "places of different length": Find(
+    "places of different length": (
         "identifiability linear-delta d.csv",
         {"d.csv": "# places: [[1 mm, 2 mm, 3 mm], [1 mm]]\n# targets: [a, b]\n" + POSITION + ROWS},
-        says="'places' must be a list of numbers, or of lists of equal length",
+        "'places' must be a list of numbers, or of lists of equal length",
     ),
-    "kind without a measured value": Find(
+    "kind without a measured value": (
         "validate linear-delta d.csv",
         {"d.csv": SEPARATION + "a,180,190,200,\nb,190,180,200,\n"},
-        says="Fill in the measured values",
+        "Fill in the measured values",
     ),
-    "tilt beyond half a turn": Find(
+    "tilt beyond half a turn": (
         "check robot.yaml",
         {"robot.yaml": TRIPOD.replace("theta: [0, 35]", "theta: [650, 750]")},
-        says="the workspace of theta runs to 13.09 rad; a tilt is above 0 and at most 180 degrees",
+        "the workspace of theta runs to 13.09 rad; a tilt is above 0 and at most 180 degrees",
     ),
-    "known position of 1e308 mm": Find(
+    "known position of 1e308 mm": (
         "import s.json --format hangprinter -o new.yaml",
         {"s.json": SAMPLES.read_text("utf-8").replace("-0.72", "-1e308", 1)},
-        says="'xyz_of_samp' contains a number beyond 1e+09; correct it",
+        "'xyz_of_samp' contains a number beyond 1e+09; correct it",
     ),
-    "output of no study": Find(
-        "reproduce -o out", says="--output has no effect without the name of a study"
+    "output of no study": (
+        "reproduce -o out",
+        {},
+        "--output has no effect without the name of a study",
     ),
-    "anchor that is used again": Find(
+    "anchor that is used again": (
         "check robot.yaml",
         {"robot.yaml": "a: &x 1\nb: &x 2\nc: *x\n"},
-        says="robot.yaml: this file states no format",
+        "robot.yaml: this file states no format",
     ),
-    "key that is a mapping in a list": Find(
+    "key that is a mapping in a list": (
         "check robot.yaml",
         {"robot.yaml": "format: 1\nlegs:\n  ? [{a: 1}]\n  : 2\n"},
-        says="robot.yaml:3: a key is a list or a mapping; write text there",
+        "robot.yaml:3: a key is a list or a mapping; write text there",
     ),
-    "key that an alias makes a mapping": Find(
+    "key that an alias makes a mapping": (
         "check robot.yaml",
         {"robot.yaml": "format: 1\nlegs: &x {a: 1}\n*x : 2\n"},
-        says="robot.yaml:3: a key is a list or a mapping; write text there",
+        "robot.yaml:3: a key is a list or a mapping; write text there",
     ),
-    "format of times that states the year twice": Find(
+    "format of times that states the year twice": (
         "import e.txt --profile p.yaml -o new.csv",
         {
             "e.txt": (EXPORTS / "six-dof.txt").read_text("utf-8"),
             "p.yaml": (EXPORTS / "six-dof.yaml").read_text("utf-8").replace("%S'", "%S %Y'"),
         },
-        says="p.yaml:14: '%Y-%m-%d %H:%M:%S %Y' is not a format of times",
+        "p.yaml:14: '%Y-%m-%d %H:%M:%S %Y' is not a format of times",
     ),
-    "target whose name no column can have": Find(
+    "target whose name no column can have": (
         "import e.txt --profile p.yaml -o new.csv",
         {
             "e.txt": (EXPORTS / "tracker-points.txt").read_text("utf-8"),
             "p.yaml": (EXPORTS / "tracker-points.yaml").read_text("utf-8").replace("SMR2", "'[a'"),
         },
-        says="the measured value '[a.x' cannot be the name of a column",
+        "the measured value '[a.x' cannot be the name of a column",
     ),
-    "measurements with such a target": Find(
+    "measurements with such a target": (
         "identifiability linear-delta d.csv",
         {"d.csv": "# targets: [a, 'b]']\n" + POSITION + ROWS},
-        says="the measured value 'b].x' cannot be the name of a column",
+        "the measured value 'b].x' cannot be the name of a column",
     ),
-    "closure of a list": Find(
+    "closure of a list": (
         "import r.urdf --closures c.yaml -o new.yaml",
         {"r.urdf": URDF, "c.yaml": "closed_loop: [[[aj], bj]]\ntype: ['6d']\nname_mot: [aj]\n"},
-        says="must be the names of two frames",
+        "must be the names of two frames",
     ),
 }
+"""Case -> a command line, the files that it reads, and what it says."""
 
 
-@pytest.mark.parametrize("find", FINDS.values(), ids=FINDS)
-def test_input_found_at_random_has_its_answer(tmp_path, monkeypatch, capsys, find) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name, text in find.files.items():
+@pytest.mark.parametrize(("command", "files", "says"), FINDS.values(), ids=FINDS)
+def test_input_found_at_random_has_its_answer(loopcal, tmp_path, command, files, says) -> None:
+    for name, text in files.items():
         (tmp_path / name).write_text(text, "utf-8")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        code = main(find.command.split())
-    printed = capsys.readouterr()
-    assert find.says in " ".join((printed.out + printed.err).split())
-    assert code == find.code
-    assert {path.name for path in tmp_path.iterdir()} == set(find.files)
+        loopcal(command, says, code=1)
+    assert {path.name for path in tmp_path.iterdir()} == set(files)
 
 
-def test_link_to_itself_is_refused_as_an_output(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_link_to_itself_is_refused_as_an_output(loopcal, tmp_path) -> None:
     (tmp_path / "loop.yaml").symlink_to("loop.yaml")
-    assert main(["new", "limbs", "-o", "loop.yaml"]) == 1
-    assert "loop.yaml: this symbolic link has no target" in capsys.readouterr().err
+    loopcal("new limbs -o loop.yaml", "loop.yaml: this symbolic link has no target", code=1)
 
 
-def test_paths_that_the_system_does_not_open_state_what_is_wrong(
-    tmp_path, monkeypatch, capsys
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_paths_that_the_system_does_not_open_state_what_is_wrong(loopcal, tmp_path) -> None:
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
     (tmp_path / "file").touch()
@@ -156,30 +138,25 @@ def test_paths_that_the_system_does_not_open_state_what_is_wrong(
         ("file/c.csv", "part of its path is a file"),
     ):
         for command in (["compensate", "linear-delta", path], ["validate", "linear-delta", path]):
-            assert main(command) == 1
-            printed = " ".join(capsys.readouterr().err.split())
+            printed = " ".join(loopcal(command, code=1).err.split())
             assert says in printed
             assert "permissions" not in printed
 
 
-def test_document_of_a_result_folder_is_never_replaced_by_a_file(
-    tmp_path, monkeypatch, capsys
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_document_of_a_result_folder_is_never_replaced_by_a_file(loopcal, tmp_path) -> None:
     (tmp_path / "run").mkdir()
     document, other = tmp_path / "run/result.json", tmp_path / "run/mine.json"
     document.write_text('{"files": {"robot.yaml": "0123"}}', "utf-8")
     other.write_text('{"files": 3}', "utf-8")
     before = document.read_bytes()
     words = ["export", "five-bar", "--format", "json", "--force", "-o"]
-    assert main([*words, str(document)]) == 1
-    assert "whose folder cannot be read without it" in capsys.readouterr().err
+    loopcal([*words, str(document)], "whose folder cannot be read without it", code=1)
     assert document.read_bytes() == before
-    assert main([*words, str(other)]) == 0
+    loopcal([*words, str(other)])
 
 
 def test_motions_that_move_nothing_fit_nothing() -> None:
-    robot = load_robot("linear-delta")
+    robot = lc.load_robot("linear-delta")
     fit = fit_frames(robot, robot.home[None], np.zeros((12, 2)))
     assert fit.solution.shape == (12, 6)
     assert not fit(np.ones((1, 6, 3))).any()

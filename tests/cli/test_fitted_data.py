@@ -6,15 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli.entry_point import main
-
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 
 
-def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(
-    tmp_path, monkeypatch, capsys
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(loopcal) -> None:
     shutil.copy(EXAMPLE / "measurements.csv", "all.csv")
     lines = Path("all.csv").read_text().splitlines()
     first = next(i for i, line in enumerate(lines) if line.startswith("pose,")) + 1
@@ -23,28 +18,23 @@ def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(
     Path("part.csv").write_text("\n".join(["## a copy", *head, *rows[7::-1]]) + "\n")
     Path("mixed.csv").write_text("\n".join(head + rows[28:]) + "\n")
     Path("rest.csv").write_text("\n".join(head + rows[30:]) + "\n")
-    assert main(["calibrate", "hexapod-42", "fit.csv", "-o", "run"]) == 0
-    capsys.readouterr()
-    assert main(["validate", "run", "part.csv"]) == 1
-    out, err = capsys.readouterr()
+    loopcal("calibrate hexapod-42 fit.csv -o run")
+    _, out, err = loopcal("validate run part.csv", code=1)
     assert out == ""
     assert err.startswith("loopcal: The calibration used 8 of 8 rows (poses ")
     assert "--allow-fitted-data" in err
-    assert main(["validate", "run", "part.csv", "--allow-fitted-data"]) == 0
-    assert main(["validate", "run", "rest.csv"]) == 0
-    assert capsys.readouterr().err == ""
-    assert main(["validate", "run", "mixed.csv"]) == 0
-    assert capsys.readouterr().err.startswith("loopcal: note: The calibration used 2 of 12 rows")
+    loopcal("validate run part.csv --allow-fitted-data")
+    assert loopcal("validate run rest.csv").err == ""
+    assert loopcal("validate run mixed.csv").err.startswith(
+        "loopcal: note: The calibration used 2 of 12 rows"
+    )
 
 
 @pytest.mark.slow
-def test_prior_refuses_fitted_rows_whatever_their_file_looks_like(
-    tmp_path, monkeypatch, capsys
-) -> None:
+def test_prior_refuses_fitted_rows_whatever_their_file_looks_like(loopcal, capsys) -> None:
     """A blank line, another order and unit, a subset, a superset, two files of which one is old,
     and rows of the prior's own prior.
     """
-    monkeypatch.chdir(tmp_path)
     lines = (EXAMPLE / "measurements.csv").read_text().splitlines()
     first = next(i for i, line in enumerate(lines) if line.startswith("pose,")) + 1
     head, rows = lines[:first], lines[first:]
@@ -76,19 +66,21 @@ def test_prior_refuses_fitted_rows_whatever_their_file_looks_like(
     files = [[write(name, chosen)] for name, chosen in copies.items()]
     files.append([write("meters.csv", [convert(line) for line in old], meters)])
     files.append(["new.csv", "old.csv"])
-    assert main(["calibrate", "hexapod-42", "old.csv", "-o", "run"]) == 0
+    loopcal("calibrate hexapod-42 old.csv -o run")
     for names in files:
         capsys.readouterr()
-        assert main(["calibrate", "hexapod-42", *names, "-o", "run2", "--prior", "run"]) == 1
-        err = capsys.readouterr().err
+        err = loopcal(
+            ["calibrate", "hexapod-42", *names, "-o", "run2", "--prior", "run"], code=1
+        ).err
         assert err.startswith("loopcal: The earlier calibration used "), (names, err)
         is_partly_new = names in (["superset.csv"], ["new.csv", "old.csv"])
         assert ("--drop POSE" in err) == is_partly_new  # else nothing would be left
-    assert main(["calibrate", "hexapod-42", "new.csv", "-o", "run2", "--prior", "run"]) == 0
-    capsys.readouterr()
+    loopcal("calibrate hexapod-42 new.csv -o run2 --prior run")
     for name in ("subset.csv", "new.csv"):  # of the prior of the prior, and of the prior
-        assert main(["calibrate", "hexapod-42", name, "-o", "run3", "--prior", "run2"]) == 1
-        assert "count twice" in capsys.readouterr().err
-        assert main(["validate", "run2", name]) == 1
-        assert "The calibration used" in capsys.readouterr().err
-    assert main(["calibrate", "hexapod-42", "third.csv", "-o", "run3", "--prior", "run2"]) == 0
+        loopcal(
+            ["calibrate", "hexapod-42", name, "-o", "run3", "--prior", "run2"],
+            "count twice",
+            code=1,
+        )
+        loopcal(["validate", "run2", name], "The calibration used", code=1)
+    loopcal("calibrate hexapod-42 third.csv -o run3 --prior run2")

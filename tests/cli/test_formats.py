@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal.cli.entry_point import find_command, main
-from loopcal.io.data.measurement_file import load_measurements
+import loopcal as lc
+from loopcal.cli.entry_point import find_command
 from loopcal.io.formats import FORMATS
-from loopcal.io.robot.robot_file import load_robot
 from tests.cli.delta_printers import list_stored_geometry, read_records
 from tests.io.formats.printers import format_printer_cfg
 
@@ -22,17 +21,6 @@ FIRMWARE_CALIBRATED = (
 )
 WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
 ONE_COMMAND = "import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg"
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def run(command: str) -> int:
-    """Run a command line; return its exit code."""
-    return main(command.split())
 
 
 def list_changed_lines(before: str, after: str) -> list[str]:
@@ -46,18 +34,18 @@ def list_changed_lines(before: str, after: str) -> list[str]:
 
 @pytest.mark.parametrize("name", sorted((*FIRMWARE_CALIBRATED, WITH_DISTANCES)))
 def test_import_reads_the_geometry_and_every_probe_of_printer_cfg(
-    folder, data_folder, name
+    loopcal, folder, data_folder, name
 ) -> None:
     record = read_records(data_folder)[name]
     (folder / "printer.cfg").write_text(format_printer_cfg(record))
-    assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
-    robot = load_robot("printer.yaml")
+    loopcal("import printer.cfg -o printer.yaml --data data.csv")
+    robot = lc.load_robot("printer.yaml")
     for parameter, value in list_stored_geometry(record).items():
         factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
         assert robot.values[robot.parameters.index(parameter)] == pytest.approx(
             value * factor, abs=1e-12
         )  # [m, rad]
-    data = load_measurements("data.csv", robot)
+    data = lc.load_measurements("data.csv", robot)
     assert data.n_rows == len(record["heights"]) + len(record["distances"])
     steps = (
         np.array(record["heights"][0]["stable_steps"])
@@ -79,16 +67,15 @@ def test_import_reads_the_geometry_and_every_probe_of_printer_cfg(
     ],
 )
 def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
-    folder, capsys, data_folder, name
+    loopcal, folder, data_folder, name
 ) -> None:
     record = read_records(data_folder)[name]
     text = format_printer_cfg(record, stop_offset=20.0)
     (folder / "printer.cfg").write_text(text)
-    assert run(ONE_COMMAND) == 0
-    out = capsys.readouterr().out
+    out = loopcal(ONE_COMMAND).out
     corrected = (folder / "corrected.cfg").read_text()
-    assert run("import corrected.cfg -o again.yaml") == 0
-    again = load_robot("again.yaml")
+    loopcal("import corrected.cfg -o again.yaml")
+    again = lc.load_robot("again.yaml")
     for parameter, value in list_stored_geometry(record).items():
         factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
         assert abs(again.values[again.parameters.index(parameter)] / factor - value) < 2e-3, (
@@ -110,40 +97,42 @@ def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
 
 
 @pytest.mark.slow
-def test_exported_printer_cfg_imports_with_the_calibrated_values(folder, data_folder) -> None:
+def test_exported_printer_cfg_imports_with_the_calibrated_values(
+    loopcal, folder, data_folder
+) -> None:
     record = read_records(data_folder)[FIRMWARE_CALIBRATED[0]]
     (folder / "printer.cfg").write_bytes(
         b"\xef\xbb\xbf" + format_printer_cfg(record, stop_offset=5.0).replace("\n", "\r\n").encode()
     )
-    assert run("import printer.cfg -o printer.yaml --data data.csv --sigma-height 50um") == 0
-    assert run("calibrate printer.yaml data.csv -o run --noise estimated") == 0
-    assert run("export run --format klipper --into printer.cfg -o corrected.cfg") == 0
+    loopcal("import printer.cfg -o printer.yaml --data data.csv --sigma-height 50um")
+    loopcal("calibrate printer.yaml data.csv -o run --noise estimated")
+    loopcal("export run --format klipper --into printer.cfg -o corrected.cfg")
     before, after = (folder / "printer.cfg").read_bytes(), (folder / "corrected.cfg").read_bytes()
     assert before != after
     assert after.startswith(b"\xef\xbb\xbf")
     assert before.count(b"\r\n") == after.count(b"\r\n") == after.count(b"\n")
-    assert run("import corrected.cfg -o again.yaml") == 0
-    found, again = load_robot("run/robot.yaml"), load_robot("again.yaml")
+    loopcal("import corrected.cfg -o again.yaml")
+    found, again = lc.load_robot("run/robot.yaml"), lc.load_robot("again.yaml")
     # six decimals are written [mm, deg]
     np.testing.assert_allclose(again.values, found.values, rtol=0, atol=1e-8)
-    assert run("export again.yaml --format klipper --into corrected.cfg -o twice.cfg") == 0
+    loopcal("export again.yaml --format klipper --into corrected.cfg -o twice.cfg")
     assert (folder / "twice.cfg").read_bytes() == after
 
 
 def test_exported_json_and_csv_contain_every_parameter_with_its_interval(
-    folder, capsys, data_folder
+    loopcal, folder, data_folder
 ) -> None:
     (folder / "printer.cfg").write_text(
         format_printer_cfg(read_records(data_folder)[FIRMWARE_CALIBRATED[0]])
     )
-    assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
-    assert run("calibrate printer.yaml data.csv -o run") == 0
-    assert run("export run -o found.json") == 0
-    assert run("export run -o found.csv --json") == 0
+    loopcal("import printer.cfg -o printer.yaml --data data.csv")
+    loopcal("calibrate printer.yaml data.csv -o run")
+    loopcal("export run -o found.json")
+    loopcal("export run -o found.csv --json")
     document = json.loads((folder / "found.json").read_text())
     result = json.loads((folder / "run" / "result.json").read_text())
     half = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}
-    robot = load_robot("run/robot.yaml")
+    robot = lc.load_robot("run/robot.yaml")
     assert [row["name"] for row in document["parameters"]] == list(robot.parameters.names)
     csv_rows = (folder / "found.csv").read_text().splitlines()
     assert csv_rows[0] == "name,nominal,value,plus_minus,unit,free"
@@ -155,19 +144,16 @@ def test_exported_json_and_csv_contain_every_parameter_with_its_interval(
         assert row["free"] == (row["name"] in half)
 
 
-def test_existing_file_is_replaced_only_with_force(folder, capsys, data_folder) -> None:
+def test_existing_file_is_replaced_only_with_force(loopcal, folder, data_folder) -> None:
     (folder / "printer.cfg").write_text(
         format_printer_cfg(read_records(data_folder)[WITH_DISTANCES])
     )
     (folder / "printer.yaml").write_text("mine")
-    assert run("import printer.cfg -o printer.yaml") == 1
-    assert "this file exists" in capsys.readouterr().err
+    loopcal("import printer.cfg -o printer.yaml", "this file exists", code=1)
     assert (folder / "printer.yaml").read_text() == "mine"
-    assert run("import printer.cfg -o printer.yaml --force") == 0
-    assert run("export printer.yaml --format klipper --into printer.cfg -o printer.cfg") == 1
-    assert (
-        run("export printer.yaml --format klipper --into printer.cfg -o printer.cfg --force") == 0
-    )
+    loopcal("import printer.cfg -o printer.yaml --force")
+    loopcal("export printer.yaml --format klipper --into printer.cfg -o printer.cfg", code=1)
+    loopcal("export printer.yaml --format klipper --into printer.cfg -o printer.cfg --force")
 
 
 @pytest.mark.parametrize(
@@ -199,12 +185,9 @@ def test_existing_file_is_replaced_only_with_force(folder, capsys, data_folder) 
     ],
 )
 def test_invalid_import_or_export_is_refused_in_one_sentence(
-    folder, capsys, command, sentence
+    loopcal, folder, command, sentence
 ) -> None:
-    assert run(command) == 1
-    error = capsys.readouterr().err
-    assert sentence in error
-    assert error.count("\n") == 1 + ("\nHint: " in error)
+    loopcal(command, sentence, code=1)
     assert list(folder.iterdir()) == []
 
 
@@ -217,31 +200,28 @@ def test_page_and_commands_list_every_format(root) -> None:
         assert set(option.type.choices) == {n for n, f in FORMATS.items() if getattr(f, ability)}
 
 
-def test_uncalibrated_five_bar_exports_to_the_same_urdf_file(folder, capsys, data_folder) -> None:
+def test_uncalibrated_five_bar_exports_to_the_same_urdf_file(loopcal, folder, data_folder) -> None:
     source = data_folder / "urdf_closures" / "5bar_linkage" / "robot.urdf"
-    assert run(f"import {source} -o five-bar.yaml") == 0
-    assert (
-        "5 rigid bodies with the base (of 8 links), 5 joints (1 close loops), 2 motors, mobility 2"
-        in " ".join(capsys.readouterr().out.split())
+    loopcal(
+        f"import {source} -o five-bar.yaml",
+        "5 rigid bodies with the base (of 8 links), 5 joints (1 close loops), 2 motors, mobility 2",
     )
-    assert run(f"export five-bar.yaml --format urdf --into {source} -o same.urdf") == 0
+    loopcal(f"export five-bar.yaml --format urdf --into {source} -o same.urdf")
     assert (folder / "same.urdf").read_bytes() == source.read_bytes()
 
 
 @pytest.mark.slow
 def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
-    folder, capsys, data_folder
+    loopcal, folder, data_folder
 ) -> None:
     """The weights are those of the firmware. Two of its arms are not optimal (cost 0.6477)."""
     record = read_records(data_folder)[WITH_DISTANCES]
     (folder / "printer.cfg").write_text(format_printer_cfg(record))
     sigma = 0.1 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))
     words = f"{ONE_COMMAND} --sigma-height {sigma}mm --sigma-distance 0.1mm --json"
-    assert run(words) == 2  # the residuals are 2.5 times this noise
+    loopcal(words, code=2)
     assert not (folder / "corrected.cfg").exists()
-    capsys.readouterr()
-    assert run(f"{words} --force") == 2
-    document = json.loads(capsys.readouterr().out)
+    document = loopcal(f"{words} --force", code=2).json
     assert document["fit"]["rank"] == 9
     assert document["fit"]["chi_square"] * 0.1**2 == pytest.approx(0.6160, abs=1e-4)  # [mm^2]
     found = {row["name"]: row["estimate"] for row in document["fit"]["parameters"]}
@@ -261,8 +241,8 @@ def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
         )
         <= 9
     )
-    assert run("import corrected.cfg -o again.yaml") == 0
-    again = load_robot("again.yaml")
+    loopcal("import corrected.cfg -o again.yaml")
+    again = lc.load_robot("again.yaml")
     for name, value in found.items():
         factor = np.pi / 180 if name.endswith("angle") else 1e-3
         assert again.values[again.parameters.index(name)] / factor == pytest.approx(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -13,61 +12,51 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli.entry_point import main
 from loopcal.io.example_folders import list_examples
 
 
-def test_version_has_a_short_option(capsys) -> None:
-    assert main(["-V"]) == 0
-    short = capsys.readouterr().out
-    assert main(["--version"]) == 0
-    assert short == capsys.readouterr().out
+def test_version_has_a_short_option(loopcal) -> None:
+    short = loopcal("-V").out
+    assert short == loopcal("--version").out
     assert short.startswith("loopcal ")
 
 
-def test_examples_are_listed_with_their_titles(root, capsys) -> None:
-    assert main(["example"]) == 0
-    out = capsys.readouterr().out
+def test_examples_are_listed_with_their_titles(loopcal, root) -> None:
+    out = loopcal("example").out
     for folder in (root / "examples").iterdir():
         assert folder.name in out
     assert "A hexapod from nominal to calibrated" in out
-    assert main(["example", "--json"]) == 0
-    assert set(json.loads(capsys.readouterr().out)["examples"]) == set(list_examples())
+    assert set(loopcal("example --json").json["examples"]) == set(list_examples())
 
 
 @pytest.mark.parametrize("name", sorted(list_examples()))
-def test_an_example_is_written_whole(name, root, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["example", name]) == 0
+def test_an_example_is_written_whole(loopcal, name, root, tmp_path) -> None:
+    printed = loopcal(["example", name])
     written = {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
     originals = (root / "examples" / name).iterdir()
     assert written == {path.name: path.read_bytes() for path in originals}
-    assert capsys.readouterr().out.startswith(f"Written to {name}: ")
+    assert printed.out.startswith(f"Written to {name}: ")
 
 
-def test_an_example_replaces_nothing(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_an_example_replaces_nothing(loopcal) -> None:
     Path("mine").mkdir()
-    assert main(["example", "hexapod-42", "-o", "mine"]) == 0  # an empty folder
+    loopcal("example hexapod-42 -o mine")  # an empty folder
     Path("mine/poses.csv").write_text("my own")
-    assert main(["example", "hexapod-42", "-o", "mine"]) == 1
-    assert "This folder is in use" in " ".join(capsys.readouterr().err.split())
+    loopcal("example hexapod-42 -o mine", "This folder is in use", code=1)
     assert Path("mine/poses.csv").read_text() == "my own"
-    assert main(["example", "hexapod-42", "-o", "."]) == 1
+    loopcal("example hexapod-42 -o .", code=1)
 
 
-def test_an_unknown_example_is_refused_with_similar_names(capsys) -> None:
-    assert main(["example", "hexapod"]) == 1
-    err = " ".join(capsys.readouterr().err.split())
+def test_an_unknown_example_is_refused_with_similar_names(loopcal) -> None:
+    err = " ".join(loopcal("example hexapod", code=1).err.split())
     assert "hexapod is not an example" in err
     assert "hexapod-42" in err
 
 
-def test_a_written_example_is_calibrated(tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["example", "delta-printer"]) == 0
+def test_a_written_example_is_calibrated(loopcal, monkeypatch) -> None:
+    loopcal("example delta-printer")
     monkeypatch.chdir("delta-printer")
-    assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 0
+    loopcal("calibrate printer.yaml heights.csv -o run")
 
 
 def test_the_wheel_contains_the_examples(root) -> None:
@@ -79,15 +68,12 @@ def test_the_wheel_contains_the_examples(root) -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_scripts_call_loopcal(shell, capsys) -> None:
-    assert main(["completion", shell]) == 0
-    script = capsys.readouterr().out
-    assert f"_LOOPCAL_COMPLETE={shell}_complete" in script
+def test_completion_scripts_call_loopcal(loopcal, shell) -> None:
+    loopcal(["completion", shell], f"_LOOPCAL_COMPLETE={shell}_complete")
 
 
-def test_an_unknown_shell_is_refused(capsys) -> None:
-    assert main(["completion", "csh"]) == 1
-    assert "'bash', 'zsh', 'fish'" in capsys.readouterr().err
+def test_an_unknown_shell_is_refused(loopcal) -> None:
+    loopcal("completion csh", "'bash', 'zsh', 'fish'", code=1)
 
 
 def complete(words: str, tmp_path: Path) -> list[str]:
@@ -124,9 +110,8 @@ def test_commands_options_robots_and_files_are_completed(tmp_path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-def test_bash_accepts_the_script(capsys) -> None:
-    assert main(["completion", "bash"]) == 0
-    script = capsys.readouterr().out + "\ncomplete -p loopcal"
+def test_bash_accepts_the_script(loopcal) -> None:
+    script = loopcal("completion bash").out + "\ncomplete -p loopcal"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "_loopcal_completion" in done.stdout

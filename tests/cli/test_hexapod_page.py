@@ -10,12 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.geometry import align_point_sets
-from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import forward, inverse
-from loopcal.mechanism.workspace import sample_workspace
 from loopcal.typing import FloatArray
 from tests.cli.page_commands import list_commands
 
@@ -49,7 +46,7 @@ def list_offsets(path: Path) -> FloatArray:
     return np.array([float(text) for text in found]) * 1e-3
 
 
-def measure_error(controller: Mechanism, truth: Mechanism, added: FloatArray) -> float:
+def measure_error(controller: lc.Mechanism, truth: lc.Mechanism, added: FloatArray) -> float:
     """Return the error of points of the true platform [m], rms, after fits of base and platform.
 
     Parameters
@@ -57,8 +54,8 @@ def measure_error(controller: Mechanism, truth: Mechanism, added: FloatArray) ->
     controller : whose kinematics command the joint positions. added : (6,) to all HOME_OFFSET, so
         that a joint position is the reading of the robot file plus this.
     """
-    commanded = inverse(controller, sample_workspace(truth, 200, seed=5).coordinates)
-    reached = forward(truth, commanded.q - added).T
+    commanded = lc.inverse(controller, lc.sample_workspace(truth, 200, seed=5).coordinates)
+    reached = lc.forward(truth, commanded.q - added).T
     wanted, true = (T[:, None, :3, :3] @ PLACES[:, :, None] for T in (commanded.T, reached))
     a = wanted[..., 0] + commanded.T[:, None, :3, 3]
     b = true[..., 0] + reached[:, None, :3, 3]
@@ -81,14 +78,14 @@ def test_commands_print_the_text_of_the_page(outputs) -> None:
         assert any(block in text for text in (*written, *printed.values())), block
 
 
-def test_corrected_files_bring_the_true_machine_to_its_poses(outputs) -> None:
+def test_corrected_files_bring_the_true_machine_to_its_poses(loopcal, outputs) -> None:
     folder, page, _ = outputs
-    robot, truth = load_robot(folder / "hexapod.yaml"), load_robot(folder / "truth.yaml")
+    robot, truth = lc.load_robot(folder / "hexapod.yaml"), lc.load_robot(folder / "truth.yaml")
     words = "import corrected.hal --unit mm --home-z 420mm -o controller.yaml"
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert main(words.split()) == 0
-    controller = load_robot(folder / "controller.yaml")
+        loopcal(words)
+    controller = lc.load_robot(folder / "controller.yaml")
     added = list_offsets(folder / "corrected.ini") - list_offsets(folder / "machine.ini")
     before = measure_error(robot.with_values(robot.parameters.nominal), truth, np.zeros(6))
     after = measure_error(controller, truth, added)

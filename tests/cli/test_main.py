@@ -9,10 +9,10 @@ from pathlib import Path
 import click
 import pytest
 
+import loopcal as lc
 from loopcal.cli.commands import robot_commands
 from loopcal.cli.commands.study_commands import study
 from loopcal.cli.entry_point import command_line, main
-from loopcal.errors import MechanismError
 
 NAMES = sorted(command_line.list_commands(click.Context(command_line)))
 
@@ -81,7 +81,7 @@ def test_ordinary_calibration_imports_only_what_it_needs(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [
-        (MechanismError("two\n  lines"), "loopcal: two lines\n"),
+        (lc.MechanismError("two\n  lines"), "loopcal: two lines\n"),
         (KeyboardInterrupt(), "loopcal: stopped before the end; no result was written.\n"),
         (
             PermissionError(13, "Permission denied", "run"),
@@ -124,7 +124,7 @@ def test_closed_output_pipe_causes_no_traceback() -> None:
         assert process.wait() == 1
 
 
-def test_command_line_called_from_python_leaves_the_garbage_collection_as_it_was(capsys) -> None:
+def test_command_line_called_from_python_leaves_the_garbage_collection_as_it_was() -> None:
     before = gc.get_threshold()
     assert main(["check", "hexapod-42"]) == 0
     assert gc.get_threshold() == before

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli.entry_point import main
-from loopcal.errors import FileError
+import loopcal as lc
 from loopcal.io.core.text_file import write_text
 from loopcal.io.robot.robot_file import find_robot_file
 
@@ -18,22 +17,15 @@ TARGETS = "pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]\nhome,0,0,
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run a command line in a folder with a robot and data; return exit code, standard output and
-    standard error.
-    """
-    monkeypatch.chdir(tmp_path)
+def loopcal(loopcal):
+    """Run a command line in a folder with a robot and data."""
     shutil.copy(find_robot_file("hexapod-42"), "robot.yaml")
     shutil.copy(EXAMPLE / "measurements.csv", "data.csv")
     Path("pp.csv").write_text(TARGETS)
     Path("old.csv").write_text("mine\n")
     Path("old.png").write_text("mine\n")
 
-    def run(words: str) -> tuple[int, str, str]:
-        code = main(words.split())
-        return code, *capsys.readouterr()
-
-    return run
+    return loopcal
 
 
 def read_all_files() -> dict[str, bytes]:
@@ -67,38 +59,33 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_output_that_would_overwrite_a_file_is_refused_before_writing(run, words) -> None:
+def test_output_that_would_overwrite_a_file_is_refused_before_writing(loopcal, words) -> None:
     before = read_all_files()
-    code, out, err = run(words)
-    assert (code, out, err.count("\n")) == (1, "", 1 + err.count("\nHint: "))
-    assert REFUSED[words] in err
+    loopcal(words, REFUSED[words], code=1)
     assert read_all_files() == before
 
 
-def test_force_replaces_a_file_that_is_not_an_input(run) -> None:
-    assert run("simulate robot.yaml -o old.csv --force")[0] == 0
+def test_force_replaces_a_file_that_is_not_an_input(loopcal) -> None:
+    loopcal("simulate robot.yaml -o old.csv --force")
     assert Path("old.csv").read_text() != "mine\n"
-    assert run("compensate robot.yaml pp.csv -o old.csv --force")[0] == 0
+    loopcal("compensate robot.yaml pp.csv -o old.csv --force")
     assert "note status" in Path("old.csv").read_text()
 
 
 @pytest.mark.slow
-def test_run_folder_used_as_input_is_not_replaced(run) -> None:
-    assert run("calibrate robot.yaml data.csv -o run")[0] == 0
+def test_run_folder_used_as_input_is_not_replaced(loopcal) -> None:
+    loopcal("calibrate robot.yaml data.csv -o run")
     before = read_all_files()
     for words in (
         "run/robot.yaml data.csv -o run --force",
         "robot.yaml pp.csv -o run --force --prior run",
     ):
-        code, _, err = run(f"calibrate {words}")
-        assert code == 1
-        assert "cannot be replaced" in err
-    code, _, err = run("compensate run pp.csv -o run/robot.yaml --force")
-    assert (code, IS_INPUT in err) == (1, True)
+        loopcal(f"calibrate {words}", "cannot be replaced", code=1)
+    loopcal("compensate run pp.csv -o run/robot.yaml --force", IS_INPUT, code=1)
     assert read_all_files() == before
 
 
-def test_pipe_is_not_replaced_even_with_force(run) -> None:
+def test_pipe_is_not_replaced_even_with_force(loopcal) -> None:
     os.mkfifo("pipe")
     Path("link").symlink_to("pipe")
     for name in ("pipe", "link"):
@@ -106,43 +93,37 @@ def test_pipe_is_not_replaced_even_with_force(run) -> None:
             f"simulate robot.yaml -o {name} --force",
             f"new gough -o new.yaml --measurements {name} --force",
         ):
-            code, out, err = run(words)
-            assert (code, out, err.count("\n")) == (1, "", 1)
-            assert "this is a device or a pipe" in err
-        with pytest.raises(FileError, match="this is a device or a pipe"):
+            loopcal(words, "this is a device or a pipe", code=1)
+        with pytest.raises(lc.FileError, match="this is a device or a pipe"):
             write_text(name, "text")
     assert stat.S_ISFIFO(os.lstat("pipe").st_mode)
     assert Path("link").is_symlink()
     assert not Path("new.yaml").exists()
 
 
-def test_force_on_a_symbolic_link_writes_its_target(run) -> None:
+def test_force_on_a_symbolic_link_writes_its_target(loopcal) -> None:
     Path("folder").mkdir()
     Path("folder/real.csv").write_text("mine\n")
     Path("link.csv").symlink_to("folder/real.csv")
     Path("new.csv").symlink_to("folder/later.csv")
-    code, _, err = run("simulate robot.yaml -o link.csv")
-    assert (code, EXISTS in err) == (1, True)
+    loopcal("simulate robot.yaml -o link.csv", EXISTS, code=1)
     for link, real in (("link.csv", "folder/real.csv"), ("new.csv", "folder/later.csv")):
-        assert run(f"simulate robot.yaml -o {link} --force")[0] == 0
+        loopcal(f"simulate robot.yaml -o {link} --force")
         assert Path(link).is_symlink()
         assert "pose,q1" in Path(real).read_text()
         assert not Path(real).is_symlink()
     assert sorted(path.name for path in Path("folder").iterdir()) == ["later.csv", "real.csv"]
 
 
-def test_circular_and_broken_links_are_refused(run) -> None:
+def test_circular_and_broken_links_are_refused(loopcal) -> None:
     Path("circle").symlink_to("circle")
     Path("lost").symlink_to("nodir/file")
     for name, sentence in (
         ("circle", "this symbolic link has no target"),
         ("lost", "does not exist"),
     ):
-        code, out, err = run(f"simulate robot.yaml -o {name} --force")
-        assert (code, out, err.count("\n")) == (1, "", 1)
-        assert sentence in err
-    code, out, err = run("compensate robot.yaml circle -o new.csv")
-    assert (code, out, err.count("\n")) == (1, "", 1)
+        loopcal(f"simulate robot.yaml -o {name} --force", sentence, code=1)
+    loopcal("compensate robot.yaml circle -o new.csv", code=1)
 
 
 PRINTER = """[printer]
@@ -167,39 +148,36 @@ radius: 50
 """
 
 
-def test_import_with_a_failed_calibration_changes_no_file(run) -> None:
+def test_import_with_a_failed_calibration_changes_no_file(loopcal) -> None:
     """Two heights are too few for the six parameters."""
     Path("printer.cfg").write_text(PRINTER)
     before = read_all_files()
     for words in ("-o printer.yaml --data heights.csv", "-o old.csv --data heights.csv --force"):
-        code, out, err = run(f"import printer.cfg {words} --corrected corrected.cfg")
-        assert (code, out) == (1, "")
-        assert "2 equations" in err
+        command = f"import printer.cfg {words} --corrected corrected.cfg"
+        loopcal(command, "2 equations", code=1)
         assert read_all_files() == before
 
 
-def test_template_of_a_kind_that_compares_poses_explains_their_names(run) -> None:
-    assert run("new gough -o a.yaml --measurements m.csv --kind separation")[0] == 0
+def test_template_of_a_kind_that_compares_poses_explains_their_names(loopcal) -> None:
+    loopcal("new gough -o a.yaml --measurements m.csv --kind separation")
     assert "name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
-    assert run("new gough -o b.yaml --measurements n.csv --kind position")[0] == 0
+    loopcal("new gough -o b.yaml --measurements n.csv --kind position")
     assert "compares two poses" not in Path("n.csv").read_text()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a working folder cannot be removed there")
-def test_removed_working_folder_is_named_as_the_cause(run, tmp_path, monkeypatch) -> None:
+def test_removed_working_folder_is_named_as_the_cause(loopcal, tmp_path, monkeypatch) -> None:
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
     robot = find_robot_file("five-bar")
     for words in ("plan {} -o plan", "simulate {} -o data.csv", "check {}"):
-        code, _, said = run(words.format(robot))
-        assert code == 1
+        said = loopcal(words.format(robot), code=1).err
         assert said == "loopcal: the working folder was removed; change to a folder that exists.\n"
 
 
-def test_folder_that_refuses_new_entries_is_not_called_missing(run) -> None:
+def test_folder_that_refuses_new_entries_is_not_called_missing(loopcal) -> None:
     if not Path("/proc/self").is_dir():
         pytest.skip("needs a file system in which nothing can be made")
-    code, _, said = run("simulate five-bar -o /proc/data.csv")
-    assert code == 1
+    said = loopcal("simulate five-bar -o /proc/data.csv", code=1).err
     assert "does not exist" not in said

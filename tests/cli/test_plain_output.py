@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What commands print is plain text, and nothing of a file that is not one of loopcal."""
 
-import json
 import os
 import shlex
 import subprocess
@@ -10,17 +9,10 @@ import sys
 import pytest
 
 from loopcal.cli import terminal
-from loopcal.cli.entry_point import main
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.plain_text import find_not_plain
 
 EVIL = "a\x1b[2J\n\u202eb"
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def refuse_escapes(text: str) -> None:
@@ -44,31 +36,30 @@ LINES = {
 
 
 @pytest.mark.parametrize("case", LINES)
-def test_words_of_the_command_line_are_printed_as_plain_text(folder, capsys, case) -> None:
-    assert main(LINES[case]) == 1
-    printed = capsys.readouterr()
+def test_words_of_the_command_line_are_printed_as_plain_text(loopcal, folder, case) -> None:
+    printed = loopcal(LINES[case], code=1)
     refuse_escapes(printed.out + printed.err)
     assert printed.err.count("\n") <= 2  # the message and a hint
 
 
 @pytest.mark.parametrize("name", [EVIL, "\udcff\udc9b"])
-def test_results_name_files_as_plain_text(folder, capsys, name) -> None:
-    robot = f"{name}.yaml"
+def test_results_name_files_as_plain_text(loopcal, folder, name) -> None:
+    robot, printed = f"{name}.yaml", []
     (folder / robot).write_bytes(find_robot_file("five-bar").read_bytes())
     for words in (["check", robot], ["simulate", robot, "-o", f"{name}.csv", "--draw", "3"]):
-        assert main(words) == 0
-        assert main([*words, "--json", *(["--force"] if "-o" in words else [])]) == 0
-    assert main(["new", "five-bar", "-o", f"{name}-2.yaml"]) == 0
-    assert main(["check", f"{name}-2.yaml"]) == 0
-    printed = capsys.readouterr()
-    refuse_escapes(printed.out + printed.err)
-    assert "\\x1b" in printed.out or "\\udcff" in printed.out
+        printed += loopcal(words)[1:]
+        printed += loopcal([*words, "--json", *(["--force"] if "-o" in words else [])])[1:]
+    printed += loopcal(["new", "five-bar", "-o", f"{name}-2.yaml"])[1:]
+    printed += loopcal(["check", f"{name}-2.yaml"])[1:]
+    refuse_escapes("".join(printed))
+    assert "\\x1b" in "".join(printed) or "\\udcff" in "".join(printed)
 
 
-def test_json_keeps_names_of_files_that_are_not_utf_8(folder, capsys) -> None:
+def test_json_keeps_names_of_files_that_are_not_utf_8(loopcal, folder) -> None:
     name = os.fsdecode(b"a\xff.csv")
-    assert main(["simulate", "five-bar", "-o", name, "--draw", "3", "--json"]) == 0
-    assert name in json.loads(capsys.readouterr().out).values()
+    assert (
+        name in loopcal(["simulate", "five-bar", "-o", name, "--draw", "3", "--json"]).json.values()
+    )
 
 
 def test_terminal_that_lacks_a_character_shows_its_escape(folder) -> None:
@@ -79,9 +70,10 @@ def test_terminal_that_lacks_a_character_shows_its_escape(folder) -> None:
     assert b"\\u2500" in done.stdout
 
 
-def test_command_to_copy_is_read_by_a_shell_as_it_is(folder, capsys) -> None:
-    assert main(["new", "five-bar", "-o", "$(reboot) a.yaml", "--measurements", "b;c.csv"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_command_to_copy_is_read_by_a_shell_as_it_is(loopcal, folder) -> None:
+    lines = loopcal(
+        ["new", "five-bar", "-o", "$(reboot) a.yaml", "--measurements", "b;c.csv"]
+    ).out.splitlines()
     following = [shlex.split(line) for line in lines if line.startswith("Next: ")]
     assert following == [
         ["Next:", "loopcal", "check", "$(reboot) a.yaml"],
@@ -133,11 +125,10 @@ READERS = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("content", SECRETS)
-def test_nothing_is_shown_of_a_file_that_is_not_one_of_loopcal(folder, capsys, content) -> None:
+def test_nothing_is_shown_of_a_file_that_is_not_one_of_loopcal(loopcal, folder, content) -> None:
     (folder / "file").write_text(SECRETS[content])
     kind = "settings: {kind: position, noise: {x: 1 um, y: 1 um, z: 1 um}}\n"
     (folder / "profile.yaml").write_text("delimiter: spaces\n" + PROFILE + kind)
     for command in READERS:
-        assert main(command.replace("FILE", "file").split()) == 1, command
-        printed = capsys.readouterr()
+        printed = loopcal(command.replace("FILE", "file"), code=1)
         assert SECRET not in printed.out + printed.err, command

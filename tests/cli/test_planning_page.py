@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli.entry_point import main
-from loopcal.io.robot.robot_file import load_robot
+import loopcal as lc
 
 
 @pytest.fixture
@@ -19,7 +18,7 @@ def page(root, tmp_path, monkeypatch) -> str:
 
 
 @pytest.mark.slow
-def test_commands_of_the_page_run_and_calibrate_the_machine(page, capsys) -> None:
+def test_commands_of_the_page_run_and_calibrate_the_machine(loopcal, page) -> None:
     commands = [
         line
         for block in re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
@@ -35,8 +34,7 @@ def test_commands_of_the_page_run_and_calibrate_the_machine(page, capsys) -> Non
         if "nategh-agheli" in command:  # tests/cli/test_planes_and_lines.py
             continue
         assert command.startswith("loopcal ")
-        assert main(command.split()[1:]) == 0, capsys.readouterr().err
-        said = capsys.readouterr().out
+        said = loopcal(command.split()[1:]).out
         if "-o plan " in command:
             assert said.startswith(printed[1])
         if " calibrate " in command:
@@ -45,15 +43,15 @@ def test_commands_of_the_page_run_and_calibrate_the_machine(page, capsys) -> Non
         if "--accuracy" in command:
             assert "poses reach an expected position error of 0.02 mm (rms)" in said
     nominal, truth, found = (
-        load_robot(name).values for name in ("printer.yaml", "truth.yaml", "run/robot.yaml")
+        lc.load_robot(name).values for name in ("printer.yaml", "truth.yaml", "run/robot.yaml")
     )
     assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(nominal - truth)
 
 
-def test_python_code_of_the_page_runs(page, capsys) -> None:
+def test_python_code_of_the_page_runs(loopcal, page, capsys) -> None:
     block = re.search(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert block
-    assert main(["new", "linear-delta", "-o", "printer.yaml"]) == 0
+    loopcal("new linear-delta -o printer.yaml")
     names: dict = {}
     exec(block[1], names)  # noqa: S102
     assert names["plan"].n_poses == 12

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.cli.entry_point import main
-from loopcal.errors import DataError
 from loopcal.findings import report_finding
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
@@ -31,13 +31,12 @@ def folder_with_wrong_cell(tmp_path, monkeypatch) -> Path:
 
 
 def test_wrong_cell_fails_the_quality_gate_and_widens_the_intervals(
-    folder_with_wrong_cell, capsys
+    loopcal, folder_with_wrong_cell
 ) -> None:
-    assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", "good"]) == 0
-    assert main(["calibrate", "hexapod-42", "bad.csv", "-o", "bad"]) == 2
-    out, err = capsys.readouterr()
+    loopcal("calibrate hexapod-42 measurements.csv -o good")
+    _, out, err = loopcal("calibrate hexapod-42 bad.csv -o bad", code=2)
     assert "loopcal: quality gate not met: The residuals" in err
-    assert out[out.index("Written to good") :].count("Not calibrated: ") == 1
+    assert out.count("Not calibrated: ") == 1
     good, bad = (
         json.loads((folder_with_wrong_cell / name / "result.json").read_text())
         for name in ("good", "bad")
@@ -74,17 +73,16 @@ def test_larger_errors_on_held_out_poses_fail_the_quality_gate(
 
 @pytest.mark.parametrize("hold_out", ["", "--hold-out 0.25"])
 def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
-    folder_with_wrong_cell, capsys, monkeypatch, hold_out
+    loopcal, folder_with_wrong_cell, monkeypatch, hold_out
 ) -> None:
     def raise_data_error(*_):
         code = "residuals.calibrated-out-of-reach"
-        raise DataError(report_finding(code, robot="hexapod-42", poses=10, before=10, after=0))
+        raise lc.DataError(report_finding(code, robot="hexapod-42", poses=10, before=10, after=0))
 
     monkeypatch.setattr("loopcal.apply.calibration.validate", raise_data_error)
-    assert (
-        main(["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()]) == 2
+    _, out, err = loopcal(
+        ["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()], code=2
     )
-    out, err = capsys.readouterr()
     assert err.startswith("loopcal: quality gate not met: ")
     assert err.count("\n") == 1
     assert out.endswith("Written to run: result.json, arrays.npz, robot-not-calibrated.yaml\n")

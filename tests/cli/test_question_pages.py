@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+import loopcal as lc
 from evidence.questions.example_studies import find_cell
 from loopcal.cli.entry_point import main
-from loopcal.studies.files.study_file import load_study
 from tests.cli.page_commands import list_commands
 
 PAGES = {"instrument": "instruments", "poses": "poses", "method": "methods"}
@@ -52,7 +52,7 @@ def test_commands_of_the_page_run(page, root, tmp_path, monkeypatch, capsys) -> 
 @pytest.mark.parametrize("page", PAGES)
 def test_the_evidence_is_of_the_study_file_and_its_figures_are_shown(page, root) -> None:
     document, name = read_evidence(root, PAGES[page]), PAGES[page]
-    study = load_study(root / "examples" / "studies" / f"{name}.yaml")
+    study = lc.load_study(root / "examples" / "studies" / f"{name}.yaml")
     assert document["replicates"] == study.replicates
     assert [cell["levels"] for cell in document["cells"]] == [dict(c.levels) for c in study.cells]
     shown = re.findall(r"\(\.\./evidence/(study_[\w.-]+)\)", read_page(root, page))

@@ -8,36 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli.entry_point import main
-from loopcal.io.data.measurement_writer import save_measurements
-from loopcal.io.robot.robot_file import load_robot
-from loopcal.measure.instrument import Gaussian, Instrument, Sensor
-from loopcal.measure.kinds.directions import Inclination
-from loopcal.measure.kinds.poses import Pose
-from loopcal.measure.measurements import Measurements
-from loopcal.measure.nuisance import StatedValue
-from loopcal.measure.simulation import sample_truth, simulate
-from loopcal.mechanism.workspace import sample_workspace
+import loopcal as lc
 
 SD = "tracker.x: {start: 0 mm, sd: 1 mm}"
 
 
 @pytest.fixture(scope="module")
-def data() -> Measurements:
+def data() -> lc.Measurements:
     """Measurements of 20 poses by a tracker with unknown frame on two days, and an inclinometer."""
-    robot = load_robot("hexapod-42")
-    poses = sample_workspace(robot, 20, 3).coordinates
+    robot = lc.load_robot("hexapod-42")
+    poses = lc.sample_workspace(robot, 20, 3).coordinates
     days = np.array(["monday"] * 11 + ["tuesday"] * 9)
-    tracker = Sensor(
-        Pose(unknown=("frame",), frame="tracker"),
-        Gaussian(np.repeat([2e-6, 1e-6], 3)),
+    tracker = lc.Sensor(
+        lc.Pose(unknown=("frame",), frame="tracker"),
+        lc.Gaussian(np.repeat([2e-6, 1e-6], 3)),
         session=days,
     )
-    truth = robot.with_values(sample_truth(robot, 1, 5)[0])
-    seen = simulate(
+    truth = robot.with_values(lc.sample_truth(robot, 1, 5)[0])
+    seen = lc.simulate(
         truth,
         poses,
-        Instrument((tracker, Sensor(Inclination(), Gaussian(np.full(2, 5e-6))))),
+        lc.Instrument((tracker, lc.Sensor(lc.Inclination(), lc.Gaussian(np.full(2, 5e-6))))),
         seed=4,
     )
     warm = 20 + 0.1 * np.arange(20.0)
@@ -54,10 +45,10 @@ def data() -> Measurements:
 def folder(tmp_path, monkeypatch, data):
     """Write the measurements as one file, as one file per instrument, and with separate poses."""
     monkeypatch.chdir(tmp_path)
-    robot = load_robot("hexapod-42")
-    save_measurements(data, "both.csv", robot)
+    robot = lc.load_robot("hexapod-42")
+    lc.save_measurements(data, "both.csv", robot)
     for name, rows in zip(("tracker", "tilts"), data.observations, strict=True):
-        save_measurements(replace(data, observations=(rows,)), f"{name}.csv", robot)
+        lc.save_measurements(replace(data, observations=(rows,)), f"{name}.csv", robot)
     lines = [
         line.split(",")
         for line in Path("tilts.csv").read_text().splitlines()
@@ -71,19 +62,12 @@ def folder(tmp_path, monkeypatch, data):
     return tmp_path
 
 
-def run_json(capsys, *words: str, code: int = 0):
-    """Run a command with --json; return its document."""
-    assert main([*words, "--json"]) == code
-    return json.loads(capsys.readouterr().out)
-
-
 @pytest.mark.slow
-def test_splitting_data_into_several_files_gives_the_same_calibration(folder, capsys) -> None:
+def test_splitting_data_into_several_files_gives_the_same_calibration(loopcal, folder) -> None:
     runs = {}
     for files in ("both.csv", "tracker.csv tilts.csv", "values.csv poses.csv tracker.csv"):
-        found = run_json(
-            capsys, "calibrate", "hexapod-42", *files.split(), "-o", files.split(".")[0]
-        )
+        output = files.split(".")[0]
+        found = loopcal(f"calibrate hexapod-42 {files} -o {output} --json").json
         runs[files] = np.array([p["estimate"] for p in found["fit"]["parameters"]])
     one, two, three = runs.values()
     np.testing.assert_allclose(
@@ -95,22 +79,18 @@ def test_splitting_data_into_several_files_gives_the_same_calibration(folder, ca
         "data": "values.csv", "poses": "poses.csv", "data-2": "tracker.csv"}  # fmt: skip
     with np.load(folder / "both" / "arrays.npz") as arrays:
         np.testing.assert_array_equal(arrays["temperature_0_pose"], 20 + 0.1 * np.arange(20.0))
-    assert main(["validate", "values", "poses.csv", "tracker.csv"]) == 1
-    assert "The calibration used 20 of 20 rows" in capsys.readouterr().err
-    assert (
-        main(["validate", "both", "poses.csv", "values.csv"]) == 1
-    )  # the same rows under another name
-    assert "The calibration used 20 of 20 rows" in capsys.readouterr().err
-    assert main(["validate", "both", "poses.csv", "values.csv", "--allow-fitted-data"]) == 0
+    loopcal("validate values poses.csv tracker.csv", "The calibration used 20 of 20 rows", code=1)
+    loopcal("validate both poses.csv values.csv", "The calibration used 20 of 20 rows", code=1)
+    loopcal("validate both poses.csv values.csv --allow-fitted-data")
 
 
-def test_unknowns_stated_in_a_file_change_the_rank(folder, capsys) -> None:
+def test_unknowns_stated_in_a_file_change_the_rank(loopcal, folder) -> None:
     def rank(**changed: str) -> int:
         text = Path("tracker.csv").read_text()
         for unknowns in changed.values():
             text = text.replace("# kind: pose", f"# unknowns: {{{unknowns}}}\n# kind: pose", 1)
         Path("changed.csv").write_text(text)
-        return run_json(capsys, "identifiability", "hexapod-42", "changed.csv")["rank"]
+        return loopcal("identifiability hexapod-42 changed.csv --json").json["rank"]
 
     assert rank() == 36
     assert rank(known='"tracker.*": fixed') == 42
@@ -120,24 +100,15 @@ def test_unknowns_stated_in_a_file_change_the_rank(folder, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_priors_stated_in_a_file_are_used_with_held_out_poses(folder, capsys) -> None:
+def test_priors_stated_in_a_file_are_used_with_held_out_poses(loopcal, folder) -> None:
     text = (
         Path("tracker.csv")
         .read_text()
         .replace("# kind: pose", f'# unknowns: {{{SD}, "*.tracker.z": fixed}}\n# kind: pose', 1)
     )
     Path("changed.csv").write_text(text)
-    found = run_json(
-        capsys,
-        "calibrate",
-        "hexapod-42",
-        "changed.csv",
-        "tilts.csv",
-        "-o",
-        "run",
-        "--hold-out",
-        "0.25",
-    )
+    words = "calibrate hexapod-42 changed.csv tilts.csv -o run --hold-out 0.25 --json"
+    found = loopcal(words).json
     local = {row["name"]: row for row in found["fit"]["local"]}
     for day in ("monday", "tuesday"):
         assert local[f"{day}.tracker.x"]["tolerance"] == pytest.approx(1.0)  # [mm]
@@ -147,12 +118,15 @@ def test_priors_stated_in_a_file_are_used_with_held_out_poses(folder, capsys) ->
 
 
 def test_stated_values_survive_split_take_and_save(data, tmp_path) -> None:
-    robot = load_robot("hexapod-42")
+    robot = lc.load_robot("hexapod-42")
     known = replace(
         data,
-        stated_values=(StatedValue("monday.tracker.x", 1e-3), StatedValue("tuesday.tracker.rz")),
+        stated_values=(
+            lc.StatedValue("monday.tracker.x", 1e-3),
+            lc.StatedValue("tuesday.tracker.rz"),
+        ),
     )
     fit, held_out = known.split(hold_out=0.5, seed=2)
     assert fit.stated_values == held_out.stated_values == known.stated_values
-    save_measurements(known.take(np.arange(11)), tmp_path / "monday.csv", robot)
+    lc.save_measurements(known.take(np.arange(11)), tmp_path / "monday.csv", robot)
     assert "# unknowns: {monday.tracker.x: {sd: 1 mm}}" in (tmp_path / "monday.csv").read_text()

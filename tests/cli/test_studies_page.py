@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+import loopcal as lc
 from loopcal.cli.entry_point import main
-from loopcal.studies.files.study_file import MOST_TRIALS, load_study
+from loopcal.studies.files.study_file import MOST_TRIALS
 from tests.cli.page_commands import list_commands
 
 TRIALS = 18
@@ -50,7 +51,7 @@ def test_commands_and_code_of_the_page_lead_from_a_new_file_to_figures(page, cap
             shrink(Path("study.yaml"))
         if words[1] == "ask":
             assert "no trials" not in out
-    assert len(load_study("study.yaml").cells) == 8
+    assert len(lc.load_study("study.yaml").cells) == 8
     assert Path("results/position.png").read_bytes().startswith(b"\x89PNG")
     assert Path("trials.csv").read_text().count("\n") == 8 * TRIALS + 1
     assert Path("trial/result.json").exists()
@@ -77,11 +78,11 @@ def test_the_rule_for_the_size_of_blocks_is_true_of_the_evidence(page, root) -> 
     assert f"The store of a million trials has {1e-3 * stored:.2f} GB." in page
 
 
-def test_the_question_of_the_page_is_one_of_a_study_file(page, tmp_path) -> None:
+def test_the_question_of_the_page_is_one_of_a_study_file(loopcal, page, tmp_path) -> None:
     (block,) = re.findall(r"^```yaml\n(questions:.*?)^```", page, re.MULTILINE | re.DOTALL)
-    assert main(["study", "new", "study.yaml"]) == 0
+    loopcal("study new study.yaml")
     file = tmp_path / "study.yaml"
     text = file.read_text()
     file.write_text(re.sub(r"^questions:\n(  .*\n)+", "", text, flags=re.MULTILINE) + "\n" + block)
-    questions = load_study(file).questions
+    questions = lc.load_study(file).questions
     assert {question.wanted for question in questions.values()} == {"smallest", "largest"}

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 import signal
 import subprocess
@@ -15,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import loopcal as lc
 from evidence.study_interruption import read_contents
 from loopcal.cli.entry_point import main
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.studies.files.store import NAME, open_store
-from loopcal.studies.results.study_result import StudyResult
 from tests.studies.small_study import CELLS, write_study
 
 ROOT = str(Path(__file__).parents[2])
@@ -28,15 +26,9 @@ ONE = "--workers 1"
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run a command line in an empty folder; return exit code, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(words: str) -> tuple[int, str, str]:
-        code = main(["study", *words.split()])
-        return code, *capsys.readouterr()
-
-    return run
+def loopcal(loopcal):
+    """Run a command of studies."""
+    return lambda words, *said, **code: loopcal(f"study {words}", *said, **code)
 
 
 def shrink(file: Path) -> None:
@@ -45,19 +37,16 @@ def shrink(file: Path) -> None:
     file.write_text(text.replace("poses: [10, 20, 40]", "poses: [10]"))
 
 
-def test_new_file_leads_to_results_by_the_commands_that_each_step_names(run, tmp_path) -> None:
-    code, out, _ = run("new study.yaml")
-    assert (code, out.splitlines()[-1]) == (0, "Next: loopcal study check study.yaml")
+def test_new_file_leads_to_results_by_the_commands_that_each_step_names(loopcal, tmp_path) -> None:
+    out = loopcal("new study.yaml").out
+    assert out.splitlines()[-1] == "Next: loopcal study check study.yaml"
     shrink(tmp_path / "study.yaml")
-    code, out, _ = run("check study.yaml")
-    assert code == 0
-    assert "4 cells, 24 trials" in out
+    out = loopcal("check study.yaml", "4 cells, 24 trials").out
     assert out.splitlines()[-1] == "Next: loopcal study run study.yaml -o FOLDER"
-    code, out, _ = run(f"run study.yaml -o results {ONE}")
-    assert (code, out.splitlines()[-1]) == (0, "Next: loopcal study summary results")
+    out = loopcal(f"run study.yaml -o results {ONE}").out
+    assert out.splitlines()[-1] == "Next: loopcal study summary results"
     assert "8 of 8 blocks are stored in results: 8 new, 24 trials" in out
-    code, out, _ = run("summary results")
-    assert code == 0
+    out = loopcal("summary results").out
     for word in ("instrument", "effects", "tracker", "noisier", "position", "[mm]"):
         assert word in out
     rows = list(csv.DictReader((tmp_path / "results" / "summary.csv").open()))
@@ -70,15 +59,14 @@ def test_new_file_leads_to_results_by_the_commands_that_each_step_names(run, tmp
 
 
 @pytest.mark.parametrize("robot", ["five-bar", "hexapod-42"])
-def test_template_is_valid_for_other_robots(run, tmp_path, robot) -> None:
-    assert run(f"new study.yaml --robot {robot}")[0] == 0
+def test_template_is_valid_for_other_robots(loopcal, tmp_path, robot) -> None:
+    loopcal(f"new study.yaml --robot {robot}")
     shrink(tmp_path / "study.yaml")
-    code, out, err = run("check study.yaml --json")
-    assert (code, err) == (0, "")
-    assert json.loads(out)["cells"] == 4
+    printed = loopcal("check study.yaml --json")
+    assert (printed.err, printed.json["cells"]) == ("", 4)
 
 
-def test_every_command_prints_json(run, tmp_path) -> None:
+def test_every_command_prints_json(loopcal, tmp_path) -> None:
     file = write_study(tmp_path, 4, 2).name
     documents = {}
     for words in (
@@ -91,9 +79,7 @@ def test_every_command_prints_json(run, tmp_path) -> None:
         "replay f 1/5 -o trial",
         "merge f -o g",
     ):
-        code, out, err = run(f"{words} --json")
-        assert code in (0, 2), err
-        documents[words.split()[0]] = json.loads(out)
+        documents[words.split()[0]] = loopcal(f"{words} --json", code=(0, 2)).json
     assert documents["check"]["trials"] == CELLS * 4
     assert documents["run"]["computed"] == CELLS * 2
     assert documents["status"]["total"] == CELLS * 2
@@ -105,13 +91,13 @@ def test_every_command_prints_json(run, tmp_path) -> None:
     assert read_contents(tmp_path / "g") == read_contents(tmp_path / "f")
 
 
-def test_exports_contain_every_trial_with_its_factors(run, tmp_path) -> None:
+def test_exports_contain_every_trial_with_its_factors(loopcal, tmp_path) -> None:
     from pyarrow import parquet
 
     file = write_study(tmp_path, 3, 2).name
-    run(f"run {file} -o f {ONE}")
+    loopcal(f"run {file} -o f {ONE}")
     for name in ("trials.csv", "trials.parquet"):
-        assert run(f"export f -o {name}")[0] == 0
+        loopcal(f"export f -o {name}")
     rows = list(csv.DictReader((tmp_path / "trials.csv").open()))
     table = parquet.read_table(tmp_path / "trials.parquet")
     assert len(rows) == table.num_rows == CELLS * 3
@@ -119,54 +105,45 @@ def test_exports_contain_every_trial_with_its_factors(run, tmp_path) -> None:
     assert [row["method"] for row in rows] == table["method"].to_pylist()
     assert [float(row["position [m]"]) for row in rows] == table["position"].to_pylist()
     assert table.schema.field("position").metadata == {b"unit": b"m"}
-    code, _, err = run("export f -o trials.txt")
-    assert (code, "must end in .csv or .parquet" in err) == (1, True)
+    loopcal("export f -o trials.txt", "must end in .csv or .parquet", code=1)
 
 
-def test_replayed_trial_is_a_normal_run_with_the_numbers_of_the_study(run, tmp_path) -> None:
+def test_replayed_trial_is_a_normal_run_with_the_numbers_of_the_study(loopcal, tmp_path) -> None:
     file = write_study(tmp_path, 4, 2).name
-    run(f"run {file} -o f {ONE}")
-    code, out, err = run("replay f 2/3 -o trial")
-    assert code == 0, err
-    assert "Written to trial, and its inputs to trial-input" in out
+    loopcal(f"run {file} -o f {ONE}")
+    words = "Written to trial, and its inputs to trial-input"
+    code = loopcal("replay f 2/3 -o trial", words).code
     data = "trial-input/robot.yaml trial-input/measurements.csv"
     again = main(f"calibrate {data} -o again --method map".split())
-    robots = [load_robot(tmp_path / name / "robot.yaml") for name in ("trial", "again")]
+    robots = [lc.load_robot(tmp_path / name / "robot.yaml") for name in ("trial", "again")]
     assert again == code
     assert robots[0].values == pytest.approx(robots[1].values, rel=1e-9)
-    truth = load_robot(tmp_path / "trial-input" / "truth.yaml")
+    truth = lc.load_robot(tmp_path / "trial-input" / "truth.yaml")
     error = (robots[0].values - truth.values)[select_free_parameters(truth).places]
     scaled = error / select_free_parameters(truth).tolerance
-    stored = StudyResult(tmp_path / "f").read_scores(2, ["parameters"])[3, 0]
+    stored = lc.StudyResult(tmp_path / "f").read_scores(2, ["parameters"])[3, 0]
     assert np.sqrt(np.mean(scaled**2)) == pytest.approx(stored, rel=1e-6)
     for words in ("9/0", "0/4", "x"):
-        code, _, err = run(f"replay f {words} -o other")
-        assert code == 1
+        err = loopcal(f"replay f {words} -o other", code=1).err
         assert "this study has no" in err or "such as 3/17" in err
 
 
 def test_folder_in_use_changed_study_other_version_and_two_drivers_are_refused(
-    run, tmp_path
+    loopcal, tmp_path
 ) -> None:
     file = write_study(tmp_path, 4, 2)
     start = f"run {file.name} -o f {ONE}"
-    assert run(start)[0] == 0
-    code, _, err = run(start)
-    assert code == 1
-    assert "already contains a study" in err
-    assert "Hint: use --resume to continue it" in err
-    assert run(f"{start} --resume")[0] == 0
+    loopcal(start)
+    loopcal(start, "already contains a study", "Hint: use --resume to continue it", code=1)
+    loopcal(f"{start} --resume")
     file.write_text(file.read_text().replace("seed: 3", "seed: 4"))
-    code, _, err = run(f"{start} --resume")
-    assert (code, "seed: 3 -> 4" in err) == (1, True)
+    loopcal(f"{start} --resume", "seed: 3 -> 4", code=1)
     with open_store(tmp_path / "f") as store:
-        code, _, err = run("extend f --replicates 8")
-        assert (code, "another process computes this study now" in err) == (1, True)
-        assert "it is being computed now" in run("status f")[1].replace("\n", " ")
+        loopcal("extend f --replicates 8", "another process computes this study now", code=1)
+        loopcal("status f", "it is being computed now")
         store.connection.execute("PRAGMA user_version = 9")
     for words in ("status f", "summary f", "extend f --replicates 8"):
-        code, _, err = run(words)
-        assert (code, "has format 9" in err) == (1, True)
+        loopcal(words, "has format 9", code=1)
 
 
 @pytest.mark.slow
@@ -239,25 +216,21 @@ def test_study_on_a_full_disk_is_continued_when_there_is_space(tmp_path) -> None
         ("sumary f", "did you mean 'summary'"),
     ],
 )
-def test_wrong_use_gets_a_sentence(run, tmp_path, words, sentence) -> None:
+def test_wrong_use_gets_a_sentence(loopcal, tmp_path, words, sentence) -> None:
     write_study(tmp_path)
-    code, out, err = run(words)
-    assert (code, out) == (1, "")
-    assert sentence in err
+    loopcal(words, sentence, code=1)
     assert not (tmp_path / "f").exists()
 
 
-def test_share_of_a_job_and_scores_of_the_summary_are_chosen(run, tmp_path) -> None:
+def test_share_of_a_job_and_scores_of_the_summary_are_chosen(loopcal, tmp_path) -> None:
     file = write_study(tmp_path, 4, 2).name
     for part in (1, 2):
-        assert run(f"run {file} -o part-{part} --cells {part}/2 {ONE}")[0] == 0
-    code, out, _ = run("status part-1")
-    assert "4 of 8 blocks" in out
-    assert run("merge part-1 part-2 -o whole")[0] == 0
-    code, out, _ = run("summary whole --score condition --score rank")
-    assert (code, "condition" in out, "position" in out) == (0, True, False)
-    code, _, err = run("summary whole --score positon")
-    assert (code, "did you mean 'position'" in err) == (1, True)
+        loopcal(f"run {file} -o part-{part} --cells {part}/2 {ONE}")
+    loopcal("status part-1", "4 of 8 blocks")
+    loopcal("merge part-1 part-2 -o whole")
+    out = loopcal("summary whole --score condition --score rank", "condition").out
+    assert "position" not in out
+    loopcal("summary whole --score positon", "did you mean 'position'", code=1)
 
 
 PER_LEG = """\
@@ -271,38 +244,38 @@ scores: {{held_out: 3}}
 """
 
 
-def test_failed_trials_lead_to_the_reason_in_check_summary_and_replay(run, tmp_path) -> None:
+def test_failed_trials_lead_to_the_reason_in_check_summary_and_replay(loopcal, tmp_path) -> None:
     file = write_study(tmp_path, 4, 2, PER_LEG.replace("{robot}", "linear-delta")).name
-    code, out, _ = run(f"check {file}")
-    assert (code, "1 cell, 4 trials" in out) == (0, True)
+    out = loopcal(f"check {file}", "1 cell, 4 trials").out
     advice = "Replay one of these trials to see the reason."
     assert "Failed trials: 2 of 2. The trial was refused" in " ".join(out.split())
     assert advice in " ".join(out.split())
-    run(f"run {file} -o f {ONE}")
-    assert advice in " ".join(run("summary f")[1].split())
-    code, _, err = run("replay f 0/1 -o trial")
-    assert (code, "linear-delta has 3 actuators" in err) == (1, True)
+    loopcal(f"run {file} -o f {ONE}")
+    loopcal("summary f", advice)
+    loopcal("replay f 0/1 -o trial", "linear-delta has 3 actuators", code=1)
     assert not (tmp_path / "trial").exists()
 
 
 def test_replay_says_where_the_method_of_the_trial_is_not_that_of_the_calibration(
-    run, tmp_path
+    loopcal, tmp_path
 ) -> None:
     file = write_study(tmp_path, 2, 2, PER_LEG.replace("{robot}", "hexapod-42")).name
-    run(f"run {file} -o f {ONE}")
-    code, out, err = run("replay f 0/1 -o trial")
-    assert code in (0, 2), err
+    loopcal(f"run {file} -o f {ONE}")
+    _, out, err = loopcal("replay f 0/1 -o trial", code=(0, 2))
     assert "fitted by per-leg, a published method" in " ".join((out + err).split())
 
 
-def test_joined_folders_of_two_studies_are_both_named(run, tmp_path) -> None:
+def test_joined_folders_of_two_studies_are_both_named(loopcal, tmp_path) -> None:
     for name, replicates in (("small", 4), ("large", 6)):
         text = (tmp_path / write_study(tmp_path, replicates, 2).name).read_text()
         seed = "seed: 3" if name == "small" else "seed: 4"
         (tmp_path / "s.yaml").write_text(text.replace("seed: 3", seed))
-        run(f"run s.yaml -o {name} {ONE} --cells 1/4")
-    code, _, err = run("merge small large -o both")
-    assert (code, "small: the study of this folder differs from that of large" in err) == (1, True)
+        loopcal(f"run s.yaml -o {name} {ONE} --cells 1/4")
+    loopcal(
+        "merge small large -o both",
+        "small: the study of this folder differs from that of large",
+        code=1,
+    )
 
 
 def test_durations_have_two_digits_in_the_unit_that_is_printed() -> None:

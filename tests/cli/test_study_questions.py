@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli.entry_point import main
-from loopcal.studies.running import study
+import loopcal as lc
 
 TEXT = """\
 format: 1
@@ -32,14 +31,15 @@ questions:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     base = tmp_path_factory.mktemp("questions")
     (base / "study.yaml").write_text(TEXT)
-    return study(base / "study.yaml", base / "results").folder
+    return lc.study(base / "study.yaml", base / "results").folder
 
 
-def test_summary_answers_the_questions_of_the_file_and_writes_figures(folder, capsys) -> None:
-    assert main(["study", "summary", str(folder)]) == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "how many: smallest level of poses with position up to 30 um on 80 % of machines" in out
-    assert "summary.json, summary.csv, position.png, covered_parameters.png" in out
+def test_summary_answers_the_questions_of_the_file_and_writes_figures(loopcal, folder) -> None:
+    loopcal(
+        f"study summary {folder}",
+        "how many: smallest level of poses with position up to 30 um on 80 % of machines",
+        "summary.json, summary.csv, position.png, covered_parameters.png",
+    )
     assert (folder / "position.png").read_bytes().startswith(b"\x89PNG")
     (answered,) = json.loads((folder / "summary.json").read_text())["questions"]
     (answer,) = answered["answers"]
@@ -47,14 +47,10 @@ def test_summary_answers_the_questions_of_the_file_and_writes_figures(folder, ca
     assert [share["trials"] for share in answer["shares"]] == [60, 60]
 
 
-def test_a_question_is_asked_after_the_run(folder, capsys) -> None:
+def test_a_question_is_asked_after_the_run(loopcal, folder) -> None:
     words = ["study", "ask", str(folder), "--smallest", "poses", "--limit", "30um"]
-    assert main([*words, "--share", "0.8"]) == 0
-    out = capsys.readouterr().out
-    assert "40" in out
-    assert "position up to 30 um on 80 % of machines" in out
-    assert main([*words, "--share", "0.8", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["answers"][0]["best"] == "40"
+    loopcal([*words, "--share", "0.8"], "40", "position up to 30 um on 80 % of machines")
+    assert loopcal([*words, "--share", "0.8", "--json"]).json["answers"][0]["best"] == "40"
 
 
 @pytest.mark.parametrize(
@@ -68,11 +64,9 @@ def test_a_question_is_asked_after_the_run(folder, capsys) -> None:
         ("--smallest poses --limit 30um --share 95", "--share"),
     ],
 )
-def test_wrong_questions_get_a_sentence(folder, capsys, words, sentence) -> None:
-    assert main(["study", "ask", str(folder), *words.split()]) == 1
-    assert sentence in " ".join(capsys.readouterr().err.split())
+def test_wrong_questions_get_a_sentence(loopcal, folder, words, sentence) -> None:
+    loopcal(["study", "ask", str(folder), *words.split()], sentence, code=1)
 
 
-def test_figures_against_an_unknown_factor_are_refused(folder, capsys) -> None:
-    assert main(["study", "summary", str(folder), "--against", "pose"]) == 1
-    assert "'pose' is not a factor" in capsys.readouterr().err
+def test_figures_against_an_unknown_factor_are_refused(loopcal, folder) -> None:
+    loopcal(f"study summary {folder} --against pose", "'pose' is not a factor", code=1)

@@ -20,7 +20,7 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -89,6 +89,15 @@ SECTIONS = {
 """Heading of the help -> command -> its module, imported when it runs, and what it does."""
 
 
+def find_command(name: str) -> click.Command | None:
+    """Import a command; None where there is none of this name."""
+    for members in SECTIONS.values():
+        if name in members:
+            module = import_module(f"loopcal.cli.commands.{members[name][0]}_commands")
+            return getattr(module, name.replace("-", "_") + "_" * keyword.iskeyword(name))
+    return None
+
+
 class CommandGroup(click.Group):
     """A command that consists of commands; a wrong name is refused with similar ones."""
 
@@ -125,13 +134,14 @@ class SectionedGroup(CommandGroup):
                 formatter.write_dl([(name, what) for name, (_, what) in members.items()])
 
 
-def find_command(name: str) -> click.Command | None:
-    """Import a command; None where there is none of this name."""
-    for members in SECTIONS.values():
-        if name in members:
-            module = import_module(f"loopcal.cli.commands.{members[name][0]}_commands")
-            return getattr(module, name.replace("-", "_") + "_" * keyword.iskeyword(name))
-    return None
+def _print_version(context: click.Context, _option: click.Parameter, is_asked: bool) -> None:
+    """Print the version of loopcal and the engine that computes, and exit."""
+    if not is_asked or context.resilient_parsing:
+        return
+    from loopcal.engine import get_current_engine
+
+    click.echo(f"loopcal {version('loopcal')}\nengine {get_current_engine()}")
+    context.exit()
 
 
 @click.group(
@@ -148,7 +158,7 @@ def find_command(name: str) -> click.Command | None:
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=lambda context, _option, is_asked: _print_version(context, is_asked),
+    callback=_print_version,
     help="Show the version and the engine, and exit.",
 )
 def command_line() -> None:
@@ -167,16 +177,6 @@ def command_line() -> None:
       2  a quality gate is not met (see calibrate, validate, compensate, import and export)
       3  a defect of loopcal; the message names a report to send to the developers
     """  # noqa: D301
-
-
-def _print_version(context: click.Context, is_asked: bool) -> None:
-    """Print the version of loopcal and the engine that computes, and exit."""
-    if not is_asked or context.resilient_parsing:
-        return
-    from loopcal.engine import get_current_engine
-
-    click.echo(f"loopcal {version('loopcal')}\nengine {get_current_engine()}")
-    context.exit()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -250,7 +250,7 @@ def _report(
             return _refuse("there is not enough memory for this; use fewer poses at a time.")
         case _:
             _refuse(describe_defect(error, words))
-            return DEFECT_CODE
+            return 3
 
 
 def _refuse(sentence: str, hint: str | None = None) -> int:
@@ -261,17 +261,13 @@ def _refuse(sentence: str, hint: str | None = None) -> int:
     return 1
 
 
-DELAY = 0.01
-"""From a lost interrupt to its repetition [s]; by then the callback has ended."""
-
-
 @contextmanager
 def repeat_lost_interrupts() -> Iterator[None]:
     """Raise an interrupt that a callback lost again, a moment after the callback."""
     report = sys.unraisablehook
 
     def interrupt_main_thread() -> None:
-        time.sleep(DELAY)
+        time.sleep(0.01)  # [s], by then the callback has ended
         main = threading.main_thread().ident
         if main is not None and hasattr(signal, "pthread_kill"):  # reaches it while it waits
             signal.pthread_kill(main, signal.SIGINT)
@@ -291,13 +287,6 @@ def repeat_lost_interrupts() -> Iterator[None]:
         sys.unraisablehook = report
 
 
-PACKAGES = ("loopcal", "numpy", "scipy", "ruamel.yaml", "msgspec", "click")
-"""Packages whose versions a report of a defect states."""
-
-DEFECT_CODE = 3
-"""Exit code of a command that ended by a defect of loopcal."""
-
-
 def describe_defect(error: BaseException, words: Sequence[str]) -> str:
     """Save a report of an exception that is no mistake of the user, and return the sentence for the
     screen.
@@ -310,21 +299,10 @@ def describe_defect(error: BaseException, words: Sequence[str]) -> str:
         file = Path(own[-1].filename).relative_to(package.parent).as_posix()
         place = f"{place} at {file}:{own[-1].lineno}"
     sentence = f"this is a defect of loopcal, not of your input ({place})"
-    versions = {name: _find_version(name) for name in PACKAGES}
-    path = save_report(format_report(error, words, versions))
-    if path is None:
-        return (
-            f"{sentence}; no report could be saved: send the developers this message, the command "
-            f"and the version {versions['loopcal']}"
-        )
-    return (
-        f"{sentence}; please read {path}, which contains the command, versions and the Python "
-        "traceback, and send it to the developers together with the input files"
-    )
-
-
-def format_report(error: BaseException, words: Sequence[str], versions: Mapping[str, str]) -> str:
-    """Return the text of a report: command, versions and traceback."""
+    versions = {"loopcal": "unknown"}
+    for name in ("loopcal", "numpy", "scipy", "ruamel.yaml", "msgspec", "click"):
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
     listed = ", ".join(f"{name} {number}" for name, number in versions.items())
     machine = platform.uname()
     lines = (
@@ -335,7 +313,16 @@ def format_report(error: BaseException, words: Sequence[str], versions: Mapping[
         "",
         "".join(traceback.format_exception(error, limit=-100)),
     )
-    return "\n".join(lines)
+    path = save_report("\n".join(lines))
+    if path is None:
+        return (
+            f"{sentence}; no report could be saved: send the developers this message, the command "
+            f"and the version {versions['loopcal']}"
+        )
+    return (
+        f"{sentence}; please read {path}, which contains the command, versions and the Python "
+        "traceback, and send it to the developers together with the input files"
+    )
 
 
 def save_report(text: str) -> Path | None:
@@ -358,11 +345,3 @@ def save_report(text: str) -> Path | None:
             continue
         return Path(name)
     return None
-
-
-def _find_version(package: str) -> str:
-    """Return the version of a package; `unknown` where it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import tomllib
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -23,6 +22,8 @@ if TYPE_CHECKING:
 @cache
 def load_hints() -> dict[str, str]:
     """Return code -> advice, in the imperative."""
+    import tomllib
+
     subjects = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
     return {f"{of}.{name}": text for of, texts in subjects.items() for name, text in texts.items()}
 

@@ -22,21 +22,15 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
+import loopcal as lc
 from loopcal.cli import terminal
 from loopcal.errors import DataError, LoopcalError, UnitError, suggest_names
 from loopcal.registry import Registry
 from loopcal.units import Dimension, find_unit, parse_quantity
 
 if TYPE_CHECKING:
-    import numpy as np
     from click.shell_completion import CompletionItem
 
-    from loopcal.diagnose.conventions.convention_check import ConventionCheck
-    from loopcal.estimate.options import FitOptions
-    from loopcal.measure.instrument import Instrument
-    from loopcal.measure.measurements import Measurements
-    from loopcal.mechanism.model import Mechanism
-    from loopcal.planning.constraints import Constraints
     from loopcal.typing import FloatArray
 
 
@@ -391,7 +385,7 @@ def refuse_given(
 
 def open_robot(
     robot: str, outputs: Iterable[Path | None], inputs: Iterable[Path | None], force: bool
-) -> Mechanism:
+) -> lc.Mechanism:
     """Return a robot; refuse outputs that exist, or that are its file or another input."""
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.robot.robot_file import find_robot_file, load_robot
@@ -400,7 +394,9 @@ def open_robot(
     return load_robot(robot)
 
 
-def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
+def read_measurements(
+    paths: Sequence[Path], robot: lc.Mechanism, **allowed: bool
+) -> lc.Measurements:
     """Read measurement files as one set.
 
     Print a note where a file names another robot, or another file by its absolute path, or contains
@@ -420,8 +416,7 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
             facts = {"file": str(path), "stated": stated, "used": robot.name}
             terminal.print_finding("workflow.robot-of-other-name", **facts)
     try:
-        with terminal.ProgressBar() as progress:
-            progress(0, 1, "reading the measurements")
+        with terminal.ProgressBar("reading the measurements"):
             data = load_measurements(paths, robot, **allowed)
             unfilled = list_unfilled_files(paths, data)
     except DataError as error:
@@ -439,32 +434,30 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
 
 def read_checked_measurements(
     paths: Sequence[Path],
-    robot: Mechanism,
+    robot: lc.Mechanism,
     *,
     allow_still: bool = False,
     allow_implausible: bool = False,
     **allowed: bool,
-) -> Measurements:
+) -> lc.Measurements:
     """Read measurement files as `read_measurements`, and check their conventions."""
-    from loopcal.diagnose.conventions.convention_check import check_conventions
-
     data = read_measurements(paths, robot, **allowed)
-    check = check_conventions(
+    check = lc.check_conventions(
         robot, data, allow_still=allow_still, allow_implausible=allow_implausible
     )
     print_convention_note(check, paths)
     return data
 
 
-def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None:
+def print_convention_note(check: lc.ConventionCheck, paths: Sequence[Path]) -> None:
     """Print a note where a check of these files leaves a doubt."""
     if check.finding is not None:
         terminal.print_note(f"{' and '.join(map(str, paths))}: {check.finding}")
 
 
 def read_fitted_measurements(
-    paths: Sequence[Path], robot: Mechanism, allowed: Mapping[str, bool]
-) -> Measurements:
+    paths: Sequence[Path], robot: lc.Mechanism, allowed: Mapping[str, bool]
+) -> lc.Measurements:
     """Read the poses that a fit would use, as `ALLOWED`; print a note where others are held out."""
     data = read_checked_measurements(paths, robot, **allowed)
     if count := int(data.is_held_out.sum()):
@@ -484,16 +477,16 @@ RANK_TOLERANCE: Any = option(
 )
 
 
-def _make_fit_options(stated: Mapping[str, Any]) -> FitOptions:
+def _make_fit_options(stated: Mapping[str, Any]) -> lc.FitOptions:
     """Return the options of the library from those of `FIT`."""
-    from loopcal.estimate.options import FitOptions, find_foreign_setting
+    from loopcal.estimate.options import find_foreign_setting
 
     if (foreign := find_foreign_setting(stated)) is not None:
         raise DataError(
             f"--{foreign[0]} belongs to --method {foreign[1]}, not to {stated['method']}; leave it "
             "out, or change the method"
         )
-    return FitOptions.from_dict(stated)
+    return lc.FitOptions.from_dict(stated)
 
 
 FIT: Any = Group(
@@ -610,7 +603,7 @@ SIGMA_READING: Any = option(
 )
 
 
-def make_instrument(stated: Mapping[str, Any], robot: Mechanism | None = None) -> Instrument:
+def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None) -> lc.Instrument:
     """Return the instrument of `INSTRUMENT`, and of `UNKNOWN` and the distribution where they are
     stated.
 
@@ -644,7 +637,7 @@ def make_instrument(stated: Mapping[str, Any], robot: Mechanism | None = None) -
     return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)
 
 
-def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None:
+def parse_reading_sigma(text: str | None, robot: lc.Mechanism) -> FloatArray | None:
     """Return the standard deviations (a,) [SI] that --sigma-reading states; None without it."""
     import numpy as np
 
@@ -677,10 +670,8 @@ def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None
 _SIGHT = "loopcal.planning.constraints:LineOfSight"
 
 
-def _make_constraints(stated: Mapping[str, Any]) -> Constraints:
+def _make_constraints(stated: Mapping[str, Any]) -> lc.Constraints:
     """Return the constraints of the library from those of `CONSTRAINTS`."""
-    from loopcal.planning.constraints import Constraints, LineOfSight
-
     margin, measured = stated["stroke_margin"] or (0.0, "position")
     margins = {"stroke_margin" if measured == "position" else "stroke_margin_angle": margin}
     if stated["seen_from"] is None:
@@ -689,15 +680,15 @@ def _make_constraints(stated: Mapping[str, Any]) -> Constraints:
             "state the position of the instrument with --seen-from",
             "{option} belongs to a line of sight; {reason}",
         )
-        return Constraints(stated["min_margin"], stated["max_tilt"], None, **margins)
-    sight = LineOfSight(
+        return lc.Constraints(stated["min_margin"], stated["max_tilt"], None, **margins)
+    sight = lc.LineOfSight(
         _parse_three(stated["seen_from"], "--seen-from", Dimension.LENGTH),
         _parse_three(stated["facing"], "--facing", None),
         stated["cone"],
         stated["nearest"],
         math.inf if stated["farthest"] is None else stated["farthest"],
     )
-    return Constraints(stated["min_margin"], stated["max_tilt"], sight, **margins)
+    return lc.Constraints(stated["min_margin"], stated["max_tilt"], sight, **margins)
 
 
 def _parse_three(text: str, option: str, dimension: Dimension | None) -> FloatArray:

@@ -160,16 +160,16 @@ class ProgressBar:
     """The progress callback of the command line: a bar on standard error.
 
     It is drawn only where standard error is a terminal, and only after two seconds of work. A timer
-    draws it, so that a long step without further reports shows, too.
+    draws it, so that a long step without further reports shows, too; `step` is the first one.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, step: str = "") -> None:
         self._lock = threading.Lock()
         self._timer = threading.Timer(DELAY, self._start)
         self._timer.daemon = True
         self._bar: Any = None
         self._task: Any = None
-        self._state: tuple[int, int, str] | None = None
+        self._state: tuple[int, int, str] | None = (0, 1, step) if step else None
         self._total: int | None = None
 
     def __enter__(self) -> Self:

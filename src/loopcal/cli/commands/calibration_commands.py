@@ -113,8 +113,7 @@ def calibrate(
     with terminal.ProgressBar() as progress:
         report = lc.calibrate(machine, measurements, settings, progress)
     opt.print_convention_note(report.conventions, data)
-    with terminal.ProgressBar() as progress:
-        progress(0, 1, "writing the run folder")
+    with terminal.ProgressBar("writing the run folder"):
         lc.save_run(output, report, inputs, sys.argv, force)
     written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
     return Output(
@@ -418,8 +417,7 @@ def report(
     refuse_outputs(files, [run / name for name in calibrated.result.get("files", {})], force)
     if pdf:
         check_browser(files[-1])
-    with terminal.ProgressBar() as progress:
-        progress(0, 1, "writing the report")
+    with terminal.ProgressBar("writing the report") as progress:
         lc.write_report(output, calibrated)
         if pdf:
             progress(0, 1, "printing the report")

@@ -142,8 +142,7 @@ def view(
     run = load_run_or_robot(source)
     files = [Path(source) / name for name in run.result.get("files", {})]
     refuse_outputs((output,), files or (Path(source),), force)
-    with terminal.ProgressBar() as progress:
-        progress(0, 1, "writing the view")
+    with terminal.ProgressBar("writing the view"):
         write_view(output, run if run.result else run.robot)
     is_open = not no_browser and open_page(output.resolve().as_uri())
     failures = [] if run.failure is None else [run.failure]

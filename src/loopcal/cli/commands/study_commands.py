@@ -282,8 +282,7 @@ def summary(
     from loopcal.studies.results.summary_drawing import render_figures
 
     result = StudyResult(folder)
-    with terminal.ProgressBar() as progress:
-        progress(0, 1, "summarizing trials")
+    with terminal.ProgressBar("summarizing trials"):
         summarized, answered = result.summarize(), result.answer_questions()
         shown = questions.list_shown(result.study, summarized, scores)
         page = questions.view_summary(result.study, summarized, shown)
