@@ -49,20 +49,17 @@ def test_path_inside_the_folder_is_read(folders, name) -> None:
     assert np.isfinite(load(folders, MEASURED, name).readings).all()
 
 
-OUTSIDE = ["../poses.csv", "deeper/../../poses.csv", "out/poses.csv", "out.csv"]
+OUTSIDE = [
+    *((MEASURED, name) for name in ("../poses.csv", "deeper/../../poses.csv", "out/poses.csv")),
+    *((COMMANDED, name) for name in ("../robot.yaml", "out/robot.yaml", "out.yaml")),
+    (MEASURED, "out.csv"),
+]
 
 
-@pytest.mark.parametrize("name", OUTSIDE)
-def test_path_that_leaves_the_folder_is_refused_at_its_line(folders, name) -> None:
+@pytest.mark.parametrize(("text", "name"), OUTSIDE)
+def test_path_that_leaves_the_folder_is_refused_at_its_line(folders, text, name) -> None:
     with pytest.raises(FileError) as caught:
-        load(folders, MEASURED, name)
-    assert (caught.value.code, caught.value.line) == ("files.reference-outside", 4)
-
-
-@pytest.mark.parametrize("name", ["../robot.yaml", "out/robot.yaml", "out.yaml"])
-def test_controller_outside_the_folder_is_refused_at_its_line(folders, name) -> None:
-    with pytest.raises(FileError) as caught:
-        load(folders, COMMANDED, name)
+        load(folders, text, name)
     assert (caught.value.code, caught.value.line) == ("files.reference-outside", 4)
 
 
