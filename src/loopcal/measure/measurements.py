@@ -32,7 +32,7 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
 
 
-def check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observations]) -> None:
+def _check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observations]) -> None:
     """Refuse rows of the base among those of poses, the reverse, and a target on two bodies."""
     kinds = [rows.kind for rows in (*of_poses, *of_base)]
     for i, kind in enumerate(kinds):
@@ -172,7 +172,7 @@ class Measurements(TableResult):
             base_observations=tuple(self.base_observations),
             is_held_out=_check_held_out(self.is_held_out, block, labels),
         )
-        check_bodies(self.observations, self.base_observations)
+        _check_bodies(self.observations, self.base_observations)
         if self.reading_sigma is not None:
             sigma = check_reading_sigma(self.reading_sigma, readings, labels)
             set_fields(self, reading_sigma=sigma)

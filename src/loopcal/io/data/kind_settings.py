@@ -107,16 +107,15 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     kind = KINDS[name]
     settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
     values = vars(read_record(file, settings, _make_record(kind), None, location))
-    for key, value in values.items():
-        if isinstance(value, list) and not _is_array(value):
-            sentence = f"{key!r} must be a list of numbers, or of lists of equal length; correct it"
-            raise file.error(sentence, (*location, key))
     given, types = {}, list_kind_settings(kind)
     for key in settings:
         value = values[key]
-        is_single = isinstance(value, str) and "tuple" in str(types[key])
+        if isinstance(value, list) and not _is_array(value):
+            sentence = f"{key!r} must be a list of numbers, or of lists of equal length; correct it"
+            raise file.error(sentence, (*location, key))
+        if isinstance(value, str) and "tuple" in str(types[key]):
+            value = (value,)
         given[key] = value.matrix if isinstance(value, PoseRecord) else value
-        given[key] = (value,) if is_single else given[key]
     try:
         made = kind(**given)
     except DataError as error:
@@ -326,14 +325,12 @@ def format_stated_values(known: Sequence[StatedValue], entries: Sequence[Paramet
     for value in known:
         if value.name not in dimensions:
             continue
+        numbers = {"start": value.nominal, "sd": value.sd or None}
         dimension = dimensions[value.name]
-        text = FIXED
-        if value.sd:
-            text = f"{{sd: {format_quantity(value.sd, dimension)}}}"
-        if value.nominal is not None:
-            start = f"start: {format_quantity(value.nominal, dimension)}"
-            text = f"{{{start}, {text[1:]}" if value.sd else f"{{{start}, {FIXED}: true}}"
-        texts[value.name] = text
+        stated = {k: format_quantity(v, dimension) for k, v in numbers.items() if v is not None}
+        if stated and not value.sd:
+            stated[FIXED] = "true"
+        texts[value.name] = format_flow_mapping(stated) if stated else FIXED
     return format_flow_mapping(texts) if texts else ""
 
 
