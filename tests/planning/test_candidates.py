@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Candidates satisfy all constraints; excluded ones are counted by reason."""
+"""Candidates satisfy all constraints, and excluded ones are counted by reason; straight paths
+between them are checked, and a short order visits them.
+"""
+
+from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -7,10 +12,20 @@ from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError, MechanismError
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
-from loopcal.mechanism.singularities import analyze_singularity
+from loopcal.mechanism.singularities import analyze_singularity, trace_singularity
+from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import check_limits, workspace_ranges
+from loopcal.planning import path
 from loopcal.planning.candidates import check_listed_poses, draw_candidates
-from loopcal.planning.constraints import Constraints, LineOfSight
+from loopcal.planning.constraints import Constraints, LineOfSight, build_checker
+from loopcal.planning.path import (
+    check_paths,
+    find_short_order,
+    interpolate_path,
+    locate_home,
+    measure_distance,
+    order_poses,
+)
 from tests.findings.expectations import expect_refusal
 
 STATION = np.array([0.5, -0.3, 0.6])
@@ -163,3 +178,157 @@ def test_impossible_stroke_margin_is_refused(margin, words) -> None:
 def test_stroke_margin_is_a_finite_number(margin) -> None:
     with pytest.raises(DataError, match="margin from the ends of strokes"):
         Constraints(stroke_margin=margin)
+
+
+@pytest.fixture(scope="module")
+def hexapod(tmp_path_factory):
+    """Candidates of a hexapod with short strokes, so that some straight paths leave the strokes."""
+    path = tmp_path_factory.mktemp("robot") / "short.yaml"
+    path.write_text(
+        find_robot_file("hexapod-42")
+        .read_text("utf-8")
+        .replace("stroke: [-75, 75]", "stroke: [-20, 75]")
+    )
+    return draw_candidates(load_robot(path), Constraints(min_margin=0.3), 120, seed=1)
+
+
+def _check_path_finely(found, start, end, steps):
+    """Return limits, margin and closure sign of a path at more places than `check_paths` checks."""
+    robot = found.checker.robot
+    share = np.linspace(0.0, 1.0, steps)
+    x = interpolate_path(
+        robot, np.repeat(start[None], steps, 0), np.repeat(end[None], steps, 0), share
+    )
+    path = trace_singularity(robot, coordinates=x, medians=found.checker.medians)
+    inside = check_limits(robot, robot.values[None], path.solution.q[None], path.solution.state)[0][
+        0
+    ]
+    margin = np.fmin(path.ratio, path.drive_ratio)
+    return inside, margin, path.closure_sign
+
+
+def test_allowed_paths_satisfy_the_constraints_at_finer_steps(hexapod):
+    rng = np.random.default_rng(2)
+    edge = hexapod.coordinates[~hexapod.is_uniform]
+    pairs = rng.integers(0, len(edge), (60, 2))
+    verdict = check_paths(hexapod.checker, edge[pairs[:, 0]], edge[pairs[:, 1]])
+    assert verdict.allowed.sum() > 30
+    for a, b in pairs[verdict.allowed][:2]:
+        inside, margin, sign = _check_path_finely(hexapod, edge[a], edge[b], 150)
+        assert inside.all()
+        assert margin.min() > 0.3 - 1e-3
+        assert (sign == hexapod.checker.robot.home_state.closure_sign).all()
+
+
+def test_path_that_leaves_the_strokes_is_refused_with_the_reason(hexapod):
+    rng = np.random.default_rng(2)
+    edge = hexapod.coordinates[~hexapod.is_uniform]
+    pairs = rng.integers(0, len(edge), (60, 2))
+    verdict = check_paths(hexapod.checker, edge[pairs[:, 0]], edge[pairs[:, 1]])
+    refused = np.flatnonzero(~verdict.allowed)
+    assert len(refused)
+    assert all("stroke" in dict(verdict.violations[i].data)["limit"] for i in refused)
+    a, b = pairs[refused[0]]
+    inside, *_ = _check_path_finely(hexapod, edge[a], edge[b], 100)
+    assert inside[[0, -1]].all()
+    assert not inside.all()
+
+
+def test_path_through_a_singularity_is_refused():
+    robot = load_robot("five-bar")
+    checker = build_checker(robot, Constraints(min_margin=0.0))
+    home = locate_home(robot)
+    # mirrored at the line through both feet: the other side of the singularity where the links are
+    # in line
+    across = home * np.array([1.0, -1.0])
+    verdict = check_paths(checker, home[None], across[None])
+    assert not verdict.allowed[0]
+    assert verdict.violations[0] is not None
+
+
+def test_tilt_path_takes_the_shorter_azimuth_or_passes_zero_tilt():
+    robot = load_robot("3-prs")
+    names = robot.controlled
+    start, end = np.zeros((2, 1, len(names)))
+    z, phi, theta = (names.index(name) for name in ("z", "phi", "theta"))
+    start[0, [z, phi, theta]] = 0.5, np.radians(170.0), 0.2
+    end[0, [z, phi, theta]] = 0.6, np.radians(-170.0), 0.2
+    middle = interpolate_path(robot, start, end, 0.5)[0]
+    assert abs(abs(middle[phi]) - np.pi) < 1e-12
+    assert_allclose(middle[theta], 0.2 * np.cos(np.radians(10.0)), rtol=1e-12)
+    end[0, phi] = np.radians(-10.0)
+    assert interpolate_path(robot, start, end, 0.5)[0, theta] < 1e-15
+    assert_allclose(
+        measure_distance(robot, start, end), np.hypot(0.1, 0.4 * robot.size), rtol=1e-12
+    )
+
+
+def test_a_robot_of_one_meter_wraps_angles_like_others():
+    robot = load_robot("hexapod-42")
+    start, end = np.zeros((2, len(robot.controlled)))
+    start[-1], end[-1] = 3.1, -3.1
+    lengths = [measure_distance(replace(robot, size=size), start, end) for size in (1.0, 2.0)]
+    assert_allclose(lengths, (2.0 * np.pi - 6.2) * np.array([1.0, 2.0]))
+
+
+def test_order_of_few_poses_is_within_5_percent_of_the_shortest():
+    rng = np.random.default_rng(0)
+    exact = 0
+    for _ in range(10):
+        points = rng.random((8, 2))
+        cost = np.linalg.norm(points[1:, None] - points[None, 1:], axis=2)
+        begin = np.linalg.norm(points[1:] - points[0], axis=1)
+        order, length, is_converged = find_short_order(cost, begin)
+        assert is_converged
+        orders = np.array(list(permutations(range(7))))
+        lengths = begin[orders[:, 0]] + cost[orders[:, :-1], orders[:, 1:]].sum(axis=1)
+        assert sorted(order) == list(range(7))
+        assert_allclose(length, begin[order[0]] + cost[order[:-1], order[1:]].sum(), rtol=1e-12)
+        assert length <= 1.05 * lengths.min()  # 2-opt from seven beginnings: within a few per cent
+        exact += length <= lengths.min() * (1 + 1e-12)
+    assert exact >= 7
+
+
+def test_order_that_runs_out_of_steps_is_marked_and_passes_home(hexapod, monkeypatch):
+    poses = hexapod.coordinates[:12]
+    whole = order_poses(hexapod.checker, poses)
+    assert whole.is_converged
+    monkeypatch.setattr(path, "REVERSALS", 0)
+    assert not order_poses(hexapod.checker, poses).is_converged
+    monkeypatch.undo()
+    monkeypatch.setattr(path, "ORDERS", 0)
+    unchecked = order_poses(hexapod.checker, poses)  # no path between two poses was checked
+    assert not unchecked.is_converged
+    assert unchecked.via_home[1:].all()
+    assert unchecked.length > whole.length
+
+
+def test_ordered_poses_have_allowed_paths_or_pass_the_home_pose(hexapod):
+    rng = np.random.default_rng(2)
+    edge = hexapod.coordinates[~hexapod.is_uniform]
+    pairs = rng.integers(0, len(edge), (60, 2))
+    verdict = check_paths(hexapod.checker, edge[pairs[:, 0]], edge[pairs[:, 1]])
+    a, b = pairs[~verdict.allowed][0]
+    only = order_poses(hexapod.checker, edge[[a, b]])
+    assert only.via_home.tolist() == [False, True]
+    poses = edge[rng.choice(len(edge), 12, replace=False)]
+    visit = order_poses(hexapod.checker, poses)
+    ordered = poses[visit.order]
+    direct = np.flatnonzero(~visit.via_home[1:]) + 1
+    assert check_paths(hexapod.checker, ordered[direct - 1], ordered[direct]).allowed.all()
+    plain = measure_distance(hexapod.checker.robot, poses[:-1], poses[1:]).sum()
+    assert visit.length < 0.9 * plain
+
+
+def test_path_ends_with_the_readings_of_its_last_pose(hexapod):
+    robot = hexapod.checker.robot
+    x = hexapod.coordinates[:5]
+    home = np.broadcast_to(locate_home(robot), x.shape)
+    assert check_paths(hexapod.checker, home, x).allowed.all()
+    last = trace_singularity(
+        robot,
+        coordinates=interpolate_path(
+            robot, home[:1].repeat(20, 0), x[:1].repeat(20, 0), np.linspace(0, 1, 20)
+        ),
+    )
+    assert_allclose(last.solution.q[-1], inverse(robot, x[:1]).q[0], atol=1e-9)  # [m]

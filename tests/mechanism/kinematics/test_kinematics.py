@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inverse and forward kinematics over whole workspaces: closure, round trips, marked failures
-instead of exceptions.
+instead of exceptions; of an unreachable pose the nearest reachable one, rows and paths that say
+so.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,20 +12,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.errors import DataError
 from loopcal.findings.catalog import load_catalog
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.mechanism import chains as chain_inverse
+from loopcal.mechanism import kinematics as reading_paths
 from loopcal.mechanism.assembly import Address, LinearMap
+from loopcal.mechanism.chains import bound_platform
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
-from loopcal.mechanism.solutions import forward, inverse, jacobian
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
+from loopcal.mechanism.solutions import (
+    controls_all,
+    differentiate_by_coordinates,
+    forward,
+    inverse,
+    jacobian,
+)
 from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import Parameter
 from tests import zoo
 from tests.engine.cases import actuated_joint_values, stack_dense_rows
+from tests.zoo import load_cached_robot
 
 ROBOT_NAMES = ["mixed_hexapod", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
+
 WORKSPACES = {
     "hexapod": ([-0.04, -0.04, 0.17, -0.24, -0.24, -0.24], [0.04, 0.04, 0.23, 0.24, 0.24, 0.24]),
     "mixed_hexapod": (
@@ -238,3 +256,250 @@ def test_repr_of_robots_and_results_is_short():
         assert len(text) < 600
     assert "42" in repr(robot)
     assert "3 of 3 rows" in repr(solution)
+
+
+def squared_distance(robot, T, target):
+    """|log(R R*')|^2 size^2 + |t - t*|^2 (n,) [m^2]."""
+    gap = geometry.pose_difference(T, target) * np.array([robot.size] * 3 + [1.0] * 3)
+    return (gap**2).sum(axis=1)
+
+
+def make_unreachable_poses(n=20):
+    """Draw poses up to 2 cm and 0.05 rad from the workspace of a 3-PRS, in all six directions."""
+    rng = np.random.default_rng(5)
+    values = rng.uniform([0.66, -np.pi, 0.1], [0.74, np.pi, 0.5], (n, 3))
+    T = inverse(zoo.three_prs(), values).T
+    return geometry.apply_twist(T, rng.uniform(-1, 1, (n, 6)) * np.array([0.05] * 3 + [0.02] * 3))
+
+
+def test_nearest_pose_of_a_3_prs_minimizes_the_distance():
+    robot, target = zoo.three_prs(), make_unreachable_poses()
+    sol = inverse(robot, target)
+    assert_array_equal(sol.status, Status.CONVERGED)
+    result = read_coordinates(sol.T, robot.controlled)
+    best, h = squared_distance(robot, sol.T, target), 1e-5
+    for i in range(3):
+        ahead, behind = (
+            squared_distance(robot, inverse(robot, result + s * h * np.eye(3)[i]).T, target)
+            for s in (1, -1)
+        )
+        # slope against curvature: how far along this coordinate the minimum still is
+        assert (np.abs(ahead - behind) / (ahead + behind - 2 * best) * h / 2 < 1e-6).all()
+        assert (np.minimum(ahead, behind) >= best).all()
+
+
+def test_reachable_pose_is_its_own_nearest_pose():
+    robot, sol, _ = sample_inverse("three_prs", 20)
+    back = inverse(robot, sol.T)
+    assert_allclose(geometry.pose_difference(back.T, sol.T), 0.0, atol=1e-11)
+    assert_allclose(back.q, sol.q, atol=1e-11)
+
+
+def test_delta_ignores_the_orientation_of_a_target_pose():
+    robot = zoo.delta()
+    T = zoo.make_poses(np.array([[0.02, -0.03, 0.08, 0.3, 0.2, 0.1]]))
+    sol = inverse(robot, T)
+    assert_array_equal(sol.status, Status.CONVERGED)
+    assert_allclose(sol.T[0, :3, 3], T[0, :3, 3], atol=1e-14)
+    assert_allclose(sol.T[0, :3, :3], np.eye(3))
+
+
+def test_hexapod_reaches_the_target_pose_exactly():
+    _, sol, _ = sample_inverse("hexapod", 20)
+    assert_allclose(
+        geometry.pose_difference(inverse(zoo.hexapod(), sol.T).T, sol.T), 0.0, atol=1e-15
+    )
+
+
+def list_robots_with_few_freedoms():
+    """Shipped robots whose controlled coordinates do not state each freedom of the platform."""
+    return [name for name in list_shipped_robots() if not controls_all(load_robot(name))]
+
+
+def make_far_poses(robot, far, n):
+    """Draw poses `far` sizes and `far` rad away from home, in random directions."""
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=(n, 2, 3))
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    twist = np.concatenate([direction[:, 0], robot.size * direction[:, 1]], axis=1) * far
+    return geometry.apply_twist(np.broadcast_to(robot.home_state.T[0, 0], (n, 4, 4)), twist)
+
+
+SLOWEST = "solar-tracker"  # as long as all the others but the excavator, which is a chain as well
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.evidence) if name == SLOWEST else name
+        for name in list_robots_with_few_freedoms()
+    ],
+)
+def test_projection_is_converged_only_where_the_distance_is_stationary(name):
+    """The gradient by central differences of inverse solutions vanishes where a row is converged,
+    for targets up to two sizes and 2 rad away from home.
+    """
+    robot, n = load_robot(name), 4
+    target = np.concatenate([make_far_poses(robot, far, n // 2) for far in (0.05, 2.0)])
+    sol = inverse(robot, target)
+    done = sol.converged
+    assert done[: n // 2].sum() >= 0.9 * (n // 2)  # the near ones are not merely given up
+    assert not np.isin(sol.status, Status.NOT_FINITE).any()
+    end, target = sol.take(done), target[done]
+    at = read_coordinates(end.T, robot.controlled)
+    distance, h = squared_distance(robot, end.T, target), 1e-5  # [rad] or a share of the size
+    for i, coordinate in enumerate(robot.controlled):
+        step = np.zeros(len(at[0]))
+        step[i] = h * (robot.size if coordinate in POSITION else 1.0)
+        ahead, behind = (inverse(robot, at + sign * step, end) for sign in (1, -1))
+        both = ahead.converged & behind.converged
+        slope = (
+            squared_distance(robot, ahead.T, target) - squared_distance(robot, behind.T, target)
+        ) / (2 * h)
+        # the share 1e-6 of the distance that the search allows, at a lever of at most 3 sizes,
+        # the error of differences, and what rounding of the distances leaves
+        limit = 1e-5 * robot.size * np.sqrt(distance) + 1e-8 * (robot.size**2 + distance)
+        assert (np.abs(slope) <= limit)[both].all()
+
+
+def test_projection_that_ends_at_the_limit_of_the_reach_says_so():
+    sol = inverse(load_robot("ru-pus-prs"), make_far_poses(load_robot("ru-pus-prs"), 2.0, 20))
+    codes = {
+        sol.explain(int(row)).code for row in np.flatnonzero(sol.status == Status.NOT_CONVERGED)
+    }
+    assert "kinematics.not-nearest" in codes
+
+
+@pytest.fixture
+def calls(monkeypatch) -> list[int]:
+    solve, calls = engine.solve, []
+
+    def counted(*args, **options):
+        calls.append(1)
+        return solve(*args, **options)
+
+    monkeypatch.setattr(engine, "solve", counted)
+    return calls
+
+
+def test_unreachable_readings_take_few_solutions_and_stay_marked(calls) -> None:
+    far = 0.45 * np.array([[1.0, 1.0, 1.0, -1.0, -1.0, -1.0], [-1.0, 1.0, -1.0, 1.0, -1.0, 1.0]])
+    robot = load_robot("hexapod-42")
+    calls.clear()
+    assert not forward(robot, far).converged.any()
+    first, last = reading_paths.PATH_STEPS
+    assert len(calls) < 1 + first + last  # the finer path ended before its last step
+
+
+def test_redundant_readings_that_contradict_each_other_take_few_solutions(calls) -> None:
+    robot = load_robot("cable-4")
+    calls.clear()
+    state = forward(robot, np.full((3, 4), 80.0))  # every line half a meter shorter than at home
+    assert not state.converged.any()
+    first, last = reading_paths.PATH_STEPS
+    assert len(calls) < 1 + first + last / 2  # the finer path ended where the gap opened wide
+
+
+Array = NDArray[np.float64]
+
+
+def draw_machines(robot: Mechanism, n: int) -> Array:
+    """Draw values (n, p) of all parameters, 20 tolerances from the nominal ones."""
+    errors = np.random.default_rng(3).standard_normal((n, len(robot.parameters)))
+    return robot.parameters.nominal + 20 * errors * robot.parameters.tolerance
+
+
+@pytest.mark.parametrize("name", ["arm-6r", "excavator", "palletizer"])
+def test_no_pose_of_any_machine_is_outside_its_sphere(name: str) -> None:
+    robot = load_cached_robot(name)
+    low, high = np.array([a.stroke for a in robot.actuators]).T
+    q = np.random.default_rng(1).uniform(low, high, (100, len(low)))
+    for values in draw_machines(robot, 4):
+        machine = robot.with_values(values)
+        solution = forward(machine, q)
+        center, radius = bound_platform(machine, values[None])
+        assert np.isfinite(radius[0])
+        far = np.linalg.norm(solution.T[solution.closed, :3, 3] - center[0], axis=1)
+        assert len(far) > 20
+        assert far.max() < radius[0] + 1e-12  # [m] rounding
+        assert far.max() > 0.6 * radius[0]  # the sphere is of the size of the robot
+
+
+@pytest.mark.parametrize("name", ["tricept", "linear-delta-6", "belt-4", "hexapod-42"])
+def test_slides_and_driven_rods_have_no_sphere(name: str) -> None:
+    robot = load_cached_robot(name)
+    assert np.isinf(bound_platform(robot, robot.values[None])[1]).all()
+
+
+def count_calls(monkeypatch: pytest.MonkeyPatch, owner: object, name: str) -> list[int]:
+    """Return a list that grows by one for each call of a function."""
+    calls: list[int] = []
+    function: Callable[..., object] = getattr(owner, name)
+
+    def counted(*args: object, **options: object) -> object:
+        calls.append(1)
+        return function(*args, **options)
+
+    monkeypatch.setattr(owner, name, counted)
+    return calls
+
+
+def test_targets_beyond_the_sphere_take_a_single_evaluation(monkeypatch):
+    robot = load_cached_robot("arm-6r")
+    target = sample_workspace(robot, 3, seed=1).coordinates
+    far = target + np.array([8.0, 0, 0, 0, 0, 0])
+    calls = count_calls(monkeypatch, chain_inverse._Rows, "evaluate")
+    solution = inverse(robot, np.concatenate([far, target]))
+    reached = len(calls)
+    assert (solution.status[:3] == Status.UNREACHABLE).all()
+    assert solution.converged[3:].all()
+    assert 7.0 < solution.residual[0] < 9.0  # [m] how far away the target stays
+    calls.clear()
+    inverse(robot, far)
+    assert len(calls) == 1 < reached
+
+
+# Within the sphere: at the foot of the excavator, and behind the base of the Tricept.
+NEAR_BASE = {"excavator": [0.3, 0.2, 0.5, 1.0], "tricept": [0.1, 0.1, -1.5, 0.0, 0.8, 0.0]}
+
+
+@pytest.mark.parametrize("name", NEAR_BASE)
+def test_a_row_out_of_reach_takes_at_most_ten_times_the_evaluations(name, monkeypatch):
+    robot = load_cached_robot(name)
+    target = sample_workspace(robot, 1, seed=1).coordinates
+    calls = count_calls(monkeypatch, chain_inverse._Rows, "evaluate")
+    assert inverse(robot, target).converged.all()
+    reached = len(calls)
+    calls.clear()
+    assert not inverse(robot, [NEAR_BASE[name]]).converged.any()
+    assert reached < len(calls) <= 10 * reached
+
+
+def test_a_hexapod_turned_around_is_solved_once_at_its_pose(monkeypatch):
+    robot = load_cached_robot("hexapod-42")
+    T = robot.home[None].repeat(3, axis=0)
+    T[:, :3, :3] = (
+        geometry.exp_so3(np.radians([[0, 0, 170], [0, 160, 0], [150, 0, 10]])) @ T[:, :3, :3]
+    )
+    calls = count_calls(monkeypatch, engine, "reach")
+    solution = inverse(robot, T)
+    assert (solution.status == Status.OTHER_MODE).all()
+    assert len(calls) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["3-prs", "excavator"])
+def test_limited_steps_still_project_to_the_nearest_pose(name: str) -> None:
+    robot, n = load_cached_robot(name), 8
+    near = inverse(robot, sample_workspace(robot, n, seed=1).coordinates).T
+    twist = np.random.default_rng(2).uniform(-1.0, 1.0, (n, 6)) * np.repeat([0.3, 0.3], 3)
+    away = geometry.apply_twist(near, twist * np.repeat([1.0, robot.size], 3))
+    solution = inverse(robot, away)
+    slope = differentiate_by_coordinates(robot, robot.values[None], solution.state)[0]
+    slope = slope * robot.twist_scale[:, None]
+    gap = geometry.pose_difference(solution.T, away) * robot.twist_scale
+    gradient = np.einsum("nij,ni->nj", slope, gap)[solution.converged]
+    assert len(gradient) > 6
+    # [m] of a gap of 0.3 sizes: it is across the reachable poses; Gauss-Newton ends in 12 steps
+    assert np.abs(gradient).max() < 1e-5 * robot.size
