@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -444,25 +444,17 @@ def _compare_pair(
     else:
         obstacles = zip(words.values(), map(_find_obstacle, (first, second)), strict=True)
         run, reason = next((each for each in obstacles if each[1]), ("", "nothing"))
-        if not run:
-            earlier = first.load_posterior()
-            changes = compare_information(earlier, second.load_posterior())
-            if changes.degrees:
-                return _test(earlier, changes, words, relation, tests)
         code, data = "runs.not-tested", {"run": run, "reason": reason}
-    free = _list_free(first)
-    unknown = np.full(len(free), np.nan)
-    return PairComparison(
-        words["first"],
-        words["second"],
-        data=kind,
-        shared=shared,
-        finding=report_finding(code, **words, **data),
-        names=free,
-        shift=unknown,
-        shift_sd=unknown,
-        significant=np.zeros(len(free), dtype=bool),
+    names, finding = _list_free(first), report_finding(code, **words, **data)
+    unknown, none = np.full(len(names), np.nan), np.zeros(len(names), dtype=bool)
+    pair = PairComparison(
+        words["first"], words["second"], kind, shared, finding, names, unknown, unknown, none
     )
+    if data.get("reason") != "nothing":
+        return pair
+    earlier = first.load_posterior()
+    changes = compare_information(earlier, second.load_posterior())
+    return _test(pair, earlier, changes, words, tests) if changes.degrees else pair
 
 
 def _find_obstacle(run: Run) -> str:
@@ -476,13 +468,13 @@ def _find_obstacle(run: Run) -> str:
 
 
 def _test(
+    pair: PairComparison,
     earlier: Posterior,
     changes: ParameterChanges,
     words: Mapping[str, str],
-    relation: tuple[str, int, int],
     tests: int,
 ) -> PairComparison:
-    """Return the test of a change, and what explains it."""
+    """Return a pair with the test of a change, and what explains it."""
     level = compute_single_level(CHANGE_LEVEL, tests)
     p_value = changes.compute_p_value(changes.chi_square, changes.degrees)
     moved = bool(p_value < level)
@@ -510,11 +502,8 @@ def _test(
         judged |= {"p_value": p_value, "level": CHANGE_LEVEL}
     shifts, sd = changes.estimate_shifts()
     single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shifts).sum()))
-    return PairComparison(
-        words["first"],
-        words["second"],
-        data=relation[0],
-        shared=relation[1],
+    return replace(
+        pair,
         finding=report_finding(code, **words, **judged),
         names=changes.names,
         shift=shifts,
