@@ -111,11 +111,6 @@ class NuisanceElimination:
         return len(self.local)
 
     @property
-    def prior_count(self) -> int:
-        """Number of parameters with a prior: rows that are added to those of the data."""
-        return int(self.has_prior.sum())
-
-    @property
     def unpenalized_count(self) -> int:
         """Number of free parameters without a prior."""
         return int((self.is_free & ~self.has_prior).sum())

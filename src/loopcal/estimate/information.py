@@ -16,13 +16,14 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.linearization import LinearizedPoses, linearize_at_readings
+from loopcal.estimate.linearization import LinearizedPoses, linearize_poses
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.readings import resolve_reading_sigma
+from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.elimination import eliminate_from_factor
@@ -78,7 +79,10 @@ def observe_poses(
 
     `joints` are names of joints whose values and derivatives are needed.
     """
-    return ObservedPoses(free, readings, linearize_at_readings(free, readings, joints))
+    values = free.robot.values[None]
+    state = forward_trials(free.robot, values, readings[None])
+    poses = linearize_poses(free, values, readings[None], state, tuple(joints))
+    return ObservedPoses(free, readings, poses)
 
 
 def observe_rows(

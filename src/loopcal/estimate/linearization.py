@@ -19,7 +19,7 @@ poses. This module is the only place where poses and rows are linearized.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -32,7 +32,7 @@ from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.readings import select_joint_values
 from loopcal.mechanism.actuation import DrivenJoints
-from loopcal.mechanism.kinematics import forward_trials, step_towards_closure
+from loopcal.mechanism.kinematics import step_towards_closure
 from loopcal.mechanism.sensitivity import differentiate_pose, differentiate_sensed_values
 from loopcal.mechanism.states import Status
 from loopcal.numerics.elimination import without_rounding
@@ -221,15 +221,6 @@ def linearize_poses(
         joints_by_coordinates=turns,
     )
     return mask_unreached(free, names, q, state, poses)
-
-
-def linearize_at_readings(
-    free: FreeParameters, readings: FloatArray, names: Iterable[str] = ()
-) -> LinearizedPoses:
-    """Solve and linearize a robot at readings (n, actuators) and its present values: (1, n)."""
-    values = free.robot.values[None]
-    state = forward_trials(free.robot, values, readings[None])
-    return linearize_poses(free, values, readings[None], state, tuple(names))
 
 
 def linearize_closure(

@@ -159,11 +159,3 @@ def list_block_labels(labels: Sequence[str], member: IntArray) -> tuple[tuple[st
 def consecutive_pairs(poses: IntArray) -> IntArray:
     """Return pairs (r (l - 1), 2) of poses that rows (r, l) link."""
     return np.column_stack([poses[:, :-1].ravel(), poses[:, 1:].ravel()])
-
-
-def find_needed_poses(rows: Sequence[ObservationRows], n: int) -> BoolArray:
-    """Return the poses (n,) that a row with a present residual needs."""
-    needed = np.zeros(n, dtype=bool)
-    for r in rows:
-        needed[r.poses[r.is_present.any(axis=(0, 2))]] = True
-    return needed

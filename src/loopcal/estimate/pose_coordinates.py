@@ -370,14 +370,6 @@ def _linearize_freedoms(
     return np.where(is_closed[:, None, None], state.T[0], T), slope, is_closed, state
 
 
-def sum_squares_at(
-    rows: Sequence[ObservationRows], trial: IntArray, pose: IntArray, T: FloatArray
-) -> FloatArray:
-    """Return the sum of whitened squares (k,) of the rows of k poses, platform at T (k, 4, 4)."""
-    residuals = [_whitened_rows(r, places, trial, T)[0] for r, places in _usable_rows(rows, pose)]
-    return sum(((residual**2).sum(axis=1) for residual in residuals), start=np.zeros(len(pose)))
-
-
 def _usable_rows(
     rows: Sequence[ObservationRows], pose: IntArray
 ) -> list[tuple[ObservationRows, IntArray]]:
@@ -530,7 +522,10 @@ def _begin_at_best_reading(
     state = forward_trials(robot, robot.values[None], flat, follow=False)
     closed = np.asarray(state.status[0] == Status.CONVERGED)
     T = np.where(closed[:, None, None], state.T[0], robot.home)
-    squares = sum_squares_at(rows, np.repeat(trial, count), np.repeat(pose, count), T)
+    each = np.repeat(trial, count), T
+    squares = np.zeros(len(T))
+    for r, places in _usable_rows(rows, np.repeat(pose, count)):
+        squares = squares + (_whitened_rows(r, places, *each)[0] ** 2).sum(axis=1)
     squares = np.where(closed, squares, np.inf).reshape(-1, count)
     squares[is_recorded & np.isfinite(squares[:, 0]), 0] = -1.0
     best = squares.argmin(axis=1)

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 
 import numpy as np
 
@@ -49,7 +50,7 @@ from loopcal.estimate.linearization import (
     evaluate_rows,
     linearize_rows,
 )
-from loopcal.estimate.observation_rows import ObservationRows, consecutive_pairs, find_needed_poses
+from loopcal.estimate.observation_rows import ObservationRows, consecutive_pairs
 from loopcal.estimate.pose_coordinates import PoseCoordinates
 from loopcal.findings import report_finding
 from loopcal.mechanism.actuation import drive_joints
@@ -120,7 +121,9 @@ class PoseRows:
     def blocks(self) -> tuple[PoseBlock, ...]:
         """The poses in blocks whose rows are made together."""
         count = len(self.rows) - self.coordinates.rows_of_readings
-        is_needed = find_needed_poses(self.rows[:count], len(self.member))
+        is_needed = np.zeros(len(self.member), dtype=bool)
+        for r in self.rows[:count]:
+            is_needed[r.poses[r.is_present.any(axis=(0, 2))]] = True
         if self.coordinates.count:
             return divide_into_components(self.rows, is_needed, self.nuisance, self.member)
         return divide_into_runs(self.rows, is_needed, self.nuisance)
@@ -456,8 +459,11 @@ class PoseSearch:
                 assert begin is not None
                 states = begin.take_poses(block.poses)
                 solved = coordinates.close(values, block.poses, states, is_still is None)
-                if is_still is not None:
-                    solved = _keep_still(solved, states, is_still[:, block.poses])
+                if is_still is not None and is_still.any():
+                    # solved again, poses that did not move could end on another branch
+                    still = np.nonzero(is_still[:, block.poses])
+                    before = map_arrays(itemgetter(still), states)
+                    solved = solved.put_poses(still[0], still[1], before)
                 closed.append(solved)
                 poses = coordinates.linearize(values, solved, block.poses)
             else:
@@ -538,17 +544,6 @@ class PoseSearch:
         if step.nuisance is not None and nuisance is not None:
             nuisance = nuisance + share[:, :1] * step.nuisance
         return self.evaluate(states, nuisance, is_still=share == 0.0)
-
-
-def _keep_still(solved: PoseStates, before: PoseStates, is_still: BoolArray) -> PoseStates:
-    """Return solved poses, those that did not move (a, n) as before.
-
-    Solved again, they could end on another branch.
-    """
-    rows, poses = np.nonzero(is_still)
-    if not len(rows):
-        return solved
-    return solved.put_poses(rows, poses, map_arrays(lambda array: array[rows, poses], before))
 
 
 BLOCK = 2048

@@ -460,7 +460,7 @@ class Problem:
         if nuisance is not None and factors is not None and solution.nuisance is not None:
             estimate, rest = nuisance.eliminate(factors, solution.nuisance)
             factor = engine.fold(factor, rest)
-            equations = equations + nuisance.prior_count - estimate.elimination.rank
+            equations = equations + int(nuisance.has_prior.sum()) - estimate.elimination.rank
             slope = estimate.elimination.slope
             next_start = replace(next_start, nuisance=solution.nuisance, slope=slope)
         cost = np.where(is_lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
@@ -613,8 +613,14 @@ def make_exact_problem(
 def _make_uncertain_rows(
     free: FreeParameters, recorded: FloatArray, sigma: FloatArray, rows: tuple[ObservationRows, ...]
 ) -> PoseRows:
-    """Return the rows at uncertain readings, before nuisance parameters are eliminated."""
-    all_rows, robot = (*rows, _reading_rows(free, recorded, sigma)), free.robot
+    """Return the rows, and those of uncertain readings, (true - recorded) / sigma, before nuisance
+    parameters are eliminated.
+    """
+    robot, is_row = free.robot, np.isfinite(sigma) & (sigma > 0.0)
+    weight = np.where(is_row, 1.0 / np.where(is_row, sigma, 1.0), 0.0)
+    white = weight[None, :, :, None] * np.eye(sigma.shape[1])
+    readings = ObservationRows(make_readings_kind(robot), np.arange(len(sigma)), recorded, white)
+    all_rows = (*rows, readings)
     names = list_sensed_joints(r.kind for r in all_rows)
     if robot.program.sigma is None:
         scale = np.where(np.isinf(sigma), UNKNOWN_READING * _reading_units(robot), sigma)
@@ -646,11 +652,3 @@ def _reading_units(robot: Mechanism) -> FloatArray:
     return np.array(
         [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
     )
-
-
-def _reading_rows(free: FreeParameters, recorded: FloatArray, sigma: FloatArray) -> ObservationRows:
-    """Return the rows of uncertain readings, (true - recorded) / sigma."""
-    is_row = np.isfinite(sigma) & (sigma > 0.0)
-    weight = np.where(is_row, 1.0 / np.where(is_row, sigma, 1.0), 0.0)
-    white = weight[None, :, :, None] * np.eye(sigma.shape[1])
-    return ObservationRows(make_readings_kind(free.robot), np.arange(len(sigma)), recorded, white)

@@ -171,8 +171,8 @@ def run_residual_test(
     square, p_value = left, np.nan
     if weighted:
         square = float(decomposition.remaining(penalty)[0])
-    elif noise != "estimated":
-        p_value = _compute_tail(degrees, left)
+    elif noise != "estimated" and degrees > 0:
+        p_value = float(compute_chi_square_tail(degrees, left))
     scale, nu = _estimate_scale(left, degrees, p_value, noise, sigma_uncertainty, weighted)
     return ResidualTest(square, degrees, p_value, dof, noise, scale, nu, nu > 0.0, True, weighted)
 
@@ -207,11 +207,6 @@ def count_sigma_degrees(noise: str, uncertainty: float) -> float:
         return np.inf
     u = max(uncertainty, ASSUMED_UNCERTAINTY) if noise == "assumed" else uncertainty
     return 0.5 / u / u  # the square of a tiny one is zero
-
-
-def _compute_tail(degrees: float, square: float) -> float:
-    """Return the probability of a larger sum of squares; NaN without degrees of freedom."""
-    return float(compute_chi_square_tail(degrees, square)) if degrees > 0 else np.nan
 
 
 def coverage_factor(degrees: FloatArray | float, level: float = LEVEL) -> FloatArray:
