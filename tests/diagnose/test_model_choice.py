@@ -70,17 +70,29 @@ def test_machine_with_length_errors_alone_needs_lengths_alone():
     assert "nothing" in str(result)
 
 
-def test_machine_with_all_errors_needs_all_parameters():
-    result = choose_model(hexapod(), hexapod_data(30))
-    assert result.chosen.name == "ideal"
-    assert result.finding.code == "model.all-needed"
+def measure_perfect_machine():
+    """Measure a machine without errors by a poor instrument."""
+    return simulate(zoo.hexapod(), hexapod_poses(30), tracker(100 * UM, 500 * URAD), 1)
 
 
-def test_perfect_machine_and_poor_instrument_give_no_parameters():
-    data = simulate(zoo.hexapod(), hexapod_poses(30), tracker(100 * UM, 500 * URAD), 1)
-    result = choose_model(hexapod(), data, method=LeastSquares())
-    assert result.chosen.name == "nothing"
-    assert result.finding.code == "model.nothing-gained"
+@pytest.mark.parametrize(
+    ("data", "method", "chosen", "code"),
+    [
+        (lambda: hexapod_data(30), None, "ideal", "model.all-needed"),
+        (measure_perfect_machine, LeastSquares(), "nothing", "model.nothing-gained"),
+    ],
+)
+def test_all_parameters_or_none_are_chosen_where_the_machine_needs_them(data, method, chosen, code):
+    result = choose_model(hexapod(), data(), method=method)
+    assert (result.chosen.name, result.finding.code) == (chosen, code)
+
+
+def shift_pose(data, place: int, by: object):
+    """Return the data with one wrong row."""
+    (rows,) = data.observations
+    measured = rows.measured.copy()
+    measured[place] += by
+    return replace(data, observations=(replace(rows, measured=measured),))
 
 
 def test_nested_parameter_sets_of_the_3_prs():
@@ -101,10 +113,7 @@ def test_parameter_sets_that_are_not_nested_are_refused():
 
 def test_excluded_poses_are_neither_fitted_nor_predicted():
     data = hexapod_data(30)
-    rows = data.observations[0]
-    measured = rows.measured.copy()
-    measured[4] += 0.1  # [rad], [m]
-    wrong = replace(data, observations=(replace(rows, measured=measured),))
+    wrong = shift_pose(data, 4, 0.1)  # [rad], [m]
     options = FitOptions(method=LeastSquares(), excluded_poses=("5",))
     result = cross_validate(hexapod(), wrong, options=options)
     assert "5" not in result.poses
@@ -139,13 +148,6 @@ def test_first_fit_that_does_not_converge_ends_a_comparison():
 
 def test_parameters_are_not_chosen_by_rows_that_are_far_off():
     data = hexapod_data(30)
-    wrong = replace(data, observations=(_shift_row(data.observations[0], 4, 1000.0),))
+    wrong = shift_pose(data, 4, [0.0] * 3 + [1000.0] * 3)
     with pytest.raises(DataError, match=r"Pose 5 is far off the others and alone would decide"):
         calibrate(hexapod(), wrong, CalibrationOptions(choose_model=True))
-
-
-def _shift_row(rows, row: int, length: float):
-    """Return rows with one position that is wrong by a length [m]."""
-    measured = rows.measured.copy()
-    measured[row, 3:] += length
-    return replace(rows, measured=measured)

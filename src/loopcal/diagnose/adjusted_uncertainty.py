@@ -18,7 +18,6 @@ import numpy as np
 from loopcal.diagnose.error_frames import (
     FITTED,
     MOST_POSES,
-    choose_evenly,
     linearize_tool_errors,
     locate_measured_poses,
 )
@@ -43,7 +42,7 @@ from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.numerics.statistics import compute_median, find_distinct
+from loopcal.numerics.statistics import choose_evenly, compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS
 
@@ -169,8 +168,8 @@ def take_root(matrix: FloatArray, squares: FloatArray) -> FloatArray:
 def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
     """Return what the residuals depend on, with the size that exceeds its uncertainty most."""
     most = int(np.argmax(np.abs(effect.sizes) / effect.errors))
-    label = effect.effect.labels[most]
-    unit = DISPLAY_UNITS[label.dimension]
+    component, dimension = effect.effect.labels[most]
+    unit = DISPLAY_UNITS[dimension]
     size, error = (
         Quantity(float(values[most]) / unit.factor_to_si, unit.symbol)
         for values in (effect.sizes, effect.errors)
@@ -179,7 +178,7 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
     return report_finding(
         CODES[effect.effect.source],
         **({"name": name} if name else {}),
-        component=label.component,
+        component=component,
         size=size,
         error=error,
         ratio=ratio,
@@ -275,8 +274,7 @@ def check_heavy_tails(
 
 def assess_tails(rows: ResidualRows) -> HeavyTails:
     """Return the test of residuals."""
-    n = len(rows.residual)
-    kept = np.linspace(0, n - 1, min(n, MOST_ROWS)).astype(int)
+    kept = choose_evenly(len(rows.residual), MOST_ROWS)
     basis = rows.basis[kept]
     left = 1.0 - (basis**2).sum(axis=1)
     testable = left > TESTABLE

@@ -36,7 +36,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.elimination import find_connected_groups, fold_at
-from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.numerics.statistics import choose_evenly, compute_chi_square_tail
 from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -286,8 +286,7 @@ def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:
     if clusters.count <= MOST_CLUSTERS:
         return clusters, 1.0
     number = np.full(clusters.count, -1)
-    chosen = np.linspace(0, clusters.count - 1, MOST_CLUSTERS).astype(np.int64)
-    number[chosen] = np.arange(MOST_CLUSTERS)
+    number[choose_evenly(clusters.count, MOST_CLUSTERS)] = np.arange(MOST_CLUSTERS)
     times = clusters.count / MOST_CLUSTERS
     return replace(clusters, member=number[clusters.member], count=MOST_CLUSTERS), times
 

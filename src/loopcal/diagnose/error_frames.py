@@ -43,8 +43,8 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward
 from loopcal.mechanism.states import Status
-from loopcal.numerics.statistics import find_distinct
-from loopcal.typing import FloatArray, IntArray
+from loopcal.numerics.statistics import choose_evenly
+from loopcal.typing import FloatArray
 
 Over = Literal["measured", "home", "predicted"]
 # Frames that exist for every calibration; the others are the names of its instruments' frames.
@@ -386,8 +386,3 @@ def locate_measured_poses(
         readings = readings[choose_evenly(len(readings), most)]
     solution = forward(fit.robot, readings)
     return solution.take(np.flatnonzero(solution.converged))
-
-
-def choose_evenly(count: int, most: int) -> IntArray:
-    """Return at most so many of the numbers below `count`, evenly chosen."""
-    return find_distinct(np.linspace(0, count - 1, min(most, count)).astype(np.int64))

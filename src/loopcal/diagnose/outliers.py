@@ -42,6 +42,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import (
+    choose_evenly,
     compute_chi_square_quantile,
     compute_chi_square_tail,
     compute_f_tail,
@@ -568,8 +569,7 @@ def _refit_robustly(
     """
     count = int(member.max()) + 1
     if count > MOST_ROBUST:
-        chosen = np.linspace(0, count - 1, MOST_ROBUST).astype(np.int64)
-        data = data.take(np.isin(member, chosen))
+        data = data.take(np.isin(member, choose_evenly(count, MOST_ROBUST)))
     options = replace(fit.options, loss=Tukey(), noise="estimated")
     try:
         robust = identify(fit.initial, data, options=options, progress=progress)

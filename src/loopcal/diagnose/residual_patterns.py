@@ -16,7 +16,7 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -25,7 +25,7 @@ import numpy as np
 
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.result import Identification
-from loopcal.measure.kinds.kind import list_error_groups
+from loopcal.measure.kinds.kind import list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
@@ -181,20 +181,13 @@ def order_by_time(time: FloatArray | None, count: int) -> IntArray:
 ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
 
 
-class EffectColumn(NamedTuple):
-    """One function of the quantity, for one measured component."""
-
-    component: str  # its name, such as "z"
-    dimension: Dimension  # of its size
-
-
 class Effect(NamedTuple):
     """A dependence of the measured values on one quantity."""
 
     source: str  # what it depends on, such as "time"
     name: str  # of the temperature or actuator, else empty
     columns: FloatArray  # (R, c) whitened rows by the sizes
-    labels: tuple[EffectColumn, ...]  # what the c columns are
+    labels: tuple[tuple[str, Dimension], ...]  # component and dimension of each of the c columns
 
 
 def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
@@ -208,7 +201,8 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
     for number, o in enumerate(observations):
         chosen = np.flatnonzero(rows.kind == number)
         whitener = o.whitener[rows.row[chosen], rows.column[chosen]]
-        shifts = [(each, whitener[:, members].sum(axis=1)) for each, members in list_components(o)]
+        members = list_components(o.kind).items()
+        shifts = [(each, whitener[:, columns].sum(axis=1)) for each, columns in members]
         kinds.append((chosen, rows.row[chosen], shifts))
 
     def build(functions: Sequence[Sequence[FloatArray]], source: str, name: str = "") -> Effect:
@@ -254,15 +248,6 @@ def scale_to_range(values: FloatArray) -> FloatArray:
         return np.zeros(len(values))
     low, high = values[known].min(), values[known].max()
     return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
-
-
-def list_components(rows: Observations) -> Iterator[tuple[EffectColumn, list[int]]]:
-    """Give the measured components of a kind, with their columns: x of all targets is one."""
-    members: dict[EffectColumn, list[int]] = {}
-    for group in list_error_groups(rows.kind):
-        for name, column in zip(group.components, group.columns, strict=True):
-            members.setdefault(EffectColumn(name, group.dimension), []).append(column)
-    yield from members.items()
 
 
 # Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the

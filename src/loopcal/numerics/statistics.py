@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 NODES = 101
 """Values of the true noise of each source over which a probability is averaged."""
@@ -229,6 +229,11 @@ def find_distinct(values: NDArray[Any]) -> NDArray[Any]:
     (numpy 2.4).
     """
     return np.unique(values, return_counts=True)[0]
+
+
+def choose_evenly(count: int, most: int) -> IntArray:
+    """Return at most so many of the numbers below `count`, evenly chosen."""
+    return find_distinct(np.linspace(0, count - 1, min(most, count)).astype(np.int64))
 
 
 def compute_median(values: FloatArray) -> float:

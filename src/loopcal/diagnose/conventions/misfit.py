@@ -31,6 +31,7 @@ from loopcal.mechanism.kinematics import find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.numerics.statistics import choose_evenly
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -119,7 +120,7 @@ def select_reached(
     reached = find_directly_reachable(robot, robot.values[None], q[None])[0]
     if follow and reached.sum() < (1.0 - MOST_EXCLUDED) * len(q):
         hard = np.flatnonzero(~reached)
-        sampled = hard[np.unique(np.linspace(0, len(hard) - 1, FOLLOWED).astype(np.intp))]
+        sampled = hard[choose_evenly(len(hard), FOLLOWED)]
         reached[sampled] = forward(robot, q[sampled]).converged
         rest = np.setdiff1d(hard, sampled)
         if len(rest) and reached[sampled].mean() >= 1.0 - MOST_EXCLUDED:

@@ -49,7 +49,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.kind import Column, Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.kinematics import compute_readings
-from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.statistics import choose_evenly
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -421,7 +421,7 @@ def _select_few(data: Measurements) -> IntArray:
     count = max(FEWEST_POSES, -(-FEW_ROWS * n // max(equations, 1)))
     if n <= count or shares_poses(data):
         return np.arange(n)
-    return find_distinct(np.linspace(0, n - 1, count).astype(np.intp))
+    return choose_evenly(n, count)
 
 
 def _test_parameters(
