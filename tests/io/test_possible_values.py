@@ -34,8 +34,8 @@ def test_impossible_identified_values_are_refused_at_their_line(name: str, tmp_p
     positive = [p for p in robot.parameters.entries if p.positive]
     # each rod has a length that cannot be zero, and each family has one
     assert positive or robot.stages or name in WITHOUT_RODS
-    wrong = [(p, value) for p in positive[:2] for value in ("0", "-1.5", f"{-p.nominal!r}")]
-    wrong += [(p, value) for p in robot.parameters.entries[:2] for value in ("1e300", "-1e160")]
+    wrong = [(p, value) for p in positive[:1] for value in ("0", f"{-p.nominal!r}")]
+    wrong += [(robot.parameters.entries[0], value) for value in ("1e300", "-1e160")]
     for parameter, value in wrong:
         unit = SI_SYMBOLS[parameter.dimension]
         row = f"  - {{name: {parameter.name}, value: {value}, unit: '{unit}'}}"

@@ -46,7 +46,15 @@ from loopcal.mechanism.workspace import (
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
-ROBOTS = tuple(list_shipped_robots())
+OFTEN = {
+    "3-prs", "3-rrr", "arm-6r", "excavator", "five-bar", "hexapod-42", "linear-delta", "pentapod",
+    "solar-tracker",
+}  # fmt: skip
+ROBOTS = [
+    pytest.param(name, marks=() if name in OFTEN else pytest.mark.evidence)
+    for name in list_shipped_robots()
+]
+"""One machine of each kind of closure; the others belong to the evidence."""
 ROWS = 40
 WIDE = (1.0, 2.5, 6.0)  # times the ranges of the workspace
 ROUNDING = 1e-9  # of the size, or in radians
