@@ -19,7 +19,7 @@ from loopcal import geometry
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.io.core.records import get_field_types
-from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
@@ -29,12 +29,10 @@ from loopcal.mechanism.families import FAMILIES
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
-from tests.zoo import load_cached_robot, move_base
+from tests.zoo import ROBOTS, load_cached_robot, move_base
 
 Array = NDArray[np.float64]
-ROBOTS = tuple(list_shipped_robots())
-CHAINS = tuple(name for name in ROBOTS if load_cached_robot(name).stages)
-SINGLE = tuple(name for name in ROBOTS if name not in CHAINS)
+SINGLE = [robot for robot in ROBOTS if not load_cached_robot(str(robot.values[0])).stages]
 """Robots that are no chains: the order of the stages of a chain is their order in space, and the
 stages are read by their own families.
 """

@@ -10,10 +10,11 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism.assembly import (
     AXES,
     Actuator,
@@ -34,6 +35,18 @@ from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
 MM = 1e-3
+
+RELATIVES = {
+    "3-rps", "6-pus", "cable-4", "hexapod-nategh-agheli", "hexapod-octahedral", "linear-delta-6",
+    "palletizer", "pulley-3", "rotary-delta", "tricept",
+}  # fmt: skip
+"""Shipped robots whose closure another shipped robot has, too; here the evidence tests them."""
+
+ROBOTS = [
+    pytest.param(name, marks=pytest.mark.evidence if name in RELATIVES else ())
+    for name in list_shipped_robots()
+]
+"""The names of all shipped robots, as parameters of a test."""
 
 # --- hexapods with 42 parameters
 # ------------------------------------------------------------------------------------- "Numerical

@@ -68,7 +68,15 @@ def test_numbers_equal_those_of_the_formulas() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sd", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2)])
-@pytest.mark.parametrize(("visits", "bias"), [(5, 0.0), (5, 5.0), (30, 0.3), (30, 2.0)])
+@pytest.mark.parametrize(
+    ("visits", "bias"),
+    [
+        (5, 0.0),
+        (30, 2.0),
+        pytest.param(5, 5.0, marks=pytest.mark.evidence),
+        pytest.param(30, 0.3, marks=pytest.mark.evidence),
+    ],
+)
 def test_intervals_contain_the_truth(visits, bias, sd) -> None:
     rng, true_mean, tests = np.random.default_rng(1), np.array([bias, 0.0, 0.0]), 100
     true = float(compute_repeatability(rng.standard_normal((200_000, 3)) * sd))

@@ -105,7 +105,14 @@ def compile_limb_derivative(letters, ending, chosen, slots, size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ["mixed_hexapod", "three_prs", "delta", "five_bar", "planar_rrr"])
+@pytest.mark.parametrize(
+    "robot",
+    ["mixed_hexapod", "five_bar"]
+    + [
+        pytest.param(name, marks=pytest.mark.evidence)
+        for name in ("three_prs", "delta", "planar_rrr")
+    ],
+)
 def test_derivatives_by_displacements_and_joints_agree_with_differences_and_jax(engine, robot):
     case = make_case(getattr(zoo, robot)(), n=2)
     p = case.program

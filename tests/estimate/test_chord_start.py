@@ -50,7 +50,7 @@ def measure_distance(usual: IdentifiedTrials, other: IdentifiedTrials) -> np.nda
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [1.0, 10.0])
+@pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.evidence), 10.0])
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), MAP(InflatedTolerances())], ids=repr)
 @pytest.mark.parametrize(("robot", "poses"), [(HEXAPOD, 20), (HEXAPOD, 8), (DELTA, 12)])
 def test_estimates_are_those_of_the_usual_descent(robot, poses, method, factor):

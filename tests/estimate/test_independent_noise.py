@@ -86,7 +86,7 @@ def expand(dense, q, scale, degrees):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", ["given", "estimated"])
+@pytest.mark.parametrize("noise", [pytest.param("given", marks=pytest.mark.evidence), "estimated"])
 def test_expanded_uncertainty_of_poses_and_its_coverage_with_6_degrees_of_freedom(noise):
     fits = 60
     simulation = measure(Case("", is_few=True), fits)

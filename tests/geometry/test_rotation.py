@@ -75,7 +75,7 @@ def test_left_jacobian_times_its_inverse_is_the_identity(w):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.7, 2.0, 3.1])
+@pytest.mark.parametrize("size", [1e-9, 3.1])
 def test_left_jacobian_is_the_derivative_of_the_exponential(size):
     w = size * np.array([0.6, -0.48, 0.64])
     base = np.array(geometry.exp_so3(w)).T
@@ -87,7 +87,7 @@ def test_left_jacobian_is_the_derivative_of_the_exponential(size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.7, 2.0, 3.0])
+@pytest.mark.parametrize("size", [1e-9, 3.0])
 def test_inverse_left_jacobian_is_the_derivative_of_the_logarithm(size):
     w = size * np.array([0.6, -0.48, 0.64])
     R = geometry.exp_so3(w)

@@ -15,8 +15,8 @@ from loopcal.measure.instrument import Gaussian
 from loopcal.mechanism.compilation import find_impossible_values
 from loopcal.mechanism.solutions import forward
 from loopcal.units import SI_SYMBOLS
+from tests.zoo import ROBOTS
 
-ROBOTS = tuple(list_shipped_robots())
 WITHOUT_RODS = ("3-rps", "agile-eye", "belt-4", "pentapod", "pulley-3")
 
 

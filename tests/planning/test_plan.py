@@ -284,7 +284,7 @@ def test_lower_bound_on_pairs_holds_for_all_pairs_of_twelve_poses(caliper_proble
     assert len(members) == comb(len(caliper_problem.candidates), 2)
     # twelve poses with all their 66 pairs, the best of some that are drawn
     poses, rng, tried = np.unique(members), np.random.default_rng(0), []
-    for few in (rng.choice(poses, 12, replace=False) for _ in range(100)):
+    for few in (rng.choice(poses, 12, replace=False) for _ in range(30)):
         chosen = np.flatnonzero(np.isin(members, few).all(axis=1))
         tried.append((caliper_problem.predict_errors(chosen), len(chosen)))
     reached, pairs = min(tried, key=lambda one: one[0].position if one[0] else np.inf)

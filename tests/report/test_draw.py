@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of robots: shipped robots, drawn positions, units on the axes, file formats."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import loopcal
 from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import write_bytes
@@ -17,11 +14,9 @@ from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.pictures import save_figure
 from tests import zoo
 
-SHIPPED = sorted(path.stem for path in (Path(loopcal.__file__).parent / "robots").glob("*.yaml"))
-
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", zoo.ROBOTS)
 def test_picture_of_every_shipped_robot_has_units_on_its_axes(name):
     robot = load_robot(name)
     figure = draw_robot(robot)

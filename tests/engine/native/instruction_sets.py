@@ -5,10 +5,8 @@ import numpy as np
 from loopcal_native import list_instruction_sets
 
 from loopcal.engine import ClosureBlocks, Engine, Reached, State, select_engine
-from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.io.robot.robot_file import load_robot
 from tests.engine.cases import Case, make_case
-
-ROBOTS = tuple(list_shipped_robots())
 
 
 def make_engines() -> dict[str, Engine]:

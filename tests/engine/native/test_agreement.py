@@ -13,9 +13,10 @@ from loopcal.engine import select_engine
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
 from tests.engine.cases import displacement_units, draw_map, make_pose_rows, pose_demand
-from tests.engine.native.instruction_sets import ROBOTS, list_arrays, make_engines, make_robot_case
+from tests.engine.native.instruction_sets import list_arrays, make_engines, make_robot_case
 from tests.engine.test_compare_poses import draw_poses
 from tests.engine.test_triangles import make_systems
+from tests.zoo import ROBOTS
 
 ENGINES = make_engines()
 NATIVE, NUMPY = next(iter(ENGINES.values())), select_engine("numpy")

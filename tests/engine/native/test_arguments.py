@@ -11,7 +11,8 @@ from numpy.testing import assert_array_equal
 from loopcal.engine import CONVERGED, NOT_FINITE, Engine, Program, Slot, State, Target, TwistRows
 from loopcal.errors import MissingPackageError
 from tests.engine.cases import draw_map, draw_twist_rows, make_pose_rows
-from tests.engine.native.instruction_sets import ROBOTS, make_engines, make_robot_case
+from tests.engine.native.instruction_sets import make_engines, make_robot_case
+from tests.zoo import ROBOTS
 
 NATIVE = next(iter(make_engines().values()))
 

@@ -196,7 +196,7 @@ def test_derivatives_by_twist_and_unknowns_agree_with_finite_differences(kind, e
     check_derivatives(kind, error, with_jax=False)
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 @pytest.mark.parametrize("kind", WITH_MOST_UNKNOWNS)
 def test_derivatives_by_twist_and_unknowns_agree_with_automatic_ones(kind):
     check_derivatives(kind, 0.1, with_jax=True)

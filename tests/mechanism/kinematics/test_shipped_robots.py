@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.apply.compensation import Reach, compensate
-from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.mechanism.kinematics import compute_readings, inverse_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, forward, inverse, jacobian
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
-from tests.zoo import load_cached_robot
+from tests.zoo import ROBOTS, load_cached_robot
 
 Array = NDArray[np.float64]
 
-ROBOTS = tuple(list_shipped_robots())
 
 ROWS, MANY_ROWS, BLOCK = 1_000, 100_000, 1_500
 

@@ -14,7 +14,6 @@ from loopcal import geometry
 from loopcal.apply.compensation import Reach, compensate
 from loopcal.engine import NEAR_GOAL
 from loopcal.errors import DataError
-from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure.readings import solve_commanded_poses
 from loopcal.mechanism.kinematics import (
     clear_sign,
@@ -43,18 +42,9 @@ from loopcal.mechanism.workspace import (
     sample_workspace,
     workspace_ranges,
 )
-from tests.zoo import load_cached_robot
+from tests.zoo import ROBOTS, load_cached_robot
 
 Array = NDArray[np.float64]
-OFTEN = {
-    "3-prs", "3-rrr", "arm-6r", "excavator", "five-bar", "hexapod-42", "linear-delta", "pentapod",
-    "solar-tracker",
-}  # fmt: skip
-ROBOTS = [
-    pytest.param(name, marks=() if name in OFTEN else pytest.mark.evidence)
-    for name in list_shipped_robots()
-]
-"""One machine of each kind of closure; the others belong to the evidence."""
 ROWS = 40
 WIDE = (1.0, 2.5, 6.0)  # times the ranges of the workspace
 ROUNDING = 1e-9  # of the size, or in radians
