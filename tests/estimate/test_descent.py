@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The descent: independence of trials, penalty on the total deviation, and a status for every
-ending.
+ending. Fits that did not converge or left their tolerances state no noise, no intervals and no
+prior.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, cast
 
@@ -10,26 +12,34 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from loopcal.diagnose.fit_examination import StartVerdict, check_start_values
 from loopcal.estimate.descent import FunctionProblem, StepControl, descend
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge
+from loopcal.estimate.prior import prior_from
 from loopcal.estimate.problem import Problem, problem_of_trials
 from loopcal.estimate.result import report_status
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.distance import Distance
 from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism import kinematics as batch_kinematics
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.gauss_newton import DescentStatus
-from tests.estimate.problems import fold_rows
+from tests.estimate.problems import fold_rows, hexapod, hexapod_data
+from tests.findings.expectations import expect_refusal, get_finding, list_codes
 
 
 class Exponentials:
     """y = (1 + z0) exp(-(1 + z1) x) + z2 for several trials of noisy y."""
 
+    parameters = 3
+
     def __init__(self, y: np.ndarray) -> None:
         self.y, self.x = y, np.linspace(0.0, 3.0, y.shape[1])
-        self.parameters, self.equations = 3, np.full(len(y), y.shape[1])
+        self.equations = np.full(len(y), y.shape[1])
 
     def evaluate(self, deviation, trials):
         a, b, c = (deviation[:, i, None] for i in range(3))
@@ -72,18 +82,6 @@ def noisy_exponentials(t: int) -> np.ndarray:
     truth = rng.uniform(-0.5, 0.5, (t, 3, 1))
     clean = (1.0 + truth[:, 0]) * np.exp(-(1.0 + truth[:, 1]) * x) + truth[:, 2]
     return clean + 0.01 * rng.standard_normal(clean.shape)
-
-
-@pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(0.01)])
-def test_descent_of_stacked_trials_equals_single_trials_bit_for_bit(method):
-    y = noisy_exponentials(7)
-    together = descend(make_problem(Exponentials(y)), np.zeros((7, 3)), method)
-    assert (together.status == DescentStatus.CONVERGED).all()
-    for i in range(7):
-        alone = descend(make_problem(Exponentials(y[i : i + 1])), np.zeros((1, 3)), method)
-        assert np.array_equal(together.deviation[i], alone.deviation[0])
-        assert together.iterations[i] == alone.iterations[0]
-        assert together.cost[i] == alone.cost[0]
 
 
 def test_ridge_minimizes_squares_plus_penalty_on_the_total_deviation():
@@ -168,15 +166,28 @@ def test_chain_of_full_steps_crosses_a_bent_valley():
     assert valley.count.max() <= 6
 
 
-def test_stacked_trials_with_chains_equal_single_trials_bit_for_bit():
-    y = np.random.default_rng(3).uniform(-40.0, 40.0, (30, 2))
-    together = descend(make_problem(Valley(y)), np.zeros((30, 2)), Ridge(1e-6))
-    assert len(set(together.iterations.tolist())) > 1
-    for i in range(30):
-        alone = descend(make_problem(Valley(y[i : i + 1])), np.zeros((1, 2)), Ridge(1e-6))
+@pytest.mark.parametrize(
+    ("functions", "method"),
+    [(Exponentials, LeastSquares()), (Exponentials, MAP()), (Exponentials, Ridge(0.01)),
+     (Valley, Ridge(1e-6))],
+    ids=repr,
+)  # fmt: skip
+def test_stacked_trials_equal_single_trials_bit_for_bit(functions, method):
+    """In the valley there are chains of full steps, of different lengths."""
+    y = noisy_exponentials(7)
+    if functions is Valley:
+        y = np.random.default_rng(3).uniform(-40.0, 40.0, (30, 2))
+    p = functions.parameters
+    together = descend(make_problem(functions(y)), np.zeros((len(y), p)), method)
+    if functions is Valley:
+        assert len(set(together.iterations.tolist())) > 1
+    else:
+        assert (together.status == DescentStatus.CONVERGED).all()
+    for i in range(len(y)):
+        alone = descend(make_problem(functions(y[i : i + 1])), np.zeros((1, p)), method)
         assert np.array_equal(together.deviation[i], alone.deviation[0])
-        assert together.iterations[i] == alone.iterations[0]
-        assert together.status[i] == alone.status[0]
+        for name in ("iterations", "status", "cost"):
+            assert getattr(together, name)[i] == getattr(alone, name)[0]
 
 
 class RunsAway:
@@ -291,3 +302,73 @@ def test_each_step_of_a_fit_is_reported_with_its_sum_of_squares():
     steps = [f"0 of 1: fitting, step {i + 1}: sum of squares {c:.4g}" for i, c in enumerate(costs)]
     assert reports == ["0 of 1: fitting", *steps]
     assert len(steps) > 2
+
+
+ONE_STEP = StepControl(iterations=1)
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), MAP(), None])
+@pytest.mark.parametrize("noise", ["given", "estimated"])
+def test_fit_without_convergence_has_no_noise_test_and_no_intervals(method, noise):
+    data = hexapod_data(12)
+    rows = data.observations[0]
+    # with sigmas a hundred times too large even the first step leaves less than noise explains
+    loose = replace(data, observations=(replace(rows, covariance=rows.covariance * 1e4),))
+    for some in (data, loose):
+        fit = identify(hexapod(), some, method, options=FitOptions(noise=noise, control=ONE_STEP))
+        assert not fit.converged
+        assert np.isnan(fit.interval()).all()
+        assert np.isnan(fit.residual_test.p_value)
+        assert not fit.residual_test.failed
+        codes = list_codes(fit.findings)
+        assert {"fit.out-of-iterations", "noise.not-tested"} <= codes
+        assert not {code for code in codes if code.startswith("noise.")} - {"noise.not-tested"}
+        assert bool(codes & {"fit.no-prior", "fit.beyond-tolerance"}) == (method == LeastSquares())
+        assert check_start_values(fit).verdict is StartVerdict.OPEN
+        assert check_start_values(fit).finding.code == "residuals.start-not-comparable"
+
+
+def test_fit_without_convergence_cannot_be_a_prior():
+    with expect_refusal("prior.no-uncertainty"):
+        prior_from(
+            identify(hexapod(), hexapod_data(12), options=FitOptions(control=ONE_STEP)).posterior
+        )
+
+
+def test_estimate_far_outside_its_tolerance_is_reported():
+    robot, data = hexapod(), hexapod_data(12)
+    place = robot.parameters.names.index("leg1.length")
+    entries = list(robot.parameters.entries)
+    entries[place] = replace(
+        entries[place], nominal=entries[place].nominal + 40 * (entries[place].tolerance or 0.0)
+    )
+    wrong = replace(robot, parameters=replace(robot.parameters, entries=tuple(entries)))
+    fit = identify(wrong, data, LeastSquares())
+    assert fit.converged
+    far = get_finding(fit.findings, "fit.beyond-tolerance")
+    assert far.data["names"][0] == "leg1.length"
+    assert far.data["factor"] > 10.0
+    findings = (
+        identify(robot, data, LeastSquares()).findings + identify(wrong, data, MAP()).findings
+    )
+    assert "fit.beyond-tolerance" not in list_codes(findings)
+
+
+def test_hopeless_fit_follows_no_paths_to_poses_that_its_steps_do_not_reach(monkeypatch):
+    """Such a step is shortened. Paths from its own readings took most of the time of these fits."""
+    followed = []
+    follow = batch_kinematics.follow_path
+
+    def count(loops, joints, begin, state, wrong):
+        followed.append(int(wrong.sum()))
+        return follow(loops, joints, begin, state, wrong)
+
+    data = hexapod_data(12)
+    rows = data.observations[0]
+    measured = rows.measured.copy()
+    measured[4, 3:] += 1000.0  # [m]
+    wrong = replace(data, observations=(replace(rows, measured=measured),))
+    monkeypatch.setattr(batch_kinematics, "follow_path", count)
+    fit = identify(hexapod(), wrong, LeastSquares())
+    assert not fit.converged
+    assert followed == []

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Setup parameters (frames, targets, surfaces), linked poses and joint sensors in the fit."""
+"""Setup parameters (frames, targets, surfaces), linked poses and joint sensors in the fit. Frames
+of the measurements, as arrays of a run folder.
+"""
 
 import tracemalloc
 from dataclasses import replace
@@ -20,6 +22,7 @@ from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.information import observe_poses, observe_rows
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.posterior import FrameKnowledge, InstrumentFrame, frames_from_arrays
 from loopcal.estimate.problem import problem_of
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.distance import Separation
@@ -391,3 +394,20 @@ def test_command_line_calibrates_with_a_tracker_in_an_unknown_frame(tmp_path):
         == 0
     )
     assert "frame.rz" in (tmp_path / "run" / "result.json").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_arrays_of_a_run_folder_return_the_frames(count):
+    """An inclinometer has no frame; its run could not be written."""
+    rng = np.random.default_rng(count)
+    instruments = {
+        f"tracker{i}": InstrumentFrame(np.eye(4), rng.standard_normal((6, 5)), np.eye(6))
+        for i in range(count)
+    }
+    frames = FrameKnowledge(rng.standard_normal((12, 2)), rng.standard_normal((7, 3)), instruments)
+    restored = frames_from_arrays(frames.arrays())
+    assert restored is not None
+    assert np.array_equal(restored.unfixed, frames.unfixed)
+    assert list(restored.instruments) == list(instruments)
+    for name, frame in instruments.items():
+        assert np.array_equal(restored.instruments[name].by_parameters, frame.by_parameters)

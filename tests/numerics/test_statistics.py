@@ -1,11 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The test of a variance component against simulated vectors, its size against an integral."""
+"""The test of a variance component against simulated vectors, its size against an integral. The
+chi-square distribution against closed forms. Distinct values and medians are those of numpy, and
+need no masked arrays.
+"""
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import integrate
 
-from loopcal.numerics.statistics import compute_component_tail, estimate_variance_component
+from loopcal.numerics.statistics import (
+    compute_chi_square_quantile,
+    compute_chi_square_tail,
+    compute_component_tail,
+    compute_median,
+    estimate_variance_component,
+    find_distinct,
+)
 
 WEIGHTS = np.geomspace(5.0, 1e-3, 12)
 
@@ -66,3 +80,64 @@ def test_an_exact_sigma_is_the_limit_of_many_degrees_of_freedom():
     y = rng.standard_normal(12) * np.sqrt(1.0 + 0.1 * weights)
     exact = estimate_variance_component(weights, y, np.inf)
     assert np.allclose(exact, estimate_variance_component(weights, y, 1e9), rtol=1e-5)
+
+
+def test_tail_of_two_degrees_of_freedom_is_exponential():
+    statistic = np.array([0.0, 0.5, 3.0, 40.0])
+    tail = compute_chi_square_tail(2, statistic)
+    assert_allclose(tail, np.exp(-statistic / 2.0), rtol=1e-13)  # rounding of the series
+
+
+def test_tail_without_a_degree_of_freedom_is_one():
+    assert compute_chi_square_tail([0.0, -1.0, 2.0], [5.0, 5.0, 0.0]).tolist() == [1.0, 1.0, 1.0]
+
+
+def test_quantile_is_the_inverse_of_the_tail():
+    degrees, probability = np.array([1.0, 6.0, 300.0]), np.array([1e-6, 0.05, 0.5])
+    statistic = compute_chi_square_quantile(degrees, probability)
+    assert_allclose(compute_chi_square_tail(degrees, statistic), probability, rtol=1e-9)
+
+
+ARRAYS = (
+    np.array([3, 1, 3, 2, 1]),
+    np.array([[2.0, -1.0], [np.nan, 2.0], [np.nan, 0.0]]),
+    np.array(["day 2", "", "day 1", ""]),
+    np.array([True, False, True]),
+    np.zeros(0),
+    np.zeros(0, dtype=np.intp),
+)
+
+
+@pytest.mark.parametrize("values", ARRAYS, ids=lambda values: f"{values.dtype}-{values.shape}")
+def test_distinct_values_are_those_of_numpy(values) -> None:
+    before, expected = values.copy(), np.unique(values)
+    distinct = find_distinct(values)
+    assert distinct.dtype == expected.dtype
+    np.testing.assert_array_equal(distinct, expected)
+    np.testing.assert_array_equal(values, before)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [3.0],
+        [2.0, 1.0],
+        [0.1, 0.7, 0.3],
+        [0.1, 0.3, 0.2, 1e9],
+        [1.0, np.nan, 2.0],
+        [np.inf, 1.0],
+        [[0.1, 9.0], [0.7, 0.3], [0.2, 0.8]],
+    ],
+)
+def test_the_median_is_that_of_numpy_to_the_last_bit(values) -> None:
+    np.testing.assert_array_equal(compute_median(np.array(values)), np.median(values))
+
+
+def test_masked_arrays_are_not_imported() -> None:
+    code = (
+        "import sys, numpy as np; from loopcal.numerics import statistics as own; "
+        "own.find_distinct(np.array([2, 1, 2])); own.compute_median(np.array([0.1, 0.2])); "
+        "print('numpy.ma' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
