@@ -8,7 +8,7 @@ import pytest
 
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError, MechanismError
-from loopcal.io.formats.gcode_program import GcodeSettings, format_gcode, read_stops
+from loopcal.io.formats.gcode_program import format_gcode, read_stops
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.planning.path import check_route
 
@@ -70,7 +70,7 @@ def test_default_feed_is_the_same_speed_in_each_unit(folder, unit: str, feed: st
 def test_robot_without_tilt_has_three_words(folder) -> None:
     robot = load_robot("linear-delta")
     (folder / "delta.csv").write_text("step,pose,use,x [mm],y [mm],z [mm]\n1,1,fit,10,5,100\n")
-    text = format_gcode(robot, read_stops("delta.csv", robot), np.zeros(3), GcodeSettings(0.01))
+    text = format_gcode(robot, read_stops("delta.csv", robot), np.zeros(3), 0.01)
     assert list_moves(text)[1] == "X10 Y5 Z100 F600"
     assert "A B C" not in text
 
@@ -78,20 +78,21 @@ def test_robot_without_tilt_has_three_words(folder) -> None:
 def test_stops_that_cannot_be_reached_are_refused(folder) -> None:
     robot = load_robot("hexapod-42")
     (folder / "plan.csv").write_text(SHEET.replace("210.25", "290"))
-    stops = read_stops("plan.csv", robot)
+    labels, _, coordinates = read_stops("plan.csv", robot)
     with pytest.raises(MechanismError, match=r"path from home to 2 .far. is not allowed: stroke"):
-        check_route(robot, stops.labels, stops.coordinates)
+        check_route(robot, labels, coordinates)
 
 
 def test_coordinates_without_a_word_are_refused(folder) -> None:
     (folder / "p.csv").write_text("step,pose,use,z [mm],phi [deg],theta [deg]\n1,1,fit,700,0,1\n")
     robot = load_robot("3-prs")
     with pytest.raises(DataError, match="commanded in phi and theta, which have no word"):
-        format_gcode(robot, read_stops("p.csv", robot), np.zeros(3), GcodeSettings(0.01))
+        read_stops("p.csv", robot)
 
 
 def test_other_files_and_settings_are_refused(folder) -> None:
     robot = load_robot("hexapod-42")
+    stops = read_stops("plan.csv", robot)
     (folder / "plan.csv").write_text(SHEET.replace("via", "visit"))
     with pytest.raises(FileError, match="the use 'visit' is not fit, held-out or via"):
         read_stops("plan.csv", robot)
@@ -100,4 +101,4 @@ def test_other_files_and_settings_are_refused(folder) -> None:
         read_stops("plan.csv", robot)
     for feed, pause in ((0.0, None), (np.nan, None), (1.0, -1.0)):
         with pytest.raises(DataError, match="finite number above 0"):
-            GcodeSettings(feed, pause=pause)
+            format_gcode(robot, stops, np.zeros(6), feed, pause)

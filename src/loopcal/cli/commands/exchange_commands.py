@@ -69,13 +69,11 @@ def gcode(
     feed_unit = find_unit(program_unit).factor_to_si / 60.0  # [m/s]
     speed = gcode_program.DEFAULT_FEED if feed is None else feed * feed_unit
     stops = gcode_program.read_stops(plan, machine)
-    gcode_program.refuse_coordinates(machine)
-    home = check_route(machine, stops.labels, stops.coordinates)
-    text = gcode_program.format_gcode(
-        machine, stops, home, gcode_program.GcodeSettings(speed, pause, program_unit)
-    )
+    labels, _, coordinates = stops
+    home = check_route(machine, labels, coordinates)
+    text = gcode_program.format_gcode(machine, stops, home, speed, pause, program_unit)
     write_text(output, text)
-    counts = {"stops": len(stops.labels), "unit": program_unit}
+    counts = {"stops": len(labels), "unit": program_unit}
     page = [f"{output}: {counts['stops']} stops, lengths in {program_unit}"]
     return Output({"program": output, **counts}, lambda: page)
 

@@ -13,7 +13,6 @@ move, as on the paths that a plan checks. Source: LinuxCNC, "G-Codes" (G4, G53, 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -38,39 +37,14 @@ DEFAULT_FEED = 0.005
 UNIT_CODES = {"mm": "G21", "in": "G20"}
 
 
-@dataclass(frozen=True)
-class GcodeSettings:
-    """Settings of a program.
-
-    `feed` is that of moves [m/s], and of moves that only rotate the same number in degrees per
-    minute; `pause` the time at each pose [s], None until the operator continues; `unit` that of
-    lengths.
-    """
-
-    feed: float
-    pause: float | None = None
-    unit: Literal["mm", "in"] = "mm"
-
-    def __post_init__(self) -> None:
-        for name, value in (("feed", self.feed), ("pause", self.pause)):
-            if value is not None and not 0.0 < value < np.inf:
-                raise DataError(f"the {name} is {value:g}; give a finite number above 0")
+Stops = tuple[tuple[str, ...], tuple[str, ...], FloatArray]
+"""Labels of the poses (or "home"), uses (fit, held-out or via), and coordinates (n, c) [m, rad]."""
 
 
-@dataclass(frozen=True, eq=False)
-class PlannedStops:
-    """The stops of an operator's sheet: labels of the poses (or "home"), uses (fit, held-out or
-    via), and coordinates (n, c) [m, rad].
-    """
+def read_stops(path: str | Path, robot: Mechanism) -> Stops:
+    """Read the stops of a plan: its folder, or its sheet plan.csv.
 
-    labels: tuple[str, ...]
-    uses: tuple[str, ...]
-    coordinates: FloatArray
-
-
-def read_stops(path: str | Path, robot: Mechanism) -> PlannedStops:
-    """Read the stops of a plan: its folder, or its sheet plan.csv; FileError where it is of
-    another robot.
+    FileError : it is of another robot. DataError : a controlled coordinate has no word.
     """
     path = Path(path)
     file = path / SHEET if path.is_dir() else path
@@ -82,36 +56,40 @@ def read_stops(path: str | Path, robot: Mechanism) -> PlannedStops:
         if use not in (FIT, HELD_OUT, VIA):
             raise table.row_error(row, f"the use {use!r} is not {FIT}, {HELD_OUT} or {VIA}")
     columns = [table.numbers(n, get_dimension(n), empty=False) for n in robot.controlled]
-    return PlannedStops(table.text("pose"), uses, np.column_stack(columns))
-
-
-def refuse_coordinates(robot: Mechanism) -> None:
-    """Raise DataError for a robot with a controlled coordinate that has no word."""
-    others = tuple(name for name in robot.controlled if name not in WORDS)
-    if others:
+    if others := tuple(name for name in robot.controlled if name not in WORDS):
         code = "files.no-gcode-word"
         raise DataError(report_finding(code, robot=robot.name, names=others, words=tuple(WORDS)))
+    return table.text("pose"), uses, np.column_stack(columns)
 
 
 def format_gcode(
-    robot: Mechanism, stops: PlannedStops, home: FloatArray, settings: GcodeSettings
+    robot: Mechanism,
+    stops: Stops,
+    home: FloatArray,
+    feed: float = DEFAULT_FEED,
+    pause: float | None = None,
+    unit: Literal["mm", "in"] = "mm",
 ) -> str:
     """Return a program that starts at home, visits all stops in order, and returns to home.
 
-    `home` : (c,) of `loopcal.planning.path.check_route`, which has checked all of these paths.
+    home : (c,) of `loopcal.planning.path.check_route`, which has checked all of these paths.
+    feed : of moves [m/s], and of moves that only rotate the same number in degrees per minute.
+    pause : time at each pose [s], None until the operator continues. unit : of lengths.
     """
-    refuse_coordinates(robot)
-    poses = sum(use != VIA for use in stops.uses)
-    feed = settings.feed * 60.0 / find_unit(settings.unit).factor_to_si
-    wait = "M0" if settings.pause is None else f"G4 P{format_short(settings.pause, 3)}"
+    for name, value in (("feed", feed), ("pause", pause)):
+        if value is not None and not 0.0 < value < np.inf:
+            raise DataError(f"the {name} is {value:g}; give a finite number above 0")
+    poses = sum(use != VIA for use in stops[1])
+    shown_feed = format_short(feed * 60.0 / find_unit(unit).factor_to_si, 3)
+    wait = "M0" if pause is None else f"G4 P{format_short(pause, 3)}"
 
-    symbols = {Dimension.LENGTH: settings.unit, Dimension.ANGLE: "deg"}
+    symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
     factors = [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
 
     def move(coordinates: FloatArray) -> str:
         triples = zip(robot.controlled, coordinates.tolist(), factors, strict=True)
         words = (f"{WORDS[name]}{format_short(value / f, DECIMALS)}" for name, value, f in triples)
-        return f"G53 G1 {' '.join(words)} F{format_short(feed, 3)}"
+        return f"G53 G1 {' '.join(words)} F{shown_feed}"
 
     lines = [
         f"({_clean(robot.name)}: {poses} poses of a plan, in its order, and back to home)",
@@ -122,13 +100,13 @@ def format_gcode(
             if "roll" in robot.controlled
             else []
         ),
-        f"(Lengths in {settings.unit}. The paths from home are checked; the way to home is not.)",
-        f"{UNIT_CODES[settings.unit]} G90 G94 G40 G49 G61",
+        f"(Lengths in {unit}. The paths from home are checked; the way to home is not.)",
+        f"{UNIT_CODES[unit]} G90 G94 G40 G49 G61",
         "(MSG, the next move goes to home: check that the way is free)",
         "M0",
         move(home),
     ]
-    for label, use, coordinates in zip(stops.labels, stops.uses, stops.coordinates, strict=True):
+    for label, use, coordinates in zip(*stops, strict=True):
         if use == VIA:
             lines += ["(via home)", move(coordinates)]
             continue
