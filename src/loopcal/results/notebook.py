@@ -41,19 +41,13 @@ def render_html(blocks: Iterable[Block]) -> str:
     sections = []
     for is_table, group in groupby(blocks, lambda block: isinstance(block, Table)):
         if is_table:
-            sections += [_render_table(table) for table in group if isinstance(table, Table)]
+            for table in (block for block in group if isinstance(block, Table)):
+                sections.append(replace(table, rows=table.rows[:MOST_ROWS]).to_html())
+                if (more := len(table.rows) - MOST_ROWS) > 0:
+                    sections.append(f"<pre>and {more} more {'row' if more == 1 else 'rows'}</pre>")
         elif text := "\n".join(str(block) for block in group).strip("\n"):
             sections.append(f"<pre>{html.escape(text)}</pre>")
     return escape(f'<div class="loopcal">{STYLE}{"".join(sections)}</div>', "\n")
-
-
-def _render_table(table: Table) -> str:
-    """Return the first rows of a table, and how many more there are."""
-    more = len(table.rows) - MOST_ROWS
-    if more <= 0:
-        return table.to_html()
-    shown = replace(table, rows=table.rows[:MOST_ROWS]).to_html()
-    return f"{shown}<pre>and {more} more {'row' if more == 1 else 'rows'}</pre>"
 
 
 def build_main_table(records: Records, caption: str = "") -> Table:
