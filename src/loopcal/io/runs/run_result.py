@@ -415,9 +415,13 @@ def find_problem(arrays: Mapping[str, np.ndarray], is_complete: bool = True) -> 
     for name, rule in RULES.items():
         if name in arrays and (problem := _find_misfit(name, arrays[name], rule, sizes)):
             return problem
-    for name in arrays:
-        if name.startswith("fitted_") and (problem := _find_bad_rows(name, arrays[name])):
+    for name in (name for name in arrays if name.startswith("fitted_")):
+        if FITTED_NAME.fullmatch(name) is None:
+            return f"the array {name!r} is unknown"
+        if problem := _find_misfit(name, arrays[name], FITTED, {}):
             return problem
+        if not np.isfinite(arrays[name]).any(axis=1).all():
+            return f"a row of the array {name!r} holds no number"
     return _find_array_contradiction(arrays)
 
 
@@ -445,16 +449,6 @@ def _find_misfit(
     if not np.all(values.test(array)):
         return f"the array {name!r} holds something else than {values.words}"
     return None
-
-
-def _find_bad_rows(name: str, array: np.ndarray) -> str | None:
-    """Return what is wrong with an array of fitted rows; None where nothing is."""
-    if FITTED_NAME.fullmatch(name) is None:
-        return f"the array {name!r} is unknown"
-    problem = _find_misfit(name, array, FITTED, {})
-    if problem is None and not np.isfinite(array).any(axis=1).all():
-        return f"a row of the array {name!r} holds no number"
-    return problem
 
 
 def _find_array_contradiction(arrays: Mapping[str, np.ndarray]) -> str | None:
