@@ -28,10 +28,13 @@ TOO_FEW_HELD_OUT = (
     "workflow.held-out-setup",
     "workflow.nothing-to-validate",
 )
-# Findings on held-out poses that do not fit; the second leaves the verdict open.
-BLUNDERS = ("validation.blunder", "validation.blunders-dominate")
+BLUNDER = "validation.blunder"  # finding on held-out poses that do not fit
 # Findings that leave the verdict open.
-TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDERS[1])
+TOO_LITTLE_VALIDATION = (
+    "workflow.no-held-out-poses",
+    *TOO_FEW_HELD_OUT,
+    "validation.blunders-dominate",
+)
 LIMIT_EXCEEDED = "gates.limit-exceeded"  # finding that an error is above a stated limit
 # Finding that a limit was stated for something that no row measures.
 LIMIT_NOT_MEASURED = "gates.limit-not-measured"
@@ -242,7 +245,7 @@ def choose_next_step(
         return report_finding(NEXT_WITH_VALUES.get(recommendation, "workflow.next-use-result"))
     if any(finding.code in BASE_MOVED for finding in findings):
         return report_finding("workflow.next-check-base-targets")
-    wrong = [f.data["poses"] for f in findings if f.code == BLUNDERS[0]]
+    wrong = [f.data["poses"] for f in findings if f.code == BLUNDER]
     if wrong and verdict is not Verdict.RESERVATIONS:
         labels = tuple(dict.fromkeys(label for poses in wrong for label in poses))
         return report_finding(

@@ -198,6 +198,7 @@ def check_held_out_rows(
 ) -> HeldOutCheck | None:
     """Search the held-out blocks that neither the fit nor the other blocks explain; None without
     any block that can be tested.
+
     robot, values, kept, uncertainty : see `Predictor`. data : held-out rows whose poses are
         reached.
     """

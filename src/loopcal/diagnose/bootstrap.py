@@ -276,6 +276,7 @@ UNITS = ("pose", "block", "session", "day")  # names of units
 
 def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters:
     """Return the blocks of poses that are resampled together.
+
     unit : "pose", "block", "session" or "day", or the number of consecutive poses of a block, in
         the order of the column `time`, or else of the file. None takes the largest unit with at
         least `ENOUGH_BLOCKS` blocks, or else the smallest.

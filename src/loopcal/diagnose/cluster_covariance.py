@@ -154,6 +154,7 @@ def check_clusters(
 ) -> ClusterCheck:
     """Compare the stated uncertainty with one that allows common errors within clusters of poses,
     the largest independent units of which there are enough.
+
     frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means relative
         to the home pose.
     """

@@ -154,6 +154,7 @@ def choose_error_frame(
     origin_name: str = "1",
 ) -> ErrorFrame:
     """Return a frame for the errors of poses of a calibrated robot.
+
     frame : "fitted" fits the motions of the base and platform frames that the measurements do not
         determine, and is the base frame of the robot file where they determine all; "base" is that
         base frame in any case; "relative" is the first pose; otherwise the frame of an instrument.
@@ -215,6 +216,7 @@ def refer_errors(
     followed: FollowedMotion | None = None,
 ) -> ErrorFrame:
     """Return the frame in which errors are stated.
+
     reference : poses over which frames are fitted. motions : (12, k) that the measurements do not
         determine; those that `followed` leaves are fitted, unless the frame is "base".
     """

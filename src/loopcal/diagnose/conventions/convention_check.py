@@ -248,6 +248,7 @@ def find_moved_setups(
 ) -> tuple[tuple[str, ...], float] | None:
     """Return the frames, targets and surfaces that were moved since a fit, or all that may have
     moved, and the factor by which errors decrease when they are fitted again; None without any.
+
     names : of those whose values are kept.
     sizes : from the names that are fitted again to the root mean square [1] of whitened errors, per
         degree of freedom, and the number of equations left; NaN and 0 where the rows do not
@@ -405,6 +406,7 @@ def explain_outside_strokes(
     """Find the interpretation that puts all readings inside their strokes and fits the data:
     `conventions.strokes-explained`, or `conventions.strokes-contradicted` if the data fit as they
     are written; None if nothing explains them.
+
     described : these readings, as of `describe_outside_strokes`; default: without places.
     """
     described = describe_outside_strokes(data, robot) if described is None else described

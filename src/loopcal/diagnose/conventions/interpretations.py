@@ -309,6 +309,7 @@ def list_reading_interpretations(
     data: Measurements, actuators: Sequence[Actuator], home: FloatArray | None = None
 ) -> Iterator[Interpretation]:
     """Yield all other interpretations of the readings of actuators, the likelier slips first.
+
     home : (a,) readings of the home pose [SI], from which wrong gear factors are counted, too.
     """
     for source, poses in _list_sources(data):

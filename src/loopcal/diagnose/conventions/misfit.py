@@ -141,6 +141,7 @@ def compare_with_robot(
     start: FloatArray | None = None,
 ) -> Comparison:
     """Compare measurements, at poses that the robot reaches, with it, all rows included.
+
     interpretations : of their values; default: as written. start : (t, U) nuisance parameters to
         start from; default: guessed from the data.
     """
