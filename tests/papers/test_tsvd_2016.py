@@ -16,6 +16,7 @@ import pytest
 from loopcal.estimate.published_steps import (
     EPSILON,
     LIMIT,
+    RawSteps,
     penalize_none,
     penalize_ridge,
     penalize_truncated,
@@ -170,7 +171,8 @@ def test_ridge_steps_with_one_matrix_end_where_single_steps_do(tripod) -> None:
     assert (single.count == together.count).all()
     assert len(together.history) < 20
     first, second = (
-        tripod.compute_output_errors(run.values, run.machine)[:, :2] for run in (single, together)
+        tripod.compute_output_errors(run.values, np.zeros(3, np.int64))[:, :2]
+        for run in (single, together)
     )
     np.testing.assert_allclose(second, first, rtol=0.01)
 
@@ -181,7 +183,7 @@ def test_ridge_runs_until_its_steps_are_small(tripod) -> None:
     assert run.is_converged.all()
     assert (run.count > [50, 500, 2000]).all()
     assert (run.count < LIMIT).all()
-    again, _ = tripod.raw.take(run.machine).linearize(run.values)
+    again, _ = tripod.raw.take(np.repeat(FIRST, 3)).linearize(run.values)
     step = again.deviation(again.solution(penalty))
     assert (np.abs(step).max(axis=1) < 1.01 * EPSILON).all()
 
@@ -320,7 +322,7 @@ def draw_random(draws: steps.Draws, rng: np.random.Generator, spread: float) -> 
     """Return random errors and iterations at the same settings; with a large spread, errors that
     rise with the settings.
     """
-    made = randomize(draws, rng, spread, (steps.Study, steps.Iterations))
+    made = randomize(draws, rng, spread, (steps.Study, RawSteps))
     pairs = zip(made.sweeps, draws.sweeps, strict=True)
     sweeps = [replace(drawn, settings=given.settings) for drawn, given in pairs]
     if spread > 1.0:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.papers import published
 from loopcal.papers.cmm_constraint_2011 import steps
 from loopcal.papers.cmm_constraint_2011.steps import (
     ABSOLUTE,
@@ -25,20 +26,9 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     Draw,
     Stated,
 )
-from loopcal.papers.published import (
-    Comparison,
-    Figure,
-    PaperText,
-    Printed,
-    Row,
-    Series,
-    Table,
-    Verdict,
-    decide,
-)
 from loopcal.typing import FloatArray
 
-TEXT = PaperText(__file__)
+TEXT = published.PaperText(__file__)
 POSITION_ALIGNED = "position, aligned [mm]"
 NO_GAUGE = "parameters without gauge [mm]"
 WEIGHTS = ("as printed: weight one", "divided by |d_1|", "divided by the sd of each",
@@ -56,11 +46,11 @@ class Results:
 
     study: steps.Study  # the ten groups
     draws: tuple[Draw, ...]  # tables and figures show the first
-    arrangements: list[Row]  # TEN, ONE and ANY
-    candidates: list[Row]  # interpretations, the nearest first
-    forms: list[Row]  # surfaces as unknowns, the hardest first
+    arrangements: list[published.Row]  # TEN, ONE and ANY
+    candidates: list[published.Row]  # interpretations, the nearest first
+    forms: list[published.Row]  # surfaces as unknowns, the hardest first
     covariance: float  # largest relative difference of a variance of both forms
-    ranks: list[Row]  # of random groups
+    ranks: list[published.Row]  # of random groups
     pair: tuple[int, int]  # points of a group and rank of the equations of all its pairs
     gauge_effects: FloatArray  # (9,) of the directions of GAUGE_NAMES on the rows
     table_4: Mapping[str, Stated]  # factors as printed
@@ -124,18 +114,18 @@ def compute(
     )
 
 
-def compare_tables(results: Results) -> tuple[Comparison, Comparison]:
+def compare_tables(results: Results) -> tuple[published.Comparison, published.Comparison]:
     """Return the stated counts beside the computed ones, and figure 5 beside the nearest
     interpretation.
     """
-    counts = Printed.parse({
+    counts = published.Printed.parse({
         "parameters identified": PRINTED.find("parameters"),
         "iterations for 50 points, at most": "5",
     })  # fmt: skip
     rank = max(row["rank"] for row in results.ranks)
     iterations = max(int(cell.iterations.max()) for cell in results.draws[0].fifties.values())
     figure, nearest = PRINTED.find("figure_5"), results.candidates[0]
-    stated = Printed.parse({name: given["stated"] for name, given in figure.items()})
+    stated = published.Printed.parse({name: given["stated"] for name, given in figure.items()})
     names = ["parameters" if name == "estimation" else name for name in figure]
     reductions = np.array([[nearest[name]] for name in names])
     return (
@@ -144,7 +134,7 @@ def compare_tables(results: Results) -> tuple[Comparison, Comparison]:
     )
 
 
-def make_tables(results: Results) -> tuple[Table, ...]:
+def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return all tables of the reproduction."""
     first, trials = results.draws[0], results.trials
     effects = zip(steps.GAUGE_NAMES, results.gauge_effects, strict=True)
@@ -190,7 +180,7 @@ def compute_statistics(cell: Cell, method: str, frame: str) -> FloatArray:
     return np.array([cell.compute_median(method, f"{s}, {frame}") for s in steps.STATISTICS])
 
 
-def _list_given(study: steps.Study) -> Table:
+def _list_given(study: steps.Study) -> published.Table:
     rows = [("robot", f"{steps.ROBOT}, 42 parameters, nominal geometry of Nategh and Agheli 2009")]
     for name, (low, high) in study.robot.assembly.workspace.items():
         scale, unit = (np.pi / 180.0, "deg") if name in {"roll", "pitch", "yaw"} else (MM, "mm")
@@ -202,7 +192,7 @@ def _list_given(study: steps.Study) -> Table:
     return TEXT.table("given", [*rows, ("points", each), ("coordinate exchange", exchange)])
 
 
-def _list_table_3(results: Results, name: str, measures: tuple[str, ...]) -> Table:
+def _list_table_3(results: Results, name: str, measures: tuple[str, ...]) -> published.Table:
     methods = (BEFORE, LS, PRIOR)
     rows = [
         (*key, *(c.compute_median(m, measure) for measure in measures for m in methods),
@@ -215,7 +205,7 @@ def _list_table_3(results: Results, name: str, measures: tuple[str, ...]) -> Tab
     return TEXT.table(name, rows, "", more, trials=results.trials, failed=failed)
 
 
-def _list_arithmetic(results: Results) -> Table:
+def _list_arithmetic(results: Results) -> published.Table:
     rows: list[tuple[Any, ...]] = []
     for name, given in results.table_4.items():
         numbers = (given.before, given.after, given.stated, given.factor)
@@ -229,12 +219,12 @@ def _list_arithmetic(results: Results) -> Table:
     return TEXT.table("arithmetic", rows)
 
 
-def make_figures(results: Results) -> tuple[Figure, ...]:
+def make_figures(results: Results) -> tuple[published.Figure, ...]:
     """Return all figures."""
     return _draw_figure_4(results), _draw_figure_5(results), _draw_table_3(results)
 
 
-def _draw_figure_4(results: Results) -> Figure:
+def _draw_figure_4(results: Results) -> published.Figure:
     """Return pose error over parameter error, both after / before, so that growth has a place."""
     frames = {"": ("parameters [mm]", "position [mm]"), ", aligned": (NO_GAUGE, POSITION_ALIGNED)}
     lines = []
@@ -244,11 +234,11 @@ def _draw_figure_4(results: Results) -> Figure:
                 tuple(c.compute_median(method, m) / c.compute_median(BEFORE, m) for m in measures)
                 for c in results.cells.values()
             )
-            lines.append(Series.of(f"{method}{frame}", *zip(*both, strict=True)))
+            lines.append(published.Series.of(f"{method}{frame}", *zip(*both, strict=True)))
     return TEXT.figure("figure_4", lines, joined=False, count=len(results.cells))
 
 
-def _draw_figure_5(results: Results) -> Figure:
+def _draw_figure_5(results: Results) -> published.Figure:
     """Return position errors of single poses of the first machine, before and after."""
     given, study = SIZES.find("figure_5"), results.study
     made = results.cells[f"{given['errors']:g}", f"{given['noise']:g}"]
@@ -261,11 +251,11 @@ def _draw_figure_5(results: Results) -> Figure:
             sizes[label] = np.linalg.norm(twists[:, 3:], axis=1) / MM
     order = np.argsort(sizes[BEFORE])
     x = range(1, len(order) + 1)
-    lines = [Series.of(label, x, size[order]) for label, size in sizes.items()]
+    lines = [published.Series.of(label, x, size[order]) for label, size in sizes.items()]
     return TEXT.figure("figure_5", lines, joined=False, **given, count=len(order))
 
 
-def _draw_table_3(results: Results) -> Figure:
+def _draw_table_3(results: Results) -> published.Figure:
     """Return the position error by noise, for each set of errors."""
     lines, levels = [], {}
     for given in PRINTED.find("sets").split():
@@ -275,18 +265,18 @@ def _draw_table_3(results: Results) -> Figure:
         for method in (LS, PRIOR):
             y = [c.compute_median(method, POSITION_ALIGNED) for c in cells]
             x = [c.noise / MM for c in cells]
-            lines.append(Series.of(f"{method}, errors of {given} mm", x, y))
+            lines.append(published.Series.of(f"{method}, errors of {given} mm", x, y))
     return TEXT.figure("table_3", lines, levels, trials=results.trials)
 
 
-def judge_claims(results: Results) -> tuple[Verdict, ...]:
+def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim."""
     groups = (_judge_equations, _judge_table_3, _judge_figure_5, _judge_points, _judge_arithmetic,
               _judge_methods, _judge_forms)  # fmt: skip
     return tuple(verdict for judge in groups for verdict in judge(results))
 
 
-def _judge_equations(results: Results) -> tuple[Verdict, ...]:
+def _judge_equations(results: Results) -> tuple[published.Verdict, ...]:
     points, rank = results.pair
     effect, parameters = results.gauge_effects[:6].max(), int(PRINTED.find("parameters"))
     ranks = sorted({row["rank"] for row in results.ranks})
@@ -295,14 +285,14 @@ def _judge_equations(results: Results) -> tuple[Verdict, ...]:
     missing, judge = points - rank, TEXT.judge
     return (
         judge("independent", effect < 1e-9, effect=effect),
-        judge("counted", decide(missing == 1, missing != 2), points=points, rank=rank,
+        judge("counted", published.decide(missing == 1, missing != 2), points=points, rank=rank,
               missing=missing),
         judge("least_squares", ranks[0] == parameters, parameters=parameters, ranks=ranks,
               fewest=min(groups), most=max(groups), largest=unused),
     )  # fmt: skip
 
 
-def _judge_table_3(results: Results) -> tuple[Verdict, ...]:
+def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
     from scipy.stats import beta
 
     draws, cells, judge = results.draws, results.cells, TEXT.judge
@@ -345,7 +335,7 @@ def _list_medians(draw: Draw) -> dict[tuple[str, str], list[float]]:
     }
 
 
-def _judge_figure_5(results: Results) -> tuple[Verdict, ...]:
+def _judge_figure_5(results: Results) -> tuple[published.Verdict, ...]:
     ranked = sorted(results.candidates, key=lambda row: row["distance"])
     deviation, variance = (
         next(row for row in ranked if row["reading"] == reading)
@@ -366,21 +356,17 @@ def _judge_figure_5(results: Results) -> tuple[Verdict, ...]:
     )  # fmt: skip
 
 
-def _judge_points(results: Results) -> tuple[Verdict, ...]:
+def _judge_points(results: Results) -> tuple[published.Verdict, ...]:
     """Judge the exchange, the number of planes, and fifty points."""
     ten, one, free = results.arrangements
     fifties, judge = results.draws[0].fifties, TEXT.judge
     places = {"ls": (ABSOLUTE, LS), "nominal": (AT_NOMINAL, LS), "aligned": (ALIGNED, LS),
               "prior": (ALIGNED, PRIOR)}  # fmt: skip
-    changes = {
-        name: [
-            "{:.2g} to {:.2g} mm".format(
-                *(compute_statistics(cell, m, frame)[0] for m in (BEFORE, method))
-            )
-            for cell in fifties.values()
-        ]
-        for name, (frame, method) in places.items()
-    }
+    changes = {name: [] for name in places}
+    for name, (frame, method) in places.items():
+        for cell in fifties.values():
+            before, after = (compute_statistics(cell, m, frame)[0] for m in (BEFORE, method))
+            changes[name].append(f"{before:.2g} to {after:.2g} mm")
     factors = {
         (groups, frame, m): compute_statistics(c, BEFORE, frame) / compute_statistics(c, m, frame)
         for groups, c in fifties.items() for frame in steps.FRAMES for m in METHODS
@@ -389,6 +375,7 @@ def _judge_points(results: Results) -> tuple[Verdict, ...]:
     gains = [draw.points["gain"] for draw in results.draws]
     least, most = min(fifties), max(fifties)
     within = [draw.fifties[least].within_five for draw in results.draws]
+    agrees = published.decide(falling == len(factors), falling == 0)
     return (
         judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains), ten=ten,
               one=one),
@@ -397,14 +384,13 @@ def _judge_points(results: Results) -> tuple[Verdict, ...]:
         judge("iterations", [share >= 90.0 for share in within], within=within[0],
               one=int(fifties[least].iterations.max()), five=int(fifties[most].iterations.max()),
               five_within=fifties[most].within_five, least=min(within), most=max(within)),
-        judge("full_poses", decide(falling == len(factors), falling == 0), falling=falling,
-              ways=len(factors), **changes,
+        judge("full_poses", agrees, falling=falling, ways=len(factors), **changes,
               factors=", ".join(f"{f:.1f}" for f in factors[most, ABSOLUTE, PRIOR]),
               stated=", ".join(given.stated for given in results.table_4.values())),
     )  # fmt: skip
 
 
-def _judge_arithmetic(results: Results) -> tuple[Verdict, ...]:
+def _judge_arithmetic(results: Results) -> tuple[published.Verdict, ...]:
     """Judge the factors of Table 4, and those of root mean squares: rms^2 = mean^2 + sd^2."""
     table, possible, stated = results.table_4, {}, results.conclusion
     for name in stated:
@@ -418,19 +404,16 @@ def _judge_arithmetic(results: Results) -> tuple[Verdict, ...]:
     )  # fmt: skip
 
 
-def _judge_methods(results: Results) -> tuple[Verdict, Verdict]:
+def _judge_methods(results: Results) -> tuple[published.Verdict, published.Verdict]:
     """Judge the prior, and the weights of the rows."""
     sure, given, first = SIZES.find("sure"), SIZES.find("figure_5"), results.draws[0]
     priors, positions = [], []
     for draw in results.draws:
         medians = _list_medians(draw)
-        priors.append(
-            {
-                "better": sum(prior <= (1.0 + sure) * ls for _, ls, prior in medians.values()),
-                "harmed": sum(not prior <= before for before, _, prior in medians.values()),
-                "medians": medians["0.01", "0.1"],
-            }
-        )
+        better = sum(prior <= (1.0 + sure) * ls for _, ls, prior in medians.values())
+        harmed = sum(not prior <= before for before, _, prior in medians.values())
+        least = medians["0.01", "0.1"]
+        priors.append({"better": better, "harmed": harmed, "medians": least})
         weights = draw.weights.items()
         positions.append({name: c.compute_median(LS, POSITION_ALIGNED) for name, c in weights})
     count, position = len(results.cells), positions[0]
@@ -450,7 +433,7 @@ def _judge_methods(results: Results) -> tuple[Verdict, Verdict]:
     )  # fmt: skip
 
 
-def _judge_forms(results: Results) -> tuple[Verdict, Verdict]:
+def _judge_forms(results: Results) -> tuple[published.Verdict, published.Verdict]:
     """Judge the two forms of the equations."""
     forms, (hardest, *others), judge = results.forms, results.forms, TEXT.judge
     noises = sorted({row["noise"] for row in forms})
@@ -460,7 +443,7 @@ def _judge_forms(results: Results) -> tuple[Verdict, Verdict]:
     )
     compared, fits = (sum(row[key] for row in forms) for key in ("converged", "machines"))
     largest = max((row["largest"] for row in forms if row["converged"]), default=np.nan)
-    agrees = decide(largest < 0.05 and results.covariance < 1e-6, compared > 0)
+    agrees = published.decide(largest < 0.05 and results.covariance < 1e-6, compared > 0)
     converged, rest = (sum(row[key] for row in others) for key in ("converged", "machines"))
     return (
         judge("forms", agrees, covariance=results.covariance, compared=compared, largest=largest,

@@ -233,17 +233,11 @@ def compute_ranks(study: Study, seed: int) -> list[Row]:
         rows = planned.linearize(planned.draw(groups, seed)).reshape(-1, len(planned.free))
         s = np.linalg.svd(rows, compute_uv=False)
         rank = int((s > 1e-10 * s[0]).sum())
+        unused = float(s[rank]) if rank < len(s) else None
         ranks.append(
-            {
-                "groups": groups,
-                "points": points,
-                "rows": len(rows),
-                "rank": rank,
-                "smallest": float(s[rank - 1]),
-                "unused": float(s[rank]) if rank < len(s) else None,
-                "largest": float(s[0]),
-            }
-        )
+            {"groups": groups, "points": points, "rows": len(rows), "rank": rank,
+             "smallest": float(s[rank - 1]), "unused": unused, "largest": float(s[0])}
+        )  # fmt: skip
     return ranks
 
 
@@ -366,14 +360,10 @@ def calibrate_grid(
             numbers = find_cells(grid, errors=f"set {given}", instrument=f"{noise} mm")
             made = {cell.levels["method"]: cell for cell in calibrate_cells(grid, numbers)}
             cells[given, noise] = judge_cell(
-                study,
-                float(given) * MM,
-                float(noise) * MM,
-                made[LS].truth,
-                {name: cell.values for name, cell in made.items()},
-                made[LS].iterations,
+                study, float(given) * MM, float(noise) * MM, made[LS].truth,
+                {name: cell.values for name, cell in made.items()}, made[LS].iterations,
                 {name: cell.is_converged for name, cell in made.items()},
-            )
+            )  # fmt: skip
     return cells
 
 
@@ -573,15 +563,10 @@ def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) ->
             change = s * (vt @ (fit.robot.values - values[i])) / sd  # in standard deviations
             unlike.append(float(np.abs(change).max()))
     return {
-        "noise": noise / MM,
-        "method": name,
-        "machines": len(q),
-        "converged": len(unlike),
-        "iterations": iterations,
-        "ranks": sorted(ranks),
+        "noise": noise / MM, "method": name, "machines": len(q), "converged": len(unlike),
+        "iterations": iterations, "ranks": sorted(ranks), "largest": max(unlike, default=np.nan),
         "median": float(np.median(unlike)) if unlike else np.nan,
-        "largest": max(unlike, default=np.nan),
-    }
+    }  # fmt: skip
 
 
 def compare_covariances(layout: Layout, noise: float) -> float:

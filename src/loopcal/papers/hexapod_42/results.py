@@ -10,6 +10,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.mechanism.solutions import inverse
+from loopcal.papers import published
 from loopcal.papers.hexapod_42 import steps
 from loopcal.papers.hexapod_42.steps import (
     MM,
@@ -23,20 +24,9 @@ from loopcal.papers.hexapod_42.steps import (
     compute_rms,
     find_places,
 )
-from loopcal.papers.published import (
-    Comparison,
-    Figure,
-    PaperText,
-    Printed,
-    Row,
-    Series,
-    Table,
-    Verdict,
-    decide,
-)
 from loopcal.typing import BoolArray, FloatArray
 
-TEXT = PaperText(__file__)
+TEXT = published.PaperText(__file__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +37,12 @@ class Results:
     # "exact": without noise; "frozen": the same with one matrix; "presumed", "stated": with noise
     runs: Mapping[str, steps.Iterations]
     levels: Mapping[str, steps.Level]  # by instrument of study.yaml
-    methods: list[Row]
-    poses: list[Row]
-    orders: list[Row]  # the best first
+    methods: list[published.Row]
+    poses: list[published.Row]
+    orders: list[published.Row]  # the best first
     outliers: steps.Outliers
-    rounding: list[Row]
-    comparisons: Mapping[str, Comparison]  # of Tables 2 to 6, by name
+    rounding: list[published.Row]
+    comparisons: Mapping[str, published.Comparison]  # of Tables 2 to 6, by name
     sizes: FloatArray  # (4,) of Tables 5 and 6, see `Level`
     explained: FloatArray  # (6,) share of the residuals of Table 6 that parameters explain
     noise: FloatArray  # (n, 6) [m, rad] that Tables 5 and 6 imply
@@ -105,14 +95,14 @@ def find_rule() -> tuple[float, int]:
     return PRINTED.number("threshold", "value"), int(PRINTED.find("iterations", "value"))
 
 
-def compare_tables(results: Results) -> tuple[Comparison, ...]:
+def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
     """Return Tables 2 to 6, printed beside computed."""
     return tuple(results.comparisons.values())
 
 
 def _compare(
     setup: Setup, exact: steps.Iterations, noisy: steps.Iterations
-) -> tuple[Comparison, ...]:
+) -> tuple[published.Comparison, ...]:
     used = find_rule()[1]
     robot, measured = setup.robot, PRINTED.table("table_4", "PP")
     errors = setup.truth.values - noisy.values
@@ -122,7 +112,7 @@ def _compare(
     identified = (exact.values[used + 1] - robot.values)[places] / MM
     odd = measured.labels.index(ODD_POSE)
     odd_row = steps.make_setup(leg_lengths=False).actual[odd : odd + 1] * TO_PRINTED
-    printed_row = Printed({ODD_POSE: measured.rows[ODD_POSE]})
+    printed_row = published.Printed({ODD_POSE: measured.rows[ODD_POSE]})
     noise, six = _describe_noise(PRESUMED), PRINTED.table("table_6", "before")
     compare, printed = TEXT.compare, PRINTED.table
     return (
@@ -152,7 +142,7 @@ def make_symmetric(setup: Setup) -> FloatArray:
     return table
 
 
-def _compare_table_4(setup: Setup) -> Comparison:
+def _compare_table_4(setup: Setup) -> published.Comparison:
     """Return nominal poses, actual poses and their differences beside the computed ones. A
     difference is no finer than the poses it was taken from.
     """
@@ -164,10 +154,10 @@ def _compare_table_4(setup: Setup) -> Comparison:
     texts = {f"{row} {name}": printed[name].rows[row] for _, row, name in order}
     numbers = np.array([computed[name][i] for i, _, name in order]) * TO_PRINTED
     unit = np.array([units[name][i] for i, _, name in order])
-    return TEXT.compare("table_4", Printed(texts), numbers, unit, row=ODD_POSE)
+    return TEXT.compare("table_4", published.Printed(texts), numbers, unit, row=ODD_POSE)
 
 
-def make_tables(results: Results) -> tuple[Table, ...]:
+def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return the tables beyond those of the paper."""
     threshold, used = find_rule()
     runs, stated = results.runs.values(), results.levels[STATED]
@@ -208,25 +198,25 @@ def _describe_noise(instrument: str) -> str:
     return f"noise within +-{length:g} mm, +-{angle:g} rad"
 
 
-def make_figures(results: Results) -> tuple[Figure, ...]:
+def make_figures(results: Results) -> tuple[published.Figure, ...]:
     """Return all figures."""
     return _draw_figure_4(results), _draw_noise(results)
 
 
-def _draw_figure_4(results: Results) -> Figure:
+def _draw_figure_4(results: Results) -> published.Figure:
     """Return max dQint by iteration."""
     threshold, used = find_rule()
     labels = ("without noise", "without noise, one matrix throughout", _describe_noise(PRESUMED),
               _describe_noise(STATED))  # fmt: skip
     lines = [
-        Series.of(label, range(len(run.integrated)), run.integrated)
+        published.Series.of(label, range(len(run.integrated)), run.integrated)
         for label, run in zip(labels, results.runs.values(), strict=True)
     ]
     levels = {f"published rule {threshold:g}": threshold}
     return TEXT.figure("figure_4", lines, levels, threshold=threshold, iterations=used)
 
 
-def _draw_noise(results: Results) -> Figure:
+def _draw_noise(results: Results) -> published.Figure:
     """Return the sizes after calibration by noise, with 1e-3 rad of angle noise per mm."""
     levels = [
         level
@@ -236,7 +226,7 @@ def _draw_noise(results: Results) -> Figure:
     x, sizes = [level.limits[0] for level in levels], results.sizes
     places = {"parameter error rms [mm]": (2, 5), "pose residual rms [mm]": (0, 6)}
     lines = [
-        Series.of(label, x, [level.median[i] for level in levels])
+        published.Series.of(label, x, [level.median[i] for level in levels])
         for label, (i, _) in places.items()
     ]
     marks = {f"published, Table {number}": float(sizes[i]) for i, number in places.values()}
@@ -245,7 +235,7 @@ def _draw_noise(results: Results) -> Figure:
     return TEXT.figure("noise", lines, marks, trials=trials, iterations=find_rule()[1], noise=noise)
 
 
-def judge_claims(results: Results) -> tuple[Verdict, ...]:
+def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim."""
     used = find_rule()[1]
     second, third = (results.comparisons[name] for name in ("table_2", "table_3"))
@@ -264,7 +254,7 @@ def _count(values: BoolArray) -> int:
     return int(values.sum())
 
 
-def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
+def _judge_table_4(results: Results) -> tuple[published.Verdict, ...]:
     judge, (best, second, *_) = TEXT.judge, results.orders
     printed = steps.write_rotation(PRINTED.find("rotation", "order"))
     stated = next(order for order in results.orders if order["formula"] == printed)
@@ -291,7 +281,7 @@ def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
     )  # fmt: skip
 
 
-def _judge_noise(results: Results) -> tuple[Verdict, ...]:
+def _judge_noise(results: Results) -> tuple[published.Verdict, ...]:
     """Judge the stopping rule, and the origin of Tables 5 and 6."""
     threshold, used = find_rule()
     exact, frozen = results.runs["exact"], results.runs["frozen"]
@@ -321,7 +311,7 @@ def _judge_noise(results: Results) -> tuple[Verdict, ...]:
               holding=holding, stated=stated.median),
         judge("residuals", explained.max() < 25.0, least=explained.min(), most=explained.max(),
               random=100.0 * np.sqrt(0.7)),
-        judge("milliradians", decide(as_mrad > as_rad, as_rad > as_mrad), as_rad=as_rad,
+        judge("milliradians", published.decide(as_mrad > as_rad, as_rad > as_mrad), as_rad=as_rad,
               as_mrad=as_mrad, count=3 * _count(is_good), row=ODD_POSE),
         judge("mean_noise", offset < 4.0, offset=offset, lengths=lengths, angles=angles,
               scatter_mm=scatter[:3].max(), scatter_rad=scatter[3:].max(), limit=presumed,
@@ -329,7 +319,7 @@ def _judge_noise(results: Results) -> tuple[Verdict, ...]:
     )  # fmt: skip
 
 
-def _judge_methods(results: Results) -> tuple[Verdict, ...]:
+def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:
     names = ("before", "alone", "together", "prior")
     methods = dict(zip(names, results.methods, strict=True))
     before, alone, together, _ = results.methods

@@ -308,13 +308,11 @@ def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> lis
         other = replace(setup, poses=poses)
         exact = iterate(other, other.actual)
         level = PosesLevel(len(poses), coordinates=tuple(map(tuple, poses.tolist())))
+        left = compute_rms((setup.truth.values - exact.values[-1]) / MM)
         row: Row = {
-            "poses": name,
-            "number": len(poses),
-            "iterations": exact.count_needed(threshold),
-            "left": compute_rms((setup.truth.values - exact.values[-1]) / MM),
-            "condition": float(exact.conditions.max()),
-        }
+            "poses": name, "number": len(poses), "iterations": exact.count_needed(threshold),
+            "left": left, "condition": float(exact.conditions.max()),
+        }  # fmt: skip
         for cell in calibrate_methods(seed, trials, STATED, methods, poses=level):
             row[cell.levels["method"]] = compute_rms((cell.values - setup.truth.values) / MM)
         rows.append(row)
@@ -378,12 +376,10 @@ def rank_euler_orders(setup: Setup, nominal: FloatArray, measured: FloatArray) -
             reached = forward(setup.truth, commanded.q, commanded).T
             change = geometry.pose_difference(reached, printed)
             orders.append(
-                {
-                    "formula": write_rotation(order, angles),
-                    "position": compute_rms(change[:, 3:] / MM),
-                    "rotation": compute_rms(change[:, :3]),
-                }
-            )
+                {"formula": write_rotation(order, angles),
+                 "position": compute_rms(change[:, 3:] / MM),
+                 "rotation": compute_rms(change[:, :3])}
+            )  # fmt: skip
     return sorted(orders, key=lambda order: order["position"])
 
 
@@ -418,14 +414,9 @@ def search_outliers(setup: Setup, printed: Printed) -> Outliers:
         for pose in keep:
             test = lc.identify(setup.robot, data.take(keep[keep != pose]), method).residual_test
             fits.append(
-                {
-                    "label": data.labels[pose],
-                    "chi_square": test.chi_square,
-                    "degrees": test.degrees,
-                    "p_value": test.p_value,
-                    "drop": whole - test.chi_square,
-                }
-            )
+                {"label": data.labels[pose], "chi_square": test.chi_square, "degrees": test.degrees,
+                 "p_value": test.p_value, "drop": whole - test.chi_square}
+            )  # fmt: skip
         rounds.append(fits)
         worst = max(range(len(keep)), key=lambda i: fits[i]["drop"])
         level = SIZES.find("outlier_level") / len(keep)

@@ -16,16 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from loopcal.estimate.published_steps import LINEARIZATIONS
-from loopcal.papers.published import (
-    Cell,
-    Comparison,
-    Figure,
-    PaperText,
-    Printed,
-    Series,
-    Table,
-    Verdict,
-)
+from loopcal.papers import published
 from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.steps import (
     BEFORE,
@@ -53,7 +44,7 @@ from loopcal.papers.tsvd_2016.steps import (
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-TEXT = PaperText(__file__)
+TEXT = published.PaperText(__file__)
 DIVERGED = "diverged"
 """Cell of a number that a diverged fit does not have."""
 ROUNDING = 1e-10
@@ -91,7 +82,7 @@ class Results:
     draws: tuple[Draws, ...]  # of both manipulators
     # best lambda and errors of RE after some iterations, 3-PRS with 6-DOF measurement
     ridge_steps: list[tuple[int | str, float, FloatArray]]
-    noise: Printed  # Appendix 1 as printed
+    noise: published.Printed  # Appendix 1 as printed
 
     @property
     def sweeps(self) -> dict[str, Sweep]:
@@ -112,19 +103,19 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
     return Results(cases, draws, ridge_steps, steps.PRINTED.table("appendix_1"))
 
 
-def show_number(value: float) -> Cell:
+def show_number(value: float) -> published.Cell:
     """Return a number as a cell: rounding as 0, and what is not finite as a fit that diverged."""
     if not np.isfinite(value):
         return DIVERGED
     return float(value) if abs(value) > ROUNDING else 0.0
 
 
-def show_all(values: Iterable[float]) -> list[Cell]:
+def show_all(values: Iterable[float]) -> list[published.Cell]:
     """Return numbers as cells, see `show_number`."""
     return [show_number(value) for value in values]
 
 
-def compare_tables(results: Results) -> Iterator[Comparison]:
+def compare_tables(results: Results) -> Iterator[published.Comparison]:
     """Yield the numbers that the text states, beside the computed ranks."""
     tripod = results.cases["3-PRS", 6]
     chain = sum("1" in name for name in tripod.study.robot.parameters.names)
@@ -134,7 +125,7 @@ def compare_tables(results: Results) -> Iterator[Comparison]:
     yield TEXT.compare("counts", steps.PRINTED.table("counts"), computed)
 
 
-def make_tables(results: Results) -> Iterator[Table]:
+def make_tables(results: Results) -> Iterator[published.Table]:
     """Yield all tables: the analogues of Tables 1 to 8, and the figures as numbers."""
     cases, draws, noise = results.cases.values(), results.draws, results.noise.values
     yield TEXT.table("given", [row for name in ROBOTS for row in _list_machine(name)])
@@ -200,7 +191,7 @@ def _list_machine(name: str) -> list[tuple[str, str, str]]:
     return [*rows, (name, "output range", f"{count} poses, tilts of {tilts} deg{z}")]
 
 
-def _list_outputs(name: str, results: Results) -> Table:
+def _list_outputs(name: str, results: Results) -> published.Table:
     study = results.cases[name, 6].study
     rows: list[tuple[Any, ...]] = []
     for method, values in ((BEFORE, study.robot.parameters.nominal[None]),
@@ -217,7 +208,7 @@ def _list_outputs(name: str, results: Results) -> Table:
     return TEXT.table("outputs", rows, f"table_{number}", name=name, number=number)
 
 
-def _list_curves(case: Case) -> Table:
+def _list_curves(case: Case) -> published.Table:
     sweep, rows = case.sweep, []
     for algorithm, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 is LS
         for i, setting in enumerate(sweep.settings[algorithm][first:]):
@@ -232,16 +223,16 @@ def _list_curves(case: Case) -> Table:
     return TEXT.table("curves", rows, name, case=case.study.label, low=low, high=high)
 
 
-def make_medians(draws: Draws) -> Table:
+def make_medians(draws: Draws) -> published.Table:
     """Return medians with their intervals."""
     rows = []
     for method in steps.METHODS:
         middle, ends = draws.compute_median(method), draws.compute_interval(method)
-        cells: list[Cell] = []
+        cells: list[published.Cell] = []
         for i in (0, 1, 2):
             low, high = (f"{e[i]:.2g}" if np.isfinite(e[i]) else DIVERGED for e in ends)
             cells += [show_number(middle[i]), f"{low} to {high}"]
-        after: list[Cell] = [None, None]
+        after: list[published.Cell] = [None, None]
         if method in draws.commanded:
             after = show_all(np.median(draws.commanded[method], axis=0))
         lost = np.isinf(draws.errors[method][:, 0]).sum()
@@ -250,7 +241,7 @@ def make_medians(draws: Draws) -> Table:
     return TEXT.table("draws", rows, name, name=draws.name, trials=len(draws))
 
 
-def make_ratios(draws: Draws) -> Table:
+def make_ratios(draws: Draws) -> published.Table:
     """Return ratios of medians: MAP, the default kind of fit, over each of the others."""
     rows = []
     for other in COMPARED:
@@ -260,7 +251,7 @@ def make_ratios(draws: Draws) -> Table:
     return TEXT.table("ratios", rows, name, name=draws.name, trials=len(draws))
 
 
-def make_median_curves(sweep: Sweep) -> Table:
+def make_median_curves(sweep: Sweep) -> published.Table:
     """Return median errors at every lambda and k."""
     rows, short = [], np.median(sweep.short, axis=0)[:, :2]
     for algorithm, settings in sweep.settings.items():
@@ -303,7 +294,7 @@ def list_labels(study: steps.Study) -> list[tuple[str, str]]:
     return list(zip(table.names, units, strict=True))
 
 
-def make_figures(results: Results) -> Iterator[Figure]:
+def make_figures(results: Results) -> Iterator[published.Figure]:
     """Yield all figures: the analogues of figures 6 to 11, and medians over many machines."""
     for draws in results.draws:
         for sweep, method in zip(draws.sweeps, (PRIOR, PRIOR_FIVE), strict=True):
@@ -330,23 +321,23 @@ def make_figures(results: Results) -> Iterator[Figure]:
 def _draw_curve(
     text: str, file: str, algorithm: str, settings: FloatArray, errors: FloatArray,
     prior: FloatArray, **data: Any,
-) -> Figure:  # fmt: skip
+) -> published.Figure:  # fmt: skip
     """Return position and angle errors (s, ..) over the settings (s,), and those of MAP.
 
     Settings that diverged have no error; they are a series of their own at the upper end.
     """
     usable = np.isfinite(errors[:, :2]).all(axis=1)
-    lines = [Series.of(label, settings[usable], errors[usable, i])
+    lines = [published.Series.of(label, settings[usable], errors[usable, i])
              for i, label in enumerate(LABELS)]  # fmt: skip
     if not usable.all():
         top = float(errors[usable, :2].max(initial=0.0)) or 1.0
-        lines.append(Series.of(DIVERGED, settings[~usable], [top] * int((~usable).sum())))
+        lines.append(published.Series.of(DIVERGED, settings[~usable], [top] * int((~usable).sum())))
     levels = {f"MAP, {label}": float(prior[i]) for i, label in enumerate(LABELS)}
     data |= {"algorithm": algorithm, "setting": SETTING[algorithm]}
     return TEXT.figure(text, lines, levels, file, LOG[algorithm], **data)
 
 
-def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
+def _draw_history(case: Case, algorithm: str, unit: str) -> published.Figure:
     """Return the parameters of one unit by iteration; those that RE changes most are named."""
     labels, names = list_labels(case.study), case.study.robot.parameters.names
     chosen = [i for i, (_, u) in enumerate(labels) if u == unit]
@@ -356,7 +347,9 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
     log = "x" if done[-1] > LONG else ""
     usable = np.isfinite(values).all(axis=1) & ((done > 0) | (log == ""))
     lines = [
-        Series.of(names[i] if i in named else f"_{names[i]}", done[usable], values[usable, i])
+        published.Series.of(
+            names[i] if i in named else f"_{names[i]}", done[usable], values[usable, i]
+        )
         for i in (*named, *(i for i in chosen if i not in named))
     ]
     what, is_diverged = "lengths" if unit == "mm" else "angles", case.is_diverged(algorithm)
@@ -370,7 +363,7 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
     )  # fmt: skip
 
 
-def _draw_steps(results: Results) -> Figure:
+def _draw_steps(results: Results) -> published.Figure:
     """Return the largest component of each step."""
     lines, longest = [], 0
     for name in ROBOTS:
@@ -381,13 +374,13 @@ def _draw_steps(results: Results) -> Figure:
             end = int(np.searchsorted(done, done[-1]))
             done, usable = done[:end] + 1, np.isfinite(sizes[:end])
             label = f"{algorithm}, {name}{f' ({DIVERGED})' * case.is_diverged(algorithm)}"
-            lines.append(Series.of(label, done[usable], sizes[:end][usable]))
+            lines.append(published.Series.of(label, done[usable], sizes[:end][usable]))
             longest = max(longest, int(done.max(initial=0)))
     log = "xy" if longest > LONG else "y"
     return TEXT.figure("convergence", lines, {"end of the iteration": 1e-6}, "", log)
 
 
-def judge_claims(results: Results) -> tuple[Verdict, ...]:
+def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim."""
     draws, sweeps, judge = results.draws, results.sweeps, _judge_places
     six, five = ({d.sweeps[i].study.label: d for d in draws} for i in (0, 1))
@@ -418,7 +411,7 @@ Held = tuple[BoolArray, dict[str, Any]]
 
 def _judge_places(
     claim: str, places: Mapping[str, Place], compare: Callable[[Place], Held], **data: Any
-) -> Verdict:
+) -> published.Verdict:
     """Judge a claim that holds in a draw if it holds there in all places."""
     held, rows, shares = [], [], []
     for name, place in places.items():
@@ -429,7 +422,7 @@ def _judge_places(
     return TEXT.judge(claim, np.all(held, axis=0), rows=rows, shares=shares, **data)
 
 
-def _judge_curve(sweep: Sweep) -> Verdict:
+def _judge_curve(sweep: Sweep) -> published.Verdict:
     """Judge the curves over lambda and k of one figure: position and angle, each machine."""
     gain, curves, held = SIZES.find("gain"), [], np.ones(len(sweep), dtype=bool)
     for algorithm in (RE, TSVD):
@@ -546,7 +539,7 @@ def _find_best_k(sweep: Sweep) -> Held:
     return (distance <= 0.1) & (distance > 0.0), row
 
 
-def _judge_lambda(results: Results) -> Verdict:
+def _judge_lambda(results: Results) -> published.Verdict:
     """Judge the range of the best lambda, looked for beyond that range, and its differences."""
     best = {label: sweep.chosen[RE].settings for label, sweep in results.sweeps.items()}
     first, *others = (draws.sweeps[0].chosen[RE].settings for draws in results.draws)
@@ -561,7 +554,7 @@ def _judge_lambda(results: Results) -> Verdict:
     return TEXT.judge("lambda_range", holds, rows=rows, by_steps=by_steps, **ends)
 
 
-def _judge_noise(noise: Printed) -> Verdict:
+def _judge_noise(noise: published.Printed) -> published.Verdict:
     shares = noise.values * np.array([steps.MM] * 3 + [1.0] * 3) / steps.list_limits()
     largest, rms = np.abs(noise.values).max(axis=0), float(np.sqrt(np.mean(shares**2)))
     # three standard deviations of the rms of that many uniform numbers
@@ -573,7 +566,7 @@ def _judge_noise(noise: Printed) -> Verdict:
     )  # fmt: skip
 
 
-def _judge_own_checks(draws: Sequence[Draws]) -> tuple[Verdict, ...]:
+def _judge_own_checks(draws: Sequence[Draws]) -> tuple[published.Verdict, ...]:
     """Judge rank detection and units, and MAP: against the raw methods, with wrong tolerances, and
     near the best choice.
     """
@@ -593,7 +586,7 @@ def _judge_own_checks(draws: Sequence[Draws]) -> tuple[Verdict, ...]:
 def _judge_groups(
     claim: str, draws: Sequence[Draws], limits: Mapping[tuple[str, str], float], *,
     sign: float = 1.0, first: int = 0, only: str = "", **data: Any,
-) -> Verdict:  # fmt: skip
+) -> published.Verdict:  # fmt: skip
     """Judge ratios of medians in each group of machines, see `Draws.list_groups`.
 
     limits : of each pair of methods, which the largest ratio of all structures (or `only` one), in

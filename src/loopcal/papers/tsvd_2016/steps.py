@@ -225,9 +225,8 @@ def measure_machines(name: str, truth: FloatArray, seed: int = 0) -> Study:
 
 def measure_case(name: str, seed: int) -> Study:
     """Measure one machine with drawn errors and the noise of Appendix 1."""
-    return measure_machines(name, draw_true_values(load_machine(name), 1, seed)).with_noise(
-        read_noise()
-    )
+    truth = draw_true_values(load_machine(name), 1, seed)
+    return measure_machines(name, truth).with_noise(read_noise())
 
 
 def read_noise() -> FloatArray:
@@ -281,24 +280,16 @@ def draw_true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
     return np.array(values)
 
 
-@dataclass(frozen=True, eq=False)
-class Iterations(RawSteps):
-    """Result of the steps for t settings. machine : (t,) which machine was measured."""
-
-    machine: IntArray
-
-
 def iterate(
     study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT,
     ahead: float = AHEAD,
-) -> Iterations:  # fmt: skip
+) -> RawSteps:  # fmt: skip
     """Run steps 5 to 9 with the penalty (t | 1, p) of each setting, see `take_steps`.
 
     machine : (t,) which machine was measured; default: the first. limit, ahead : see `StepRule`.
     """
     machine = np.zeros(len(penalty), dtype=np.int64) if machine is None else machine
-    rule = StepRule(limit=limit, ahead=ahead)
-    return Iterations(**vars(take_steps(study.raw.take(machine), penalty, rule)), machine=machine)
+    return take_steps(study.raw.take(machine), penalty, StepRule(limit=limit, ahead=ahead))
 
 
 def linearize(study: Study) -> Decomposition:
@@ -371,7 +362,7 @@ class Sweep:
     # of LS and RANKED, and of RE and TSVD at the bottom of their curves, without LS
     chosen: Mapping[str, Chosen]
     exact: FloatArray  # (t, 5) errors of LS with rank detection, measured without noise
-    runs: Iterations  # of the last machines: for each machine all k, then all lambdas
+    runs: RawSteps  # of the last machines: for each machine all k, then all lambdas
     places: Mapping[str, IntArray]  # (t,) of the chosen settings, among all of a machine
 
     def __len__(self) -> int:
@@ -415,15 +406,14 @@ def run_settings(
     for first in range(0, t, together):
         progress(f"{study.label}, machine {first + 1} of {t}")
         machines = np.arange(first, min(first + together, t))
-        run = iterate(
-            study, np.tile(penalty, (len(machines), 1)), np.repeat(machines, len(penalty))
-        )
+        machine = np.repeat(machines, len(penalty))
+        run = iterate(study, np.tile(penalty, (len(machines), 1)), machine)
         runs = [run]  # of these machines; histories are large
         state = np.searchsorted(run.done.max(axis=1), SIZES.find("short"))
         is_ridge = np.tile(np.arange(len(penalty)) >= k, len(machines))
         history = run.history[min(int(state), len(run.done) - 1), is_ridge]
-        short = study.compute_output_errors(history, run.machine[is_ridge])
-        errors = study.compute_output_errors(run.values, run.machine)
+        short = study.compute_output_errors(history, machine[is_ridge])
+        errors = study.compute_output_errors(run.values, machine)
         arrays = (errors, run.count, run.values, run.is_converged, short)
         parts.append([x.reshape(len(machines), -1, *x.shape[1:]) for x in arrays])
     errors, count, values, is_converged, short = (
