@@ -54,6 +54,7 @@ REFUSED = {
     "identifiability robot.yaml data.csv --reduce -o robot.yaml --force": IS_INPUT,
     "export robot.yaml --format csv -o robot.yaml --force": IS_INPUT,
     "new gough -o a.yaml --measurements nodir/x.csv": NO_FOLDER,
+    "new 3-prs -o old.csv": EXISTS,
     "new gough -o a.yaml --measurements a.yaml": IS_NAMED_TWICE,
 }
 
@@ -70,6 +71,8 @@ def test_force_replaces_a_file_that_is_not_an_input(loopcal) -> None:
     assert Path("old.csv").read_text() != "mine\n"
     loopcal("compensate robot.yaml pp.csv -o old.csv --force")
     assert "note status" in Path("old.csv").read_text()
+    loopcal("new 3-prs -o old.csv --force")
+    assert "family: 3-prs" in Path("old.csv").read_text()
 
 
 @pytest.mark.slow
