@@ -32,31 +32,22 @@ UNITS = "units: {length: mm, angle: deg}\n"
 
 
 @pytest.fixture
-def run_refused(tmp_path, monkeypatch, capsys):
-    """Run a command line in an empty folder with the given files; return the error
-    message.
-    """
-    monkeypatch.chdir(tmp_path)
+def run_refused(loopcal, folder):
+    """Run a command line with the given files; return the message with which it is refused."""
 
     def run(words: str, **files: str | bytes | None) -> str:
         for name, content in files.items():
-            path = tmp_path / name.replace("_", ".")
+            path = folder / name.replace("_", ".")
             if content is None:
                 path.mkdir()
             else:
                 path.write_bytes(content.encode() if isinstance(content, str) else content)
-        before = sorted(p.name for p in tmp_path.rglob("*"))
-        code = main(words.split())
-        out, err = capsys.readouterr()
-        assert code == 1
-        assert out == ""
+        before = sorted(p.name for p in folder.rglob("*"))
+        err = loopcal(words, code=1).err
         assert err.startswith("loopcal: ")
-        _, *hint = err.splitlines()
-        assert len(hint) <= 1, err
-        assert all(line.startswith("Hint: ") for line in hint)
-        assert err.endswith("\n")
+        assert err.count("\n") == 1 + err.count("\nHint: ") <= 2
         assert "Traceback" not in err
-        assert sorted(p.name for p in tmp_path.rglob("*")) == before, "something was written"
+        assert sorted(p.name for p in folder.rglob("*")) == before, "something was written"
         return err
 
     return run
