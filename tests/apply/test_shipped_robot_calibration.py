@@ -10,17 +10,17 @@ from scipy.stats import chi2
 
 from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate_trials
 from loopcal.mechanism.workspace import sample_workspace
+from tests.zoo import ROBOTS as SHIPPED
 from tests.zoo import load_cached_robot
 
 DRAWS, POSES = 20, 40
 # their chi-square has other degrees of freedom: redundant readings; parameters without effect
 OTHER_FREEDOMS = ("belt-4", "cable-4", "linear-delta-6")
-ROBOTS = [name for name in list_shipped_robots() if name not in OTHER_FREEDOMS]
+ROBOTS = [robot for robot in SHIPPED if robot.values[0] not in OTHER_FREEDOMS]
 
 
 @pytest.mark.parametrize("name", ROBOTS)

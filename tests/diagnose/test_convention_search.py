@@ -262,7 +262,15 @@ RANDOM = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", RANDOM)
+@pytest.mark.parametrize(
+    "case",
+    [
+        "readings",
+        "rows",
+        pytest.param("values", marks=pytest.mark.evidence),
+        pytest.param("large values", marks=pytest.mark.evidence),
+    ],
+)
 def test_random_data_are_explained_by_nothing_and_the_text_lists_what_was_tried(case) -> None:
     name, kind = RANDOM[case]
     robot, data, rng = (

@@ -41,9 +41,9 @@ def compute_tail(rows, effect):
 
 CLEAN = [
     ("linear-delta", "component", 20, None),
-    ("linear-delta", "component", 10, LeastSquares()),
+    pytest.param("linear-delta", "component", 10, LeastSquares(), marks=pytest.mark.evidence),
     ("3-prs", "pose", 12, Ridge(3.0)),
-    ("hexapod-42", "tracker", 12, None),
+    pytest.param("hexapod-42", "tracker", 12, None, marks=pytest.mark.evidence),
 ]
 
 

@@ -143,14 +143,7 @@ def position_errors(values, truth):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "moved",
-    [
-        dict.fromkeys(ARMS, 4.0),
-        dict.fromkeys(ARMS, 6.0),
-        {"arm2.length": 5.0},
-        {"arm2.length": -10.0},
-        {"tower1.stop": 20.0},
-    ],
+    "moved", [dict.fromkeys(ARMS, 4.0), {"arm2.length": -10.0}, {"tower1.stop": 20.0}]
 )
 def test_default_is_at_most_ten_percent_worse_than_least_squares(moved):
     truth, trials = simulate_deltas(24, moved)

@@ -123,7 +123,7 @@ def test_variance_of_map_is_the_sandwich(scale):
     np.testing.assert_allclose(root @ root.T, square * B @ A @ B, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("lam", [3.0, 10.0])
+@pytest.mark.parametrize("lam", [pytest.param(3.0, marks=pytest.mark.evidence), 10.0])
 def test_intervals_of_a_ridge_contain_the_truth(lam):
     """The bias is that of the stated tolerances, not of 1 / lam: coverage was 51 to 84 %."""
     robot, held = lc.load_robot("linear-delta"), []

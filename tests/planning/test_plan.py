@@ -475,8 +475,6 @@ ONE_OF_EACH = (CASES[1], CASES[2], CASES[4])
 """Hexapod by positions, 3-PRS by full poses, delta."""
 
 LEAST_SEEDS = 15
-
-
 """If planned poses were no better than random ones, so many of 20 seeds would favour them with a
 chance of 2 %.
 """

@@ -313,7 +313,7 @@ def test_hexapod_reaches_the_target_pose_exactly():
 
 def list_robots_with_few_freedoms():
     """Shipped robots whose controlled coordinates do not state each freedom of the platform."""
-    return [name for name in list_shipped_robots() if not controls_all(load_robot(name))]
+    return [name for name in list_shipped_robots() if not controls_all(load_cached_robot(name))]
 
 
 def make_far_poses(robot, far, n):
@@ -332,7 +332,9 @@ SLOWEST = "solar-tracker"  # as long as all the others but the excavator, which 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.evidence) if name == SLOWEST else name
+        pytest.param(name, marks=pytest.mark.evidence)
+        if name in {SLOWEST, *zoo.RELATIVES}
+        else name
         for name in list_robots_with_few_freedoms()
     ],
 )

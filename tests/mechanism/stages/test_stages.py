@@ -283,7 +283,7 @@ def test_poses_out_of_reach_are_marked_and_cost_no_exception() -> None:
     assert solution.residual[1] > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_an_arm_with_a_spherical_wrist_has_eight_working_modes() -> None:
     """Shoulder, elbow and wrist have two each; Pieper 1968."""
     arm = load_cached_robot("arm-6r")

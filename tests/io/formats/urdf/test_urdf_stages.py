@@ -79,7 +79,14 @@ def draw_readings(robot: Mechanism, count: int) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("machine", "seed"),
-    [("leg", None), ("leg", 3), ("head", 3), ("arm", None), ("digger", 3), ("tilted table", 3)],
+    [
+        ("leg", 3),
+        ("head", 3),
+        ("digger", 3),
+        pytest.param("leg", None, marks=pytest.mark.evidence),
+        pytest.param("arm", None, marks=pytest.mark.evidence),
+        pytest.param("tilted table", 3, marks=pytest.mark.evidence),
+    ],
 )
 def test_chains_agree_with_the_solver(tmp_path, machine, seed) -> None:
     """So does the corrected file, after every parameter has been changed."""
