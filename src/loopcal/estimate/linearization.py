@@ -176,15 +176,6 @@ def scale_parameters(free: FreeParameters, by_parameter: FloatArray) -> FloatArr
     return columns * free.tolerance
 
 
-def locate_poses(
-    free: FreeParameters, q: FloatArray, state: engine.State, names: Sequence[str]
-) -> LinearizedPoses:
-    """Return solved poses without derivatives, with the values of the named joints."""
-    none = np.zeros((*state.T.shape[:2], 6, 0))
-    unmasked = LinearizedPoses(state.T, np.zeros(0, dtype=bool), none)
-    return mask_unreached(free, names, q, state, unmasked)
-
-
 def linearize_poses(
     free: FreeParameters,
     values: FloatArray,

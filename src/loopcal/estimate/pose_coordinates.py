@@ -26,7 +26,6 @@ from loopcal.estimate.linearization import (
     PoseStates,
     linearize_closure,
     linearize_poses,
-    locate_poses,
     mask_unreached,
     scale_parameters,
     spread_states,
@@ -128,7 +127,9 @@ class PoseCoordinates:
         q = states.q if states.q.shape[2] else self.readings_at(poses)
         if by_parameters:
             return linearize_poses(self.free, values, q, states.state, self.names)
-        return locate_poses(self.free, q, states.state, self.names)
+        none = np.zeros((*states.state.T.shape[:2], 6, 0))
+        unmasked = LinearizedPoses(states.state.T, np.zeros(0, dtype=bool), none)
+        return mask_unreached(self.free, self.names, q, states.state, unmasked)
 
 
 class MeasuredPoses(PoseCoordinates):

@@ -89,8 +89,11 @@ def find_most_probable_factor(decomposition: Decomposition) -> FloatArray:
 
     with f_i = 1 - 1 / d_i and r_i = c_i^2 / d_i.
     """
-    square, projected = _count_penalized(decomposition)
-    best = np.argmin(_score(square, projected, GRID), axis=1)
+    counts = are_penalized(decomposition)
+    s, c = decomposition.singular_values, decomposition.projections
+    square, projected = np.where(counts, s, 0.0) ** 2, np.where(counts, c, 0.0) ** 2
+    d = 1.0 + np.exp(2.0 * GRID)[:, None] * square[:, None, :]
+    best = np.argmin((np.log(d) + projected[:, None, :] / d).sum(axis=2), axis=1)
     x, low, high = (2.0 * GRID[np.clip(best + shift, 0, len(GRID) - 1)] for shift in (0, -1, 1))
     for _ in range(NEWTON_STEPS):
         d = 1.0 + np.exp(x)[:, None] * square
@@ -125,21 +128,6 @@ def are_penalized(decomposition: Decomposition) -> BoolArray:
     if unpenalized is None:
         return np.ones(decomposition.singular_values.shape, dtype=bool)
     return ~unpenalized
-
-
-def _count_penalized(decomposition: Decomposition) -> tuple[FloatArray, FloatArray]:
-    """Return s^2 and c^2 (t, p), zero for directions of which the prior knows nothing."""
-    counted = are_penalized(decomposition)
-    return (
-        np.where(counted, decomposition.singular_values, 0.0) ** 2,
-        np.where(counted, decomposition.projections, 0.0) ** 2,
-    )
-
-
-def _score(square: FloatArray, projected: FloatArray, log_factor: FloatArray) -> FloatArray:
-    """Return L (t, g) up to a constant at g log factors."""
-    d = 1.0 + np.exp(2.0 * log_factor)[:, None] * square[:, None, :]
-    return (np.log(d) + projected[:, None, :] / d).sum(axis=2)
 
 
 Kind = Literal["shift", "group", "single"]
