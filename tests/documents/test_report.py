@@ -12,11 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.documents import load_record
 from loopcal.errors import FileError
+from loopcal.report.document import figures
 from loopcal.report.document.calibration_document import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
@@ -288,5 +290,20 @@ def test_noise_floor_of_uncertain_readings_is_called_a_lower_bound(page, root) -
     data = lc.simulate(machine, poses, instrument, seed=3)
     report = lc.calibrate(machine, data, lc.CalibrationOptions(hold_out=0.4))
     assert report.reading_errors is not None
-    assert READING_NOISE in build(load_record(report), "errors").sections[0].elements[0]
+    assert READING_NOISE in str(build(load_record(report), "errors").sections[0].elements[0])
     assert READING_NOISE in report._repr_html_()
+
+
+def test_a_decorated_function_adds_a_figure_to_its_section(run, monkeypatch) -> None:
+    monkeypatch.setattr(figures, "FIGURES", dict(figures.FIGURES))
+
+    @figures.report_figure("poses")
+    def draw_count(record):
+        figure = Figure()
+        figure.suptitle(f"{len(record.fitted_labels)} poses")
+        yield figures.make_picture(figure, "count-figure", "Number of poses.", "It is a number.")
+
+    (section,) = build(load_record(run), "poses").sections
+    *_, picture = section.elements
+    assert isinstance(picture, Picture)
+    assert (picture.name, picture.caption) == ("count-figure", "Number of poses.")

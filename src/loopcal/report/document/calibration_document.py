@@ -36,9 +36,11 @@ from loopcal.report.validation_view import (
 )
 from loopcal.results.tables import ABSENT, format_number, make_table, word_column
 
-Describe = Callable[[CalibrationRecord], Iterator[Element]]
+Describe = Callable[[CalibrationRecord], Iterator[Element | None]]
 SECTIONS: dict[str, tuple[str, Describe]] = {}
-"""Name of a section -> its title, and the function that yields its elements; in their order."""
+"""Name of a section -> its title, and the function that yields its elements, and None where its
+figures are; without None they are at the end.
+"""
 
 
 def describes_section(name: str, title: str) -> Callable[[Describe], Describe]:
@@ -53,8 +55,15 @@ def describes_section(name: str, title: str) -> Callable[[Describe], Describe]:
 
 def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Section, ...]:
     """Return the sections of these names; one without content is left out."""
-    built = (Section(name, SECTIONS[name][0], tuple(SECTIONS[name][1](record))) for name in names)
-    return tuple(section for section in built if section.elements)
+    sections = []
+    for name in names:
+        title, describe = SECTIONS[name]
+        described = list(describe(record))
+        elements: list[Element] = []
+        for element in described if None in described else [*described, None]:
+            elements += draw_figures(name, record) if element is None else [element]
+        sections.append(Section(name, title, tuple(elements)))
+    return tuple(section for section in sections if section.elements)
 
 
 # Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
@@ -193,7 +202,7 @@ NOT_STORED = (
 
 
 @describes_section("errors", "Errors at held-out poses")
-def describe_errors(record: CalibrationRecord) -> Iterator[Element]:
+def describe_errors(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the errors at held-out poses before and after, with the noise floor."""
     errors = record.validation
     if errors is None:
@@ -208,36 +217,36 @@ def describe_errors(record: CalibrationRecord) -> Iterator[Element]:
     yield f"{explained} {READING_NOISE}" if record.result.get("reading_errors") else explained
     yield from view_errors(errors, "held-out")
     yield from filter(None, [" ".join(describe_improvements(errors))])
-    yield from draw_figures("errors", record)
+    yield None
     yield from (table for table in view_error_statistics(errors) if not isinstance(table, str))
 
 
 @describes_section("heights", "Height errors")
-def describe_heights(record: CalibrationRecord) -> Iterator[Element]:
+def describe_heights(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the errors of heights over x and y, where heights were measured."""
     if record.heights is not None:
         yield HEIGHTS
         yield build_height_summary(record.heights)
-        yield from draw_figures("heights", record)
+        yield None
         yield build_height_map(record.heights)
 
 
 @describes_section("residuals", "Residuals of the fit")
-def describe_residuals(record: CalibrationRecord) -> Iterator[Element]:
+def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the residuals against the noise, in words and as a figure."""
     fit = record.result["fit"]
     if record.converged and fit["degrees"]:
         square, degrees = (format_number(fit[key], 4) for key in ("chi_square", "degrees"))
         p_value = format_number(fit["p_value"], 2)
         yield f"Chi-square is {square} with {degrees} degrees of freedom (p = {p_value})."
-    yield from draw_figures("residuals", record)
+    yield None
     yield from select_findings(record, OF_RESIDUALS)
 
 
 @describes_section("workspace", "Measured poses and accuracy over the workspace")
-def describe_workspace(record: CalibrationRecord) -> Iterator[Element]:
+def describe_workspace(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the robot with its measured poses, and the uncertainty over its workspace."""
-    yield from draw_figures("workspace", record)
+    yield None
 
 
 # Parameters with their uncertainty, correlations, and the uncertainty budget.
@@ -275,7 +284,6 @@ def describe_parameters(record: CalibrationRecord) -> Iterator[Element]:
         yield fit["interval_note"]
     if fit.get("local"):
         yield build_parameter_table("Setup parameters", fit["local"])
-    yield from draw_figures("parameters", record)
 
 
 @describes_section("budget", "Uncertainty budget")
