@@ -107,13 +107,13 @@ def draw_value(
     if isinstance(kind, click.types.IntParamType):
         least = getattr(kind, "min", None) or 0
         return rng.choice(WRONG_COUNTS) if is_wrong else str(max(int(rng.choice(COUNTS)), least))
-    if isinstance(kind, click.types.FloatParamType):
+    if isinstance(kind, click.types.FloatParamType) or kind.name == "share":
         return rng.choice(WRONG_SHARES if is_wrong else SHARES)
     if isinstance(kind, click.Path):
         return rng.choice(PATHS) if is_wrong else rng.choice([*files, *PATHS[:3]])
     if kind.name == "duration":
         return rng.choice(WRONG_TIMES if is_wrong else TIMES)
-    if hasattr(kind, "dimension") or kind.name == "quantity":
+    if kind.name == "quantity":
         return _draw_quantity(rng, is_wrong)
     return _draw_text(rng, words, is_wrong)
 
