@@ -11,6 +11,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
+from loopcal.io.runs.result_files import format_draws
 from loopcal.io.runs.run_folder import read_run_folder, write_run_folder
 from loopcal.units import find_unit
 
@@ -89,6 +90,12 @@ def test_sample_prints_the_size_of_the_sample_and_weights_its_draws(loopcal, fol
     arrays = lc.load_run(run).arrays
     mean = 1e-3 * (numbers[:, 0] @ numbers[:, 1:])
     assert (np.abs(mean - arrays["estimate"]) < 0.25 * arrays["sd"]).all()
+
+
+def test_each_column_of_draws_has_the_unit_of_its_own_parameter() -> None:
+    draws = np.array([[0.2, np.pi], [0.3, np.pi / 2.0]])
+    text = format_draws(("length", "offset"), ("mm", "deg"), np.array([1e-3, np.pi / 180.0]), draws)
+    assert text == "length [mm],offset [deg]\n200,180\n300,90\n"
 
 
 def test_files_give_the_same_fit_as_a_run(loopcal, folder) -> None:

@@ -135,5 +135,5 @@ def format_draws(
     if weight is not None:
         columns["weight"] = map(repr, weight.tolist())
     for name, unit, factor, column in zip(names, units, factors, draws.T.tolist(), strict=True):
-        columns[f"{name} [{unit}]"] = (format_scaled(value, factor) for value in column)
+        columns[f"{name} [{unit}]"] = [format_scaled(value, factor) for value in column]
     return format_columns(columns)
