@@ -7,14 +7,16 @@ import runpy
 import shlex
 import sys
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
-from loopcal.errors import DataError
+from loopcal.errors import DataError, FileError
 from loopcal.estimate.losses import LOSSES
 from loopcal.io.formats import FORMATS
 from loopcal.measure.kinds import KINDS
@@ -115,6 +117,26 @@ def test_the_kind_of_the_page_has_the_derivatives_of_its_columns(registered, tmp
         move = np.eye(3)[axis] * step
         high, low = (kind.predict(x + sign * move, np.zeros((1, 0)))[0] for sign in (1, -1))
         assert slope[0, 0, 0, axis] == pytest.approx((high - low).item() / (2 * step), abs=1e-8)
+
+
+def test_a_setting_has_the_dimension_that_it_declares(registered, tmp_path) -> None:
+    kind = run_module(tmp_path)["Runout"]
+    annotations = {"lean": Annotated[float, lc.Dimension.ANGLE], "name": ClassVar[str]}
+    tilted = type(
+        "Tilted", (kind,), {"__annotations__": annotations, "lean": 0.0, "name": "tilted"}
+    )
+    lc.register_kind(dataclass(frozen=True, eq=False, kw_only=True)(tilted))
+    robot, path = lc.load_robot("hexapod-42"), tmp_path / "data.csv"
+    sensor = lc.Sensor(KINDS["tilted"](lean=np.pi / 6), lc.Gaussian(np.array([1e-6])))
+    poses = lc.sample_workspace(robot, 3, seed=1).coordinates
+    data = lc.simulate(robot, poses, lc.Instrument((sensor,)), seed=1)
+    lc.save_measurements(data, path, robot)
+    assert "# lean: 30 deg\n" in path.read_text()
+    (rows,) = lc.load_measurements(path, robot).observations
+    assert rows.kind.lean == pytest.approx(np.pi / 6, rel=1e-15)
+    path.write_text(path.read_text().replace("30 deg", "30 mm"))
+    with pytest.raises(FileError, match="lean"):
+        lc.load_measurements(path, robot)
 
 
 def test_what_is_no_kind_and_no_loss_cannot_be_registered(registered) -> None:

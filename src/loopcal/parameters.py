@@ -18,8 +18,6 @@ from loopcal.units import Dimension
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-SCOPES = ("machine", "session", "group", "pose")
-
 
 @dataclass(frozen=True)
 class Parameter:

@@ -23,6 +23,7 @@ from loopcal.diagnose.value_comparison import (
 )
 from loopcal.errors import DataError
 from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.recalibration import CHANGE_LEVEL, TOO_WELL
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
@@ -37,11 +38,7 @@ if TYPE_CHECKING:
 
 NEEDED = ("path", "result", "robot", "arrays", "load_posterior")  # attributes of a run
 QUANTITIES = ("position", "orientation", "length")  # quantities whose errors are compared
-# Probability that any of the compared machines is declared changed although none is.
-CHANGE_LEVEL = 0.05
 CAUSE_LEVEL = 0.01  # probability of rejecting the true cause of a change
-# Probability of a chi-square as small as that of runs which share rows in another form.
-TOO_WELL = 1e-3
 COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a change
 
 
@@ -364,8 +361,8 @@ def _find_common_poses(runs: Sequence[Run]) -> tuple[str, ...]:
         digests.append(sorted(files[role]["sha256"] for role in of_data))
     if not digests[0] or any(digest != digests[0] for digest in digests):
         return ()
-    held_out = [((run.result.get("split") or {}).get("held_out") or ()) for run in runs]
-    return tuple(label for label in held_out[0] if all(label in others for others in held_out))
+    first, *others = (run.held_out for run in runs)
+    return tuple(label for label in first if all(label in other for other in others))
 
 
 def _read_errors(run: Run, poses: Sequence[str] | None) -> dict[str, Statistics]:

@@ -414,7 +414,7 @@ class PoseSearch:
         located: list[LinearizedPoses] | None = None,
     ) -> None:
         self.rows, self.values, self.trials = rows, rows.free.values(z), trials
-        self.nuisance = rows.nuisance if solves_nuisance else None
+        self.nuisance: NuisanceElimination | None = rows.nuisance if solves_nuisance else None
         self.located = located
 
     def minimize(

@@ -123,7 +123,7 @@ def _build_error_summary(validation: Validation, caption: str, with_before: bool
         is_part = quantity == "position" and len(measured) < 3
         name = f"{quantity} {' '.join(measured)}" if is_part else quantity
         for key in SUMMARY:
-            values = (before[key], after[key], floor.metrics[key][quantity])
+            values = (before[key], after[key], floor.metrics.get(key, {}).get(quantity, math.nan))
             shown = (format_in(unit, x, 3) for x in values)
             rows.append([name, METRICS[key].words, str(after.count), *shown, unit.symbol])
     return _build_error_table(caption, "quantity", rows, with_before)

@@ -479,7 +479,7 @@ class _Point:
 
 
 class _Step(NamedTuple):
-    """A full Gauss-Newton step (1, p); see `FullStep`."""
+    """A full Gauss-Newton step (1, p)."""
 
     direction: FloatArray
     change: FloatArray

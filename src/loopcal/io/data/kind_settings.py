@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A kind of measurement in a file: its name, its own settings, its noise and its rows.
 
-    kind: pose                                the name of a kind of `loopcal.measure.KINDS`
+    kind: pose                                the name of a kind of `loopcal.measure.kinds.KINDS`
     orientation: euler-xyz                    the fields of its dataclass
     T_base_frame: {x: 12 mm, yaw: 90 deg}     poses: x y z, and R = Rz(yaw) Ry(pitch) Rx(roll)
     places: [[100 mm, 0 mm, 20 mm]]           lengths with units; directions as plain numbers
@@ -10,8 +10,9 @@
     noise_source: assumed                     nobody stated this noise
 
 The record of a kind's settings is made from its dataclass, so that a new kind needs nothing here:
-arrays called T_.. are poses, those in DIRECTIONS are directions, other arrays and numbers are
-lengths, the rest is text.
+arrays called T_.. are poses, those in DIRECTIONS are directions, other arrays are lengths, and
+numbers, too, unless they state another dimension, as Annotated[float, Dimension.ANGLE]; the rest is
+text.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
 
 def list_kind_settings(kind: type[Kind]) -> dict[str, Any]:
     """Return name -> annotation of the settings of a kind."""
-    hints = typing.get_type_hints(kind)
+    hints = typing.get_type_hints(kind, include_extras=True)
     return {f.name: hints[f.name] for f in dataclasses.fields(cast(Any, kind)) if f.init}
 
 
@@ -180,7 +181,7 @@ def format_kind(
 
     Keyword-only settings are left out where they are the default, or the robot's `tool`.
     """
-    texts = {"kind": kind.name}
+    texts, types = {"kind": kind.name}, list_kind_settings(type(kind))
     for setting in dataclasses.fields(cast(Any, kind)):
         if not setting.init or (value := getattr(kind, setting.name)) is None:
             continue
@@ -191,7 +192,8 @@ def format_kind(
             usual = setting.default_factory()
         is_usual = usual is not dataclasses.MISSING and bool(np.array_equal(value, usual))
         if not is_usual or (not setting.kw_only and isinstance(value, str | tuple)):
-            texts[setting.name] = _format_setting(setting.name, value)
+            (dimension,) = getattr(types[setting.name], "__metadata__", (Dimension.LENGTH,))
+            texts[setting.name] = _format_setting(setting.name, value, dimension)
     if noise:
         units = {column.name: NOISE_UNITS[column.dimension] for column in kind.noise_columns}
         # nine digits: more would be rounding
@@ -222,6 +224,8 @@ def _make_record(kind: type[Kind]) -> type:
             in_file = PoseRecord if name.startswith("T_") else in_file
         elif annotation is float:
             in_file = Annotated[float, Dimension.LENGTH]
+        elif typing.get_origin(annotation) is Annotated:
+            in_file = annotation
         elif "tuple" in text:
             in_file = tuple[str, ...] | str
         fields.append((name, in_file, None))
@@ -236,8 +240,8 @@ def _is_array(value: list[Any]) -> bool:
     return len(lengths) == 1 and all(_is_array(item) for item in value)
 
 
-def _format_setting(key: str, value: Any) -> str:
-    """Return a setting as text that `read_kind` reads."""
+def _format_setting(key: str, value: Any, dimension: Dimension) -> str:
+    """Return a setting as text that `read_kind` reads; numbers have the dimension."""
     if key.startswith("T_"):
         angles = geometry.matrix_to_euler(value[:3, :3], "xyz")
         numbers = [float(v) + 0.0 for v in (*value[:3, 3], *angles)]
@@ -248,11 +252,11 @@ def _format_setting(key: str, value: Any) -> str:
     if isinstance(value, str):
         return quote_scalar(value)
     if isinstance(value, float):
-        return repr(value) if key in DIRECTIONS else format_quantity(value, Dimension.LENGTH)
+        return repr(value) if key in DIRECTIONS else format_quantity(value, dimension)
     items = value if isinstance(value, list | tuple) else value.tolist()
     if not isinstance(items, list | tuple):
-        return _format_setting(key, items)
-    return f"[{', '.join(_format_setting(key, item) for item in items)}]"
+        return _format_setting(key, items, dimension)
+    return f"[{', '.join(_format_setting(key, item, dimension) for item in items)}]"
 
 
 # Prior knowledge of setup parameters (frames, targets, surfaces, offsets).
@@ -521,11 +525,8 @@ def read_kinds(table: Table, robot: Mechanism, several: bool = False) -> tuple[K
         of_kind = {"kind", *KIND_SETTINGS} - {"instrument"}
         refuse_unknown_keys(file, list(content), [key for key in SETTINGS if key not in of_kind])
         if not isinstance(labeled, dict) or not all(isinstance(n, dict) for n in labeled.values()):
-            sentence = (
-                "'kinds' must map labels to kinds, as 'kinds: {height: {kind: component, ..}}'"
-            )
             example = "'kinds: {height: {kind: component, ..}}'"
-            raise file.error(f"{sentence}, as {example}", ("kinds",))
+            raise file.error(f"'kinds' must map labels to kinds, as {example}", ("kinds",))
         require_columns(table, ["kind"], "which assigns each row to one of the kinds")
         cells = np.array(table.text("kind"))
         for row, cell in enumerate(cells):

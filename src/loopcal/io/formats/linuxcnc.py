@@ -22,6 +22,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -80,7 +81,9 @@ class HalFile(ValueFile):
     title = phrase = "{0}.{1}"
     missing = "'setp {0}.{1} ..' is missing, and loopcal assumes no default; add it"
     group = COMPONENT
-    entry = re.compile(rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(?:\s*=\s*|\s+)([^\s#]+)")
+    entry: ClassVar[re.Pattern[str]] = re.compile(
+        rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(?:\s*=\s*|\s+)([^\s#]+)"
+    )
     new = "setp {0}.{1} {2}"
 
     def format(self, number: float) -> str:
@@ -250,8 +253,8 @@ class IniFile(ValueFile):
     title = "[{0}]{1}"
     phrase = "{1} of [{0}]"
     missing = "[{0}] has no {1}; add the one of the machine"
-    section = re.compile(r"\s*\[(\w+)\]")
-    entry = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
+    section: ClassVar[re.Pattern[str] | None] = re.compile(r"\s*\[(\w+)\]")
+    entry: ClassVar[re.Pattern[str]] = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
     new = "[{0}]\n{1} = {2}"
     does_first_count = True
 

@@ -44,8 +44,8 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 Number = float | None
-PARAMETERS = [{"name": str, "plus_minus": Number, "estimate?": Number, "unit?": str}]
-SOURCE = {
+PARAMETERS: list[Any] = [{"name": str, "plus_minus": Number, "estimate?": Number, "unit?": str}]
+SOURCE: dict[str, Any] = {
     "kind": str,
     "name": str,
     "evaluation": str,
@@ -55,7 +55,7 @@ SOURCE = {
     "parameters": {"*": Number},
     "halved": ({"position_rms": Number, "orientation_rms": Number, "worst_parameter_sd": Number},),
 }
-BUDGET = {
+BUDGET: dict[str, Any] = {
     "position": {"rms": Number},
     "orientation": {"rms": Number},
     "parameters": {"*": Number},
@@ -65,7 +65,7 @@ BUDGET = {
     "finding": {"text": str},
     "sources?": ([SOURCE],),  # earlier versions state none
 }
-STATED = {
+STATED: dict[str, Any] = {
     "format": Literal[1, 2],
     "made_by": {"command": [str], "inputs": {"*": {"path": str, "sha256": str}}},
     "fit": {

@@ -65,8 +65,8 @@ of ten only; a shorter one has even steps.
 """
 
 
-ZERO = {"color": REFERENCE, "lw": THIN}
-DASHED = {**ZERO, "ls": "--"}
+ZERO: dict[str, Any] = {"color": REFERENCE, "lw": THIN}
+DASHED: dict[str, Any] = {**ZERO, "ls": "--"}
 """Styles of a line at zero, and of a reference that data are compared with."""
 
 

@@ -96,10 +96,12 @@ def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
     content = json.loads(task.content)
     cell, trials, fits = calibrate_block(content, threads)
     stream = make_stream(cell.content.seed, content["block"])
-    names = (column.name for column in list_columns(cell.content.scores))
+    names = [column.name for column in list_columns(cell.content.scores)]
     scores: dict[str, Any] = dict.fromkeys(names, np.nan)
     scores |= score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
-    columns = np.broadcast_arrays(*{**scores, **fits.scores}.values())
+    scores |= fits.scores
+    assert set(scores) == set(names), "a score needs its column in studies/specification/study.py"
+    columns = np.broadcast_arrays(*(scores[name] for name in names))
     return np.stack(columns, axis=1)
 
 
@@ -185,7 +187,7 @@ def score_poses(
     truth = forward_trials(robot, trials.truth, readings, held_out.state)
     state, reference = fits.states or solve_cell_poses(cell, fits.values)
     is_lost = (fits.outcome == 0) & ~(is_reached(truth) & is_reached(state))
-    is_known = np.isfinite(fits.values).all(axis=1)[:, None, None, None]
+    is_known = np.all(np.isfinite(fits.values), axis=1)[:, None, None, None]
     nominal = held_out.T[None], cell.reference.T[None]
     fitted = (np.where(is_known, s.T, np.nan) for s in (state, reference))
     scores: dict[str, FloatArray] = {"outcome": np.where(is_lost, NOT_REACHED, fits.outcome)}
