@@ -30,6 +30,7 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     BEFORE,
     LS,
     MM,
+    POSITION_ALIGNED,
     PRIOR,
     Stated,
     draw_true_machines,
@@ -42,7 +43,7 @@ from tests.papers.small_reproduction import MADE_BY
 
 ROOT = Path(__file__).parents[2]
 DRAWS = 6
-POSITION, POSITION_ALIGNED = "position [mm]", "position, aligned [mm]"
+POSITION = "position [mm]"
 ALIGNED, ABSOLUTE = steps.MEASURES.index(POSITION_ALIGNED), steps.MEASURES.index(POSITION)
 NOMINAL = steps.MEASURES.index("position, gauge at nominal [mm]")
 

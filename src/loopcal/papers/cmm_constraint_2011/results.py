@@ -19,6 +19,8 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     LS,
     METHODS,
     MM,
+    NO_GAUGE,
+    POSITION_ALIGNED,
     PRINTED,
     PRIOR,
     SIZES,
@@ -29,8 +31,6 @@ from loopcal.papers.cmm_constraint_2011.steps import (
 from loopcal.typing import FloatArray
 
 TEXT = published.PaperText(__file__)
-POSITION_ALIGNED = "position, aligned [mm]"
-NO_GAUGE = "parameters without gauge [mm]"
 WEIGHTS = ("as printed: weight one", "divided by |d_1|", "divided by the sd of each",
            "full covariance")  # fmt: skip
 MOTIONS = (

@@ -55,13 +55,15 @@ with poses nearest to the true ones.
 """
 STATISTICS = ("position, mean [mm]", "position, standard deviation [mm]", "orientation, mean [deg]",
               "orientation, standard deviation [deg]")  # fmt: skip
+POSITION_ALIGNED = "position, aligned [mm]"
+NO_GAUGE = "parameters without gauge [mm]"
 MEASURES = (
     "position [mm]",
     "orientation [deg]",
-    "position, aligned [mm]",
+    POSITION_ALIGNED,
     "orientation, aligned [deg]",
     "parameters [mm]",
-    "parameters without gauge [mm]",
+    NO_GAUGE,
     "position, gauge at nominal [mm]",
     *(f"{name}, {frame}" for frame in FRAMES for name in STATISTICS),
 )
@@ -398,7 +400,7 @@ def calibrate_figure_5(
 def describe_points(name: str, study: Study, cell: Cell) -> Row:
     """Return the accuracy of one way to place 100 points; cell : of figure 5."""
     drawn, optimized = study.spreads
-    medians = {m: cell.compute_median(m, "position, aligned [mm]") for m in METHODS}
+    medians = {m: cell.compute_median(m, POSITION_ALIGNED) for m in METHODS}
     row = {"name": name, "rows": study.layout.equations, "drawn": drawn, "optimized": optimized}
     return row | {"gain": drawn / optimized} | medians
 
@@ -438,7 +440,7 @@ def rank_candidates(studies: Mapping[str, Study], seed: int, trials: int) -> lis
     """
     frames = {
         "absolute": ("parameters [mm]", "position [mm]", "orientation [deg]"),
-        "aligned": ("parameters without gauge [mm]", "position, aligned [mm]",
+        "aligned": (NO_GAUGE, POSITION_ALIGNED,
                     "orientation, aligned [deg]"),
     }  # fmt: skip
     rows, printed = [], list_printed()
