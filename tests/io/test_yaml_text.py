@@ -126,7 +126,7 @@ def test_what_no_edit_can_express_is_written_anew() -> None:
 
 
 WORDS = """
-yes null ~ 1e3 =a *w %w "q" ' a: .inf NaN 0x1 1_0 2026-01-01 << !x &x | > @ ` { } [ ] , ---
+yes y N null ~ 1e3 =a *w %w "q" ' a: .inf NaN 0x1 1_0 2026-01-01 << !x &x | > @ ` { } [ ] , ---
 ... é \U0001f916"""
 PHRASES = (" a", "a ", "leg #1", "a, b", "x: y", "- a", "? b", "\u2028", "\ufeff", "\x85", "# a")
 NAMES = st.sampled_from((*WORDS.split(), *PHRASES)) | st.text(
@@ -141,6 +141,11 @@ def test_any_name_is_quoted_so_that_yaml_reads_it_back(names: list[str]) -> None
     assert parse(f"a: [{', '.join(quoted)}]\n").content == {"a": names}
     assert parse("".join(f"{text}: 1\n" for text in quoted)).content == dict.fromkeys(names, 1)
     assert "\n" not in "".join(quoted)
+
+
+@pytest.mark.parametrize("word", ["y", "N", "yes", "Off", "True", "null"])
+def test_words_that_older_yaml_reads_as_something_else_are_quoted(word: str) -> None:
+    assert quote_scalar(word) == f'"{word}"'
 
 
 SCALARS = (

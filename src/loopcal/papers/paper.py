@@ -10,7 +10,6 @@ compare_tables, make_tables, judge_claims and make_figures yield what a page sho
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -168,6 +167,7 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
     Another robot gets as many poses of its own workspace in place of a file of poses, and errors by
     its tolerances in place of the errors of one machine.
     """
+    from loopcal.io.core.yaml_file import quote_scalar
     from loopcal.studies.files.study_file import quote_robot
 
     first = next(iter(paper.studies))
@@ -179,9 +179,7 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
         if file is None:
             return PaperStudyFile({path: text}, wanted)
         beside = path.with_name(f"{path.stem}-poses.csv")
-        is_plain = re.fullmatch(r"[\w.-]+", beside.name)
-        name = beside.name if is_plain else json.dumps(beside.name, ensure_ascii=False)
-        text = text.replace(f"{{file: {file[1]}}}", f"{{file: {name}}}")
+        text = text.replace(f"{{file: {file[1]}}}", f"{{file: {quote_scalar(beside.name)}}}")
         return PaperStudyFile({path: text, beside: poses}, wanted)
     changes = {"robots": f"robots: [{quote_robot(path, wanted)}]"}
     if file is not None:

@@ -320,7 +320,7 @@ def _make_bounded_composer(loader: Any) -> Any:
 # Text of YAML: names in quotes where they need them, and one key added to or removed from a
 # file.
 
-PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*", re.IGNORECASE)
+PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)\Z)[a-z][\w.-]*", re.IGNORECASE)
 """Text that every version of YAML reads as the same text without quotes."""
 
 

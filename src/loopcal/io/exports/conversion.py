@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -45,6 +44,7 @@ from loopcal.io.core.limits import (
     make_name,
 )
 from loopcal.io.core.text_file import as_path, read_bytes, write_text
+from loopcal.io.core.yaml_file import quote_scalar
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.exports.profile import ColumnSource, PatternClock, Place, Profile, normalize_name
@@ -323,9 +323,6 @@ def _is_equal(cell: str, other: str) -> bool:
     return cell == other or (value is not None and value == parse_finite(other))
 
 
-PLAIN = re.compile(r"(?!(?i:null|true|false|yes|no|on|off|y|n)$)[A-Za-z](?:[\w /.-]*[\w/.-])?")
-"""Text that YAML reads as itself."""
-
 ROTATION_ERROR = 1e-3
 """Accepted deviation of an exported matrix from a rotation [1]: the rounding of four decimals."""
 
@@ -507,5 +504,4 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
 
 def _format_setting(value: Any) -> str:
     """Return a setting on one line of YAML."""
-    is_plain = isinstance(value, str) and PLAIN.fullmatch(value) is not None
-    return str(value) if is_plain else json.dumps(value, ensure_ascii=False)
+    return quote_scalar(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +18,7 @@ from loopcal.io.core.yaml_file import (
     Location,
     YamlFile,
     find_file_beside,
+    quote_scalar,
     read_yaml,
     refuse_unknown_keys,
 )
@@ -329,7 +329,6 @@ def quote_robot(path: Path, robot: str) -> str:
     """Return how a study file names a robot: a shipped one by its name, another one by its file,
     relative to the study file.
     """
-    file, name = find_robot_file(robot), robot
-    if robot not in list_shipped_robots():
-        name = Path(os.path.relpath(file, path.parent)).as_posix()
-    return name if name.replace("-", "").isalnum() else json.dumps(name, ensure_ascii=False)
+    if robot in list_shipped_robots():
+        return robot
+    return quote_scalar(Path(os.path.relpath(find_robot_file(robot), path.parent)).as_posix())
