@@ -23,7 +23,7 @@ WORK = """
 import sys, time
 from loopcal.cli import terminal
 terminal.DELAY = float(sys.argv[2])
-with terminal.ProgressBar() as progress:
+with terminal.TerminalProgress() as progress:
     for i in range(int(sys.argv[1])):
         progress(i, 10, "fitting")
         time.sleep(0.1)
@@ -106,7 +106,7 @@ def test_long_work_shows_percentage_and_remaining_time_on_a_terminal():
 
 
 def test_bar_begins_at_the_steps_that_are_done_and_keeps_its_time():
-    bar = terminal.ProgressBar()
+    bar = terminal.TerminalProgress()
     bar._bar = terminal._make_bar()
     bar(2, 5, "fitting")
     first = bar._task

@@ -416,7 +416,7 @@ def read_measurements(
             facts = {"file": str(path), "stated": stated, "used": robot.name}
             terminal.print_finding("workflow.robot-of-other-name", **facts)
     try:
-        with terminal.ProgressBar("reading the measurements"):
+        with terminal.TerminalProgress("reading the measurements"):
             data = load_measurements(paths, robot, **allowed)
             unfilled = list_unfilled_files(paths, data)
     except DataError as error:

@@ -156,7 +156,7 @@ def print_finding(code: str, **facts: Any) -> None:
     print_note(report_finding(code, **facts))
 
 
-class ProgressBar:
+class TerminalProgress:
     """The progress callback of the command line: a bar on standard error.
 
     It is drawn only where standard error is a terminal, and only after two seconds of work. A timer

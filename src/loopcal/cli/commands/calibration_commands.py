@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal calibrate`, `loopcal budget`, `loopcal validate` and `loopcal compensate`."""
+"""Calibrate a robot, and what uses a calibration: its accuracy, comparisons, documents."""
 
 from __future__ import annotations
 
@@ -110,10 +110,10 @@ def calibrate(
     )
     refuse_run_folder(output, force, list(inputs.values()))
     measurements = opt.read_measurements(data, machine, **allowed)
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         report = lc.calibrate(machine, measurements, settings, progress)
     opt.print_convention_note(report.conventions, data)
-    with terminal.ProgressBar("writing the run folder"):
+    with terminal.TerminalProgress("writing the run folder"):
         lc.save_run(output, report, inputs, sys.argv, force)
     written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
     return Output(
@@ -260,7 +260,7 @@ def compensate(
     robot = known if isinstance(known, lc.Mechanism) else known.robot
     coordinates, labels = load_targets(targets, robot)
     old = None if controller is None else lc.load_robot(controller)
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         result = lc.compensate(known, coordinates, mode, old, steps, labels, progress, frame=frame)
     if output is not None:
         write_text(output, format_compensation(result))
@@ -417,7 +417,7 @@ def report(
     refuse_outputs(files, [run / name for name in calibrated.result.get("files", {})], force)
     if pdf:
         check_browser(files[-1])
-    with terminal.ProgressBar("writing the report") as progress:
+    with terminal.TerminalProgress("writing the report") as progress:
         lc.write_report(output, calibrated)
         if pdf:
             progress(0, 1, "printing the report")
@@ -469,7 +469,7 @@ def regularize(
     if output is not None:
         refuse_folder(output, CURVES, force, list(inputs.values()))
     measurements = opt.read_fitted_measurements(data, machine, allowed)
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         curves = lc.compute_regularization_curves(
             machine,
             measurements,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal import` and `loopcal export`: files of controllers and other programs."""
+"""Files of other programs, of controllers and of instruments: read and written."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ def plan(
             opt.refuse_given((name,), reason, sentence)
         sigma = instrument["sigma_position"]
         surface_options = lc.SurfaceOptions(groups, points, sigma, constraints, seed)
-        with terminal.ProgressBar() as progress:
+        with terminal.TerminalProgress() as progress:
             result = lc.plan_surfaces(machine, surface_options, progress)
         document = result.to_dict()
     else:
@@ -167,7 +167,7 @@ def plan(
             curve=curve,
             seed=seed,
         )
-        with terminal.ProgressBar() as progress:
+        with terminal.TerminalProgress() as progress:
             result = lc.plan(machine, measuring, options=plan_options, progress=progress)
         document = {"format": FORMAT, **result.to_dict()}
     written = _write_plan(output, result, inputs, seed, force)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal new` and `loopcal check`: write a robot file, and show one."""
+"""Begin: write, check and view a robot file, write the files of an example, complete commands."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def view(
     run = load_run_or_robot(source)
     files = [Path(source) / name for name in run.result.get("files", {})]
     refuse_outputs((output,), files or (Path(source),), force)
-    with terminal.ProgressBar("writing the view"):
+    with terminal.TerminalProgress("writing the view"):
         write_view(output, run if run.result else run.robot)
     is_open = not no_browser and open_page(output.resolve().as_uri())
     failures = [] if run.failure is None else [run.failure]

@@ -44,7 +44,7 @@ def load_fit(
     if data:
         robot = lc.load_robot(source)
         measurements = opt.read_fitted_measurements(data, robot, allowed)
-        with terminal.ProgressBar() as progress:
+        with terminal.TerminalProgress() as progress:
             fit = lc.identify(robot, measurements, options=options, progress=progress)
     else:
         if Path(source).is_file():
@@ -54,7 +54,7 @@ def load_fit(
             )
         opt.refuse_given(FIT_NAMES, "with a run folder")
         run = lc.load_run(source)
-        with terminal.ProgressBar() as progress:
+        with terminal.TerminalProgress() as progress:
             fit, measurements = repeat_fit(run, progress)
     return adjust_uncertainty(fit, measurements), measurements
 
@@ -111,7 +111,7 @@ def bootstrap(
     fit, measurements = load_fit(source, data, fit_options, allowed)
     is_number = unit is not None and unit.isdecimal() and len(unit) < MOST_DIGITS
     chosen = int(unit) if unit is not None and is_number else unit
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         result = lc.bootstrap(
             fit, measurements, count, scheme=scheme, unit=chosen, seed=seed, progress=progress
         )
@@ -184,7 +184,7 @@ def sample(
     opt.refuse_given(("names", "rule"), "without --region")
     refuse_outputs((output,), (Path(source), *data), force)
     fit, measurements = load_fit(source, data, fit_options, allowed)
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         result = lc.sample_posterior(fit, measurements, count, seed=seed, progress=progress)
     intervals = result.intervals(level)
     return _finish(result, intervals, view_posterior(result, intervals), output)

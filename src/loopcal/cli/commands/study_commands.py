@@ -87,7 +87,7 @@ def run_and_report(
 
     executor, share = work
     try:
-        with terminal.ProgressBar() as progress:
+        with terminal.TerminalProgress() as progress:
             report = run_blocks(chosen, store, executor, share, progress)
     except KeyboardInterrupt:
         done, total = count_stored(chosen, store, share), count_blocks(chosen, share)
@@ -189,7 +189,7 @@ def check(study_file: Path = STUDY, quick: bool = QUICK) -> Output:
     from loopcal.studies.running import estimate_time, read_source, view_estimate
 
     chosen = read_source(study_file, quick).study
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         estimate = estimate_time(chosen, count_processors(), progress)
     following = f"Next: loopcal study run {study_file} -o FOLDER"
     return Output(estimate, lambda: [*view_estimate(chosen, estimate, round_duration), following])
@@ -282,7 +282,7 @@ def summary(
     from loopcal.studies.results.summary_drawing import render_figures
 
     result = StudyResult(folder)
-    with terminal.ProgressBar("summarizing trials"):
+    with terminal.TerminalProgress("summarizing trials"):
         summarized, answered = result.summarize(), result.answer_questions()
         shown = questions.list_shown(result.study, summarized, scores)
         page = questions.view_summary(result.study, summarized, shown)
@@ -310,7 +310,7 @@ def ask(
     ),
     share: float = opt.option(
         "Share of the machines that stay within the limit.",
-        type=click.FloatRange(0, 1, min_open=True, max_open=True),
+        type=opt.OPEN_SHARE,
         default=0.95,
         metavar="SHARE",
     ),
@@ -355,7 +355,7 @@ def export(
     from loopcal.studies.results.study_result import export_trials
 
     refuse_outputs((output,), (), force)
-    with read_store(folder) as store, terminal.ProgressBar() as progress:
+    with read_store(folder) as store, terminal.TerminalProgress() as progress:
         count = export_trials(load_specification(store), store, output, progress)
     document = {"written": str(output), "trials": count}
     return Output(document, lambda: [f"Written: {output} ({count} trials)"])
@@ -376,7 +376,7 @@ def merge(
     from loopcal.studies.files.store import merge_studies
     from loopcal.studies.results.study_result import read_status, view_status
 
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         count = merge_studies(part_folders, output, progress)
     state = read_status(output)
     written = f"Written to {output}: {count} new blocks"
@@ -409,7 +409,7 @@ def replay(
     from loopcal.cli.hints import hint_for
     from loopcal.report.calibration_view import view_calibration
 
-    with terminal.ProgressBar() as progress:
+    with terminal.TerminalProgress() as progress:
         done = calibrate_trial(
             folder, int(match[1]), int(match[2]), output, sys.argv, force, progress
         )
