@@ -23,7 +23,6 @@ from loopcal.report.document.elements import (
     Element,
     Listing,
     Section,
-    describe_call,
     list_options,
 )
 from loopcal.report.document.figures import draw_figures
@@ -362,12 +361,16 @@ def describe_provenance(record: CalibrationRecord) -> Iterator[Element]:
     """Yield command, versions, seeds, options and digests of the files."""
     made_by = record.result.get("made_by") or {}
     versions = made_by.get("versions", {}).items()
+    method = str(record.result["fit"].get("method") or "unknown")
+    options = record.result.get("options")
+    if isinstance(options, Mapping):  # the settings of a stated method are among them
+        method = method.partition("(")[0]
     rows = [
         ("command", " ".join(made_by.get("command") or ()) or "called from Python"),
         *((n if n == "engine" else f"version of {n}", value) for n, value in versions),
         *((f"seed: {name}", str(seed)) for name, seed in made_by.get("seeds", {}).items()),
-        ("method", describe_call(str(record.result["fit"].get("method") or "unknown"))),
-        *list_options(record.result.get("options")),
+        ("method", method),
+        *list_options(options),
     ]
     value, file, digest = (word_column(t, wraps=True) for t in ("value", "file", "SHA-256"))
     yield make_table("Origin of this result", ("item", value), rows)

@@ -6,10 +6,8 @@ A sentence is a `str`; a table is the one that the terminal shows, too.
 
 from __future__ import annotations
 
-import ast
 import base64
 import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -263,16 +261,10 @@ class CalibrationRecord:
         return self.arrays.get("frames_readings")
 
 
-# Options and method of a stored calibration in words.
+# Options of a stored calibration in words.
 
 UNITS = {"limit_position": "m", "limit_angle": "rad"}
 """Units of options that are numbers [SI]."""
-
-PYTHON_OBJECT = re.compile(r"(?<==)<([A-Za-z_]+)[^<>]*>")
-"""What Python writes of an argument that is an object."""
-
-UNSTATED = ("None", "()", "[]", "{}")
-"""Values of options that nobody stated."""
 
 
 def list_options(options: object) -> list[tuple[str, str]]:
@@ -304,35 +296,3 @@ def describe_value(value: Any) -> str:
         return str(value[OBJECT]).strip("<>").split(" ")[0]
     settings = ", ".join(f"{k} {describe_value(v)}" for k, v in value.items() if k != "name")
     return f"{value['name']} ({settings})" if "name" in value else settings
-
-
-def describe_call(text: str) -> str:
-    """Return a call in words, such as `Ridge (parameter 0.1)`; the text where it is no call."""
-    try:
-        node = ast.parse(PYTHON_OBJECT.sub(r"\1()", text), mode="eval").body
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return text
-    is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-    return _describe_expression(node) if is_call else text
-
-
-def _describe_expression(node: ast.expr) -> str:
-    """Return a value in words."""
-    match node:
-        case ast.Call(func=ast.Name(id=name), args=values, keywords=named):
-            stated = [k for k in named if ast.unparse(k.value) not in UNSTATED]
-            arguments = [
-                *map(_describe_expression, values),
-                *(
-                    f"{(k.arg or '').replace('_', ' ')} {_describe_expression(k.value)}"
-                    for k in stated
-                ),
-            ]
-            return f"{name} ({', '.join(arguments)})" if arguments else name
-        case ast.Tuple(elts=items) | ast.List(elts=items):
-            return ", ".join(map(_describe_expression, items))
-        case ast.Constant(value=bool(is_true)):
-            return "yes" if is_true else "no"
-        case ast.Constant(value=value):
-            return str(value)
-    return ast.unparse(node)
