@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.data_checks import check_strokes, find_outside_strokes
-from loopcal.measure.instrument import Gaussian, Instrument, Noise, Sensor, Uniform
+from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Noise, Sensor, Uniform
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.position import TargetKind
 from loopcal.measure.measurements import Measurements
@@ -29,6 +29,8 @@ from loopcal.mechanism.workspace import resolve_poses
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
+DRAWN = 40  # number of poses that are drawn from the workspace where none are given
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedMeasurements:
@@ -42,7 +44,7 @@ class SimulatedMeasurements:
 def simulate_measurements(
     robot: Mechanism,
     instrument: Instrument,
-    poses: ArrayLike | int = 40,
+    poses: ArrayLike | int = DRAWN,
     *,
     draw_errors: bool = False,
     reading_sigma: ArrayLike | None = None,
@@ -117,7 +119,7 @@ def _choose_truth(robot: Mechanism, draw_errors: bool, seed: int) -> Mechanism:
 def predict_noise_free(
     robot: Mechanism,
     instrument: Instrument,
-    poses: ArrayLike | int = 40,
+    poses: ArrayLike | int = DRAWN,
     *,
     reading_sigma: ArrayLike | None = None,
     labels: Sequence[str] = (),
@@ -152,8 +154,8 @@ class InstrumentDescription:
     components: Sequence[str] = ()  # coordinates that the kind `component` measures
     orientation: str | None = None  # form of measured angles; None for the default of the kind
     # sigma_position, sigma_angle: standard deviations of each length [m] and angle [rad]
-    sigma_position: float = 1e-5
-    sigma_angle: float = 5e-5
+    sigma_position: float = SIGMA[Dimension.LENGTH]
+    sigma_angle: float = SIGMA[Dimension.ANGLE]
     # of "base" (the frame of the instrument in the base) and "tool"
     unknown_frames: Sequence[str] = ()
     # names of targets on the platform whose places are unknown; none leaves the tool

@@ -92,24 +92,35 @@ def keep_blocks(text: str) -> str:
     return re.sub(r"(?<=\n\n)(?=\S.*\n )", "\b\n", cleandoc(text))
 
 
-def _import(place: str) -> Any:
+def look_up(place: str) -> Any:
     """Return what a place such as `package.module:NAME` names."""
     module, _, name = place.partition(":")
     return attrgetter(name)(import_module(module))
 
 
 class LibraryOption(click.Option):
-    """An option with the default of the library: of the function, or record of options, at the
-    place `of`, that has it under the same name.
+    """An option that asks the library when it is used: for its default, which is the constant at
+    the place `of`, or that of the function or record of options there under the same name, and for
+    its help text where this is a function.
     """
 
-    def __init__(self, *arguments: Any, of: str, **settings: Any) -> None:
-        super().__init__(*arguments, **settings)
+    def __init__(self, *arguments: Any, of: str = "", **settings: Any) -> None:
+        self.write_help: str | Callable[[], str] = settings.pop("help")
         self.of = of
+        super().__init__(*arguments, **settings)
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the option and its help text, for the help."""
+        self.help = self.write_help() if callable(self.write_help) else self.write_help
+        return super().get_help_record(ctx)
 
     def get_default(self, ctx: click.Context, call: bool = True) -> Any:
         """Return the default; for the help (without `call`) as a text."""
-        value = signature(_import(self.of)).parameters[self.name or ""].default
+        if not self.of:
+            return super().get_default(ctx, call)
+        value = look_up(self.of)
+        if callable(value):
+            value = signature(value).parameters[self.name or ""].default
         return self.type.show(value) if not call and isinstance(self.type, Parsed) else value
 
 
@@ -118,12 +129,11 @@ def argument(metavar: str | None = None, **settings: Any) -> Any:
     return Declared(click.Argument, (), {"metavar": metavar, **settings})
 
 
-def option(help: str, *names: str, **settings: Any) -> Any:  # noqa: A002
+def option(help: str | Callable[[], str], *names: str, **settings: Any) -> Any:  # noqa: A002
     """Declare an option, with other names than that of the argument; `of` is the place in the
     library that states its default, see `LibraryOption`.
     """
-    kind = LibraryOption if "of" in settings else click.Option
-    return Declared(kind, names, {"help": help, **settings})
+    return Declared(LibraryOption, names, {"help": help, **settings})
 
 
 def path(help: str, *names: str, **settings: Any) -> Any:  # noqa: A002
@@ -142,9 +152,9 @@ def force(what: str, more: str = "") -> Any:
     return flag(f"Replace {what} if {exists}{more}.")
 
 
-def seed(what: str) -> Any:
-    """Declare the option for the seed of something random."""
-    return option(f"Seed of {what}.", type=click.IntRange(min=0), default=1, metavar="N")
+def seed(what: str, of: str) -> Any:
+    """Declare the option for the seed of something random, which a function `of` makes."""
+    return option(f"Seed of {what}.", of=of, type=click.IntRange(min=0), metavar="N")
 
 
 # Types of values
@@ -252,7 +262,7 @@ class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # gene
     @property
     def choices(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The words that are allowed, for help texts and messages."""
-        words = _import(self.place)
+        words = look_up(self.place)
         if isinstance(words, Registry) and self.property:
             listed = [name for name, entry in words.items() if getattr(entry, self.property)]
         else:
@@ -263,7 +273,7 @@ class Words(click.Choice):  # pyright: ignore[reportMissingTypeArgument]  # gene
         """Return the word, the listed one for another name of a registry."""
         if value in self.others:
             return value
-        words = _import(self.place)
+        words = look_up(self.place)
         if isinstance(words, Registry) and not self.property and value in words:
             return words.resolve(value)
         return super().convert(value, param, ctx)
@@ -307,13 +317,13 @@ RUN: Any = argument("RUN", type=FILE)
 VERBOSE: Any = flag("Print all findings and tables, not only the summary.", "-v")
 
 
-def frame(names: str = "fitted, base, relative, or the frame of an instrument") -> Any:
-    """Declare the option for the frame in which errors are stated."""
+def frame(of: str, names: str = "fitted, base, relative, or the frame of an instrument") -> Any:
+    """Declare the option for the frame in which a function `of` states errors."""
     help_text = (
         f"Frame in which errors are stated: {names}. 'fitted' is after the best rigid fit of "
         "the base and platform frames, as far as the measurements do not determine them."
     )
-    return option(help_text, default="fitted", metavar="NAME", show_default=True)
+    return option(help_text, of=of, metavar="NAME")
 
 
 def _limit(kind: Parsed, quantity: str, example: str) -> Any:
@@ -542,7 +552,8 @@ FIT: Any = Group(
 
 # Instruments
 
-_INSTRUMENT = "loopcal.apply.simulated_measurements:InstrumentDescription"
+SIMULATION = "loopcal.apply.simulated_measurements"
+_INSTRUMENT = f"{SIMULATION}:InstrumentDescription"
 
 INSTRUMENT: Any = Group(
     kind=option(
@@ -584,8 +595,8 @@ UNKNOWN: Any = Group(
 
 DRAW: Any = option(
     "Number of poses to draw evenly from the workspace where no poses are given.",
+    of=f"{SIMULATION}:DRAWN",
     type=Count("DRAWN_POSES", 1),
-    default=40,
     metavar="N",
 )
 

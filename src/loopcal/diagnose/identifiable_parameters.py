@@ -42,7 +42,7 @@ from loopcal.findings.catalog.phrases import effect
 from loopcal.findings.wording import list_names, round_to_digits
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators
-from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.joints import Closure, JointSensor
 from loopcal.measure.kinds.kind import Kind
@@ -414,8 +414,6 @@ MOST_MISSING = 3  # largest number of open combinations that a refusal lists
 TILT = "tilt-torsion"
 # Single coordinates, the simplest further measurements.
 SINGLE = (("x",), ("y",), ("z",), ("psi",), ("theta",), ("phi", "theta"))
-# Standard deviations [SI] of a further instrument where none are stated.
-SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,10 @@ from loopcal.measure.kinds.kind import Kind, measure_progress
 from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import SD_RANGE, is_sd
+from loopcal.units import SD_RANGE, Dimension, is_sd
+
+# Standard deviations [SI] of an instrument where none are stated.
+SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
 
 
 class Noise(ABC):

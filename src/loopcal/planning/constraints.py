@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.measure.measurements import Measurements
@@ -286,7 +287,7 @@ class PlanOptions:
     target: Target = "pose"
     goal: float | None = None
     hold_out: int | None = None
-    frame: str = "fitted"
+    frame: str = FITTED
     constraints: Constraints = field(default_factory=Constraints)
     allowed_poses: FloatArray | None = field(default=None, repr=False)
     n_candidates: int = 1000

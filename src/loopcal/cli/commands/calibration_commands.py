@@ -18,6 +18,9 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
+OPTIONS = "loopcal.apply.calibration_options:CalibrationOptions"
+REGULARIZATION = "loopcal.diagnose.cross_validation:compute_regularization_curves"
+
 
 @opt.command()
 def calibrate(
@@ -49,10 +52,10 @@ def calibrate(
         "with their tolerances.",
         metavar="LIMB",
     ),
-    frame: str = opt.frame(),
+    frame: str = opt.frame(OPTIONS),
     limit_position: float | None = opt.LIMIT_POSITION,
     limit_angle: float | None = opt.LIMIT_ANGLE,
-    seed: int = opt.seed("the choice of held-out poses"),
+    seed: int = opt.seed("the choice of held-out poses", OPTIONS),
     allowed: dict[str, bool] = opt.ALLOWED,
     force: bool = opt.force(
         "the run", ", and call the robot file of a failed calibration robot.yaml"
@@ -228,7 +231,7 @@ def compensate(
         of="loopcal.apply.compensation:compensate",
         type=opt.Count("STEPS", 1),
     ),
-    frame: str = opt.frame(),
+    frame: str = opt.frame("loopcal.apply.compensation:compensate"),
     force: bool = opt.force("the output file", ", and compute also from a calibration that failed"),
 ) -> Output:
     """Compute readings or commands with which the machine of RUN reaches TARGETS, a CSV file of
@@ -434,14 +437,14 @@ def regularize(
     output: Path | None = opt.path("Folder to make, with the curves and their figure.", "-o"),
     folds: int = opt.option(
         "Number of folds of poses where frames, targets or surfaces are unknown.",
-        of="loopcal.diagnose.cross_validation:compute_regularization_curves",
+        of=REGULARIZATION,
         type=opt.Count("FOLDS", 2),
         metavar="N",
     ),
     drop: tuple[str, ...] = opt.option(
         "Exclude this pose. May be given several times.", multiple=True, metavar="POSE"
     ),
-    seed: int = opt.seed("the folds"),
+    seed: int = opt.seed("the folds", REGULARIZATION),
     force: bool = opt.force("the folder"),
     allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:

@@ -25,7 +25,7 @@ def identifiability(
     data: tuple[Path, ...] = opt.data("[DATA]...", required=False),
     poses: Path | None = opt.path("Instead of DATA: CSV file of poses that could be measured."),
     draw: int = opt.DRAW,
-    seed: int = opt.seed("the drawn poses"),
+    seed: int = opt.seed("the drawn poses", f"{opt.SIMULATION}:predict_noise_free"),
     unknown: dict[str, Any] = opt.UNKNOWN,
     reduced: bool = opt.flag(
         "Also choose a smallest set of parameters, and show what the others are merged into.",
@@ -152,7 +152,7 @@ def simulate(
     ),
     skip_unreachable: bool = opt.flag("Leave out poses that the machine does not reach."),
     truth: Path | None = opt.path("Also write the true machine, as a robot file."),
-    seed: int = opt.seed("poses, errors and noise"),
+    seed: int = opt.seed("poses, errors and noise", f"{opt.SIMULATION}:simulate_measurements"),
     force: bool = opt.force("an output file"),
 ) -> Output:
     """Command ROBOT to poses by its nominal geometry, and write what an instrument measures of the

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from loopcal.papers.reproduction import Reproduction
     from loopcal.results.tables import Block, Table
 
+RUN = "loopcal.papers.paper:Paper.run"
 HEADING = 18
 """Characters of a line of a heading."""
 
@@ -29,9 +30,10 @@ def reproduce(
     output: Path | None = opt.path(
         "Folder for a page, all tables (CSV, JSON) and figures (PNG).", "-o", metavar="FOLDER"
     ),
-    seed: int = opt.option("Seed of all random choices.", default=0, metavar="N"),
-    trials: int | None = opt.option(
-        "Number of trials behind each statistical number.  [default: 50]",
+    seed: int = opt.option("Seed of all random choices.", of=RUN, metavar="N"),
+    trials: int = opt.option(
+        "Number of trials behind each statistical number.",
+        of=RUN,
         type=opt.Count("TRIALS"),
         metavar="N",
     ),
@@ -47,7 +49,7 @@ def reproduce(
       loopcal reproduce hexapod-42
       loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
     """
-    from loopcal.papers.paper import PAPERS, TRIALS, find_paper
+    from loopcal.papers.paper import PAPERS, find_paper
 
     if paper is None:
         opt.refuse_given(
@@ -69,7 +71,7 @@ def reproduce(
         if sys.stderr.isatty():
             terminal.print_message(text)
 
-    result = chosen.run(seed, TRIALS if trials is None else trials, print_step)
+    result = chosen.run(seed, trials, print_step)
     if output is not None:
         from loopcal.io.runs.run_folder import collect_provenance
         from loopcal.papers.reproduction import write_folder

@@ -22,6 +22,7 @@ PLANE_LINE = "plane-line"
 """Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
 
 OPTIONS = "loopcal.planning.constraints:PlanOptions"
+POSES = "loopcal.planning.constraints:N_POSES"
 SURFACES = "loopcal.planning.plane_line_planning:SurfaceOptions"
 
 _COUNTED = "which is counted by --groups and --points"
@@ -44,7 +45,7 @@ def plan(
     robot: str = opt.ROBOT,
     output: Path = opt.path("Folder to make.", "-o", required=True),
     poses: int | None = opt.option(
-        "Number of poses for the calibration.  [default: 40]",
+        lambda: f"Number of poses for the calibration.  [default: {opt.look_up(POSES)}]",
         type=opt.Count("PLANNED_POSES"),
         metavar="N",
     ),
@@ -93,8 +94,8 @@ def plan(
         metavar="N",
     ),
     curve: bool = opt.flag("Also compute the expected errors by the number of poses."),
-    frame: str = opt.frame("fitted, base, or relative (to home)"),
-    seed: int = opt.seed("all random choices"),
+    frame: str = opt.frame(OPTIONS, "fitted, base, or relative (to home)"),
+    seed: int = opt.seed("all random choices", OPTIONS),
     force: bool = opt.force("the plan"),
 ) -> Output:
     """Plan which poses of ROBOT to measure with an instrument. Write a folder with a sheet for the

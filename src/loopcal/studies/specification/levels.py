@@ -24,7 +24,7 @@ from loopcal.errors import suggest_names
 from loopcal.estimate.losses import LOSSES
 from loopcal.estimate.methods import METHODS, SETTINGS
 from loopcal.estimate.options import NO_LOSS, Noise
-from loopcal.measure.instrument import Distribution
+from loopcal.measure.instrument import SIGMA, Distribution
 from loopcal.units import SI_SYMBOLS, Angle, Dimension, Length
 
 if TYPE_CHECKING:
@@ -103,8 +103,8 @@ class InstrumentLevel(Limited):
     kinds: tuple[str, ...] = ("pose",)
     components: tuple[str, ...] = ()
     orientation: str | None = None
-    sigma_position: Length = 1e-5
-    sigma_angle: Angle = 5e-5
+    sigma_position: Length = SIGMA[Dimension.LENGTH]
+    sigma_angle: Angle = SIGMA[Dimension.ANGLE]
     unknown_frames: tuple[str, ...] = ()
     distribution: Distribution = "normal"
     unused: tuple[str, ...] = ()
