@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.documents import load_record
-from loopcal.errors import FileError
+from loopcal.errors import DataError, FileError
 from loopcal.report.document import figures
 from loopcal.report.document.calibration_document import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Picture, render_html
@@ -307,3 +307,9 @@ def test_a_decorated_function_adds_a_figure_to_its_section(run, monkeypatch) -> 
     *_, picture = section.elements
     assert isinstance(picture, Picture)
     assert (picture.name, picture.caption) == ("count-figure", "Number of poses.")
+
+
+def test_a_figure_for_a_section_that_does_not_exist_is_refused(run, monkeypatch) -> None:
+    monkeypatch.setitem(figures.FIGURES, figures.draw_height_picture, "height")
+    with pytest.raises(DataError, match=r"section 'height', .*did you mean 'heights'"):
+        build(load_record(run), "poses")

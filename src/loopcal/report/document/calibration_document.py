@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from loopcal.apply.verdict import Verdict
+from loopcal.errors import DataError, suggest_names
 from loopcal.report.calibration_view import (
     build_budget_table,
     build_height_map,
@@ -25,7 +26,7 @@ from loopcal.report.document.elements import (
     Section,
     list_options,
 )
-from loopcal.report.document.figures import draw_figures
+from loopcal.report.document.figures import FIGURES, draw_figures
 from loopcal.report.validation_view import (
     READING_NOISE,
     describe_commanded,
@@ -53,7 +54,16 @@ def describes_section(name: str, title: str) -> Callable[[Describe], Describe]:
 
 
 def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Section, ...]:
-    """Return the sections of these names; one without content is left out."""
+    """Return the sections of these names; one without content is left out.
+
+    DataError : a figure belongs to a section that does not exist.
+    """
+    for name in FIGURES.values():
+        if name not in SECTIONS:
+            raise DataError(
+                f"a figure belongs to the section {name!r}, which the report does not have"
+                f"{suggest_names(name, SECTIONS)}; it has {', '.join(SECTIONS)}"
+            )
     sections = []
     for name in names:
         title, describe = SECTIONS[name]
