@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -18,7 +16,6 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.result import KindResiduals
 from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.mechanism.model import Mechanism
-from loopcal.plain_text import escape
 from loopcal.report.document.elements import CalibrationRecord, Element, Picture
 from loopcal.report.figures.fit_figures import (
     StoredFit,
@@ -32,144 +29,12 @@ from loopcal.report.figures.result_figures import (
     draw_validation,
 )
 from loopcal.report.figures.robot_figure import draw_scene
-from loopcal.report.pictures import render_svg_text
+from loopcal.report.pictures import inline_figure
 from loopcal.report.scene.scene import Scene, choose_rows, compute_pose_errors, format_scene
 from loopcal.typing import IntArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-# Figures of matplotlib as SVG elements inside of HTML, under a strict content security policy.
-
-SHAPES = ("path", "rect", "circle", "line", "polyline", "polygon", "text", "tspan", "image")
-DRAWING = frozenset((*SHAPES, "svg", "g", "defs", "use", "clipPath", "linearGradient", "stop"))
-"""Elements that draw."""
-
-FAMILY = "DejaVu Sans, Verdana, Arial, sans-serif"
-"""Fonts of all texts; a browser takes the first that it has."""
-
-_FONT = re.compile(r"([a-z0-9 ]*?)\s*([0-9.]+)px(?:\s.*)?")
-_REFERENCE = re.compile(r"url\(#([^)]+)\)")
-_DIGITS = re.compile(r"-?\d+\.\d{3,}")
-
-
-def make_picture(
-    figure: Figure, name: str, caption: str, description: str, scene: str = ""
-) -> Picture:
-    """Return a figure as a picture; see `Picture` for the arguments."""
-    svg = inline_figure(render_svg_text(figure), name)
-    return Picture(name, svg, caption, description, scene)
-
-
-def inline_figure(svg: bytes, name: str) -> str:
-    """Return an SVG file of matplotlib as elements for HTML; a name that is not plain text is
-    shown with escapes.
-
-    Parameters
-    ----------
-    name : prefix of all identifiers.
-    """
-    root = ElementTree.fromstring(escape(svg.decode("utf-8"), "\n\r\t"))
-    drawn = _copy(root, name, {})
-    for attribute in ("version", "height"):
-        drawn.attrib.pop(attribute, None)
-    drawn.set("stroke-linejoin", "round")
-    drawn.set("role", "img")
-    drawn.set("aria-labelledby", f"{name}-description")
-    drawn.set("focusable", "false")
-    return ElementTree.tostring(drawn, encoding="unicode")
-
-
-def _copy(
-    element: ElementTree.Element, name: str, styles: dict[str, dict[str, str]]
-) -> ElementTree.Element:
-    """Return an element without namespaces, styles and what does not draw.
-
-    Parameters
-    ----------
-    styles : the attributes of each style that occurred before; gets new ones.
-    """
-    copied = ElementTree.Element(element.tag.rpartition("}")[2])
-    for key, value in element.attrib.items():
-        attribute = key.rpartition("}")[2]
-        if attribute == "style":
-            if value not in styles:
-                styles[value] = _split_style(value, name)
-            copied.attrib |= styles[value]
-        elif attribute == "id":
-            copied.set("id", f"{name}-{value}")
-        elif attribute == "href":
-            copied.set("href", _address(value, name))
-        elif attribute == "transform":
-            copied.set(attribute, value)
-        elif not attribute.startswith("on"):
-            copied.set(attribute, _shorten(_refer(value, name)))
-    copied.text, copied.tail = _word(element.text), _word(element.tail)
-    for child in element:
-        if isinstance(child.tag, str) and child.tag.rpartition("}")[2] in DRAWING:
-            copied.append(_copy(child, name, styles))
-    return copied
-
-
-def _split_style(style: str, name: str) -> dict[str, str]:
-    """Return the properties of a `style` attribute as attributes of their own."""
-    attributes = {}
-    for declaration in style.split(";"):
-        prop, _, value = (part.strip() for part in declaration.partition(":"))
-        if prop == "font":
-            match = _FONT.match(value)
-            assert match is not None, value
-            attributes |= {"font-size": match[2], "font-family": FAMILY}
-            if "bold" in match[1] or "700" in match[1]:
-                attributes["font-weight"] = "bold"
-        elif prop and value:
-            attributes[prop] = _shorten(_refer(value, name))
-    return attributes
-
-
-def _refer(value: str, name: str) -> str:
-    """Return a value with the prefix in its references to other elements."""
-    return _REFERENCE.sub(rf"url(#{name}-\1)", value)
-
-
-def _shorten(value: str) -> str:
-    """Return a value with at most two decimals: a hundredth of a point cannot be seen."""
-    return _DIGITS.sub(lambda m: f"{float(m[0]):.2f}", value)
-
-
-def _address(address: str, name: str) -> str:
-    """Return the address of an element or image of the file; any other is left out."""
-    if address.startswith("#"):
-        return f"#{name}-{address[1:]}"
-    return address if address.startswith("data:image/png;base64,") else ""
-
-
-def _word(text: str | None) -> str | None:
-    """Return text without the line breaks between elements."""
-    return None if text is None or not text.strip() else text
-
-
-def restore_fit(
-    fit: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot: Mechanism
-) -> StoredFit:
-    """Return a stored fit for the functions that draw parameters.
-
-    fit : content of `fit` of a run, with numbers that are not finite. robot : of which the
-        identified parameters are free.
-    """
-    rows = fit["parameters"]
-    places = np.flatnonzero(robot.parameters.free)
-    free = FreeParameters(robot, places, arrays["nominal"], np.ones(len(places)), places < 0)
-    factor, _ = free.display()
-    tolerance = factor * np.array([row["tolerance"] for row in rows])
-    assumed = np.array([bool(row["tolerance_assumed"]) for row in rows])
-    half_widths = factor * np.array([row["plus_minus"] for row in rows])
-    free = FreeParameters(robot, places, arrays["nominal"], tolerance, assumed)
-    return StoredFit(robot, free, arrays["estimate"], arrays["covariance"], half_widths)
-
-
-# The figures of a calibration: each function yields a picture or sentences for its section.
 
 MOST_ROWS, MOST_PARAMETERS = 3000, 120
 """Rows that the figures of a report show, and parameters up to which it draws them."""
@@ -197,6 +62,13 @@ def draw_figures(section: str, record: CalibrationRecord) -> Iterator[Element]:
     for draw, of_section in FIGURES.items():
         if of_section == section:
             yield from draw(record)
+
+
+def make_picture(
+    figure: Figure, name: str, caption: str, description: str, scene: str = ""
+) -> Picture:
+    """Return a figure as a picture; see `Picture` for the arguments."""
+    return Picture(name, inline_figure(figure, name), caption, description, scene)
 
 
 @report_figure("residuals")
@@ -364,6 +236,25 @@ def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
         return accuracy_map(record.posterior, measured, MAP_POSES, SEED, frame=frame)
     except LoopcalError as error:
         return f"The accuracy over the workspace cannot be computed: {error}"
+
+
+def restore_fit(
+    fit: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot: Mechanism
+) -> StoredFit:
+    """Return a stored fit for the functions that draw parameters.
+
+    fit : content of `fit` of a run, with numbers that are not finite. robot : of which the
+        identified parameters are free.
+    """
+    rows = fit["parameters"]
+    places = np.flatnonzero(robot.parameters.free)
+    free = FreeParameters(robot, places, arrays["nominal"], np.ones(len(places)), places < 0)
+    factor, _ = free.display()
+    tolerance = factor * np.array([row["tolerance"] for row in rows])
+    assumed = np.array([bool(row["tolerance_assumed"]) for row in rows])
+    half_widths = factor * np.array([row["plus_minus"] for row in rows])
+    free = FreeParameters(robot, places, arrays["nominal"], tolerance, assumed)
+    return StoredFit(robot, free, arrays["estimate"], arrays["covariance"], half_widths)
 
 
 @report_figure("parameters")
