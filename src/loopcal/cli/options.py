@@ -334,15 +334,17 @@ def _limit(kind: Parsed, quantity: str, example: str) -> Any:
 LIMIT_POSITION = _limit(POSITIVE_LENGTH, "position", "0.02mm")
 LIMIT_ANGLE = _limit(POSITIVE_ANGLE, "orientation", "0.01deg")
 
-SHIPPED_PROFILES = ("faro", "leica", "spatial-analyzer")
-"""Profiles of exports that come with loopcal."""
-
 
 def profile(help: str, **settings: Any) -> Any:  # noqa: A002
     """Declare the option for the profile of an export: a file, or the name of a shipped one."""
-    names = ", ".join(SHIPPED_PROFILES)
-    text = f"{help} A file (docs/exports.md), or one of {names}."
-    return option(text, metavar="FILE|NAME", **settings)
+
+    def write_help() -> str:
+        from loopcal.io.exports.profile import list_shipped_profiles
+
+        names = ", ".join(list_shipped_profiles())
+        return f"{help} A file (docs/exports.md), or one of {names}."
+
+    return option(write_help, metavar="FILE|NAME", **settings)
 
 
 DECIMAL: Any = option(
