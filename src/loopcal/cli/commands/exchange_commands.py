@@ -199,33 +199,54 @@ CORRECTED_ALONE = (
     "--corrected calibrates with the measurements in the file; state where to write them, such as "
     "--data data.csv"
 )
-TAPED = (
-    "lengths measured by hand, which become prior knowledge: lines at the origin (hangprinter), "
-    "arms (klipper, marlin, reprap), joint centers (linuxcnc)"
-)
-"""What the option --sigma-tape is for."""
+
+
+def _setting(text: str, *names: str, **settings: Any) -> Any:
+    """Declare an option of reading FILE; its text may contain `{option}`, the formats that read it,
+    and `{height}`, the noise of a sort of numbers that is assumed.
+    """
+
+    def write_help() -> str:
+        from loopcal.io.formats import FORMATS
+        from loopcal.io.formats.program_format import ASSUMED_NOISE
+
+        readers: dict[str, dict[str, list[str]]] = {}
+        for name, entry in FORMATS.items():
+            for key, what in entry.read_options.items():
+                readers.setdefault(key, {}).setdefault(what, []).append(name)
+        words = {key: opt.POSITIVE_LENGTH.show(value) for key, value in ASSUMED_NOISE.items()}
+        for key, groups in readers.items():
+            parts = (f"{what} ({', '.join(formats)})" for what, formats in groups.items())
+            words[key] = ", ".join(parts).strip()
+        return text.format_map(words)
+
+    return opt.option(write_help, *names, **settings)
 
 
 def _sigma(what: str, default: str) -> Any:
-    return opt.option(f"Noise of {what}.  [default: {default}]", type=opt.POSITIVE_LENGTH)
+    return _setting(f"Noise of {what}.  [default: {default}]", type=opt.POSITIVE_LENGTH)
 
 
 SETTINGS: Any = opt.Group(
-    sigma_height=_sigma("the probe (klipper, marlin, reprap)", "0.02mm"),
-    sigma_distance=_sigma("distances (klipper)", "0.1mm"),
-    sigma_line=_sigma("lines (hangprinter)", "1mm"),
-    sigma_position=_sigma("known positions (hangprinter)", "1mm"),
-    sigma_tape=_sigma(TAPED, "10mm for lines"),
-    sigma_anchor=_sigma("anchors that FILE states (hangprinter)", "none: they are first guesses"),
-    length_unit=opt.option(
-        "Unit of lengths (linuxcnc; with --profile, in place of the one it states).",
+    sigma_height=_sigma("the probe {sigma_height}", "{height}"),
+    sigma_distance=_sigma("distances {sigma_distance}", "{distance}"),
+    sigma_line=_sigma("lines {sigma_line}", "{line}"),
+    sigma_position=_sigma("known positions {sigma_position}", "{position}"),
+    sigma_tape=_sigma(
+        "lengths measured by hand, which become prior knowledge: {sigma_tape}", "{tape} for lines"
+    ),
+    sigma_anchor=_sigma("anchors that FILE states {sigma_anchor}", "none: they are first guesses"),
+    length_unit=_setting(
+        "Unit of lengths {length_unit}; with --profile, in place of the one it states.",
         "--unit",
         type=click.Choice(list_symbols(Dimension.LENGTH)),
     ),
-    home_height=opt.option("Height of the home pose (linuxcnc).", "--home-z", type=opt.LENGTH),
-    closures=opt.path("Loops that a URDF closes (urdf); by default FILE with the ending .yaml."),
-    platform=opt.option(
-        "Link that is the platform (urdf); by default the one on a fixed joint.", metavar="LINK"
+    home_height=_setting("Height of the home pose {home_height}.", "--home-z", type=opt.LENGTH),
+    closures=_setting(
+        "Loops that a URDF closes {closures}; by default FILE with the ending .yaml.", type=opt.FILE
+    ),
+    platform=_setting(
+        "Link that is the platform {platform}; by default the one on a fixed joint.", metavar="LINK"
     ),
 )
 """How FILE is read."""
@@ -249,9 +270,9 @@ def import_(
         required=True,
     ),
     data: Path | None = opt.path("Also write the measurements that FILE or --probes contain."),
-    probes: tuple[Path, ...] = opt.path(
-        "What the firmware printed when it probed the bed (marlin: G30, G33 P3 V0, M114; reprap: "
-        "G32 with bed.g, heightmap.csv). May be given several times.",
+    probes: tuple[Path, ...] = _setting(
+        "What the firmware printed when it probed the bed: {probes}. May be given several times.",
+        type=opt.FILE,
         multiple=True,
         metavar="REPORT",
     ),

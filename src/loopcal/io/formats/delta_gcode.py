@@ -451,15 +451,22 @@ class RepRapFirmware(DeltaFirmware):
 MARLIN, REPRAP = (
     Format(
         firmware.name,
-        what,
+        f"M665 and M666 of {program} ({printed})",
         (ending,),
         firmware.read,
         firmware.write,
-        read_options=("sigma_height", "sigma_tape", "probes"),
+        read_options={"sigma_height": "", "sigma_tape": "arms", "probes": probes},
+        program=program,
     )
-    for firmware, what, ending in (
-        (Marlin(), "M665 and M666 of Marlin (as M503 prints them)", ".gcode"),
-        (RepRapFirmware(), "M665 and M666 of RepRapFirmware (config.g, config-override.g)", ".g"),
+    for firmware, program, printed, ending, probes in (
+        (Marlin(), "Marlin", "as M503 prints them", ".gcode", "G30, G33 P3 V0, M114"),
+        (
+            RepRapFirmware(),
+            "RepRapFirmware",
+            "config.g, config-override.g",
+            ".g",
+            "G32 with bed.g, heightmap.csv",
+        ),
     )
 )
 

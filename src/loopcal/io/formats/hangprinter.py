@@ -356,5 +356,10 @@ FORMAT = Format(
     "samples of a hanging printer (JSON)",
     (),
     read,
-    read_options=("sigma_line", "sigma_position", "sigma_tape", "sigma_anchor"),
+    read_options={
+        "sigma_line": "",
+        "sigma_position": "",
+        "sigma_tape": "lines at the origin",
+        "sigma_anchor": "",
+    },
 )

@@ -287,6 +287,7 @@ FORMAT = Format(
     (".cfg",),
     read,
     write,
-    read_options=("sigma_height", "sigma_distance", "sigma_tape"),
+    read_options={"sigma_height": "", "sigma_distance": "", "sigma_tape": "arms"},
     stores_fit=True,
+    program="Klipper",
 )

@@ -233,7 +233,7 @@ FORMAT = Format(
     (".hal",),
     read,
     write,
-    read_options=("length_unit", "home_height", "sigma_tape"),
+    read_options={"length_unit": "", "home_height": "", "sigma_tape": "joint centers"},
 )
 
 

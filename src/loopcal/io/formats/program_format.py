@@ -160,7 +160,9 @@ class Format:
     read : function that reads a file. write : function that writes a source, into an existing file
         (everything else in it stays as it is) or as a text of its own.
     takes_file : whether `write` can correct an existing file.
-    read_options : options of `ImportOptions` that `read` uses.
+    read_options : options of `ImportOptions` that `read` uses -> what is particular to this format,
+        such as which lengths are taped, for help texts.
+    program : whose configuration of a robot the file is, where its ending alone says so.
     stores_fit : whether a file contains a geometry together with the measurements that its firmware
         fitted it to, so that `loopcal.diagnose` can compare the two.
     """
@@ -171,8 +173,9 @@ class Format:
     read: Callable[[Path, ImportOptions], Imported] | None = None
     write: Callable[[ExportSource, Path | None], Exported] | None = None
     takes_file: bool = True
-    read_options: tuple[str, ...] = ()
+    read_options: Mapping[str, str] = field(default_factory=dict)
     stores_fit: bool = False
+    program: str = ""
 
 
 def get_record(

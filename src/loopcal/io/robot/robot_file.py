@@ -155,9 +155,6 @@ KEY = "stages"
 WHAT = "robot file"
 SHIPPED_ROBOTS = Path(__file__).parents[2] / "robots"
 
-PROGRAMS = {".cfg": "Klipper", ".g": "RepRapFirmware", ".gcode": "Marlin"}
-"""Ending of a printer's configuration -> its firmware."""
-
 
 class RobotSource(NamedTuple):
     """The origin of a loaded robot, kept as its `record`.
@@ -281,9 +278,14 @@ def find_robot_file(source: str | Path) -> Path:
     if str(source) in shipped and not path.is_file():
         return shipped[str(source)]
     if path.exists():
-        program = PROGRAMS.get(path.suffix.lower())
-        if program is not None and path.is_file():  # the configuration of a printer
-            raise FileError(report_finding("files.robot-of-program", program=program), path)
+        ending = path.suffix.lower()
+        if ending not in (".yaml", ".yml") and path.is_file():
+            from loopcal.io.formats import FORMATS
+
+            for entry in FORMATS.values():
+                if entry.program and ending in entry.endings:
+                    fault = report_finding("files.robot-of-program", program=entry.program)
+                    raise FileError(fault, path)
         return path
     hint, names = suggest_names(str(source), shipped), ", ".join(shipped) or "none"
     act = f"name a file, or one of the shipped robots: {names}"

@@ -615,5 +615,5 @@ FORMAT = Format(
     (".urdf",),
     read,
     write,
-    read_options=("closures", "platform"),
+    read_options={"closures": "", "platform": ""},
 )
