@@ -51,7 +51,8 @@ class Registry(Mapping[str, T]):
     ) -> None:
         self.noun: str = noun
         self.group: str = group
-        self._places, self._aliases = dict(places or {}), dict(aliases or {})
+        self.aliases: dict[str, str] = dict(aliases or {})
+        self._places = dict(places or {})
         self._registered: dict[str, T] = {}
 
     def register(self, entry: E, /) -> E:
@@ -67,7 +68,7 @@ class Registry(Mapping[str, T]):
         name = getattr(entry, "name", None)
         if not isinstance(name, str) or not name:
             raise DataError(f"{entry!r} has no name; a {self.noun} needs the attribute 'name'")
-        if name in self._places or name in self._aliases:
+        if name in self._places or name in self.aliases:
             raise DataError(f"{name!r} is the name of a {self.noun} of loopcal; choose another")
         self._registered[name] = entry  # type: ignore[assignment]  # what is registered is a T
         return entry
@@ -79,7 +80,7 @@ class Registry(Mapping[str, T]):
         ------
         UnknownNameError : there is none.
         """
-        name = self._aliases.get(name, name)
+        name = self.aliases.get(name, name)
         if name in self._places or name in self._registered or name in self._offered:
             return name
         hint = suggest_names(str(name), self)
@@ -105,7 +106,7 @@ class Registry(Mapping[str, T]):
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        known = (self._places, self._registered, self._aliases)
+        known = (self._places, self._registered, self.aliases)
         return any(name in names for names in known) or name in self._offered
 
     # a registry is itself, not its entries: it may stand in an annotation

@@ -501,14 +501,24 @@ def _make_fit_options(stated: Mapping[str, Any]) -> lc.FitOptions:
     return lc.FitOptions.from_dict(stated)
 
 
+def _describe_methods() -> str:
+    """Return the methods with their short names, and what they are."""
+    from loopcal.estimate.methods import METHODS
+
+    shorts = {name: f" (or {short})" for short, name in METHODS.aliases.items()}
+    others = (
+        f"{name}{shorts.get(name, '')}: {getattr(method, 'what', '')}".removesuffix(": ")
+        for name, method in METHODS.items()
+        if name != "auto"
+    )
+    auto = "auto: map, with tolerances inflated where the data contradict them"
+    return f"{'. '.join((auto, *others))}."
+
+
 FIT: Any = Group(
     _make_fit_options,
     method=option(
-        "map: the tolerances are a prior. auto: map, with tolerances inflated where the "
-        "data contradict them. least-squares (or ls): without tolerances. ridge, truncated-svd "
-        "(or tsvd): regularized least squares.",
-        type=Words("loopcal.estimate.methods:METHODS"),
-        default="auto",
+        _describe_methods, type=Words("loopcal.estimate.methods:METHODS"), default="auto"
     ),
     inflation=option(
         "For auto: which tolerances may be inflated. global: all by one factor. groups: also "

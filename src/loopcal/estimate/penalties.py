@@ -153,10 +153,12 @@ def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
 class Method(Protocol):
     """The interface of a method, with what most methods do.
 
+    `what`: a few words about it, for the help of the command line.
     `has_prior`: whether it takes the stated tolerances as standard deviations of a prior.
     `is_biased`: whether its penalty is neither nothing nor such a prior.
     """
 
+    what: ClassVar[str] = ""
     has_prior: ClassVar[bool] = False
     is_biased: ClassVar[bool] = True
 
@@ -212,6 +214,7 @@ class LeastSquares(Method):
     """
 
     name: ClassVar[str] = "least-squares"
+    what: ClassVar[str] = "without tolerances"
     is_biased: ClassVar[bool] = False
 
     def required_equations(self, parameters: int) -> int:
@@ -238,6 +241,7 @@ class TruncatedSVD(Method):
     """
 
     name: ClassVar[str] = "truncated-svd"
+    what: ClassVar[str] = "least squares over the strongest directions"
     k: int | Rule = TruncationGCV()
 
     def __post_init__(self) -> None:
@@ -279,6 +283,7 @@ class Ridge(Method):
     """
 
     name: ClassVar[str] = "ridge"
+    what: ClassVar[str] = "least squares with a penalty on deviations in tolerances"
     lam: float | tuple[float, ...] | Rule = GCV()
 
     def __post_init__(self) -> None:
@@ -381,6 +386,7 @@ class MAP(Method):
     """
 
     name: ClassVar[str] = "map"
+    what: ClassVar[str] = "the tolerances are a prior"
     has_prior: ClassVar[bool] = True
     is_biased: ClassVar[bool] = False
     inflation: float | Rule = 1.0
