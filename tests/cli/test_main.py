@@ -29,6 +29,7 @@ def test_help_of_every_command_has_an_example_and_the_option_json(name, capsys) 
     text = capsys.readouterr().out
     assert f"    loopcal {name} " in text
     assert "--json" in text or name == "study"  # its commands have it
+    assert "None" not in text
 
 
 @pytest.mark.parametrize("name", sorted(study.commands))

@@ -239,6 +239,10 @@ class Count(click.IntRange):
         super().__init__(min=least)
         self.limit = limit
 
+    def _describe_range(self) -> str:
+        """Return the range for the help: click states one without a bound as "x<=None"."""
+        return "" if self.min is None else super()._describe_range()
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         """Return the number, or fail with what is allowed."""
         from loopcal.io.core import limits
