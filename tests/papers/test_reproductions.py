@@ -172,7 +172,7 @@ def test_reproduce_refuses_an_unknown_paper_and_a_used_folder(capsys, tmp_path) 
 
 
 def test_reproduce_prints_tables_and_statements(capsys, monkeypatch) -> None:
-    monkeypatch.setattr(Paper, "run", lambda *_: build_reproduction())
+    monkeypatch.setattr(Paper, "run", lambda _, seed=0, trials=2, *__: build_reproduction())
     assert main(["reproduce", "hexapod-42"]) == 0
     printed = capsys.readouterr().out
     for part in ("small: A title", "Extra", "Our own checks", "NOT CONFIRMED: It holds.",
@@ -181,7 +181,7 @@ def test_reproduce_prints_tables_and_statements(capsys, monkeypatch) -> None:
 
 
 def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(Paper, "run", lambda *_: build_reproduction())
+    monkeypatch.setattr(Paper, "run", lambda _, seed=0, trials=2, *__: build_reproduction())
     folder = tmp_path / "out"
     assert main(["reproduce", "hexapod-42", "--trials", "2", "-o", str(folder), "--json"]) == 0
     out, err = capsys.readouterr()

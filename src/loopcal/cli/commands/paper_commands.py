@@ -30,7 +30,7 @@ def reproduce(
     output: Path | None = opt.path(
         "Folder for a page, all tables (CSV, JSON) and figures (PNG).", "-o", metavar="FOLDER"
     ),
-    seed: int = opt.option("Seed of all random choices.", of=RUN, metavar="N"),
+    seed: int = opt.option("Seed of all random choices.", of=RUN, type=int, metavar="N"),
     trials: int = opt.option(
         "Number of trials behind each statistical number.",
         of=RUN,
