@@ -158,7 +158,7 @@ def statements() -> np.ndarray:
     return np.array(rows)
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_stated_probabilities_are_the_shares_that_conform(statements) -> None:
     probability, conforms = statements.T
     assert len(probability) == 140

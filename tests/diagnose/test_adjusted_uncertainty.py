@@ -65,7 +65,7 @@ SIZES = [10, pytest.param(25, marks=pytest.mark.evidence)]
 """Machines; each has 24 intervals."""
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 @pytest.mark.parametrize("machines", SIZES)
 @pytest.mark.parametrize(("correlation", "before"), [(0.6, 0.93), (0.9, 0.82)])
 def test_poses_are_covered_where_errors_are_correlated(correlation, before, machines):
@@ -83,6 +83,7 @@ def test_poses_are_covered_where_errors_are_correlated(correlation, before, mach
     assert np.mean(named) >= (0.95 if correlation > 0.8 else 0.7)
 
 
+@pytest.mark.evidence
 def test_poses_are_covered_where_the_instrument_drifts():
     robot, inside, adjusted, named = ROBOTS["3-prs"], [], [], []
     ramp = np.linspace(-2.0, 2.0, 16)[:, None]

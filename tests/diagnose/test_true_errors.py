@@ -40,7 +40,7 @@ def figures_of(name, noise=1.0, spread=1.0):
     return true, report_medians(report_machines(study, 3))
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_reported_figures_agree_with_the_true_errors_of_a_few_machines():
     true, reported = figures_of(UNKNOWN)
     assert true.machines == FEW

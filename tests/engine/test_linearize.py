@@ -107,10 +107,10 @@ def compile_limb_derivative(letters, ending, chosen, slots, size):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "robot",
-    ["mixed_hexapod", "five_bar"]
+    ["mixed_hexapod"]
     + [
         pytest.param(name, marks=pytest.mark.evidence)
-        for name in ("three_prs", "delta", "planar_rrr")
+        for name in ("three_prs", "delta", "five_bar", "planar_rrr")
     ],
 )
 def test_derivatives_by_displacements_and_joints_agree_with_differences_and_jax(engine, robot):

@@ -52,7 +52,10 @@ def measure_distance(usual: IdentifiedTrials, other: IdentifiedTrials) -> np.nda
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.evidence), 10.0])
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), MAP(InflatedTolerances())], ids=repr)
-@pytest.mark.parametrize(("robot", "poses"), [(HEXAPOD, 20), (HEXAPOD, 8), (DELTA, 12)])
+@pytest.mark.parametrize(
+    ("robot", "poses"),
+    [pytest.param(HEXAPOD, 20, marks=pytest.mark.evidence), (HEXAPOD, 8), (DELTA, 12)],
+)
 def test_estimates_are_those_of_the_usual_descent(robot, poses, method, factor):
     usual, chords = fit_both(robot, simulate(robot, 6, poses, factor), method)
     assert usual.converged.all()

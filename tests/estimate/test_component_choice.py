@@ -141,7 +141,7 @@ def position_errors(values, truth):
     return np.sqrt(((found.T - true.T)[..., :3, 3] ** 2).sum(axis=-1).mean(axis=1))
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 @pytest.mark.parametrize(
     "moved", [dict.fromkeys(ARMS, 4.0), {"arm2.length": -10.0}, {"tower1.stop": 20.0}]
 )
@@ -218,7 +218,7 @@ def test_choice_with_the_method_of_a_fit_is_the_same():
     np.testing.assert_allclose((second.estimate - first.estimate) / first.tolerance, 0.0, atol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_right_tolerances_rarely_get_a_component():
     _, trials = simulate_deltas(60, {}, seed=4)
     fits = [identify(DELTA, trials.trial(i)) for i in range(60)]

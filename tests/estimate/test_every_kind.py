@@ -121,7 +121,7 @@ def pool_coverage(found: list[Coverage], what: str) -> float:
     return float(np.concatenate([getattr(one, what).ravel() for one in found]).mean())
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_intervals_of_a_hexapod_and_setup_parameters_have_95_percent_coverage():
     result = [compute_coverage(case, 5) for case in select_most_unknown(("hexapod-42",))]
     total = sum(one.fits for one in result)
@@ -172,7 +172,7 @@ def compute_variances_and_errors(kinds):
     return ((result.standard_deviations() / free.tolerance) ** 2).sum(axis=1), (off**2).sum(axis=1)
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_weighted_fit_of_five_kinds_is_better_than_each_kind_alone():
     predicted, made = compute_variances_and_errors(FIVE_KINDS)
     for kind in FIVE_KINDS:

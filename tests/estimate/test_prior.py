@@ -130,7 +130,7 @@ def test_moved_limb_is_detected_and_other_limbs_keep_their_prior():
     )  # keeping all of it would be wrong
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_false_alarm_rate_of_a_moved_limb_is_the_stated_one():
     # chi-square of the change over 24 repetitions of both calibrations without any change: mean 7,
     # sd of the mean sqrt(2 * 7 / 24) = 0.76; bounds at 4.5 sd. At 5 % level: binomial(24, 0.05),

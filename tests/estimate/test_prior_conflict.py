@@ -75,7 +75,7 @@ def test_correct_tolerances_are_inflated_little_and_at_no_cost():
     assert error(result) < 1.02 * error(held)
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 @pytest.mark.parametrize("narrow", [1.4, 1.7])
 def test_slightly_narrow_tolerances_keep_the_coverage_of_parameters(narrow):
     robot, measured = simulate_hexapods(40)

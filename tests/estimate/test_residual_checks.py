@@ -60,6 +60,7 @@ def test_pure_error_is_the_spread_within_groups_of_repeats():
     assert result.is_explained
 
 
+@pytest.mark.evidence
 def test_lack_of_fit_is_rarely_reported_for_a_correct_model_with_wrong_sigma():
     blamed = 0
     for seed in range(60):

@@ -153,7 +153,7 @@ def test_fit_in_an_unknown_frame_equals_that_in_a_known_frame_up_to_its_gauge():
     assert validate(second.robot, others).findings[0].code == "validation.setup-fitted"
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_intervals_of_robot_and_frame_contain_the_truth():
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame", "targets"))

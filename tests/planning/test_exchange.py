@@ -93,7 +93,7 @@ def test_tolerance_prior_changes_the_design_only_for_coarse_data():
     assert 0.98 < kept[1] < 1.02
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_design_by_criterion_i_predicts_better_than_by_criterion_d():
     rows = draw_rows(N=60, machine=6, seed=2)
     L = np.random.default_rng(3).normal(size=(4, 6)) * np.array([9.0, 3.0, 1.0, 0.3, 0.1, 0.03])

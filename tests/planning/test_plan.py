@@ -480,7 +480,7 @@ chance of 2 %.
 """
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 @pytest.mark.parametrize("case", ONE_OF_EACH, ids=lambda case: case.robot)
 def test_planned_poses_give_smaller_errors_than_as_many_random_poses(case):
     study = prepare_study(case, SHORT, MACHINES, POSES, candidates=200)

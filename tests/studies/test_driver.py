@@ -378,6 +378,7 @@ def measure_peak(folder: Path, replicates: int) -> int:
             tracemalloc.stop()
 
 
+@pytest.mark.evidence
 def test_memory_of_a_driver_is_that_of_an_eighth_of_the_trials(tmp_path) -> None:
     measure_peak(tmp_path / "first", 2 * SIZE)  # what is loaded once
     few = measure_peak(tmp_path / "few", 5_000)

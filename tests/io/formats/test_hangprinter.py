@@ -291,6 +291,7 @@ def test_estimate_is_that_of_least_squares_updated_with_the_tape(tmp_path) -> No
     assert sd[LENGTHS].max() < 0.5 * reference.sd[LENGTHS].max()
 
 
+@pytest.mark.evidence
 def test_taped_lengths_improve_the_anchors_of_simulated_machines(tmp_path) -> None:
     errors = []
     for seed in range(4):

@@ -325,15 +325,11 @@ def make_far_poses(robot, far, n):
     return geometry.apply_twist(np.broadcast_to(robot.home_state.T[0, 0], (n, 4, 4)), twist)
 
 
-LESS_OFTEN = {"solar-tracker", *zoo.RELATIVES}
-"""The tracker takes as long as all others but the excavator, which is a chain as well."""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.evidence) if name in LESS_OFTEN else name
+        pytest.param(name, marks=pytest.mark.evidence) if name in zoo.RELATIVES else name
         for name in list_robots_with_few_freedoms()
     ],
 )

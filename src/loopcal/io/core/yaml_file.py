@@ -320,8 +320,10 @@ def _make_bounded_composer(loader: Any) -> Any:
 # Text of YAML: names in quotes where they need them, and one key added to or removed from a
 # file.
 
-PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)\Z)[a-z][\w.-]*", re.IGNORECASE)
-"""Text that every version of YAML reads as the same text without quotes."""
+PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*", re.IGNORECASE)
+"""Text that YAML 1.2, and the readers of YAML 1.1 in use, read as the same text without quotes. To
+them y and n are no truth values, and y is the name of a column.
+"""
 
 
 def quote_scalar(text: str) -> str:
