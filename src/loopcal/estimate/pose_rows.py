@@ -413,9 +413,11 @@ class PoseSearch:
         solves_nuisance: bool,
         located: list[LinearizedPoses] | None = None,
     ) -> None:
-        self.rows, self.values, self.trials = rows, rows.free.values(z), trials
+        self.rows: PoseRows = rows
+        self.values: FloatArray = rows.free.values(z)
+        self.trials: IntArray = trials
         self.nuisance: NuisanceElimination | None = rows.nuisance if solves_nuisance else None
-        self.located = located
+        self.located: list[LinearizedPoses] | None = located
 
     def minimize(
         self, begin: PoseStates | None, nuisance: FloatArray | None, control: Halving

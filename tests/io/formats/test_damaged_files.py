@@ -22,7 +22,7 @@ from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from tests.io.changed_documents import change_value, list_places
 from tools.fuzz.sources import SOURCES
 
-MOST = {"urdf": 3, "hangprinter": 3}
+MOST = {"urdf": 4, "hangprinter": 4}
 """Places of each sort of damage, for files that are slow to read; 6 for others, twice as many in
 the evidence.
 """

@@ -181,7 +181,8 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
                 finding = report_finding("files.folder-in-use", content=kind.content)
                 raise FileError(finding, path)
             _refuse_other_content(path, kind)
-            if not all(os.access(place, os.W_OK | os.X_OK) for place, _, _ in os.walk(target)):
+            places = (place for place, _, _ in os.walk(target))  # gone where another command writes
+            if any(os.path.lexists(p) and not os.access(p, os.W_OK | os.X_OK) for p in places):
                 sentence = "this folder is protected against changes, so it cannot be replaced"
                 raise FileError(f"{sentence}; choose another name, or permit writing in it", path)
 
@@ -202,7 +203,7 @@ def _refuse_place(path: Path, target: Path) -> None:
 
 def _refuse_other_content(path: Path, kind: FolderKind) -> None:
     """Raise FileError where a folder is not an unchanged result of this kind, and nothing else."""
-    while True:
+    while path.is_dir():
         with watch_folder(path.resolve()) as is_same:
             try:
                 document = _read_document(path / kind.document)

@@ -53,7 +53,8 @@ def watch_folder(path: Path) -> Iterator[Callable[[], bool]]:
     next one.
     """
     with _opened(open_folder(path)) as descriptor:
-        yield lambda: descriptor is None or is_open(path, descriptor)
+        found = identify(path)  # None between the two renames of another command
+        yield lambda: found is not None and (descriptor is None or is_open(path, descriptor))
 
 
 def sync_file(path: Path) -> None:
@@ -213,7 +214,9 @@ def _take_free_name(temporary: Path, target: Path) -> bool:
     try:
         temporary.rename(target)
     except OSError as error:
-        if target.is_dir() and error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.EACCES):
+        # a folder that is not empty, and that another program may have set aside since
+        is_taken = error.errno in (errno.ENOTEMPTY, errno.EEXIST)
+        if is_taken or (error.errno == errno.EACCES and target.is_dir()):
             return False
         raise
     return True
