@@ -456,7 +456,6 @@ MARLIN, REPRAP = (
         firmware.read,
         firmware.write,
         read_options={"sigma_height": "", "sigma_tape": "arms", "probes": probes},
-        program=program,
     )
     for firmware, program, printed, ending, probes in (
         (Marlin(), "Marlin", "as M503 prints them", ".gcode", "G30, G33 P3 V0, M114"),

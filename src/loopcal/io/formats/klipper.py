@@ -289,5 +289,4 @@ FORMAT = Format(
     write,
     read_options={"sigma_height": "", "sigma_distance": "", "sigma_tape": "arms"},
     stores_fit=True,
-    program="Klipper",
 )

@@ -162,7 +162,6 @@ class Format:
     takes_file : whether `write` can correct an existing file.
     read_options : options of `ImportOptions` that `read` uses -> what is particular to this format,
         such as which lengths are taped, for help texts.
-    program : whose configuration of a robot the file is, where its ending alone says so.
     stores_fit : whether a file contains a geometry together with the measurements that its firmware
         fitted it to, so that `loopcal.diagnose` can compare the two.
     """
@@ -175,7 +174,6 @@ class Format:
     takes_file: bool = True
     read_options: Mapping[str, str] = field(default_factory=dict)
     stores_fit: bool = False
-    program: str = ""
 
 
 def get_record(

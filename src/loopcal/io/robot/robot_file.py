@@ -60,6 +60,8 @@ KEYS = ("name", "value", PLUS_MINUS, "unit")
 NOT_CALIBRATED = "# NOT CALIBRATED"
 """Beginning of a robot file that a failed calibration made."""
 EXAMPLE = "'{name: .., value: .., unit: ..}'"
+PROGRAMS = {".cfg": "Klipper", ".g": "RepRapFirmware", ".gcode": "Marlin"}
+"""Ending of the configuration of a printer -> its firmware; the formats build on this module."""
 
 
 def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = None) -> YamlFile:
@@ -278,14 +280,9 @@ def find_robot_file(source: str | Path) -> Path:
     if str(source) in shipped and not path.is_file():
         return shipped[str(source)]
     if path.exists():
-        ending = path.suffix.lower()
-        if ending not in (".yaml", ".yml") and path.is_file():
-            from loopcal.io.formats import FORMATS
-
-            for entry in FORMATS.values():
-                if entry.program and ending in entry.endings:
-                    fault = report_finding("files.robot-of-program", program=entry.program)
-                    raise FileError(fault, path)
+        program = PROGRAMS.get(path.suffix.lower())
+        if program is not None and path.is_file():
+            raise FileError(report_finding("files.robot-of-program", program=program), path)
         return path
     hint, names = suggest_names(str(source), shipped), ", ".join(shipped) or "none"
     act = f"name a file, or one of the shipped robots: {names}"
