@@ -618,7 +618,7 @@ NEWTON_STEPS, FLATTEST, ROUNDING = 40, 1e-9, 1e-15
 the trace of its form, below which a direction counts as flat; the rounding of values of the form.
 """
 
-GENERATORS = np.stack([hat(axis) for axis in np.eye(3)])
+GENERATORS = hat(np.eye(3))
 """Matrices (3, 3, 3) of the cross products with the three axes."""
 GENERATORS.setflags(write=False)
 

@@ -34,7 +34,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.elimination import NodeFactors
-from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.statistics import choose_evenly, find_distinct
 from loopcal.typing import FloatArray, IntArray
 
 MOTIONS = 12
@@ -177,9 +177,7 @@ def describe_frames(
     An earlier calibration may determine frames that these measurements do not. Without a
     linearization, or a finite noise variance, the unknown frames of instruments are not described.
     """
-    readings = data.readings
-    if len(readings) > MOST_READINGS:
-        readings = readings[np.linspace(0, len(readings) - 1, MOST_READINGS).astype(int)]
+    readings = data.readings[choose_evenly(len(data.readings), MOST_READINGS)]
     readings = readings[np.isfinite(readings).all(axis=1)]
     if unfixed is None:
         return FrameKnowledge(np.zeros((MOTIONS, 0)), readings)

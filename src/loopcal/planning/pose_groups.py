@@ -39,6 +39,7 @@ from loopcal.measure.readings import list_sensed_joints, make_readings_kind, res
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.numerics.elimination import eliminate_columns, eliminate_from_factor
+from loopcal.numerics.statistics import choose_evenly
 from loopcal.planning.design_space import (
     PriorInformation,
     divide_by_factor,
@@ -204,8 +205,8 @@ def find_group_motions(
 
     readings : (n, a) of all poses. members : (N, k) of the groups; some of them are enough.
     """
-    chosen = np.linspace(0, len(members) - 1, min(ENOUGH, len(members))).astype(int)
-    groups = linearize_groups(free, instrument, readings, members[np.unique(chosen)], True)
+    some = members[choose_evenly(len(members), ENOUGH)]
+    groups = linearize_groups(free, instrument, readings, some, True)
     of_frames = groups.rows[is_allowed(groups.rows)][:, :, len(groups.nuisance) :]
     return unfixed_motions(groups.fold()[0], float(np.linalg.norm(of_frames)))
 

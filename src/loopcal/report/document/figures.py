@@ -16,6 +16,7 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.result import KindResiduals
 from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.statistics import choose_evenly
 from loopcal.report.document.elements import CalibrationRecord, Element, Picture
 from loopcal.report.figures.fit_figures import (
     StoredFit,
@@ -31,7 +32,6 @@ from loopcal.report.figures.result_figures import (
 from loopcal.report.figures.robot_figure import draw_scene
 from loopcal.report.pictures import inline_figure
 from loopcal.report.scene.scene import Scene, choose_rows, compute_pose_errors, format_scene
-from loopcal.typing import IntArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -111,7 +111,7 @@ def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
     """
     if count <= MOST_ROWS:
         return rows
-    kept = _spread_rows(len(rows.raw), max(1, MOST_ROWS * len(rows.raw) // count))
+    kept = choose_evenly(len(rows.raw), max(1, MOST_ROWS * len(rows.raw) // count))
     return replace(
         rows,
         poses=tuple(rows.poses[i] for i in kept),
@@ -120,11 +120,6 @@ def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
         context={name: values[kept] for name, values in rows.context.items()},
         readings=rows.readings[kept],
     )
-
-
-def _spread_rows(count: int, most: int = MOST_ROWS) -> IntArray:
-    """Return at most so many of the rows, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, most).astype(np.intp))
 
 
 @report_figure("errors")
@@ -176,7 +171,7 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
         return
     accuracy = compute_accuracy(record)
     accuracy = None if isinstance(accuracy, str) else accuracy
-    rows, count = _spread_rows(len(readings)), len(readings)
+    rows, count = choose_evenly(len(readings), MOST_ROWS), len(readings)
     if len(rows) < count:
         yield f"The figure shows {len(rows):,} of {count:,} fitted poses."
     labels = record.fitted_labels
@@ -231,7 +226,10 @@ def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
     budget, readings = record.result.get("expected_error"), record.readings
     if record.posterior is None or readings is None or not budget:
         return "This run has no intervals, so the accuracy over the workspace is not known."
-    measured, frame = readings[_spread_rows(len(readings))], budget.get("frame", "fitted")
+    measured, frame = (
+        readings[choose_evenly(len(readings), MOST_ROWS)],
+        budget.get("frame", "fitted"),
+    )
     try:
         return accuracy_map(record.posterior, measured, MAP_POSES, SEED, frame=frame)
     except LoopcalError as error:

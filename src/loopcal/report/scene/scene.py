@@ -23,6 +23,7 @@ from loopcal.engine import State
 from loopcal.mechanism.kinematics import compute_limb_frames, locate_anchors
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward
+from loopcal.numerics.statistics import choose_evenly
 from loopcal.plain_text import escape
 from loopcal.report.figures.style import COLORS, ERROR, FRAME_COLORS, POSE, SEQUENTIAL
 from loopcal.typing import FloatArray, IntArray
@@ -292,10 +293,7 @@ def load_script() -> str:
 def choose_rows(robot: Mechanism, count: int) -> IntArray:
     """Return the rows, of so many, at which the robot can be shown: all, or evenly spread ones."""
     numbers = 3 * sum(part.points.shape[1] for part in list_parts(robot, robot.home_state))
-    most = max(1, MOST_NUMBERS // numbers)
-    if count <= most:
-        return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, most).astype(np.intp))
+    return choose_evenly(count, max(1, MOST_NUMBERS // numbers))
 
 
 def format_scene(scene: Scene) -> str:
