@@ -43,10 +43,13 @@ def list_incomplete_types(report: dict[str, Any]) -> list[str]:
 def main() -> int:
     """Print the public symbols without a complete type; return 1 if there are any."""
     pyright = Path(sys.executable).with_name("pyright")
-    words = [pyright, *COMMAND, "--pythonpath", sys.executable]
-    # `--verifytypes` does not follow the link of an editable installation
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
-    run = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)
+    # `--verifytypes` ignores `--pythonpath`: it asks the first `python` of PATH what is installed, and
+    # does not follow the link of an editable installation
+    path = os.pathsep.join([str(pyright.parent), os.environ.get("PATH", os.defpath)])
+    environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT / "src")}
+    run = subprocess.run(
+        [pyright, *COMMAND], check=False, capture_output=True, text=True, env=environment
+    )
     incomplete = list_incomplete_types(json.loads(run.stdout))
     print("\n".join(incomplete) or "Types of all public names are complete.")
     return int(bool(incomplete))
