@@ -14,6 +14,7 @@ import csv
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -48,15 +49,20 @@ def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
 
     def parse(cell: str) -> float:
         try:
-            if digits == (1,):  # a power of ten, such as of mm: three times as fast
-                product = float(f"{cell}e{exponent}")
-            else:
-                product = float(Decimal(cell) * exact)
+            product = float(Decimal(cell) * exact)
         except (ValueError, InvalidOperation):
             return math.nan
-        return product if math.isfinite(product) and "_" not in cell else math.nan
+        return product if "_" not in cell else math.nan
 
-    return np.array([parse(cell) for cell in cells])
+    if digits == (1,) and "_" not in "".join(cells):  # a power of ten, such as of mm
+        with suppress(ValueError):  # a cell is no plain decimal
+            power = f"e{exponent}"
+            return _keep_finite(np.array([float(cell + power) for cell in cells]))
+    return _keep_finite(np.array([parse(cell) for cell in cells]))
+
+
+def _keep_finite(values: FloatArray) -> FloatArray:
+    return np.where(np.isfinite(values), values, math.nan)
 
 
 # Numbers as text: the fewest digits that read back as the same double.

@@ -154,9 +154,10 @@ def _join_poses(files: Sequence[_File], robot: Mechanism) -> dict[str, tuple[int
     number = {name: i for i, name in enumerate(origin)}
     for file in files:
         for row, (cell, is_base) in enumerate(zip(file.names, file.is_base.tolist(), strict=True)):
-            names = [] if is_base else [cell]
-            if not is_base and cell not in number:
-                names = [part.strip() for part in cell.split(LINK)]
+            if is_base or cell in number:
+                file.members.append(() if is_base else (number[cell],))
+                continue
+            names = [part.strip() for part in cell.split(LINK)]
             for name in (name for name in names if name not in number):
                 sentence = f"unknown pose {name!r}{suggest_names(name, number)}"
                 raise file.table.row_error(row, f"{sentence}; add a row with its readings")
@@ -271,7 +272,8 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> None:
             sentence = f"pose {names[row]!r} has other readings in line {table.lines[begin[row]]}"
             act = "correct them, or rename one of the two poses"
         raise table.row_error(row, f"{sentence}; {act}")
-    file.unread = frozenset(name for name, row in file.first.items() if absent[row].all())
+    is_unread = absent.all(axis=1).tolist()
+    file.unread = frozenset(name for name, row in file.first.items() if is_unread[row])
     file.read = frozenset(file.first) - file.unread
     file.readings = rows
     if controller is not None:
