@@ -43,8 +43,8 @@ def list_incomplete_types(report: dict[str, Any]) -> list[str]:
 def main() -> int:
     """Print the public symbols without a complete type; return 1 if there are any."""
     pyright = Path(sys.executable).with_name("pyright")
-    # `--verifytypes` ignores `--pythonpath`: it asks the first `python` of PATH what is installed, and
-    # does not follow the link of an editable installation
+    # `--verifytypes` ignores `--pythonpath`: the first `python` of PATH says what is installed. It
+    # does not follow the link of an editable installation either
     path = os.pathsep.join([str(pyright.parent), os.environ.get("PATH", os.defpath)])
     environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT / "src")}
     run = subprocess.run(
