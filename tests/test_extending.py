@@ -9,7 +9,7 @@ import sys
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from loopcal.estimate.losses import LOSSES
 from loopcal.io.formats import FORMATS
 from loopcal.measure.kinds import KINDS
 from loopcal.registry import _list_entry_points
+from loopcal.typing import FloatArray
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
 
@@ -138,6 +139,52 @@ def test_a_setting_has_the_dimension_that_it_declares(registered, tmp_path) -> N
     path.write_text(path.read_text().replace("30 deg", "30 mm"))
     with pytest.raises(FileError, match="lean"):
         lc.load_measurements(path, robot)
+
+
+def test_settings_of_every_simple_type_are_written_and_read(registered, tmp_path) -> None:
+    settings: dict[str, tuple[Any, Any, str]] = {
+        "flag": (bool, True, "true"),
+        "count": (int, 3, "3"),
+        "depth": (float, 0.012, "12 mm"),
+        "lean": (Annotated[float, lc.Dimension.ANGLE], np.pi / 6, "30 deg"),
+        "gain": (Annotated[float, lc.Dimension.RATIO], 1.25, "1.25"),
+        "steps": (tuple[float, ...], (0.001, 0.002), "[1 mm, 2 mm]"),
+        "turns": (tuple[int, ...], (1, 2), "[1, 2]"),
+        "shown": (Literal["near", "far"], "far", "far"),
+        "words": (tuple[str, ...], ("a", "b"), "[a, b]"),
+        "limit": (float | None, 0.5, "500 mm"),
+        "place": (np.ndarray, np.array([1, 0, 2]), "[1000 mm, 0 mm, 2000 mm]"),
+    }
+    annotations = {key: of for key, (of, _, _) in settings.items()} | {"name": ClassVar[str]}
+    annotations["place"] = FloatArray
+    bases = (run_module(tmp_path)["Runout"],)
+    made = type(
+        "Rich", bases, {"__annotations__": annotations, "name": "rich", **dict.fromkeys(settings)}
+    )
+    lc.register_kind(dataclass(frozen=True, eq=False, kw_only=True)(made))
+    kind: Any = KINDS["rich"]
+    robot, path = lc.load_robot("hexapod-42"), tmp_path / "data.csv"
+    sensor = lc.Sensor(
+        kind(**{k: value for k, (_, value, _) in settings.items()}), lc.Gaussian(np.array([1e-6]))
+    )
+    poses = lc.sample_workspace(robot, 3, seed=1).coordinates
+    lc.save_measurements(lc.simulate(robot, poses, lc.Instrument((sensor,)), seed=1), path, robot)
+    written = path.read_text()
+    (rows,) = lc.load_measurements(path, robot).observations
+    for key, (_, value, text) in settings.items():
+        assert f"# {key}: {text}\n" in written
+        read = getattr(rows.kind, key)
+        assert type(read) is type(value)
+        assert np.array_equal(read, value), key
+    for key, wrong, fact in (
+        ("flag", "7", "the number 7, but true or false is needed"),
+        ("count", "2.5", "the number 2.5, but a whole number is needed"),
+        ("steps", "[3]", "'3' has no unit"),
+        ("shown", "left", "left.* allowed: 'near', 'far'"),
+    ):
+        path.write_text(written.replace(f"{key}: {settings[key][2]}", f"{key}: {wrong}"))
+        with pytest.raises(FileError, match=f"'{key}.*{fact}"):
+            lc.load_measurements(path, robot)
 
 
 def test_what_is_no_kind_and_no_loss_cannot_be_registered(registered) -> None:

@@ -11,20 +11,22 @@
 
 The record of a kind's settings is made from its dataclass, so that a new kind needs nothing here:
 arrays called T_.. are poses, those in DIRECTIONS are directions, other arrays are lengths, and
-numbers, too, unless they state another dimension, as Annotated[float, Dimension.ANGLE]; the rest is
-text.
+numbers, too, unless they state another dimension, as Annotated[float, Dimension.ANGLE].
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import operator
+import types
 import typing
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass, replace
 from fnmatch import fnmatchcase
-from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from functools import cache, reduce
+from typing import TYPE_CHECKING, Annotated, Any, Union, cast, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +35,7 @@ from loopcal import geometry
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, format_scaled, require_columns
-from loopcal.io.core.records import read_record
+from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import (
     Location,
@@ -87,6 +89,7 @@ MANY_SIGMAS = 3
 
 LENGTHS = Annotated[list[Any], Dimension.LENGTH]
 NUMBERS = Annotated[list[Any], Dimension.RATIO]
+NAMES = tuple[str, ...] | str
 
 
 def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
@@ -107,16 +110,19 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
         raise file.error(f"{sentence}; allowed: {known}", (*location, "kind"))
     kind = KINDS[name]
     settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
-    values = vars(read_record(file, settings, _make_record(kind), None, location))
-    given, types = {}, list_kind_settings(kind)
-    for key in settings:
-        value = values[key]
-        if isinstance(value, list) and not _is_array(value):
-            sentence = f"{key!r} must be a list of numbers, or of lists of equal length; correct it"
-            raise file.error(sentence, (*location, key))
-        if isinstance(value, str) and "tuple" in str(types[key]):
-            value = (value,)
-        given[key] = value.matrix if isinstance(value, PoseRecord) else value
+    hints = get_field_types(_make_record(kind))
+    record = read_record(file, settings, _make_record(kind), None, location)
+    given = {key: getattr(record, key) for key in settings}
+    for key, value in given.items():
+        if hints[key] in (LENGTHS, NUMBERS):
+            if not _is_array(value):
+                sentence = "must be a list of numbers, or of lists of equal length; correct it"
+                raise file.error(f"{key!r} {sentence}", (*location, key))
+            given[key] = np.array(value, dtype=float)
+        elif isinstance(value, PoseRecord):
+            given[key] = value.matrix
+        elif isinstance(value, str) and hints[key] == NAMES:
+            given[key] = (value,)
     try:
         made = kind(**given)
     except DataError as error:
@@ -181,7 +187,7 @@ def format_kind(
 
     Keyword-only settings are left out where they are the default, or the robot's `tool`.
     """
-    texts, types = {"kind": kind.name}, list_kind_settings(type(kind))
+    texts, hints = {"kind": kind.name}, get_field_types(_make_record(type(kind)))
     for setting in dataclasses.fields(cast(Any, kind)):
         if not setting.init or (value := getattr(kind, setting.name)) is None:
             continue
@@ -192,8 +198,7 @@ def format_kind(
             usual = setting.default_factory()
         is_usual = usual is not dataclasses.MISSING and bool(np.array_equal(value, usual))
         if not is_usual or (not setting.kw_only and isinstance(value, str | tuple)):
-            (dimension,) = getattr(types[setting.name], "__metadata__", (Dimension.LENGTH,))
-            texts[setting.name] = _format_setting(setting.name, value, dimension)
+            texts[setting.name] = _format_setting(value, hints[setting.name])
     if noise:
         units = {column.name: NOISE_UNITS[column.dimension] for column in kind.noise_columns}
         # nine digits: more would be rounding
@@ -205,7 +210,11 @@ def format_kind(
 
 
 def format_quantity(value: float, dimension: Dimension) -> str:
-    """Return a number with its unit, in SI where only that reads back as the same double."""
+    """Return a number with its unit, in SI where only that reads back as the same double; a ratio
+    without a unit.
+    """
+    if dimension is Dimension.RATIO:
+        return repr(value)
     shown = DISPLAY_UNITS[dimension]
     text = format_scaled(value, shown.factor_to_si)
     if float(text) * shown.factor_to_si == value:
@@ -216,20 +225,23 @@ def format_quantity(value: float, dimension: Dimension) -> str:
 @cache
 def _make_record(kind: type[Kind]) -> type:
     """Return a record of the settings of a kind (cached); all may be left out."""
-    fields: list[tuple[str, Any, None]] = []
-    for name, annotation in list_kind_settings(kind).items():
-        text, in_file = str(annotation), cast(Any, str)
-        if "ndarray" in text:
-            in_file = NUMBERS if name in DIRECTIONS else LENGTHS
-            in_file = PoseRecord if name.startswith("T_") else in_file
-        elif annotation is float:
-            in_file = Annotated[float, Dimension.LENGTH]
-        elif typing.get_origin(annotation) is Annotated:
-            in_file = annotation
-        elif "tuple" in text:
-            in_file = tuple[str, ...] | str
-        fields.append((name, in_file, None))
+    fields = [(n, _annotate(n, hint), None) for n, hint in list_kind_settings(kind).items()]
     return make_dataclass(f"{kind.__name__}Settings", fields, frozen=True)
+
+
+def _annotate(name: str, annotation: Any) -> Any:
+    """Return the annotation of a setting in files, from the annotation in its kind."""
+    origin, members = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        of_members = (_annotate(name, m) for m in members if m is not types.NoneType)
+        return reduce(operator.or_, of_members)
+    if origin is np.ndarray:
+        return PoseRecord if name.startswith("T_") else NUMBERS if name in DIRECTIONS else LENGTHS
+    if annotation == tuple[str, ...]:
+        return NAMES
+    if origin is tuple:
+        return tuple[tuple(_annotate(name, member) for member in members)]
+    return Length if annotation is float else annotation
 
 
 def _is_array(value: list[Any]) -> bool:
@@ -240,23 +252,32 @@ def _is_array(value: list[Any]) -> bool:
     return len(lengths) == 1 and all(_is_array(item) for item in value)
 
 
-def _format_setting(key: str, value: Any, dimension: Dimension) -> str:
-    """Return a setting as text that `read_kind` reads; numbers have the dimension."""
-    if key.startswith("T_"):
+def _format_setting(value: Any, annotation: Any) -> str:
+    """Return a setting as text that `read_kind` reads, by its annotation in files."""
+    if annotation is PoseRecord:
         angles = geometry.matrix_to_euler(value[:3, :3], "xyz")
         numbers = [float(v) + 0.0 for v in (*value[:3, 3], *angles)]
         names = ("x", "y", "z", "roll", "pitch", "yaw")
         units = [Dimension.LENGTH] * 3 + [Dimension.ANGLE] * 3
         texts = map(format_quantity, numbers, units)
         return format_flow_mapping(dict(zip(names, texts, strict=True)))
+    return _format_items(value, _find_dimension(annotation))
+
+
+def _find_dimension(annotation: Any) -> Dimension | None:
+    """Return the dimension of the numbers of an annotation; None where it states none."""
+    marks = getattr(annotation, "__metadata__", map(_find_dimension, get_args(annotation)))
+    return next((mark for mark in marks if isinstance(mark, Dimension)), None)
+
+
+def _format_items(value: Any, dimension: Dimension | None) -> str:
+    """Return a value, or a list or array of values, as YAML; numbers have the dimension."""
     if isinstance(value, str):
         return quote_scalar(value)
-    if isinstance(value, float):
-        return repr(value) if key in DIRECTIONS else format_quantity(value, dimension)
-    items = value if isinstance(value, list | tuple) else value.tolist()
-    if not isinstance(items, list | tuple):
-        return _format_setting(key, items, dimension)
-    return f"[{', '.join(_format_setting(key, item, dimension) for item in items)}]"
+    items = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    if isinstance(items, list | tuple):
+        return f"[{', '.join(_format_items(item, dimension) for item in items)}]"
+    return json.dumps(items) if dimension is None else format_quantity(float(items), dimension)
 
 
 # Prior knowledge of setup parameters (frames, targets, surfaces, offsets).
