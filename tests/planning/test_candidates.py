@@ -135,7 +135,7 @@ def test_listed_poses_outside_the_limits_are_excluded_with_the_reason():
         (lambda: Constraints(min_margin=1.5), "share of the median"),
         (lambda: Constraints(max_tilt=-1.0), "angle above 0"),
         (lambda: LineOfSight(np.zeros(3), np.zeros(3)), "length above 0"),
-        (lambda: LineOfSight(np.array([np.nan, 0, 0]), np.ones(3)), "three finite numbers"),
+        (lambda: LineOfSight(np.array([np.nan, 0, 0]), np.ones(3)), "station of .*: row 1 is nan"),
         (lambda: LineOfSight(np.zeros(3), np.ones(3), cone=0.0), "at most 180 deg"),
         (
             lambda: LineOfSight(np.zeros(3), np.ones(3), nearest=2.0, farthest=1.0),
@@ -176,7 +176,7 @@ def test_impossible_stroke_margin_is_refused(margin, words) -> None:
 
 @pytest.mark.parametrize("margin", [-1.0, np.inf, np.nan])
 def test_stroke_margin_is_a_finite_number(margin) -> None:
-    with pytest.raises(DataError, match="margin from the ends of strokes"):
+    with pytest.raises(DataError, match=r"stroke_margin is .*; it must be finite, 0 m or more"):
         Constraints(stroke_margin=margin)
 
 

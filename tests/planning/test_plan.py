@@ -240,12 +240,27 @@ def test_impossible_numbers_of_poses_are_refused_with_the_reason(
     [
         ({"n_poses": 0}, "0 poses for the fit; give 1 or more"),
         ({"n_poses": 10, "hold_out": -1}, "-1 poses to hold out"),
-        ({"n_poses": 10, "criterion": "G"}, "allowed are I .* and D"),
     ],
 )
 def test_invalid_plan_options_are_refused(tracker_problem, options, message):
     with pytest.raises(EstimationError, match=message):
         plan_poses(set_options(tracker_problem, **options))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"criterion": "G"}, r"criterion is G; it must be I \(.*\) or D \("),
+        ({"target": "angle"}, "target is 'angle'; .*'pose', 'position', 'orientation'"),
+        ({"target": "angle", "goal": 1e-5}, "target is 'angle'"),
+        ({"frame": "tracker"}, "frame is 'tracker'; .*'fitted', 'base', 'relative'"),
+        ({"n_candidates": 0}, "n_candidates is 0; it must be above 0"),
+        ({"seed": -1}, "seed is -1; it must be 0 or more"),
+    ],
+)
+def test_option_that_is_not_allowed_is_refused_before_anything_is_drawn(options, message):
+    with pytest.raises(DataError, match=message):
+        PlanOptions(**options)
 
 
 def test_number_of_poses_and_goal_exclude_each_other():

@@ -8,16 +8,17 @@ Many poses are checked at once; a violation is a code with numbers. Margins are 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.diagnose.error_frames import FITTED
+from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
+from loopcal.measure.array_checks import check_array
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.singularities import NEAR_SHARE, analyze_singularity, compute_median_margins
@@ -28,9 +29,21 @@ from loopcal.units import Dimension
 
 ROUNDING = 1e-12  # share of a bound by which it may be exceeded: the rounding of its own number
 
+HALF_TURN = Limit(
+    lambda value: 0.0 < value <= np.pi,
+    "an angle above 0, at most 180 deg",
+    lambda value: f"{np.degrees(value):g} deg",
+)
+
+
+class PlanSettings(Limited):
+    """Base of the options of a plan: a wrong one is a DataError."""
+
+    ERROR: ClassVar[type[Exception]] = DataError
+
 
 @dataclass(frozen=True, eq=False)
-class LineOfSight:
+class LineOfSight(PlanSettings):
     """A station from which the target on the tool must be visible.
 
     Attributes
@@ -44,6 +57,7 @@ class LineOfSight:
     Raises DataError where a vector is not finite or has no length, or a number is out of range.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {"cone": HALF_TURN}
     station: FloatArray
     facing: FloatArray
     cone: float = np.pi / 2
@@ -51,22 +65,13 @@ class LineOfSight:
     farthest: float = np.inf
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("station", "facing"):
-            given = np.array(getattr(self, name), dtype=float)
-            if given.shape != (3,) or not np.isfinite(given).all():
-                raise DataError(
-                    f"{name} of the line of sight is {given.tolist()}; give three finite numbers"
-                )
-            given.setflags(write=False)
+            given = check_array(getattr(self, name), f"{name} of the line of sight", (3,))
             object.__setattr__(self, name, given)
         if not np.linalg.norm(self.facing) > 0.0:
             raise DataError(
                 "facing of the line of sight is 0, 0, 0; give a direction with a length above 0"
-            )
-        if not 0.0 < self.cone <= np.pi:
-            raise DataError(
-                f"cone of the line of sight is {np.degrees(self.cone):g} deg; give an angle above "
-                "0, at most 180 deg"
             )
         if not 0.0 <= self.nearest < self.farthest:
             raise DataError(
@@ -89,7 +94,7 @@ class LineOfSight:
 
 
 @dataclass(frozen=True)
-class Constraints:
+class Constraints(PlanSettings):
     """Requirements on planned poses beside the machine's own strokes, joint limits and cones.
 
     Attributes
@@ -106,29 +111,19 @@ class Constraints:
     Raises DataError where a margin or the tilt is out of range.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "min_margin": Limit(
+            lambda value: 0.0 <= value < 1.0, "a share of the median, 0 or more and below 1"
+        ),
+        "max_tilt": HALF_TURN,
+        "stroke_margin": Limit(lambda value: 0.0 <= value < np.inf, "finite, 0 m or more"),
+        "stroke_margin_angle": Limit(lambda value: 0.0 <= value < np.inf, "finite, 0 rad or more"),
+    }
     min_margin: float = NEAR_SHARE
     max_tilt: float | None = None
     sight: LineOfSight | None = None
     stroke_margin: float = 0.0
     stroke_margin_angle: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.min_margin < 1.0:
-            raise DataError(
-                f"the margin from singularities is {self.min_margin:g}; give a share of the "
-                "median, 0 or more and below 1"
-            )
-        if self.max_tilt is not None and not 0.0 < self.max_tilt <= np.pi:
-            raise DataError(
-                f"the largest tilt is {np.degrees(self.max_tilt):g} deg; give an angle above 0, at "
-                "most 180 deg"
-            )
-        for margin, unit in ((self.stroke_margin, "m"), (self.stroke_margin_angle, "rad")):
-            if not 0.0 <= margin < np.inf:
-                raise DataError(
-                    f"the margin from the ends of strokes is {margin:g} {unit}; give a finite "
-                    "number, 0 or more"
-                )
 
     def stroke_margin_of(self, dimension: Dimension) -> float:
         """Return the margin from the ends of a stroke of this dimension [m or rad]."""
@@ -250,7 +245,7 @@ N_POSES = 40  # number of poses where neither a number nor a goal is given
 
 
 @dataclass(frozen=True, eq=False)
-class PlanOptions:
+class PlanOptions(PlanSettings):
     """Options of `plan`.
 
     Parameters
@@ -279,15 +274,23 @@ class PlanOptions:
         curve is always computed.
     seed : of all random choices.
 
-    Raises DataError where both `n_poses` and `goal` are given, or `n_candidates` is not positive.
+    Raises DataError for a value that is not allowed, and where `n_poses` and `goal` are given.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "criterion": Limit(
+            lambda value: value in ("I", "D"),
+            "I (mean predicted variance of poses) or D (volume of uncertainty of the parameters)",
+        ),
+        "n_candidates": POSITIVE,
+        "seed": NOT_NEGATIVE,
+    }
     n_poses: int | None = None
     criterion: str = "I"
     target: Target = "pose"
     goal: float | None = None
     hold_out: int | None = None
-    frame: str = FITTED
+    frame: Literal["fitted", "base", "relative"] = "fitted"
     constraints: Constraints = field(default_factory=Constraints)
     allowed_poses: FloatArray | None = field(default=None, repr=False)
     n_candidates: int = 1000
@@ -297,13 +300,12 @@ class PlanOptions:
     seed: int = 1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.n_poses is not None and self.goal is not None:
             raise DataError(
                 f"both a number of poses ({self.n_poses}) and an accuracy goal are given; give one "
                 "of them"
             )
-        if self.n_candidates < 1:
-            raise DataError(f"{self.n_candidates} candidate poses; give 1 or more")
         if self.allowed_poses is not None:
             poses = np.atleast_2d(np.array(self.allowed_poses, dtype=float))
             poses.setflags(write=False)

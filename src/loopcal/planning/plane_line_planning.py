@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal import geometry
+from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.findings import Finding, report_finding
@@ -59,13 +60,25 @@ DRAWN = 20  # groups drawn for each that is needed before the constraints are sa
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneLineGroups:
+class PlaneLineGroups(Limited):
     """Groups of poses whose points lie on a plane and on a line perpendicular to it.
 
     A design of u groups is (u, c): fractions of the half ranges of the workspace, from -1 to 1,
     except for the axis, which is 0, 1 or 2.
     """
 
+    ERROR: ClassVar[type[Exception]] = EstimationError
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "points": Limit(
+            lambda value: value >= 4,
+            "at least 4: one on plane and line, one on the line, two more in the plane",
+        ),
+        "sigma": POSITIVE,
+        "axes": Limit(
+            lambda value: value and set(value) <= set(POSITION),
+            f"one or more of {', '.join(POSITION)}",
+        ),
+    }
     robot: Mechanism  # moves in x, y and z, and states a workspace
     points: int  # k of a group, at least 4
     sigma: float  # of a held coordinate [m]
@@ -73,20 +86,7 @@ class PlaneLineGroups:
     shortest: float = SHORTEST  # least length of a line, in half ranges
 
     def __post_init__(self) -> None:
-        if self.points < 4:
-            raise EstimationError(
-                f"{self.points} points in a group; give at least 4: one on plane and line, one on "
-                "the line, two more in the plane"
-            )
-        if not self.sigma > 0.0:
-            raise EstimationError(
-                f"sigma of a held coordinate is {self.sigma} m; give a number above 0"
-            )
-        if not self.axes or not set(self.axes) <= set(POSITION):
-            raise EstimationError(
-                f"lines along {', '.join(self.axes) or 'no axis'}; choose from "
-                f"{', '.join(POSITION)}"
-            )
+        super().__post_init__()
         missing = tuple(name for name in POSITION if name not in self.robot.controlled)
         if missing:
             raise EstimationError(
@@ -287,7 +287,7 @@ def find_line_axes(robot: Mechanism, coordinates: FloatArray, groups: int) -> In
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceOptions:
+class SurfaceOptions(Limited):
     """Options of `plan_surfaces`.
 
     Parameters
@@ -297,6 +297,8 @@ class SurfaceOptions:
     constraints : on the poses. seed : of the first points.
     """
 
+    ERROR: ClassVar[type[Exception]] = EstimationError
+    LIMITS: ClassVar[Mapping[str, Limit]] = {"groups": POSITIVE, "seed": NOT_NEGATIVE}
     groups: int = 10
     points: int = 8
     sigma: float = 1e-5
@@ -422,8 +424,6 @@ def plan_surfaces(
     options = options or SurfaceOptions()
     groups = PlaneLineGroups(robot, options.points, options.sigma)
     checker = build_checker(robot, options.constraints)
-    if options.groups < 1:
-        raise EstimationError(f"{options.groups} groups; give 1 or more")
     designs, rows = _draw_allowed(
         groups, checker, options.groups, np.random.default_rng(options.seed)
     )

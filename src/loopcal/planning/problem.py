@@ -20,12 +20,10 @@ import numpy as np
 
 from loopcal.apply.accuracy import transport
 from loopcal.diagnose.error_frames import (
-    BASE,
     FITTED,
     RELATIVE,
     ErrorFrame,
     ReferencePoses,
-    check_frame,
     follow_pose,
     refer_errors,
     solve_home,
@@ -79,7 +77,6 @@ NO_INFORMATION = 1e-6
 # Share of a pose's error up to which its position or orientation does not change at all: the rest
 # is rounding.
 NO_MOTION = 1e-9
-FRAMES = (FITTED, BASE, RELATIVE)  # frames in which a plan can state errors
 DIMENSIONS: dict[Target, Dimension] = {  # of the error of each target
     "pose": Dimension.LENGTH,
     "position": Dimension.LENGTH,
@@ -118,12 +115,11 @@ class Prediction:
 def linearize_prediction(
     free: FreeParameters, solution: Solution, unfixed: FloatArray, frame: str = FITTED
 ) -> Prediction:
-    """Return how the tool's pose depends on the parameters, in a frame of FRAMES.
+    """Return how the tool's pose depends on the parameters, in a frame of `PlanOptions`.
 
     solution : the poses to predict. unfixed : (12, k) motions of frames that the measurements will
         not determine; "fitted" is after the best rigid fit of them over the poses to predict.
     """
-    check_frame(frame, FRAMES)
     poses = observe_poses(free, solution.q)
     T, twists = poses.T[0, poses.is_reached], poses.twists[0, poses.is_reached]
     followed = None
@@ -225,11 +221,6 @@ class PlanningProblem:
         name, target = name or self.options.criterion, target or self.options.target
         if name == "D":
             return Criterion("D")
-        if name != "I":
-            raise EstimationError(
-                f"unknown criterion {name!r}; allowed are I (mean predicted variance of poses) "
-                "and D (volume of uncertainty of the parameters)"
-            )
         rows, scale = getattr(self.prediction, target), 1.0
         if target == "orientation":
             scale = self.prediction.size

@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+from loopcal.checks import Limit, Limited, whole_numbers
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.core import limits
 from loopcal.io.core.records import read_record
@@ -43,15 +44,12 @@ from loopcal.studies.specification.levels import (
     EffectsLevel,
     ErrorsLevel,
     InstrumentLevel,
-    Limit,
-    Limited,
     MethodLevel,
     NoiseLevel,
     PosesLevel,
     Question,
     Robot,
     Scores,
-    whole_numbers,
 )
 from loopcal.studies.specification.study import BLOCK, REPLICATES, Study, check_question
 
@@ -83,9 +81,9 @@ class StudySettings(Limited):
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
-        "seed": whole_numbers(0, 2**63, "from {} to {}"),
-        "replicates": whole_numbers(1, limits.REPLICATES.most, "from {} to {}"),
-        "block": whole_numbers(1, MOST_TRIALS, "from {} to {}"),
+        "seed": whole_numbers(0, 2**63),
+        "replicates": whole_numbers(1, limits.REPLICATES.most),
+        "block": whole_numbers(1, MOST_TRIALS),
     }
     title: str
     seed: int = 1

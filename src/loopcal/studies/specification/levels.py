@@ -7,7 +7,7 @@ are in SI; the reader of study files converts them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import (
     TYPE_CHECKING,
@@ -20,7 +20,7 @@ from typing import (
     get_type_hints,
 )
 
-from loopcal.errors import suggest_names
+from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited, check_choice, whole_numbers
 from loopcal.estimate.losses import LOSSES
 from loopcal.estimate.methods import METHODS, SETTINGS
 from loopcal.estimate.options import NO_LOSS, Noise
@@ -47,31 +47,6 @@ PER_LEG = "per-leg"
 FEWEST_POINTS = 4
 """Smallest number of points of a plane with its line."""
 
-Limit = tuple[Callable[[Any], bool], str]
-"""Whether a value is allowed, and which values are, in words."""
-
-POSITIVE: Limit = (lambda value: value > 0, "above 0")
-NOT_NEGATIVE: Limit = (lambda value: value >= 0, "0 or more")
-
-
-def whole_numbers(least: int, most: int, words: str = "{} to {}") -> Limit:
-    """Return the limit of a number from `least` to `most`."""
-    return (lambda value: least <= value <= most, words.format(least, most))
-
-
-class Limited:
-    """Base of records whose settings have limits; the reader of records adds the line."""
-
-    LIMITS: ClassVar[Mapping[str, Limit]] = {}
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a setting beyond its limit; None has none."""
-        for key, (is_allowed, words) in self.LIMITS.items():
-            value = getattr(self, key)
-            if value is not None and not is_allowed(value):
-                shown = f"{value:g}" if isinstance(value, float) else str(value)
-                raise ValueError(f"{key} is {shown}; it must be {words}")
-
 
 @dataclass(frozen=True)
 class Robot:
@@ -97,8 +72,8 @@ class InstrumentLevel(Limited):
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
-        "sigma_position": (lambda value: value > 0.0, "above 0 m"),
-        "sigma_angle": (lambda value: value > 0.0, "above 0 rad"),
+        "sigma_position": Limit(lambda value: value > 0.0, "above 0 m"),
+        "sigma_angle": Limit(lambda value: value > 0.0, "above 0 rad"),
     }
     kinds: tuple[str, ...] = ("pose",)
     components: tuple[str, ...] = ()
@@ -138,7 +113,7 @@ class PosesLevel(Limited):
 
     PLAIN: ClassVar[str] = "count"
     LIMITS: ClassVar[Mapping[str, Limit]] = {
-        "count": whole_numbers(1, 10_000, "from {} to {}"),
+        "count": whole_numbers(1, 10_000),
         "seed": NOT_NEGATIVE,
         "sweeps": whole_numbers(0, 100),
     }
@@ -188,7 +163,7 @@ class ErrorsLevel(Limited):
     LIMITS: ClassVar[Mapping[str, Limit]] = {
         "tolerance_factor": POSITIVE,
         "error_factor": NOT_NEGATIVE,
-        "smallest": (lambda value: 0 <= value < 1, "0 or more, and less than 1"),
+        "smallest": Limit(lambda value: 0 <= value < 1, "0 or more, and less than 1"),
     }
     tolerance_factor: float = 1.0
     error_factor: float = 1.0
@@ -261,14 +236,13 @@ class MethodLevel(Limited):
         return self.rows.startswith("products")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for key, registry, other in (("method", METHODS, PER_LEG), ("loss", LOSSES, NO_LOSS)):
             value = getattr(self, key)
             if value in registry:
                 object.__setattr__(self, key, registry.resolve(value))
-            elif value != other:
-                allowed = (*registry, other)
-                hint = suggest_names(value, allowed)
-                raise ValueError(f"{key} is {value!r}{hint}; it must be {' or '.join(allowed)}")
+            else:
+                check_choice(key, value, (*registry, other), ValueError)
         self._check_published()
         for key in ("lam", "keep"):
             method = SETTINGS[key][0]
@@ -277,7 +251,6 @@ class MethodLevel(Limited):
                     f"{key} belongs to the method {method}, not to {self.method}; remove it, or "
                     "change the method"
                 )
-        super().__post_init__()
 
     def _check_published(self) -> None:
         """Refuse settings that methods of published studies do not have, or alone have."""
@@ -311,7 +284,7 @@ class Outliers(Limited):
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
-        "share": (lambda value: 0.0 <= value <= 1.0, "from 0 to 1")
+        "share": Limit(lambda value: 0.0 <= value <= 1.0, "from 0 to 1")
     }
     share: float = 0.05
     size: float = 20.0
@@ -355,8 +328,8 @@ class EffectsLevel(Limited):
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
         "noise": NOT_NEGATIVE,
-        "degrees": (lambda value: value > 2.0, "above 2, so that a sigma exists"),
-        "correlation": (lambda value: abs(value) < 1.0, "between -1 and 1"),
+        "degrees": Limit(lambda value: value > 2.0, "above 2, so that a sigma exists"),
+        "correlation": Limit(lambda value: abs(value) < 1.0, "between -1 and 1"),
     }
     noise: float = 1.0
     degrees: float | None = None
@@ -417,7 +390,7 @@ class Question(Limited):
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
-        "share": (lambda value: 0.0 < value < 1.0, "between 0 and 1")
+        "share": Limit(lambda value: 0.0 < value < 1.0, "between 0 and 1")
     }
     factor: str
     score: str
