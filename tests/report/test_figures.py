@@ -185,7 +185,7 @@ def test_fit_that_did_not_converge_has_last_values_only(five_bar) -> None:
 
 def test_correlation_is_one_on_the_diagonal_and_names_every_parameter(hexapod) -> None:
     fit = hexapod.fit
-    correlation = compute_correlation(fit)
+    correlation = compute_correlation(fit.covariance)
     known = np.isfinite(fit.standard_deviations)
     assert_allclose(np.diag(correlation)[known], 1.0)
     axes = draw_correlation(fit).axes[0]

@@ -3,25 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from loopcal.apply.accuracy import AccuracyMap, accuracy_map
 from loopcal.errors import LoopcalError
-from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.result import KindResiduals
 from loopcal.measure.kinds.joints import ActuatorReadings
-from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.report.document.elements import CalibrationRecord, Element, Picture
 from loopcal.report.figures.fit_figures import (
-    StoredFit,
-    draw_correlation,
-    draw_parameters,
+    draw_correlation_matrix,
+    draw_parameter_rows,
     draw_residual_rows,
 )
 from loopcal.report.figures.result_figures import (
@@ -236,45 +231,26 @@ def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
         return f"The accuracy over the workspace cannot be computed: {error}"
 
 
-def restore_fit(
-    fit: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot: Mechanism
-) -> StoredFit:
-    """Return a stored fit for the functions that draw parameters.
-
-    fit : content of `fit` of a run, with numbers that are not finite. robot : of which the
-        identified parameters are free.
-    """
-    rows = fit["parameters"]
-    places = np.flatnonzero(robot.parameters.free)
-    free = FreeParameters(robot, places, arrays["nominal"], np.ones(len(places)), places < 0)
-    factor, _ = free.display()
-    tolerance = factor * np.array([row["tolerance"] for row in rows])
-    assumed = np.array([bool(row["tolerance_assumed"]) for row in rows])
-    half_widths = factor * np.array([row["plus_minus"] for row in rows])
-    free = FreeParameters(robot, places, arrays["nominal"], tolerance, assumed)
-    return StoredFit(robot, free, arrays["estimate"], arrays["covariance"], half_widths)
-
-
 @report_figure("parameters")
 def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield shifts and uncertainties of the parameters in tolerances, and their correlations."""
-    count = len(record.result["fit"]["parameters"])
+    rows = record.result["fit"]["parameters"]
     if not record.converged:
         return
-    if count > MOST_PARAMETERS:
-        yield f"{count} parameters are too many for a figure."
+    if len(rows) > MOST_PARAMETERS:
+        yield f"{len(rows)} parameters are too many for a figure."
         return
-    fit = restore_fit(record.result["fit"], record.arrays, record.robot)
     yield make_picture(
-        draw_parameters(fit),
+        draw_parameter_rows(record.robot.name, rows),
         "parameter-figure",
         "Shift and uncertainty of the parameters in tolerances.",
         "For each parameter the figure shows the estimate minus the nominal value with its 95 % "
         "interval, and the half-width of that interval.",
     )
-    if count > 1:
+    if len(rows) > 1:
+        names = [row["name"] for row in rows]
         yield make_picture(
-            draw_correlation(fit),
+            draw_correlation_matrix(record.robot.name, names, record.arrays["covariance"]),
             "correlation-figure",
             "Correlations of the parameters.",
             "The matrix shows the correlation of each pair of parameters by color. The findings of "

@@ -12,7 +12,6 @@ import numpy as np
 from loopcal.apply.validation import owner_of
 from loopcal.diagnose.cross_validation import RegularizationCurves
 from loopcal.diagnose.identifiable_parameters import Identifiability
-from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.result import Identification, KindResiduals
 from loopcal.findings.wording import list_names, name_count
 from loopcal.measure.kinds.joints import ActuatorReadings
@@ -280,45 +279,35 @@ SHIFT, WIDTH = COLORS[0], COLORS[1]
 """Colors of shifts and of uncertainties."""
 
 
-@dataclass(frozen=True, eq=False)
-class StoredFit:
-    """What figures use of a stored fit that converged; see `Identification` for the attributes."""
-
-    robot: Mechanism
-    free_parameters: FreeParameters
-    estimate: FloatArray
-    covariance: FloatArray
-    half_widths: FloatArray
-    converged: bool = True
-
-    @property
-    def standard_deviations(self) -> FloatArray:
-        """(p,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def interval(self) -> FloatArray:
-        """Return half-widths (p,) of the 95 % intervals."""
-        return self.half_widths
-
-
 @register("figure parameters", Identification)
-def draw_parameters(fit: Identification | StoredFit) -> Figure:
+def draw_parameters(fit: Identification) -> Figure:
+    """Draw the parameters of a fit, see `draw_parameter_rows`."""
+    return draw_parameter_rows(fit.robot.name, fit.list_parameters(), fit.converged)
+
+
+def draw_parameter_rows(
+    robot: str, rows: Sequence[Mapping[str, Any]], converged: bool = True
+) -> Figure:
     """Draw the shift of each parameter in tolerances with its 95 % interval, its uncertainty in
     tolerances, and both as numbers in the unit of the robot's file.
 
     Of a fit that did not converge only the last values are drawn, without intervals.
+
+    Parameters
+    ----------
+    robot : its name. rows : see `Identification.list_parameters`; or those of a run folder.
     """
-    p, tolerance = len(fit.free_parameters.names), fit.free_parameters.tolerance
-    columns = max(-(-p // MOST_ROWS), 1)
+    p, columns = len(rows), max(-(-len(rows) // MOST_ROWS), 1)
     chunks = np.array_split(np.arange(p), columns)
-    height = 1.6 + 0.19 * max(len(chunk) for chunk in chunks)
+    height = 1.6 + 0.19 * max(map(len, chunks))
     figure, panels = start_panels(
         8.2 * columns, height, 1, 2 * columns, width_ratios=[3, 2] * columns
     )
-    half = fit.interval() / tolerance if fit.converged else np.full(p, np.nan)
+    half = np.array([row["plus_minus"] / row["tolerance"] if converged else np.nan for row in rows])
     for i, chunk in enumerate(chunks):
-        _draw_shifts(panels[0, 2 * i], fit, half[chunk], chunk)
-        _draw_uncertainties(panels[0, 2 * i + 1], fit, half[chunk], chunk)
+        shown = [rows[k] for k in chunk]
+        _draw_shifts(panels[0, 2 * i], shown, half[chunk])
+        _draw_uncertainties(panels[0, 2 * i + 1], shown, half[chunk], converged)
     handles = [
         make_handle("shift, 95 % interval", color=SHIFT, marker="o", ms=DOT, lw=1.2),
         make_handle("uncertainty (95 %)", color=WIDTH, marker="s", ms=DOT, ls="none"),
@@ -326,34 +315,30 @@ def draw_parameters(fit: Identification | StoredFit) -> Figure:
         make_handle("one tolerance", color=PALE, lw=6, alpha=0.5),
     ]
     add_legend(figure, handles)
-    status = "" if fit.converged else "; not converged: last values, no estimates"
-    n_assumed = int(fit.free_parameters.assumed.sum())
+    status = "" if converged else "; not converged: last values, no estimates"
+    n_assumed = sum(row["tolerance_assumed"] for row in rows)
     assumed = f"; {n_assumed} tolerances are assumed" if n_assumed else ""
-    words = name_count(p, "parameter")
-    return finish_figure(figure, f"{fit.robot.name}: {words}{assumed}{status}")
+    return finish_figure(figure, f"{robot}: {name_count(p, 'parameter')}{assumed}{status}")
 
 
-def _draw_shifts(
-    axes: Axes, fit: Identification | StoredFit, half: FloatArray, chunk: IntArray
-) -> None:
+def _draw_shifts(axes: Axes, rows: Sequence[Mapping[str, Any]], half: FloatArray) -> None:
     """Draw estimate minus nominal value in tolerances, with the 95 % interval."""
-    free = fit.free_parameters
-    shift = ((fit.estimate - free.nominal) / free.tolerance)[chunk]
-    known, y = np.isfinite(half), np.arange(len(chunk))
+    shift = np.array([(row["estimate"] - row["nominal"]) / row["tolerance"] for row in rows])
+    known, y = np.isfinite(half), np.arange(len(rows))
     axes.axvspan(-1.0, 1.0, color=PALE, alpha=0.35, lw=0.0, zorder=0)
     axes.axvline(0.0, **ZERO, zorder=1)
     style: dict[str, Any] = {"fmt": "o", "ms": DOT, "elinewidth": 1.2, "capsize": 1.5}
     axes.errorbar(shift[known], y[known], xerr=half[known], color=SHIFT, **style)
     axes.plot(shift[~known], y[~known], "x", color=SHIFT, ms=DOT + 1)
-    label_rows(axes, [shorten(free.names[i]) for i in chunk])
+    label_rows(axes, [shorten(row["name"]) for row in rows])
     label_axes(axes, "estimate - nominal [tolerance]", "", "shift")
 
 
 def _draw_uncertainties(
-    axes: Axes, fit: Identification | StoredFit, half: FloatArray, chunk: IntArray
+    axes: Axes, rows: Sequence[Mapping[str, Any]], half: FloatArray, converged: bool
 ) -> None:
     """Draw the half-width of the 95 % interval in tolerances; the numbers are at the right."""
-    y, drawn = np.arange(len(chunk)), np.isfinite(half) & (half > 0.0)
+    y, drawn = np.arange(len(rows)), np.isfinite(half) & (half > 0.0)
     axes.axvline(1.0, **DASHED, zorder=1)
     axes.plot(half[drawn], y[drawn], "s", color=WIDTH, ms=DOT)
     if drawn.any():
@@ -362,15 +347,12 @@ def _draw_uncertainties(
         label_logarithmic(axes.xaxis, FEW_TICKS)
     else:
         axes.set_xticks([])
-    factor, symbols = fit.free_parameters.display()
-    widths = half * fit.free_parameters.tolerance[chunk] / factor[chunk]
     numbers = []
-    for i, value, width in zip(
-        chunk, (fit.estimate / factor)[chunk].tolist(), widths.tolist(), strict=True
-    ):
-        symbol = "" if symbols[i] == "1" else f" {symbols[i]}"  # a ratio has no unit
+    for row in rows:
+        value, width = row["estimate"], row["plus_minus"]
+        unit = "" if row["unit"] == "1" else f" {row['unit']}"  # a ratio has no unit
         shown = f"{format_with_uncertainty(value, width)} ± {format_uncertainty(width)}"
-        numbers.append(f"{shown if fit.converged else f'{value:.3g}'}{symbol}")
+        numbers.append(f"{shown if converged else f'{value:.3g}'}{unit}")
     axes.yaxis.tick_right()
     label_rows(axes, numbers)
     label = "half-width [tolerance]" if drawn.any() else ""
@@ -379,13 +361,17 @@ def _draw_uncertainties(
 
 
 @register("figure correlation", Identification)
-def draw_correlation(fit: Identification | StoredFit) -> Figure:
-    """Draw the correlations of all parameters as a matrix of colors.
+def draw_correlation(fit: Identification) -> Figure:
+    """Draw the correlations of the parameters of a fit, see `draw_correlation_matrix`."""
+    return draw_correlation_matrix(fit.robot.name, fit.names, fit.covariance)
+
+
+def draw_correlation_matrix(robot: str, names: Sequence[str], covariance: FloatArray) -> Figure:
+    """Draw the correlations of all parameters as a matrix of colors; covariance : (p, p) [SI].
 
     Parameters without a finite uncertainty have a grey row.
     """
-    names, correlation = fit.free_parameters.names, compute_correlation(fit)
-    p = len(names)
+    p, correlation = len(names), compute_correlation(covariance)
     size = float(np.clip(0.155 * p, 3.4, 13.0))
     figure = start_figure(size + 2.6, size + 1.6)
     axes = figure.add_subplot()
@@ -414,15 +400,15 @@ def draw_correlation(fit: Identification | StoredFit) -> Figure:
         words += "\ngrey: without a finite uncertainty"
     if step > 1:
         words += f"\nevery {step}. name is written"
-    return finish_figure(figure, f"{fit.robot.name}: {words}")
+    return finish_figure(figure, f"{robot}: {words}")
 
 
-def compute_correlation(fit: Identification | StoredFit) -> FloatArray:
+def compute_correlation(covariance: FloatArray) -> FloatArray:
     """Return the correlations (p, p) [1]; NaN where a parameter has no finite uncertainty."""
-    sd = fit.standard_deviations
+    sd = np.sqrt(np.diag(covariance))
     usable = np.isfinite(sd) & (sd > 0.0)
     scale = np.where(usable, sd, np.nan)
-    return np.where(np.outer(usable, usable), fit.covariance, np.nan) / np.outer(scale, scale)
+    return np.where(np.outer(usable, usable), covariance, np.nan) / np.outer(scale, scale)
 
 
 SMALLEST = 1e-16
