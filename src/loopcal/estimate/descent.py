@@ -21,14 +21,9 @@ import numpy as np
 from loopcal.engine import fold
 from loopcal.errors import EstimationError
 from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.penalties import FixedPenalty, Method, decompose_for, fix_penalty
+from loopcal.estimate.penalties import Method, decompose_for, fix_penalty
 from loopcal.measure.array_checks import check_type
-from loopcal.numerics.decomposition import (
-    RANK_TOLERANCE,
-    Decomposition,
-    empty_factor,
-    solve_regular,
-)
+from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, solve_regular
 from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
@@ -114,7 +109,7 @@ class TriangularModel(TrialBatch):
     step : (t, p) the full step. gain : (t,) decrease by it of the sum of squares with penalties, as
         the linear model predicts it. is_regular : (t,) where these are known; elsewhere a direction
         might not count, and the decomposition decides.
-    method, tolerance, fixed : the method, its rank tolerance and its penalty.
+    method, tolerance : the method and its rank tolerance. fixed : (k, p) P of its penalty |P z|^2.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("method", "tolerance", "fixed")
@@ -127,7 +122,7 @@ class TriangularModel(TrialBatch):
     is_regular: BoolArray
     method: Method
     tolerance: float
-    fixed: FixedPenalty
+    fixed: FloatArray
 
     @cached_property
     def decomposition(self) -> Decomposition:
@@ -155,9 +150,7 @@ class TriangularModel(TrialBatch):
 
     def penalize(self, deviation: FloatArray) -> FloatArray:
         """Return what the penalty adds to the sum of squares (t,) at deviations (t, p)."""
-        if not len(self.fixed.rows):
-            return np.zeros(len(deviation))
-        return (self.fixed.evaluate(deviation) ** 2).sum(axis=1)
+        return (np.matmul(self.fixed, deviation[:, :, None]) ** 2).sum(axis=(1, 2))
 
 
 LinearModel = SpectralModel | TriangularModel
@@ -165,7 +158,7 @@ LinearModel = SpectralModel | TriangularModel
 
 
 def make_linear_model(
-    linearized: Linearization, method: Method, tolerance: float, fixed: FixedPenalty | None
+    linearized: Linearization, method: Method, tolerance: float, fixed: FloatArray | None
 ) -> LinearModel:
     """Return the linear model of linearized rows; `fixed` is that of `fix_penalty`."""
     factor, equations, z = linearized.factor, linearized.equations, linearized.deviation
@@ -173,30 +166,15 @@ def make_linear_model(
         decomposition = decompose_for(method, factor, equations, z, tolerance)
         penalty = np.array(method.penalty(decomposition), dtype=np.float64)
         return SpectralModel(decomposition, penalty)
-    p = z.shape[1]
-    triangle, residual = fixed.scale_columns(factor[:, :p, :p]), factor[:, :p, p]
-    if len(fixed.rows) or not fixed.is_triangular:
-        triangle, residual = _append_penalty(triangle, residual, fixed, z)
-    u, is_regular = solve_regular(triangle, -residual, tolerance)
+    p, joint = z.shape[1], factor
+    if len(fixed):
+        rows = np.empty((len(z), len(fixed), p + 1))
+        rows[:, :, :p], rows[:, :, p:] = fixed, np.matmul(fixed, z[:, :, None])
+        joint = fold(factor, rows)
+    residual = joint[:, :p, p]
+    step, is_regular = solve_regular(joint[:, :p, :p], -residual, tolerance)
     gain = (residual**2).sum(axis=1)
-    step = fixed.to_deviation(u)
     return TriangularModel(factor, z, equations, step, gain, is_regular, method, tolerance, fixed)
-
-
-def _append_penalty(
-    triangle: FloatArray, residual: FloatArray, fixed: FixedPenalty, deviation: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the triangular factor (t, p, p) and the residual (t, p) of rows and penalty."""
-    t, p = residual.shape
-    factor = empty_factor(t, p)
-    factor[:, :p, :p], factor[:, :p, p] = triangle, residual
-    rows = np.empty((t, len(fixed.rows), p + 1))
-    rows[:, :, :p], rows[:, :, p] = fixed.rows, fixed.evaluate(deviation)
-    if fixed.is_triangular:
-        factor = fold(factor, rows)
-    else:
-        factor = fold(empty_factor(t, p), np.concatenate([factor[:, :p], rows], axis=1))
-    return factor[:, :p, :p], factor[:, :p, p]
 
 
 ACCEPTED_SHARE = 1e-4

@@ -607,7 +607,7 @@ def share_factor(
         for rows in poses.blocks[0].rows
     ]
     A = np.concatenate([kind.by_parameters.reshape(-1, p) for kind in kinds])
-    q, r = np.linalg.qr(np.concatenate([A, fixed.matrix]))
+    q, r = np.linalg.qr(np.concatenate([A, fixed]))
     if len(r) < p:  # fewer rows than parameters
         return None
     _, is_regular = solve_regular(r[None], np.zeros((1, p)), tolerance)
@@ -617,9 +617,7 @@ def share_factor(
     states, is_near = poses.next_start(solution, begin)
     start = replace(begin, deviation=deviation, poses=states, is_near=is_near)
     by_residuals = np.ascontiguousarray(inverse[:, : len(A)])
-    return SharedFactor(
-        solution, start, np.array(r), by_residuals, inverse[:, len(A) :] @ fixed.matrix
-    )
+    return SharedFactor(solution, start, np.array(r), by_residuals, inverse[:, len(A) :] @ fixed)
 
 
 def take_chords(

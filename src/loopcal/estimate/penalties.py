@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -590,49 +590,9 @@ def describe_regularization(
     )
 
 
-class FixedPenalty(NamedTuple):
-    """The penalty of a method that does not depend on the rows: |P z|^2 is added to their sum of
-    squares.
-
-    Attributes
-    ----------
-    unit : (p, p) S with z = S u, where the method filters the coordinates u; (p,) if S is diagonal,
-        None if it is 1.
-    rows : (k, p) P S, one row for each penalized coordinate; k = 0 where nothing is penalized.
-    matrix : (k, p) P.
-    """
-
-    unit: FloatArray | None
-    rows: FloatArray
-    matrix: FloatArray
-
-    @property
-    def is_triangular(self) -> bool:
-        """Whether R S is triangular for every triangular R."""
-        return self.unit is None or self.unit.ndim == 1
-
-    def scale_columns(self, triangle: FloatArray) -> FloatArray:
-        """Return R S for R (t, p, p)."""
-        if self.unit is None:
-            return triangle
-        return triangle * self.unit if self.unit.ndim == 1 else triangle @ self.unit
-
-    def to_deviation(self, coordinates: FloatArray) -> FloatArray:
-        """Return S u, (t, p), of u (t, p)."""
-        if self.unit is None:
-            return coordinates
-        if self.unit.ndim == 1:
-            return coordinates * self.unit
-        return np.matmul(self.unit, coordinates[:, :, None])[:, :, 0]
-
-    def evaluate(self, deviation: FloatArray) -> FloatArray:
-        """Return P z (t, k) of deviations z (t, p)."""
-        return np.matmul(self.matrix, deviation[:, :, None])[:, :, 0]
-
-
-def fix_penalty(method: Method, parameters: int) -> FixedPenalty | None:
-    """Return the penalty of a method for p parameters where the method states it; None where it
-    chooses it from the decomposition.
+def fix_penalty(method: Method, parameters: int) -> FloatArray | None:
+    """Return P (k, p) of a method whose penalty |P z|^2 does not depend on the rows, with k = 0
+    where nothing is penalized; None where the method chooses it from the decomposition.
 
     Of another class, which may inherit from these, only its penalties of decompositions are known.
     """
@@ -649,11 +609,7 @@ def fix_penalty(method: Method, parameters: int) -> FixedPenalty | None:
     is_penalized = np.full(parameters, value > 0.0)
     if unpenalized is not None:
         is_penalized &= ~unpenalized
-    rows = np.sqrt(value) * np.eye(parameters)[is_penalized]
-    matrix, unit = rows, scale
+    matrix = np.sqrt(value) * np.eye(parameters)[is_penalized]
     if root is not None:
-        matrix = np.linalg.solve(root.T, rows.T).T
-        unit = root if scale is None else scale[:, None] * root
-    if scale is not None:
-        matrix = matrix / scale
-    return FixedPenalty(unit, rows, matrix)
+        matrix = np.linalg.solve(root.T, matrix.T).T
+    return matrix if scale is None else matrix / scale
