@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands overwrite no file unasked, and write all of their files or none."""
 
+import json
 import os
 import shutil
 import stat
@@ -184,3 +185,24 @@ def test_folder_that_refuses_new_entries_is_not_called_missing(loopcal) -> None:
         pytest.skip("needs a file system in which nothing can be made")
     said = loopcal("simulate five-bar -o /proc/data.csv", code=1).err
     assert "does not exist" not in said
+
+
+PLAN = "plan hexapod-nategh-agheli -o out"
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ("calibrate hexapod-42 data.csv -o out", "result.json"),
+        (f"{PLAN} --poses 30 --hold-out 0 --candidates 40", "plan.json"),
+        (f"{PLAN} --measure plane-line --groups 9 --points 6", "plan.json"),
+        ("regularize hexapod-42 data.csv -o out", "curves.json"),
+    ],
+)
+def test_printed_document_is_that_of_the_folder(loopcal, words, name) -> None:
+    printed = loopcal(f"{words} --json").json
+    written = json.loads(Path("out", name).read_text("utf-8"))
+    assert name in written.pop("files")
+    assert printed == written
+    assert printed["made_by"]["command"] == ["loopcal", *words.split(), "--json"]
+    assert next(iter(printed)) == "format"

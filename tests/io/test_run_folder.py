@@ -18,6 +18,7 @@ from loopcal.io.runs.run_folder import (
 from loopcal.io.runs.run_result import FIT, LATER
 
 RESULT = {
+    "format": 2,
     "made_by": {"command": [], "inputs": {}},
     "fit": {"parameters": [{"name": "x", "plus_minus": 0.1}], "status": "converged"},
     "verdict": "calibrated",

@@ -192,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 command = command.commands.get(words[1], command)
             if command is not None and not _has_working_folder():
                 return _refuse("the working folder was removed; change to a folder that exists.")
-            code = command_line.main(words, prog_name="loopcal", standalone_mode=False)
+            code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
             terminal.flush_output()
             return code if isinstance(code, int) else 0
         except BrokenPipeError:  # the reader of our output stopped (`loopcal ... | head`)

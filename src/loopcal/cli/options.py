@@ -371,6 +371,11 @@ ALLOWED: Any = Group(
 # What the user stated
 
 
+def list_words() -> list[str]:
+    """Return the words of the command line, for the provenance of a result."""
+    return ["loopcal", *click.get_current_context().find_root().obj]
+
+
 def is_given(name: str) -> bool:
     """Return whether the user stated an option on the command line."""
     source = click.get_current_context().get_parameter_source(name)

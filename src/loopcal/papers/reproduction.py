@@ -100,6 +100,11 @@ def write_page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
     return template.render(reproduction=reproduction, content=reproduction.content, made_by=made_by)
 
 
+def build_document(reproduction: Reproduction, made_by: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of result.json."""
+    return {"made_by": made_by, **reproduction.to_dict()}
+
+
 def write_folder(
     path: str | Path, reproduction: Reproduction, made_by: Mapping[str, Any], force: bool = False
 ) -> Path:
@@ -119,8 +124,7 @@ def write_folder(
     styles = choose_styles(content.figures)
     for figure in content.figures:
         files[f"figures/{figure.name}.png"] = render_figure(draw(figure, styles), ".png")
-    document = {"made_by": made_by, **reproduction.to_dict()}
-    write_result_folder(path, FOLDER, document, files, force)
+    write_result_folder(path, FOLDER, build_document(reproduction, made_by), files, force)
     return path
 
 

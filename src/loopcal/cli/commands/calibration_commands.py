@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -117,10 +116,10 @@ def calibrate(
         report = lc.calibrate(machine, measurements, settings, progress)
     opt.print_convention_note(report.conventions, data)
     with terminal.TerminalProgress("writing the run folder"):
-        lc.save_run(output, report, inputs, sys.argv, force)
+        lc.save_run(output, report, inputs, opt.list_words(), force)
     written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
     return Output(
-        build_document(report, inputs, sys.argv),
+        build_document(report, inputs, opt.list_words()),
         lambda: [*view_calibration(report, verbose, hint_for), "", written],
         report.failures,
         shown=True,
@@ -481,13 +480,12 @@ def regularize(
             seed=seed,
             progress=progress,
         )
-    if output is not None:
-        picture = render_figure(draw_regularization(curves), ".png")
-        made_by = collect_provenance(["loopcal", *sys.argv[1:]], inputs, {"folds": seed})
-        document = {"format": CURVES_FORMAT, **curves.to_dict(), "made_by": made_by}
-        files = {POINTS: tabulate_points(curves).to_csv().encode(), PICTURE: picture}
-        write_result_folder(output, CURVES, document, files, force)
-    written = ["", f"Written to {output}: curves.json, curves.csv, curves.png"]
-    return Output(
-        curves.to_dict(), lambda: [*view_regularization(curves), *(written if output else [])]
-    )
+    made_by = collect_provenance(opt.list_words(), inputs, {"folds": seed})
+    document = {"format": CURVES_FORMAT, **curves.to_dict(), "made_by": made_by}
+    if output is None:
+        return Output(document, lambda: view_regularization(curves))
+    picture = render_figure(draw_regularization(curves), ".png")
+    files = {POINTS: tabulate_points(curves).to_csv().encode(), PICTURE: picture}
+    write_result_folder(output, CURVES, document, files, force)
+    written = f"Written to {output}: curves.json, curves.csv, curves.png"
+    return Output(document, lambda: [*view_regularization(curves), "", written])

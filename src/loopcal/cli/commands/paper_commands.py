@@ -60,11 +60,12 @@ def reproduce(
             text for r in rows for text in (r["name"], f"    {r['title']}", f"    {r['source']}")
         ]
         return Output({"papers": rows}, lambda: lines)
+    from loopcal.io.core.outputs import refuse_folder
+    from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.papers.reproduction import FOLDER, build_document, write_folder
+
     chosen = find_paper(paper)
     if output is not None:
-        from loopcal.io.core.outputs import refuse_folder
-        from loopcal.papers.reproduction import FOLDER
-
         refuse_folder(output, FOLDER, force)
 
     def print_step(text: str) -> None:
@@ -72,16 +73,12 @@ def reproduce(
             terminal.print_message(text)
 
     result = chosen.run(seed, trials, print_step)
-    if output is not None:
-        from loopcal.io.runs.run_folder import collect_provenance
-        from loopcal.papers.reproduction import write_folder
-
-        command = ["loopcal", *sys.argv[1:]]
-        write_folder(output, result, collect_provenance(command, {}, {"seed": seed}), force)
+    made_by = collect_provenance(opt.list_words(), {}, {"seed": seed})
     last = "Add -o FOLDER for all tables and figures."
     if output is not None:
+        write_folder(output, result, made_by, force)
         last = f"Written to {output}: page.md, tables, figures"
-    return Output(result.to_dict(), lambda: [*_view_reproduction(result), "", last])
+    return Output(build_document(result, made_by), lambda: [*_view_reproduction(result), "", last])
 
 
 @opt.command()

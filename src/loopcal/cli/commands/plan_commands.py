@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -117,6 +116,7 @@ def plan(
     from loopcal.io.data.measurement_file import load_instrument_to_plan, load_poses
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.io.runs.plan_folder import FORMAT, PLAN
+    from loopcal.io.runs.run_folder import collect_provenance
 
     files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
     files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
@@ -133,7 +133,6 @@ def plan(
         surface_options = lc.SurfaceOptions(groups, points, sigma, constraints, seed)
         with terminal.TerminalProgress() as progress:
             result = lc.plan_surfaces(machine, surface_options, progress)
-        document = result.to_dict()
     else:
         if opt.is_given("groups") or opt.is_given("points"):
             raise DataError("--groups and --points belong to --measure plane-line; leave them out")
@@ -170,8 +169,9 @@ def plan(
         )
         with terminal.TerminalProgress() as progress:
             result = lc.plan(machine, measuring, options=plan_options, progress=progress)
-        document = {"format": FORMAT, **result.to_dict()}
-    written = _write_plan(output, result, inputs, seed, force)
+    made_by = collect_provenance(opt.list_words(), inputs, {"plan": seed})
+    document = {"format": FORMAT, **result.to_dict(), "made_by": made_by}
+    written = _write_plan(output, result, document, force)
     data = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
     page = [
         str(result),
@@ -197,16 +197,11 @@ def _read_measured(paths: tuple[Path, ...], robot: lc.Mechanism) -> lc.Measureme
 
 
 def _write_plan(
-    output: Path,
-    result: lc.Plan | lc.SurfacePlan,
-    inputs: Mapping[str, Path],
-    seed: int,
-    force: bool,
+    output: Path, result: lc.Plan | lc.SurfacePlan, document: Mapping[str, Any], force: bool
 ) -> str:
     """Write the folder of a plan; return its files in words."""
     from loopcal.io.core.outputs import write_result_folder
     from loopcal.io.runs import plan_folder
-    from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning.pose_planning import list_stops
     from loopcal.report.figures.plan_figures import draw_curve, draw_plan
     from loopcal.report.pictures import render_figure
@@ -225,8 +220,6 @@ def _write_plan(
             plan_folder.SHEET: plan_folder.format_surface_sheet(result),
             plan_folder.DATA: plan_folder.format_surface_data(result),
         }
-    document = {"format": plan_folder.FORMAT, **result.to_dict()}
-    document["made_by"] = collect_provenance(sys.argv, inputs, {"plan": seed})
     pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
     contents = {name: text.encode() for name, text in texts.items()} | pictures
     write_result_folder(output, plan_folder.PLAN, document, contents, force)

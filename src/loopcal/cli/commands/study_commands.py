@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -411,7 +410,7 @@ def replay(
 
     with terminal.TerminalProgress() as progress:
         done = calibrate_trial(
-            folder, int(match[1]), int(match[2]), output, sys.argv, force, progress
+            folder, int(match[1]), int(match[2]), output, opt.list_words(), force, progress
         )
 
     def view() -> list[Block]:

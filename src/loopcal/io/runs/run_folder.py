@@ -316,13 +316,13 @@ def write_run_folder(
 ) -> Path:
     """Write a run folder whole or not at all, see `write_result_folder`, and return it.
 
-    `format` and `files` are added to the result; arrays are in SI; `robot_name` is ROBOT or
+    `files` is added to the result; arrays are in SI; `robot_name` is ROBOT or
     FAILED_ROBOT.
     """
     path = as_path(path, "run folder")
     np.savez(stream := BytesIO(), allow_pickle=False, **arrays)
     files = {robot_name: robot_text.encode(), ARRAYS: stream.getvalue()}
-    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, force)
+    write_result_folder(path, RUN, result, files, force)
     return path
 
 
@@ -392,7 +392,7 @@ def build_document(
     """Return the content of result.json; see `save_run`."""
     files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}
     provenance = collect_provenance(command, files, report.provenance.seeds)
-    return {"made_by": provenance, **json_fields(report)}
+    return {"format": FORMAT, "made_by": provenance, **json_fields(report)}
 
 
 def load_run(path: str | Path) -> Run:
