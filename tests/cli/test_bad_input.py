@@ -55,7 +55,7 @@ def run_refused(loopcal, folder):
 
 ROBOT_CASES = [
     (UNITS, "", "states no units, which every number needs; write for example"),
-    ("length: mm", "length: deg", "'deg' is not a unit of length; allowed: m, mm"),
+    ("length: mm", "length: deg", "'units.length' is 'deg'; allowed: 'm', 'mm'"),
     ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
     (UNITS, UNITS * 2, "duplicate key 'units'; remove one"),
     (BASE, "[120, '-140', 0]", "is the text '-140', but a number is needed"),

@@ -228,7 +228,7 @@ def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:
     [
         (("country: DE   ", "country: Germany"), r"'country' is 'Germany'; write two capital"),
         (("begin: 2026-01-31", "begin: 2026-02-31"), "date|day is out of range|valid YAML"),
-        (("end: 2026-01-31", "end: 2025-01-31"), r"end is 2025-01-31, before begin"),
+        (("end: 2026-01-31", "end: 2025-01-31"), r"'end' is 2025-01-31, before begin"),
         (("place: laboratory ", "place: cellar "), "'place' is 'cellar'.*allowed"),
         (('serial_number: "0017"', 'serial_number: ""'), r"facts.yaml:9: .*serial_number' is"),
         (("machine:", "robot:"), "unknown key 'robot'|no key 'machine'"),

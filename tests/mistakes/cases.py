@@ -250,7 +250,7 @@ ROTARY_DELTA = {
     "the angles of the robot file have a unit of length": Mistake(
         replace_text(ROBOT, "units: {length: mm, angle: deg}", "units: {length: mm, angle: mm}"),
         1,
-        (r"robot\.yaml:6: 'mm' is not a unit of angle; allowed: rad",),
+        (r"robot\.yaml:6: 'units\.angle' is 'mm'; allowed: 'rad'",),
     ),
 }
 

@@ -39,7 +39,7 @@ Units = Mapping[Dimension, Unit]
 
 def read_record(
     file: YamlFile,
-    content: Mapping[str, Any],
+    content: Any,
     record: type[T],
     units: Units | None,
     location: Location = (),
@@ -55,7 +55,7 @@ def read_record(
     FileError : the first value that does not fit, at its line.
     """
     try:
-        value: T = _RecordReader(file, units).read(record, dict(content), location)
+        value: T = _RecordReader(file, units).read(record, content, location)
     except _MisfitError as error:
         if word is not None:
             raise word(file.path, error.fact) from None
@@ -63,30 +63,24 @@ def read_record(
     return value
 
 
+@cache
+def _make_units_record() -> type:
+    """Return the record of `units:`."""
+    names = (Dimension.LENGTH, Dimension.ANGLE)
+    fields = [(d.value, Literal[tuple(list_symbols(d))]) for d in names]
+    return dataclasses.make_dataclass("StatedUnits", fields, frozen=True)
+
+
 def read_units(file: YamlFile) -> dict[Dimension, Unit]:
     """Return the units that a file must state under `units:`; ratios have unit 1. FileError where
     they are missing, unknown, or of another dimension.
     """
-    example = "write for example 'units: {length: mm, angle: deg}'"
-    stated = file.content.get("units")
     if "units" not in file.content:
+        example = "write for example 'units: {length: mm, angle: deg}'"
         raise file.error(f"this file states no units, which every number needs; {example}")
-    if not isinstance(stated, dict):
-        raise file.error(f"'units' must state a unit of length and of angle; {example}", ("units",))
-    names = [d.value for d in (Dimension.LENGTH, Dimension.ANGLE)]
-    refuse_unknown_keys(file, list(stated), names, ("units",))
-    units = {Dimension.RATIO: find_unit("1")}
-    for name in names:
-        dimension = Dimension(name)
-        if name not in stated:
-            raise file.error(f"'units' states no unit of {name}; {example}", ("units",))
-        symbol, allowed = stated[name], list_symbols(dimension)
-        if not isinstance(symbol, str) or symbol not in allowed:
-            hint = suggest_names(str(symbol), allowed)
-            sentence = f"{symbol!r} is not a unit of {name}{hint}; allowed: {', '.join(allowed)}"
-            raise file.error(sentence, ("units", name))
-        units[dimension] = find_unit(symbol, dimension)
-    return units
+    record = read_record(file, file.content["units"], _make_units_record(), None, ("units",))
+    stated = {Dimension(name): find_unit(symbol) for name, symbol in vars(record).items()}
+    return {Dimension.RATIO: find_unit("1"), **stated}
 
 
 @cache

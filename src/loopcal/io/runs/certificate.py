@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import MISSING, dataclass, fields
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,7 +21,7 @@ from xml.etree.ElementTree import Element, indent, register_namespace, tostring
 
 from loopcal.errors import DataError
 from loopcal.io.core.records import read_record
-from loopcal.io.core.yaml_file import YamlFile, read_yaml
+from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.runs.run_folder import refuse_changed_run
 from loopcal.plain_text import escape
 from loopcal.units import Dimension, find_unit
@@ -45,16 +46,38 @@ persons:                      # who answers for it; the signer first
 """
 """The file to fill in."""
 
-NEEDED: Mapping[str, tuple[str, ...]] = {
-    "machine": ("name", "serial_number"),
-    "laboratory": ("name",),
-    "customer": ("name",),
+
+def _is_date(text: str) -> bool:
+    """Return whether a text is a date of the form 2026-01-31."""
+    with suppress(ValueError):
+        return date.fromisoformat(text).isoformat() == text
+    return False
+
+
+FORMS: Mapping[str, tuple[Callable[[str], Any], str]] = {
+    "country": (re.compile("[A-Z]{2}").fullmatch, "two capital letters, as DE"),
+    "language": (re.compile("[a-z]{2}").fullmatch, "two lower-case letters, as en"),
+    **dict.fromkeys(("begin", "end", "issued"), (_is_date, "a date as 2026-01-31")),
 }
-"""Texts that must not be empty."""
+"""Key -> whether a text has its form, and the form in words."""
 
 
 @dataclass(frozen=True)
-class CalibratedMachine:
+class _Texts:
+    """A record whose texts have the form of their key; those without a default are not empty."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.default is MISSING and (not value or not str(value).strip()):
+                raise ValueError(f"{field.name} is empty; fill it in")
+            is_right, form = FORMS.get(field.name, (bool, ""))
+            if form and value and not is_right(value):
+                raise ValueError(f"{field.name} is {value!r}; write {form}")
+
+
+@dataclass(frozen=True)
+class CalibratedMachine(_Texts):
     """The machine that was calibrated."""
 
     name: str
@@ -64,7 +87,7 @@ class CalibratedMachine:
 
 
 @dataclass(frozen=True)
-class Contact:
+class Contact(_Texts):
     """A laboratory or a customer."""
 
     name: str
@@ -76,7 +99,7 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Person:
+class Person(_Texts):
     """A person who answers for the certificate."""
 
     name: str
@@ -84,7 +107,7 @@ class Person:
 
 
 @dataclass(frozen=True)
-class Administration:
+class Administration(_Texts):
     """Administrative data of a certificate; dates as 2026-01-31."""
 
     number: str
@@ -101,6 +124,11 @@ class Administration:
     )
     issued: str = ""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.end < self.begin:
+            raise ValueError(f"end is {self.end}, before begin, {self.begin}; correct one")
+
 
 def load_administration(path: str | Path) -> Administration:
     """Read the administrative data of a certificate.
@@ -108,40 +136,7 @@ def load_administration(path: str | Path) -> Administration:
     FileError : a key is missing or unknown, a text is empty, or not a date or code, at its line.
     """
     file = read_yaml(path, "certificate file", has_names=False)
-    record = read_record(file, file.content, Administration, None)
-    needed = [(owner, key) for owner, keys in NEEDED.items() for key in keys]
-    for owner, key in needed:
-        if not getattr(getattr(record, owner), key).strip():
-            raise file.error(f"'{owner}.{key}' is empty; fill it in", (owner, key))
-    if not record.number.strip():
-        raise file.error("'number' is empty; fill it in", ("number",))
-    if not record.persons or not all(person.name.strip() for person in record.persons):
-        raise file.error("'persons' needs at least one name; fill it in", ("persons",))
-    countries = {("country",): record.country}
-    countries |= {(o, "country"): getattr(record, o).country for o in ("laboratory", "customer")}
-    for place, code in countries.items():
-        if not re.fullmatch("[A-Z]{2}", code):
-            name = ".".join(place)
-            raise file.error(f"{name!r} is {code!r}; write two capital letters, as DE", place)
-    if not re.fullmatch("[a-z]{2}", record.language):
-        sentence = f"language is {record.language!r}; write two lower-case letters, as en"
-        raise file.error(sentence, ("language",))
-    for key in ("begin", "end", *(["issued"] if record.issued else [])):
-        _check_date(file, key, getattr(record, key))
-    if record.end < record.begin:
-        sentence = f"end is {record.end}, before begin, {record.begin}; correct one"
-        raise file.error(sentence, ("end",))
-    return record
-
-
-def _check_date(file: YamlFile, key: str, text: str) -> None:
-    """Refuse a text that is no date of the form 2026-01-31."""
-    try:
-        is_date = date.fromisoformat(text).isoformat() == text
-    except ValueError:
-        is_date = False
-    if not is_date:
-        raise file.error(f"{key} is {text!r}; write a date as 2026-01-31", (key,))
+    return read_record(file, file.content, Administration, None)
 
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
