@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from loopcal.diagnose.fit_examination import StartVerdict, check_start_values
-from loopcal.estimate.descent import FunctionProblem, StepControl, descend
+from loopcal.estimate.descent import StepControl, descend
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
@@ -28,6 +28,7 @@ from loopcal.measure.simulation import sample_truth, simulate_trials
 from loopcal.mechanism import kinematics as batch_kinematics
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.gauss_newton import DescentStatus
+from tests.estimate.function_problem import FunctionProblem
 from tests.estimate.problems import fold_rows, hexapod, hexapod_data
 from tests.findings.expectations import expect_refusal, get_finding, list_codes
 

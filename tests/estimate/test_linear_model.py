@@ -5,16 +5,11 @@ import numpy as np
 import pytest
 
 from loopcal.engine import fold
-from loopcal.estimate.descent import (
-    FunctionProblem,
-    SpectralModel,
-    TriangularModel,
-    descend,
-    make_linear_model,
-)
+from loopcal.estimate.descent import SpectralModel, TriangularModel, descend, make_linear_model
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import MAP, LeastSquares, Method, Ridge, TruncatedSVD, fix_penalty
 from loopcal.numerics.decomposition import RANK_TOLERANCE, empty_factor
+from tests.estimate.function_problem import FunctionProblem
 
 P, M, T = 13, 40, 4
 CORRELATION = np.eye(P) + 0.4 * np.eye(P, k=1) + 0.4 * np.eye(P, k=-1)

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.estimate.descent import FunctionProblem, StepControl, descend
+from loopcal.estimate.descent import StepControl, descend
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.numerics.gauss_newton import DescentStatus
+from tests.estimate.function_problem import FunctionProblem
 from tests.estimate.nist import (
     MODELS,
     Certified,

@@ -16,12 +16,6 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.published_steps import (
-    Layout,
-    PaperRows,
-    identify_from_rows,
-    map_displacements,
-)
 from loopcal.findings import Finding
 from loopcal.papers.cmm_constraint_2011.steps import (
     build_measurements,
@@ -29,6 +23,12 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     draw_true_machines,
 )
 from loopcal.planning.plane_line_planning import PlaneLineGroups, linearize_surfaces
+from loopcal.studies.simulation.published_steps import (
+    Layout,
+    PaperRows,
+    identify_from_rows,
+    map_displacements,
+)
 
 MM = 1e-3
 NOISE = 1e-6  # [m]
@@ -81,9 +81,7 @@ def test_rank_is_33_of_42_and_nine_directions_are_rigid_motions(layout) -> None:
     assert [m["frame"] for m in motions].count("base") == 6
     turns = [m for m in motions if m["frame"] == "platform" and m["motion"] == "rotation"]
     assert sum(m["through_origin"] for m in turns) == 3
-    rows, _ = PaperRows(layout, solve_exact_readings(layout), MM, NOISE).whiten(
-        np.zeros((1, 42)), np.zeros(1, dtype=int)
-    )
+    rows, _ = PaperRows(layout, solve_exact_readings(layout), MM, NOISE).whiten(np.zeros((1, 42)))
     s = np.linalg.svd(rows[0, :, :42], compute_uv=False)
     assert s[33] < 1e-13 * s[0]
     assert s[32] > 1e-7 * s[0]
@@ -151,7 +149,7 @@ def test_both_forms_give_the_same_estimate_to_first_order(layout, method) -> Non
             method,
             options=FitOptions(allow_fewer_equations=True),
         )
-        A = problem.whiten(np.zeros((1, 42)), np.zeros(1, dtype=int))[0][0, :, :42]
+        A = problem.whiten(np.zeros((1, 42)))[0][0, :, :42]
         unlike.append(float(np.linalg.norm(A @ (found.robot.values - paper) / MM)))
     assert unlike[0] < 0.02  # [sd] of all rows together
     assert unlike[1] < 0.2

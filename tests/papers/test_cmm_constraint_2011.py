@@ -16,12 +16,6 @@ from scipy.stats import beta
 
 from loopcal import geometry
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.published_steps import (
-    PaperRows,
-    identify_from_rows,
-    linearize_products,
-    map_displacements,
-)
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.solutions import forward
 from loopcal.papers.cmm_constraint_2011 import steps
@@ -38,6 +32,12 @@ from loopcal.papers.cmm_constraint_2011.steps import (
 )
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.reproduction import write_page
+from loopcal.studies.simulation.published_steps import (
+    PaperRows,
+    identify_from_rows,
+    linearize_products,
+    map_displacements,
+)
 from tests.papers.random_results import collect_answers
 from tests.papers.small_reproduction import MADE_BY
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.estimate.published_steps import LegForm
 from loopcal.papers.hexapod_42 import steps
 from loopcal.papers.hexapod_42.results import Results, compute, find_rule, judge_claims
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.reproduction import write_page
+from loopcal.studies.simulation.published_steps import LegForm
 from tests.papers.random_results import collect_answers
 from tests.papers.small_reproduction import MADE_BY
 

@@ -11,13 +11,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.cli.entry_point import main
-from loopcal.estimate.published_steps import (
-    Layout,
-    PaperRows,
-    identify_from_rows,
-    penalize_ridge,
-    penalize_truncated,
-)
 from loopcal.measure.instrument import make_random_stream
 from loopcal.papers.cmm_constraint_2011 import steps as cmm
 from loopcal.papers.hexapod_42 import steps as hexapod
@@ -33,6 +26,13 @@ from loopcal.studies.simulation.block import (
     set_size,
 )
 from loopcal.studies.simulation.fits import OUTCOMES
+from loopcal.studies.simulation.published_steps import (
+    Layout,
+    PaperRows,
+    identify_from_rows,
+    penalize_ridge,
+    penalize_truncated,
+)
 from loopcal.studies.specification.levels import PosesLevel
 
 MM = 1e-3

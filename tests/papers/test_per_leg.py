@@ -9,10 +9,10 @@ import pytest
 
 from loopcal.cli.entry_point import main
 from loopcal.errors import EstimationError
-from loopcal.estimate.published_steps import identify_per_leg
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.simulation import simulate
+from loopcal.studies.simulation.published_steps import identify_per_leg
 from tests import zoo
 from tests.estimate.problems import bed_points, hexapod, hexapod_poses, simulate_heights, tracker
 

@@ -13,14 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal.estimate.published_steps import (
-    EPSILON,
-    LIMIT,
-    RawSteps,
-    penalize_none,
-    penalize_ridge,
-    penalize_truncated,
-)
 from loopcal.measure.instrument import Uniform
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.papers.paper import PAPERS
@@ -34,6 +26,14 @@ from loopcal.papers.tsvd_2016.results import (
     judge_claims,
     make_median_curves,
     make_medians,
+)
+from loopcal.studies.simulation.published_steps import (
+    EPSILON,
+    LIMIT,
+    RawSteps,
+    penalize_none,
+    penalize_ridge,
+    penalize_truncated,
 )
 from tests.papers.random_results import randomize
 

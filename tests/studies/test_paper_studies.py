@@ -14,7 +14,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import FileError
-from loopcal.estimate.published_steps import identify_per_leg
 from loopcal.studies.files.study_file import load_study
 from loopcal.studies.simulation.block import (
     calibrate_cells,
@@ -26,6 +25,7 @@ from loopcal.studies.simulation.block import (
 )
 from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.machines import draw_machines, prepare_cell
+from loopcal.studies.simulation.published_steps import identify_per_leg
 from loopcal.studies.specification.levels import (
     EffectsLevel,
     ErrorsLevel,

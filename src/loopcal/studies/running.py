@@ -21,7 +21,6 @@ from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.estimate.identification import check_threads
-from loopcal.estimate.published_steps import identify_per_leg
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
 from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
@@ -46,6 +45,7 @@ from loopcal.studies.simulation.block import (
 )
 from loopcal.studies.simulation.fits import OUTCOMES, choose_rule
 from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
+from loopcal.studies.simulation.published_steps import identify_per_leg
 from loopcal.studies.specification.levels import FACTORS, PER_LEG
 from loopcal.studies.specification.study import Cell, Study, compute_key, describe_cell
 from loopcal.typing import Progress, report_no_progress

@@ -14,10 +14,10 @@ from loopcal.cli import terminal
 from loopcal.cli.terminal import Output
 
 if TYPE_CHECKING:
-    from loopcal.estimate.published_steps import PerLegEstimate
     from loopcal.papers.published import Table as PaperTable
     from loopcal.papers.reproduction import Reproduction
     from loopcal.results.tables import Block, Table
+    from loopcal.studies.simulation.published_steps import PerLegEstimate
 
 RUN = "loopcal.papers.paper:Paper.run"
 HEADING = 18
@@ -87,7 +87,7 @@ def per_leg(
     data: tuple[Path, ...] = opt.data(),
     steps: int = opt.option(
         "Gauss-Newton steps.",
-        of="loopcal.estimate.published_steps:identify_per_leg",
+        of="loopcal.studies.simulation.published_steps:identify_per_leg",
         type=opt.Count("STEPS", 1),
         metavar="N",
     ),
@@ -104,7 +104,7 @@ def per_leg(
       loopcal per-leg hexapod-42 measurements.csv
       loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
     """
-    from loopcal.estimate.published_steps import identify_per_leg
+    from loopcal.studies.simulation.published_steps import identify_per_leg
 
     machine = opt.open_robot(robot, (output,), data, force)
     measurements = opt.read_fitted_measurements(data, machine, allowed)

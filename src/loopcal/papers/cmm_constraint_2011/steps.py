@@ -20,7 +20,6 @@ from loopcal import geometry
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.penalties import Method
-from loopcal.estimate.published_steps import WEIGHTS, Layout, PaperRows, Weights, identify_from_rows
 from loopcal.measure.instrument import Gaussian, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -39,6 +38,13 @@ from loopcal.planning.plane_line_planning import (
     make_plane_line_instrument,
 )
 from loopcal.studies.simulation.block import calibrate_cells, find_cells, set_size
+from loopcal.studies.simulation.published_steps import (
+    WEIGHTS,
+    Layout,
+    PaperRows,
+    Weights,
+    identify_from_rows,
+)
 from loopcal.studies.specification.study import Study as GridStudy
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -561,7 +567,7 @@ def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) ->
         fit = lc.identify(layout.robot, build_measurements(layout, readings, noise), METHODS[name])
         iterations, ranks = max(iterations, fit.history.iterations), ranks | {fit.rank}
         if fit.history.status == paper.status[i] == DescentStatus.CONVERGED:
-            s, vt = _decompose_rows(PaperRows(layout, q[i : i + 1], sd, noise))
+            s, vt = _decompose_rows(problem.take(np.array([i])))
             change = s * (vt @ (fit.robot.values - values[i])) / sd  # in standard deviations
             unlike.append(float(np.abs(change).max()))
     return {
@@ -587,7 +593,7 @@ def _decompose_rows(problem: PaperRows) -> tuple[FloatArray, FloatArray]:
     """Return singular values and directions of the paper's rows that count, of the first machine as
     designed.
     """
-    A = problem.whiten(np.zeros((1, problem.parameters)), np.zeros(1, dtype=np.int64))[0][0, :, :-1]
+    A = problem.whiten(np.zeros((1, problem.parameters)))[0][0, :, :-1]
     _, s, vt = np.linalg.svd(A, full_matrices=False)
     kept = s > 1e-10 * s[0]
     return s[kept], vt[kept]

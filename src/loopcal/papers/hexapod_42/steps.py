@@ -19,7 +19,6 @@ import numpy as np
 
 import loopcal as lc
 from loopcal import geometry
-from loopcal.estimate.published_steps import LegForm, identify_per_leg
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.measurements import Measurements
@@ -31,6 +30,7 @@ from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.published import PaperFile, Printed, Row
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
+from loopcal.studies.simulation.published_steps import LegForm, identify_per_leg
 from loopcal.studies.specification.levels import PosesLevel
 from loopcal.typing import BoolArray, FloatArray, IntArray
 

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from loopcal.estimate.published_steps import LINEARIZATIONS
 from loopcal.papers import published
 from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.steps import (
@@ -41,6 +40,7 @@ from loopcal.papers.tsvd_2016.steps import (
     Draws,
     Sweep,
 )
+from loopcal.studies.simulation.published_steps import LINEARIZATIONS
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 

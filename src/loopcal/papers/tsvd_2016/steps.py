@@ -3,9 +3,9 @@
 and k at once; one machine with the printed noise, and many drawn machines.
 
 Raw numbers as in the paper: millimeters and radians, every equation and every parameter of weight
-one, and the filter acts on the step (`loopcal.estimate.published_steps`). As in the paper the true
-machine decides which lambda and k are best: the bottom of the curve, the smallest product of the
-errors in position and angle.
+one, and the filter acts on the step (`loopcal.studies.simulation.published_steps`). As in the paper
+the true machine decides which lambda and k are best: the bottom of the curve, the smallest product
+of the errors in position and angle.
 
 Dimensions, poses, true errors and output range are ours: the paper's Tables 1 to 4 are not in our
 text. The noise is the paper's (Appendix 1). Poses are x, y, z, phi, theta, psi with tilt and
@@ -24,7 +24,15 @@ import loopcal as lc
 from loopcal import geometry
 from loopcal.diagnose.identifiable_parameters import Identifiability
 from loopcal.estimate.penalties import Method
-from loopcal.estimate.published_steps import (
+from loopcal.measure.instrument import make_random_stream
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.simulation import Trials, simulate_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution, inverse
+from loopcal.numerics.decomposition import Decomposition, are_nonzero
+from loopcal.papers.published import PaperFile
+from loopcal.studies.simulation.published_steps import (
     AHEAD,
     LIMIT,
     RawProblem,
@@ -36,14 +44,6 @@ from loopcal.estimate.published_steps import (
     penalize_truncated,
     take_steps,
 )
-from loopcal.measure.instrument import make_random_stream
-from loopcal.measure.kinds.poses import Component
-from loopcal.measure.simulation import Trials, simulate_trials
-from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
-from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import Solution, inverse
-from loopcal.numerics.decomposition import Decomposition, are_nonzero
-from loopcal.papers.published import PaperFile
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 

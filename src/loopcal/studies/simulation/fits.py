@@ -22,7 +22,15 @@ from loopcal.engine import State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import IdentifiedTrials, identify, identify_trials
-from loopcal.estimate.published_steps import (
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import Trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.states import Status
+from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.studies.simulation.machines import PreparedCell, make_fit_options
+from loopcal.studies.simulation.published_steps import (
     EPSILON,
     LIMIT,
     PaperRows,
@@ -35,14 +43,6 @@ from loopcal.estimate.published_steps import (
     penalize_truncated,
     take_steps,
 )
-from loopcal.measure.measurements import Measurements
-from loopcal.measure.simulation import Trials
-from loopcal.mechanism.kinematics import forward_trials
-from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.solutions import forward
-from loopcal.mechanism.states import Status
-from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.studies.simulation.machines import PreparedCell, make_fit_options
 from loopcal.studies.specification.levels import PER_LEG, MethodLevel
 from loopcal.typing import BoolArray, FloatArray, IntArray
 

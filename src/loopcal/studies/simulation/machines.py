@@ -22,7 +22,6 @@ from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.estimate.identification import compute_trial_posterior, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.published_steps import Layout
 from loopcal.estimate.tolerance_components import InflatedTolerances
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot
@@ -45,6 +44,7 @@ from loopcal.planning.plane_line_planning import (
     make_plane_line_instrument,
 )
 from loopcal.planning.pose_planning import plan
+from loopcal.studies.simulation.published_steps import Layout
 from loopcal.studies.specification.levels import (
     Backlash,
     EffectsLevel,

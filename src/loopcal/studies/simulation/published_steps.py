@@ -40,11 +40,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from loopcal import geometry
-from loopcal.engine import State
+from loopcal.engine import State, fold
 from loopcal.errors import EstimationError
-from loopcal.estimate.descent import Descent, FunctionProblem, StepControl, descend
+from loopcal.estimate.descent import Descent, StepControl, descend
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.linearization import Start
+from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import Method
 from loopcal.estimate.problem import Problem, problem_of_trials
 from loopcal.measure.instrument import Gaussian, Instrument, make_random_stream
@@ -57,7 +57,7 @@ from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward
 from loopcal.mechanism.states import Status
-from loopcal.numerics.decomposition import Decomposition, are_nonzero, decompose
+from loopcal.numerics.decomposition import Decomposition, are_nonzero, decompose, empty_factor
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -586,33 +586,31 @@ class PaperRows:
         """Return parameters (t, p) [m] at deviations z (t, p)."""
         return self.layout.robot.parameters.nominal + self.sd * deviation
 
-    def whiten(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, BoolArray]:
-        """Return rows (a, m, p + 1), [A | residual], of some machines at deviations (a, p), and
-        which machines reach all points.
+    def whiten(self, deviation: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return rows (t, m, p + 1), [A | residual], at deviations (t, p), and which machines reach
+        all points.
         """
-        points, J, reached = self.layout.linearize_points(self.values(deviation), self.q[trials])
+        points, J, reached = self.layout.linearize_points(self.values(deviation), self.q)
         A, c = linearize_products(points, J * self.sd)
         rows = self.whitener @ np.concatenate([A, -c[..., None]], axis=-1)
-        return rows.reshape(len(trials), self.layout.equations, -1), reached
+        return rows.reshape(len(deviation), self.layout.equations, -1), reached
 
-    def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return factor (a, p + 1, p + 1) and sum of squares (a,) of some machines."""
-        if not deviation.any() and len(trials) == len(self.q):
-            factor, cost = self.nominal_fold
-            return factor.copy(), cost.copy()
-        return self._fold(deviation, trials)
+    def start(self, deviation: FloatArray) -> Start:
+        """Return a start without nuisance parameters and poses."""
+        t, p = deviation.shape
+        return Start(deviation, np.zeros((t, 0)), np.zeros((t, 0, p)), np.zeros((t, 0)))
 
-    @cached_property
-    def nominal_fold(self) -> tuple[FloatArray, FloatArray]:
-        """Fold of all machines as designed, from which every method begins."""
-        return self._fold(np.zeros((len(self.q), self.parameters)), np.arange(len(self.q)))
+    def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
+        """Fold the rows at deviations (t, p)."""
+        (t, p), (rows, reached) = deviation.shape, self.whiten(deviation)
+        factor = fold(empty_factor(t, p), np.where(reached[:, None, None], rows, 0.0))
+        cost = np.where(reached, np.sum(rows[:, :, -1] ** 2, axis=1), np.inf)
+        equations = np.full(t, self.layout.equations)
+        return Linearization(deviation, factor, cost, equations, start)
 
-    def _fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        rows, reached = self.whiten(deviation, trials)
-        short = max(rows.shape[2] - rows.shape[1], 0)
-        rows = np.concatenate([rows, np.zeros((len(rows), short, rows.shape[2]))], axis=1)
-        factor = np.asarray(np.linalg.qr(np.where(reached[:, None, None], rows, 0.0), mode="r"))
-        return factor, np.where(reached, np.sum(rows[:, :, -1] ** 2, axis=1), np.inf)
+    def take(self, trials: IntArray) -> PaperRows:
+        """Return the rows of some machines."""
+        return replace(self, q=self.q[trials])
 
 
 def identify_from_rows(problem: PaperRows, method: Method, relative: float = 1e-2) -> Descent:
@@ -622,9 +620,7 @@ def identify_from_rows(problem: PaperRows, method: Method, relative: float = 1e-
     that the next one would change them by its square or so.
     """
     begin = np.zeros((len(problem.q), problem.parameters))
-    equations = np.full(len(problem.q), problem.layout.equations)
-    rows = FunctionProblem(problem.parameters, problem.fold, equations)
-    return descend(rows, begin, method, StepControl(relative=relative))
+    return descend(problem, begin, method, StepControl(relative=relative))
 
 
 def compute_levers(points: FloatArray) -> tuple[FloatArray, FloatArray]:
