@@ -204,21 +204,32 @@ def test_unreachable_target_is_refused_with_the_largest_possible_size(target, mo
         find_smallest_design(make_problem(draw_rows(), Criterion("A")), target, most)
 
 
-@pytest.mark.parametrize("growth", [0.1, 1.0, 5.0])
-def test_search_finds_the_smallest_size_in_few_evaluations(growth):
+@pytest.mark.parametrize("right", [3, 4, 57, 999, 1000, 1001])
+def test_search_finds_the_smallest_size_in_few_evaluations(right):
     asked: list[int] = []
 
-    def value(n: int) -> float:
+    def meets(n: int) -> bool:
         asked.append(n)
-        return float(n**-growth)
+        return n >= right
 
-    for right in (3, 4, 57, 1000):
-        asked.clear()
-        assert (
-            search_size(value, 3, 1000, 5, Criterion("A"), right**-growth * (1 + 1e-12), 4) == right
-        )
-        assert len(asked) <= 25  # twice the halvings of a thousand, and a few
-    assert search_size(value, 3, 1000, 5, Criterion("A"), 1001**-growth, 4) == 1001
+    assert search_size(meets, 3, 1000) == right
+    assert len(asked) == len(set(asked)) <= 20  # the doublings and the halvings of a thousand
+    assert search_size(meets, 1000, 1000) == max(right, 1000)
+
+
+def test_size_without_any_regular_design_does_not_meet_the_target():
+    rows = np.zeros((12, 2, 4))  # groups of two equal rows, each of one unknown
+    rows[np.arange(12), :, np.arange(12) % 4] = 1.0
+    problem = make_problem(rows, Criterion("A"))
+    assert problem.n_needed == 2
+    with expect_refusal("plan.design-singular", chosen=2):
+        choose_design(problem, 2)
+    found, at_least = find_smallest_design(problem, 2.0, perturbations=2)
+    assert (at_least, len(found.chosen)) == (4, 4)
+    found, at_least = find_smallest_design(problem, 4.0, perturbations=2)
+    assert (at_least, len(found.chosen)) == (2, 4)
+    with expect_refusal("plan.design-singular", chosen=3):
+        find_smallest_design(problem, 4.0, 3, perturbations=2)
 
 
 POINT = 1 / np.sqrt(5)

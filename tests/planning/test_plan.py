@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from math import comb
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from evidence.planned import (
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information, observe_poses
+from loopcal.findings import report_finding
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.simulation import sample_truth
@@ -198,7 +200,7 @@ def test_earlier_measurements_reduce_the_expected_error(tracker_problem, planned
     assert more.after.position < more.before.position
 
 
-def test_sample_size_reaches_the_goal_and_has_a_lower_bound():
+def test_sample_size_reaches_the_goal_and_has_a_lower_bound(monkeypatch):
     goal = 15 * UM
     made = prepare_problem(
         load_robot("linear-delta"),
@@ -215,6 +217,10 @@ def test_sample_size_reaches_the_goal_and_has_a_lower_bound():
     plan = plan_poses(made)
     assert plan.errors.after.position <= goal
     assert plan.n_poses < 1.5 * needed.at_least
+    singular = EstimationError(report_finding("plan.no-direction-observable"))
+    with monkeypatch.context() as patch, expect_refusal("plan.no-direction-observable"):
+        patch.setattr(exchange, "relax_design", Mock(side_effect=singular))
+        find_sample_size(made)  # a refusal of another kind is passed on
     with expect_refusal("plan.goal-unreachable", target="position", counted="poses") as data:
         plan_poses(set_options(made, goal=0.05 * UM))
     assert data["goal"].value < data["bound"].value <= data["best"].value

@@ -33,6 +33,7 @@ accept an exchange only if the new score is larger.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -483,64 +484,46 @@ def find_smallest_design(
     count = len(problem.allowed)
     most = count if most is None else most if problem.repeats else min(most, count)
     problem.require_enough(most)
-    bounds: dict[int, float] = {}
+    criterion, bounds, made = problem.criterion, dict[int, float](), dict[int, Design]()
 
-    def bound_of(n: int) -> float:
+    def is_possible(n: int) -> bool:
         bounds[n] = relax_design(problem, n, BOUND_GAP).bound
-        return bounds[n]
+        return criterion.meets(bounds[n], target)
 
-    made: dict[int, Design] = {}
-
-    def value_of(n: int) -> float:
+    def is_reached(n: int) -> bool:
         smaller = [k for k in made if k < n]
         first = [made[max(smaller)].chosen] if smaller else []
-        made[n] = choose_design(problem, n, seed, perturbations, first=first)
-        return made[n].value
+        try:
+            made[n] = choose_design(problem, n, seed, perturbations, first=first)
+        except EstimationError as error:
+            if error.code != "plan.design-singular" or n == most:
+                raise
+            return False
+        return criterion.meets(made[n].value, target)
 
-    criterion, least, q = problem.criterion, problem.n_needed, len(problem.space)
-    at_least = search_size(bound_of, least, most, min(2 * least, most), criterion, target, q)
+    at_least = search_size(is_possible, problem.n_needed, most)
     numbers = {"size": most, "available": count, "criterion": criterion.name, "target": target}
     if at_least > most:
-        raise EstimationError(
-            report_finding("plan.target-impossible", best=bounds[most], **numbers)
-        )
-    n = search_size(value_of, at_least, most, at_least, criterion, target, q)
+        best = bounds[most]
+        raise EstimationError(report_finding("plan.target-impossible", best=best, **numbers))
+    n = search_size(is_reached, at_least, most)
     if n > most:
         best = made[most].value
         raise EstimationError(report_finding("plan.target-not-reached", best=best, **numbers))
     return made[n], at_least
 
 
-def search_size(
-    value_of: Callable[[int], float],
-    low: int,
-    high: int,
-    n: int,
-    criterion: Criterion,
-    target: float,
-    q: int,
-) -> int:
-    """Return the smallest size from low to high whose value meets the target, else high + 1.
+def search_size(meets: Callable[[int], bool], low: int, high: int) -> int:
+    """Return the smallest size from low to high that meets a target, else high + 1.
 
-    Values are assumed to be monotone. The next size is estimated as if the information grew with
-    the size; every second step halves the interval, or doubles the size while no size has met the
-    target.
-
-    n : first size to try. q : number of observable directions.
+    Steps double until a size meets it; larger sizes are assumed to do so, too.
     """
-    low, limit, step = low - 1, high + 1, 0
-    high = limit
-    while high - low > 1:
-        n = min(max(n, low + 1), high - 1)
-        value, step = value_of(n), step + 1
-        meets = value >= target if criterion.is_d else value <= target
-        low, high = (low, n) if meets else (n, high)
-        if step % 2:
-            growth = np.exp((target - value) / q) if criterion.is_d else value / target
-            n = int(np.ceil(n * min(growth, 4.0)))
-        else:
-            n = 2 * n if high == limit else (low + high) // 2
-    return high
+    size, step = low, 1
+    while not meets(size):
+        if size == high:
+            return high + 1
+        low, size, step = size + 1, min(size + step, high), 2 * step
+    return bisect_left(range(size), True, low, key=meets)
 
 
 # Coordinate exchange.

@@ -478,7 +478,9 @@ def find_sample_size(
     problem.require_equations(most)
     try:
         best, at_least = find_smallest_design(design, goal**2, most, options.seed, PERTURBATIONS)
-    except EstimationError:
+    except EstimationError as error:
+        if error.code not in ("plan.target-impossible", "plan.target-not-reached"):
+            raise
         (last,) = compute_design_curve(design, [most], options.seed, 0)
         reached, bound = (np.sqrt(v) for v in (last.value, last.relaxed.bound))
         raise EstimationError(
