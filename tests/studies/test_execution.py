@@ -20,6 +20,7 @@ import dask.config
 import numpy as np
 import pytest
 
+import loopcal as lc
 from evidence.study_interruption import Contents, read_contents
 from loopcal.errors import FileError, StudyError
 from loopcal.studies.executors import MOST_LOSSES, Answer, Dask, Executor, Processes, Ray, Serial
@@ -62,6 +63,22 @@ def executor(request) -> Executor:
             return Processes(2)
         case _:
             return Dask(request.getfixturevalue("cluster").scheduler_address)
+
+
+@pytest.mark.parametrize("count", [0, -1])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda count, folder: lc.study(write_study(folder), folder / "results", workers=count),
+        lambda count, _: Processes(count),
+        lambda count, _: Ray(processors=count),
+        lambda count, _: Dask("tcp://127.0.0.1:1", patience=count),
+    ],
+)
+def test_numbers_of_workers_and_seconds_below_one_are_refused(make, count, tmp_path) -> None:
+    with pytest.raises(StudyError, match=f" is {count}; it must be above 0"):
+        make(count, tmp_path)
+    assert not (tmp_path / "results").exists()
 
 
 def collect(answers) -> dict[int, Answer]:

@@ -8,11 +8,12 @@ import signal
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
+from loopcal.checks import POSITIVE, Limit, Limited
 from loopcal.environment import import_optional, use_one_thread
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
@@ -115,8 +116,10 @@ class Pool(Protocol):
         ...
 
 
-class _PooledExecutor:
+class _PooledExecutor(Limited):
     """Base of executors whose workers are a pool that is opened for each iteration."""
+
+    ERROR: ClassVar[type[Exception]] = StudyError
 
     def _open(self) -> AbstractContextManager[Pool]:
         raise NotImplementedError
@@ -159,9 +162,10 @@ class Processes(_PooledExecutor):
 
     Parameters
     ----------
-    workers : their number.
+    workers : their number, 1 or more.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {"workers": POSITIVE}
     workers: int
 
     @contextmanager
@@ -264,6 +268,7 @@ class Dask(_PooledExecutor):
     address : of the scheduler, such as `tcp://host:8786`. patience : see `PATIENCE`.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {"patience": POSITIVE}
     address: str
     patience: float = PATIENCE
 
@@ -346,6 +351,7 @@ class Ray(_PooledExecutor):
     processors : of a cluster that is started. Default: all.
     """
 
+    LIMITS: ClassVar[Mapping[str, Limit]] = {"processors": POSITIVE}
     address: str | None = None
     processors: int | None = None
 

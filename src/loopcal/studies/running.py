@@ -402,7 +402,8 @@ def study(
 
     Raises
     ------
-    FileError : the study file or the folder cannot be used. StudyError : no workers.
+    FileError : the study file or the folder cannot be used. StudyError : fewer than one worker, or
+        none can be reached.
     EstimationError : no threads.
 
     Notes
