@@ -2,6 +2,8 @@
 """The progress bar draws a line in a terminal, and nothing elsewhere."""
 
 import io
+import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -39,6 +41,25 @@ def test_two_pieces_of_work_have_a_line_each(monkeypatch) -> None:
     bar(2, 2, "folds")
     bar(3, 3, "resamples")
     assert stream.getvalue().splitlines() == ["", "folds: 2 of 2", "", "resamples: 3 of 3"]
+
+
+def test_two_pieces_of_work_of_equal_size_have_a_bar_each_in_a_notebook(monkeypatch) -> None:
+    shown: list[list[str]] = []
+
+    def display(content: str, display_id: bool) -> SimpleNamespace:
+        shown.append([content])
+        return SimpleNamespace(update=shown[-1].append)
+
+    shell = SimpleNamespace(kernel=object())
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    drawing = SimpleNamespace(HTML=str, display=display)
+    monkeypatch.setitem(sys.modules, "IPython.display", drawing)
+    bar = lc.ProgressBar()
+    for what in ("folds", "resamples"):
+        for done in (0, 1, 2):
+            bar(done, 2, what)
+    assert [len(updates) for updates in shown] == [2, 2]  # 1 of 2 comes too early to be drawn
+    assert ["folds: 2 of 2" in shown[0][-1], "resamples: 2 of 2" in shown[1][-1]] == [True, True]
 
 
 @pytest.mark.slow

@@ -21,6 +21,8 @@ from loopcal.units import Dimension, find_unit, list_symbols, parse_quantity
         ("3600arcsec", math.pi / 180),
         ("7 1", 7.0),
         ("10nm", 1e-8),
+        ("+.5E-2 mm", 5e-6),
+        ("2.mm", 2e-3),
     ],
 )
 def test_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value: float) -> None:
@@ -37,6 +39,11 @@ def test_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value: f
         ("nan mm", "not finite"),
         ("", "not a number with a unit"),
         ("1_0mm", "unknown unit"),
+        ("5e", "unknown unit 'e'"),
+        ("-Infinity m", "not finite"),
+        ("- 5 mm", "not a number with a unit"),
+        ("0x" * 10**6, "unknown unit"),
+        ("m" * 10**6, "not a number with a unit"),
     ],
 )
 def test_invalid_quantity_is_refused_with_the_allowed_units(text: str, message: str) -> None:

@@ -24,11 +24,12 @@ class ProgressBar:
 
     def __init__(self) -> None:
         self._handle: Any = None
-        self._total, self._drawn, self._width = 0, float("-inf"), 0
+        self._done, self._total, self._drawn, self._width = 0, 0, float("-inf"), 0
 
     def __call__(self, done: int, total: int, what: str, /) -> None:
         """Draw `done` of `total` steps of `what`."""
-        now, is_new = time.monotonic(), total != self._total
+        now, is_new = time.monotonic(), total != self._total or done < self._done
+        self._done = done
         if not is_new and done < total and now - self._drawn < INTERVAL:
             return
         self._total, self._drawn = total, now

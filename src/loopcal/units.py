@@ -8,6 +8,7 @@ them by the factor of the stated unit, the writer divides by it.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -117,6 +118,10 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     return known
 
 
+NUMBER = re.compile(r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|inf(?:inity)?|nan)", re.IGNORECASE)
+"""The number at the beginning of a quantity."""
+
+
 def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
     """Return the SI value of a number with its unit, such as `0.02mm` or `5 urad`.
 
@@ -125,10 +130,10 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
     UnitError : not a finite number, unit missing, unknown, or of another dimension.
     """
     stripped, example = text.strip(), EXAMPLES[dimension or Dimension.LENGTH]
-    cut = next((i for i in range(len(stripped), 0, -1) if _is_number(stripped[:i])), 0)
-    if cut == 0:
+    number = NUMBER.match(stripped)
+    if number is None:
         raise UnitError(f"{text!r} is not a number with a unit; write for example {example}")
-    value, symbol = float(stripped[:cut]), stripped[cut:].strip()
+    value, symbol = float(number[0]), stripped[number.end() :].strip()
     if not math.isfinite(value):
         raise UnitError(
             f"{text!r} is not finite; write a finite number with a unit, for example {example}"
@@ -169,12 +174,3 @@ def find_sd_fault(value: float) -> str | None:
     if is_sd(value):
         return None
     return "write a positive number" if not value > 0.0 else f"write a number {SD_RANGE}"
-
-
-def _is_number(text: str) -> bool:
-    """Return whether Python reads `text` as a float."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return "_" not in text
