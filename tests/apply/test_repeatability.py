@@ -125,6 +125,62 @@ def test_directions_of_approach_have_numbers_of_their_own() -> None:
     assert all(get_estimates(p)[1].value < 10 * UM for p in result.poses["position"])
 
 
+@pytest.mark.parametrize("visits", [2, 5])
+def test_equal_visits_have_no_scatter_and_no_finding_on_noise(visits) -> None:
+    robot = lc.load_robot("hexapod-42")
+    data = visit_poses(robot, hexapod_poses(2), visits, 10 * UM, SHIFT)
+    (rows,) = data.observations
+    equal = np.repeat(rows.measured[::visits], visits, axis=0)
+    result = lc.assess_repeatability(
+        robot, replace(data, observations=(replace(rows, measured=equal),))
+    )
+    assert {p.visits for of in result.poses.values() for p in of} == {visits}
+    for pose in result.poses["position"]:
+        assert [e.value for e in pose.repeatabilities] == pytest.approx([0.0] * 3, abs=1e-15)
+    assert {f.code for f in result.findings} == {"repeatability.few-visits"}
+
+
+def measure_with_gauges(robot, visits, *kinds):
+    """Return readings of gauges, each of one kind, at repeated visits of one pose."""
+    sensors = [lc.Sensor(kind, lc.Gaussian(np.full(len(kind.columns), 10 * UM))) for kind in kinds]
+    poses = np.repeat(hexapod_poses(1), visits, axis=0)
+    return lc.simulate(robot, poses, lc.Instrument(tuple(sensors)), seed=4)
+
+
+@pytest.mark.parametrize("axes", [("x", "y"), ("z", "xy"), ("xz", "y", "zx")])
+def test_gauges_of_several_axes_are_instruments_of_their_own(axes) -> None:
+    """Each has the numbers it has alone, under the names of its axes."""
+    robot = lc.load_robot("hexapod-42")
+    data = measure_with_gauges(robot, 6, *(lc.Component(tuple(each)) for each in axes))
+    together = lc.assess_repeatability(robot, data).poses["position"]
+    assert [pose.components for pose in together] == [tuple(each) for each in axes]
+    for pose, rows in zip(together, data.observations, strict=True):
+        (alone,) = lc.assess_repeatability(robot, replace(data, observations=(rows,))).poses[
+            "position"
+        ]
+        assert pose.visits == alone.visits == 6
+        assert pose.mean == pytest.approx(alone.mean, rel=1e-12)
+        assert get_estimates(pose) == get_estimates(alone)
+
+
+def test_visits_of_two_instruments_do_not_count_as_two() -> None:
+    robot = lc.load_robot("hexapod-42")
+    data = measure_with_gauges(robot, 1, lc.Component(("x",)), lc.Component(("y",)))
+    with pytest.raises(DataError, match="No pose is visited twice"):
+        lc.assess_repeatability(robot, data)
+
+
+def test_directions_of_approach_are_compared_for_each_gauge() -> None:
+    robot = lc.load_robot("hexapod-42")
+    data = measure_with_gauges(robot, 10, lc.Component(("x",)), lc.Component(("y",)))
+    side, shift = np.array(["up"] * 5 + ["down"] * 5), np.zeros((10, 1))
+    shift[:5] = 300 * UM
+    x, y = data.observations
+    x, y = replace(x, measured=x.measured + shift, group=side), replace(y, group=side)
+    result = lc.assess_repeatability(robot, replace(data, observations=(x, y)))
+    assert result.variations["1", ""] == pytest.approx(300 * UM, abs=20 * UM)
+
+
 def test_coarse_instruments_are_reported() -> None:
     robot = lc.load_robot("hexapod-42")
     result = lc.assess_repeatability(robot, visit_poses(robot, hexapod_poses(1), 8, 10 * UM, 0.0))

@@ -26,19 +26,15 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.apply.validation import describe_frame, group_setup
-from loopcal.diagnose.row_errors import (
-    QuantityErrors,
-    compare_predictions,
-    compute_noise_floor,
-    compute_row_errors,
-)
+from loopcal.diagnose.row_errors import compare_predictions, compute_noise_floor, compute_row_errors
 from loopcal.errors import DataError
 from loopcal.estimate.residual_test import coverage_factor
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.data_checks import check_actuators
-from loopcal.measure.kinds.kind import list_error_groups
+from loopcal.measure.kinds.kind import ErrorGroup, list_error_groups
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.results.description import Field, fields
@@ -212,53 +208,57 @@ def assess_repeatability(
     data = replace(data, observations=kept)
     compared = compare_predictions(robot, robot, data, nuisance_values, nuisance_values)
     rows = compared.data.observations
-    errors = compute_row_errors(rows, compared.after.residuals(rows))
-    poses = {
-        quantity: entries
-        for quantity in DIMENSIONS
-        if (entries := _describe_poses(errors[quantity], quantity, compared.data))
-    }
-    if not poses:
+    residuals = compared.after.residuals(rows)
+    poses: dict[str, list[VisitedPose]] = {quantity: [] for quantity in DIMENSIONS}
+    variations: dict[tuple[str, str], float] = {}
+    for o, residual in zip(rows, residuals, strict=True):
+        for group in list_error_groups(o.kind):
+            if group.quantity in DIMENSIONS:
+                visited = _describe_poses(o, residual, group, compared.data)
+                poses[group.quantity] += visited
+                if group.quantity == POSITION:
+                    for key, value in _find_variations(visited).items():
+                        variations[key] = max(value, variations.get(key, 0.0))
+    if not any(poses.values()):
         raise DataError(report_finding("repeatability.no-repeats"))
     setup = group_setup(compared.after)
+    errors = compute_row_errors(rows, residuals)
+    described = {quantity: tuple(of) for quantity, of in poses.items() if of}
     return Repeatability(
         frame=describe_frame(errors, (*setup["kept"], *setup["fitted"])),
-        poses=poses,
-        variations=_find_variations(poses.get(POSITION, ())),
-        findings=_report(poses, setup["fitted"], compute_noise_floor(rows).rms),
+        poses=described,
+        variations=variations,
+        findings=_report(described, setup["fitted"], compute_noise_floor(rows).rms),
     )
 
 
 def _describe_poses(
-    errors: QuantityErrors, quantity: str, data: Measurements
-) -> tuple[VisitedPose, ...]:
-    """Return the characteristics of all targets at poses that were visited twice or more."""
-    visit = np.concatenate([o.rows for o in data.observations])
-    direction = np.concatenate([o.group for o in data.observations])
-    commanded_poses = data.repeats[visit]
-    is_measured = np.isfinite(errors.components).any(axis=0)
-    names = np.array(["", "", ""], dtype=object)
-    names[is_measured] = errors.measured[: int(is_measured.sum())]
-    keys: dict[tuple[int, str, str], list[int]] = {}
-    for i, (row, target) in enumerate(zip(errors.rows.tolist(), errors.targets, strict=True)):
-        key = (int(commanded_poses[row]), target, str(direction[row]))
-        keys.setdefault(key, []).append(i)
+    o: Observations, residual: FloatArray, group: ErrorGroup, data: Measurements
+) -> list[VisitedPose]:
+    """Return the characteristics of one target at poses that one instrument visited twice or more.
+
+    o : its rows. residual : (r, m) predicted minus measured values. group : which of them are the
+    components of one error.
+    """
+    attained = np.where(o.present, -residual, np.nan)[:, list(group.columns)]
+    visits: dict[tuple[int, str], list[int]] = {}
+    for row in np.flatnonzero(np.isfinite(attained).any(axis=1)).tolist():
+        key = (int(data.repeats[o.rows[row]]), str(o.group[row]))
+        visits.setdefault(key, []).append(row)
     entries = []
-    for (commanded, target, of), chosen in keys.items():
-        attained = -errors.components[chosen]
-        columns = np.isfinite(attained).all(axis=0)
-        attained = attained[:, columns]
-        if len(chosen) >= FEWEST_VISITS and attained.size:
+    for (commanded, direction), chosen in visits.items():
+        columns = np.isfinite(attained[chosen]).all(axis=0)
+        if len(chosen) >= FEWEST_VISITS and columns.any():
             entry = replace(
-                describe_visits(attained, quantity == POSITION),
-                pose=data.labels[int(visit[errors.rows[chosen[0]]])],
-                target=target,
-                direction=of,
-                components=tuple(str(name) for name in names[columns]),
+                describe_visits(attained[chosen][:, columns], group.quantity == POSITION),
+                pose=data.labels[o.rows[chosen[0]]],
+                target=group.target,
+                direction=direction,
+                components=tuple(np.array(group.components)[columns].tolist()),
                 commanded=commanded,
             )
             entries.append(entry)
-    return tuple(entries)
+    return entries
 
 
 def describe_visits(attained: FloatArray, is_position: bool) -> VisitedPose:
@@ -338,18 +338,18 @@ def _estimate_repeatability(attained: FloatArray) -> Estimate:
 
 
 def _find_variations(poses: Sequence[VisitedPose]) -> dict[tuple[str, str], float]:
-    """Return vAP_p of targets at poses that were approached from several directions; the labels of
-    one commanded pose differ, so it has that of its first direction.
+    """Return vAP_p of one target at poses that were approached from several directions; the labels
+    of one commanded pose differ, so it has that of its first direction.
     """
-    groups: dict[tuple[int, str], list[VisitedPose]] = {}
+    groups: dict[int, list[VisitedPose]] = {}
     for pose in poses:
-        groups.setdefault((pose.commanded, pose.target), []).append(pose)
+        groups.setdefault(pose.commanded, []).append(pose)
     variations = {}
-    for (_, target), of in groups.items():
+    for of in groups.values():
         if len(of) > 1 and len({p.components for p in of}) == 1:
             means = np.array([p.mean for p in of])
             distances = np.linalg.norm(means[:, None] - means[None], axis=2)
-            variations[of[0].pose, target] = float(distances.max())
+            variations[of[0].pose, of[0].target] = float(distances.max())
     return variations
 
 
@@ -366,14 +366,14 @@ def _report(
             report_finding("repeatability.few-visits", visits=visits, standard=STANDARD_VISITS)
         )
     for quantity, of in poses.items():
-        scatter = [np.sqrt(sum((r.value / 3.0) ** 2 for r in p.repeatabilities)) for p in of]
-        share = noise[quantity] / float(np.sqrt(np.mean(np.square(scatter)))) if scatter else 0.0
-        if share > LARGEST_NOISE:
+        variances = [sum((r.value / 3.0) ** 2 for r in p.repeatabilities) for p in of]
+        scatter = float(np.sqrt(np.mean(variances)))
+        if noise[quantity] > LARGEST_NOISE * scatter > 0.0:
             findings.append(
                 report_finding(
                     "repeatability.instrument-noise",
                     quantity=quantity,
-                    share=share,
+                    share=noise[quantity] / scatter,
                     largest=LARGEST_NOISE,
                 )
             )
