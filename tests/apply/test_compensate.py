@@ -129,6 +129,17 @@ def test_invalid_compensation_arguments_are_refused():
         compensate(robot, [[0.7, 0, 0]], "commands", steps=0)
     with pytest.raises(DataError, match="a target of shape"):
         compensate(robot, [[0.7, 0.0]])
+    with pytest.raises(DataError, match="0 labels for 0 targets: give at least one target"):
+        compensate(robot, np.zeros((0, 3)))
+
+
+@pytest.mark.parametrize("mode", ["readings", "commands"])
+@pytest.mark.parametrize("labels", [("a",), ("a", "b", "c", "d")])
+def test_another_number_of_labels_than_of_targets_is_refused(labels, mode) -> None:
+    robot = load_robot("3-prs")
+    for given in (np.tile([0.7, 0.0, 0.0], (3, 1)), np.tile(robot.home, (3, 1, 1))):
+        with pytest.raises(DataError, match=f"{len(labels)} labels? for 3 targets"):
+            compensate(robot, given, mode, labels=labels)
 
 
 @pytest.mark.parametrize(("mode", "passes"), [("readings", 4), ("commands", 7)])

@@ -26,6 +26,7 @@ from loopcal.errors import DataError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import name_count
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions, read_coordinates
@@ -193,7 +194,8 @@ def compensate(
 
     Raises
     ------
-    DataError : unknown mode, no step, targets of another shape.
+    DataError : unknown mode, no step, no target or targets of another shape, another number of
+        labels.
     EstimationError : no such frame.
     """
     if mode not in get_args(Mode):
@@ -208,6 +210,12 @@ def compensate(
     uncorrected = inverse(old, targets)
     is_pose = np.shape(targets)[-2:] == (4, 4)
     wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
+    names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
+    if not names or len(names) != len(wanted):
+        raise DataError(
+            f"{name_count(len(names), 'label')} for {name_count(len(wanted), 'target')}: give at "
+            "least one target, and one label for each or none"
+        )
     count.begin(TASK)
     best = inverse(robot, targets)
     count.begin(TASK)
@@ -228,7 +236,6 @@ def compensate(
         q=np.where(is_solved[:, None], final.q, np.nan),
         T=np.where(is_solved[:, None, None], final.T, np.nan),
     )
-    names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
     uncertainty = None
     if posterior is not None:
         before = _remove_unfixed_frames(posterior, old, wanted, before, frame)
