@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from loopcal.diagnose.outliers import iterate_blocks
+from loopcal.diagnose.outliers import TESTABLE, iterate_blocks
 from loopcal.diagnose.row_errors import (
     PoseErrors,
     compare_predictions,
@@ -58,10 +58,6 @@ from loopcal.units import Dimension
 
 if TYPE_CHECKING:
     from loopcal.results.tables import Block, Table
-
-
-# Determinant of 1 - leverage of a block below which the other blocks do not determine its rows.
-NOTHING_LEFT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +233,7 @@ def score_leave_one_out(
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
         H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))
         remaining = np.eye(A.shape[1]) - H
-        singular = np.linalg.det(remaining) <= NOTHING_LEFT
+        singular = np.linalg.eigvalsh(remaining)[..., 0] <= TESTABLE
         remaining = np.where(singular[..., None, None], np.eye(A.shape[1]), remaining)
         deleted = np.linalg.solve(remaining, residual[..., None])[..., 0]
         square[numbers] = np.where(singular, np.inf, (deleted**2).sum(axis=2)).T
