@@ -219,13 +219,14 @@ def test_a_penalty_without_a_prior_is_reported() -> None:
     assert "sampling.bias-not-drawn" in codes
 
 
-def test_consecutive_poses_are_resampled_together_in_the_order_of_time() -> None:
+@pytest.mark.parametrize("number", [int, np.int64, np.uint8])
+def test_consecutive_poses_are_resampled_together_in_the_order_of_time(number) -> None:
     robot, data = linear_delta()
     time = np.arange(14.0)[::-1].copy()
     fit = identify(robot, data)
     (rows,) = data.observations
     timed = replace(data, observations=(replace(rows, context={"time": time}),))
-    blocks = lc.bootstrap(fit, timed, 10, unit=3).blocks
+    blocks = lc.bootstrap(fit, timed, 10, unit=number(3)).blocks
     assert blocks.count == 5  # from the last pose on, which is the earliest
     assert blocks.member[13] == blocks.member[11] != blocks.member[10]
     assert blocks.member[0] == blocks.member[1] != blocks.member[2]

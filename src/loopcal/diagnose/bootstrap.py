@@ -138,7 +138,7 @@ class BlockErrors:
             normal errors. sigma : standard deviation of these, and of untested directions.
         """
         block = self.values.block
-        if isinstance(factor, int):
+        if isinstance(factor, int | np.integer):
             offset = sigma * rng.standard_normal((factor, len(block))) - self.residual
         else:
             offset = factor[:, block] * self.error - self.residual
@@ -281,7 +281,7 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
         the order of the column `time`, or else of the file. None takes the largest unit with at
         least `ENOUGH_BLOCKS` blocks, or else the smallest.
     """
-    if isinstance(unit, int):  # runs of poses; blocks of linked poses stay together
+    if isinstance(unit, int | np.integer):  # runs of poses; blocks of linked poses stay together
         if unit < 1:
             raise EstimationError(f"blocks of {unit} poses: give a number of at least 1")
         n, linked = data.n_poses, linked_blocks(data)

@@ -179,8 +179,8 @@ def sample_workspace(
 
 def resolve_poses(robot: Mechanism, poses: ArrayLike | int, seed: int) -> FloatArray:
     """Return coordinates (n, c) [m, rad]: those given, or a number of them from the workspace."""
-    if isinstance(poses, int):
-        return sample_workspace(robot, poses, seed).coordinates
+    if isinstance(poses, int | np.integer):
+        return sample_workspace(robot, int(poses), seed).coordinates
     return np.asarray(poses, dtype=np.float64)
 
 

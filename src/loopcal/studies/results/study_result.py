@@ -135,7 +135,7 @@ class StudyResult(TableResult):
         ------
         DataError : a score that the study does not have.
         """
-        chosen = self.study.cells[cell] if isinstance(cell, int) else cell
+        chosen = self.study.cells[cell] if isinstance(cell, int | np.integer) else cell
         places = find_columns(self.study, columns)
         with read_store(self.folder) as store:
             return read_trials(self.study, store, chosen, places)[1]
