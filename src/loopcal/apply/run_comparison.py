@@ -10,8 +10,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from loopcal.apply.validation import report_reused_rows, validate
-from loopcal.diagnose.row_errors import Statistics, compute_statistics
+from loopcal.apply.validation import (
+    find_error_units,
+    report_reused_rows,
+    restore_validation,
+    validate,
+)
+from loopcal.diagnose.row_errors import PoseErrors, Statistics, join_errors
 from loopcal.diagnose.value_comparison import (
     EQUAL,
     ChangeCause,
@@ -37,7 +42,6 @@ if TYPE_CHECKING:
     from loopcal.io.runs.run_folder import Run
 
 NEEDED = ("path", "result", "robot", "arrays", "load_posterior")  # attributes of a run
-QUANTITIES = ("position", "orientation", "length")  # quantities whose errors are compared
 CAUSE_LEVEL = 0.01  # probability of rejecting the true cause of a change
 COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a change
 
@@ -127,7 +131,8 @@ class RunComparison(DrawnResult):
     runs : in the given order. parameters : names of all identified parameters.
     units : of each parameter, in which it is shown.
     pairs : each run but the first against the first.
-    errors : of each run at held-out poses. common_poses : number of poses that are common to all.
+    errors : of each run at held-out poses. error_units : quantity -> unit in which they are shown.
+    common_poses : number of poses that are common to all.
     findings : results of the pairs, runs that failed, and notes.
     """
 
@@ -136,6 +141,7 @@ class RunComparison(DrawnResult):
     units: tuple[Unit, ...]
     pairs: tuple[PairComparison, ...]
     errors: tuple[RunErrors, ...]
+    error_units: Mapping[str, Unit]
     common_poses: int
     findings: tuple[Finding, ...]
 
@@ -226,13 +232,14 @@ def compare_runs(runs: Sequence[Run], data: Measurements | None = None) -> RunCo
     if data is None:
         held_out = _find_common_poses(runs)
         poses = len(held_out)
-        common = [_read_errors(run, held_out) if held_out else {} for run in runs]
+        common = [_read_errors(run, held_out) for run in runs]
     else:
         poses = data.n_poses
         common = [_validate(run, data, findings) for run in runs]
+    own = [_read_errors(run) for run in runs]
     errors = tuple(
-        RunErrors(name, _read_errors(run, None), at_common)
-        for name, run, at_common in zip(names, runs, common, strict=True)
+        RunErrors(name, *({q: e.statistics for q, e in of.quantities.items()} for of in both))
+        for name, *both in zip(names, own, common, strict=True)
     )
     if not poses and all(run_errors.own for run_errors in errors):
         findings.append(report_finding("runs.no-common-poses"))
@@ -241,7 +248,16 @@ def compare_runs(runs: Sequence[Run], data: Measurements | None = None) -> RunCo
     dimensions = [table.dimensions[table.index(name)] for name in parameters]
     units = tuple(find_unit(first.robot.get_unit(d).symbol) for d in dimensions)
     summaries = tuple(_summarize(name, run) for name, run in zip(names, runs, strict=True))
-    return RunComparison(summaries, parameters, units, tuple(pairs), errors, poses, tuple(findings))
+    return RunComparison(
+        summaries,
+        parameters,
+        units,
+        tuple(pairs),
+        errors,
+        find_error_units(first.robot, join_errors([*own, *common])),
+        poses,
+        tuple(findings),
+    )
 
 
 def _summarize(name: str, run: Run) -> RunSummary:
@@ -335,7 +351,7 @@ def _list_structure(robot: Mechanism) -> dict[str, str]:
 # The errors of calibrations at the same held-out poses.
 
 
-def _validate(run: Run, data: Measurements, findings: list[Finding]) -> dict[str, Statistics]:
+def _validate(run: Run, data: Measurements, findings: list[Finding]) -> PoseErrors:
     """Return the errors of a run at other measurements; add a finding on rows that it fitted."""
     reused = report_reused_rows(run.fitted_rows, data)
     findings += [] if reused is None else [reused]
@@ -347,7 +363,7 @@ def _validate(run: Run, data: Measurements, findings: list[Finding]) -> dict[str
         nuisance_values_before=run.initial_nuisance_values,
         uncertainty=run.load_uncertainty(),
     )
-    return {name: e.statistics for name, e in validation.after.quantities.items()}
+    return validation.after
 
 
 def _find_common_poses(runs: Sequence[Run]) -> tuple[str, ...]:
@@ -365,23 +381,18 @@ def _find_common_poses(runs: Sequence[Run]) -> tuple[str, ...]:
     return tuple(label for label in first if all(label in other for other in others))
 
 
-def _read_errors(run: Run, poses: Sequence[str] | None) -> dict[str, Statistics]:
-    """Return the stored errors at some of the held-out poses; at all of them where None."""
-    validation = run.result.get("validation") or {}
-    labels = validation.get("poses", ())
-    result = {}
-    for name in QUANTITIES:
-        stored = (validation.get("after") or {}).get(name)
-        if not stored or len(stored["errors"]) != len(labels):
-            continue
-        chosen = [
-            error
-            for label, error in zip(labels, stored["errors"], strict=True)
-            if error is not None and (poses is None or label in poses)
-        ]
-        if chosen:
-            result[name] = compute_statistics(np.abs(np.array(chosen, dtype=float)))
-    return result
+def _read_errors(run: Run, poses: Sequence[str] | None = None) -> PoseErrors:
+    """Return the stored errors at held-out poses: at all, or in rows that measure only `poses`."""
+    stored = run.result.get("validation")
+    validation = stored and restore_validation(stored, run.arrays, run.robot)
+    if not validation:
+        return PoseErrors()
+    rows = [
+        i
+        for i, label in enumerate(validation.poses)
+        if poses is None or label in poses or set(label.split("/")) <= set(poses)
+    ]
+    return validation.after.take(np.array(rows, dtype=np.intp))
 
 
 # Two calibrations: whether the machine has changed, and by what.

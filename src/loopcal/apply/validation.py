@@ -412,7 +412,7 @@ def _summarize(
         unreachable=(),
         limit_position=limits["position"],
         limit_angle=limits["orientation"],
-        units=_find_units(robot, errors),
+        units=find_error_units(robot, errors),
         alignment=group_setup(compared.after),
         kinds=compared.kind_errors(),
         setup_count=compared.after.fitted_count,
@@ -421,7 +421,8 @@ def _summarize(
     )
 
 
-def _find_units(robot: Mechanism, errors: PoseErrors) -> dict[str, Unit]:
+def find_error_units(robot: Mechanism, errors: PoseErrors) -> dict[str, Unit]:
+    """Return the unit of each quantity of errors, that in which a robot shows its dimension."""
     return {name: robot.get_unit(e.dimension) for name, e in errors.quantities.items()}
 
 
@@ -687,7 +688,7 @@ def restore_validation(
         Validation,
         content,
         **errors,
-        units=_find_units(robot, errors["after"]),
+        units=find_error_units(robot, errors["after"]),
         noise_floor=restore(NoiseFloor, {"metrics": content["noise_floor"]}),
         findings=(),
         conformity={},

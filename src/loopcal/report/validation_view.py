@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,7 @@ from loopcal.results.tables import (
     make_table,
     word_column,
 )
-from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit
 
 if TYPE_CHECKING:
     from loopcal.apply.run_comparison import RunComparison
@@ -269,23 +269,15 @@ SHIFTS = (
 )
 
 
-def view_comparison(
-    comparison: RunComparison, show_unit: Callable[[str], Unit] | None = None
-) -> list[Block]:
-    """Return the page of a comparison.
-
-    Parameters
-    ----------
-    show_unit : quantity ("position", ...) -> the unit of its errors.
-    """
+def view_comparison(comparison: RunComparison) -> list[Block]:
+    """Return the page of a comparison."""
     names = ", ".join(run.name for run in comparison.runs)
     findings = list_findings(sort_by_importance(comparison.findings))
     blocks: list[Block] = [f"Comparison of {names}.", "", *findings, ""]
     blocks += [*format_list(_describe_runs(comparison)), "", build_estimates(comparison), ""]
     if any(pair.moved is not None for pair in comparison.pairs):
         blocks += [build_shifts(comparison), ""]
-    show_unit = show_unit or find_error_units(comparison).__getitem__
-    return [*blocks, build_errors(comparison, show_unit)]
+    return [*blocks, build_errors(comparison)]
 
 
 def _describe_runs(comparison: RunComparison) -> list[tuple[str, str]]:
@@ -341,14 +333,14 @@ def build_shifts(comparison: RunComparison) -> Table:
     return make_table(caption, ("parameter", *of_pairs, "unit"), rows)
 
 
-def build_errors(comparison: RunComparison, show_unit: Callable[[str], Unit]) -> Table:
+def build_errors(comparison: RunComparison) -> Table:
     """Return the errors after calibration of each run: at common held-out poses, or at its own."""
     has_common = comparison.common_poses > 0
     rows = []
     for of_run in comparison.errors:
         errors = of_run.common if has_common else of_run.own
         for quantity, error in errors.items():
-            unit = show_unit(quantity)
+            unit = comparison.error_units[quantity]
             cells = (format_in(unit, error[key], 3) for key in SUMMARY)
             rows.append((of_run.run, quantity, str(error.count), *cells, unit.symbol))
         if not errors:
@@ -384,13 +376,6 @@ def tabulate_comparison(comparison: RunComparison) -> Table:
             rows.append((run.name, name, unit.symbol, *cells, ratio, tested))
     titles = ("run", "parameter", "unit", "estimate", "plus_minus", "shift", "shift_sd")
     return make_table("", (*titles, "shift_in_sd", "significant"), rows)
-
-
-def find_error_units(comparison: RunComparison) -> dict[str, Unit]:
-    """Return the unit of each quantity of errors: that in which the parameters are shown."""
-    shown = {unit.dimension: unit for unit in comparison.units}
-    length, angle = (shown.get(unit.dimension, unit) for unit in map(find_unit, ("mm", "deg")))
-    return {"position": length, "length": length, "orientation": angle}
 
 
 # Regularization curves as tables.

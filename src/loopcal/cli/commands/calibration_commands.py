@@ -344,7 +344,7 @@ def compare(
     """
     from loopcal.documents import ENDINGS, check_ending
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.report.validation_view import find_error_units, view_comparison
+    from loopcal.report.validation_view import view_comparison
 
     if output is not None:
         check_ending(output, "comparison", ENDINGS)
@@ -355,8 +355,7 @@ def compare(
     if output is not None:
         lc.write_comparison(output, comparison)
     written = [] if output is None else ["", f"Written to {output}"]
-    units = find_error_units(comparison).__getitem__
-    return Output(comparison.to_dict(), lambda: [*view_comparison(comparison, units), *written])
+    return Output(comparison.to_dict(), lambda: [*view_comparison(comparison), *written])
 
 
 @opt.command()

@@ -27,13 +27,7 @@ from loopcal.report.figures.result_figures import (
 )
 from loopcal.report.figures.robot_figure import draw_scene
 from loopcal.report.scene.scene import Scene, format_scene
-from loopcal.report.validation_view import (
-    build_errors,
-    build_estimates,
-    build_runs,
-    build_shifts,
-    find_error_units,
-)
+from loopcal.report.validation_view import build_errors, build_estimates, build_runs, build_shifts
 
 HEADS: Mapping[bool | None, str] = {True: "not_calibrated", False: "calibrated", None: "undecided"}
 """Whether a machine has changed -> the color of the head, as of a verdict."""
@@ -109,11 +103,10 @@ def _describe_shifts(comparison: RunComparison) -> Iterator[Element]:
 
 def _describe_errors(comparison: RunComparison) -> Iterator[Element]:
     """Yield the errors after calibration, at common poses or at those of each run."""
-    show_unit = find_error_units(comparison).__getitem__
-    yield build_errors(comparison, show_unit)
+    yield build_errors(comparison)
     if any(run.common or run.own for run in comparison.errors):
         yield make_picture(
-            draw_run_errors(comparison, show_unit),
+            draw_run_errors(comparison),
             "errors-figure",
             "Errors of each run after calibration.",
             "Bars are root mean squares and dots are the largest errors of each run. Errors at "

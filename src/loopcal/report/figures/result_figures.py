@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -404,20 +404,15 @@ def draw_run_parameters(comparison: RunComparison) -> Figure:
     return finish_figure(figure, f"Estimates with their 95 % intervals{part}")
 
 
-def draw_run_errors(comparison: RunComparison, show_unit: Callable[[str], Unit]) -> Figure:
-    """Draw rms (bar) and largest (dot) error of each run after calibration, by quantity.
-
-    Parameters
-    ----------
-    show_unit : quantity ("position", ...) -> the unit of its errors.
-    """
+def draw_run_errors(comparison: RunComparison) -> Figure:
+    """Draw rms (bar) and largest (dot) error of each run after calibration, by quantity."""
     has_common = comparison.common_poses > 0
     errors = [run.common if has_common else run.own for run in comparison.errors]
     quantities = tuple(dict.fromkeys(name for of_run in errors for name in of_run))
     n = max(len(quantities), 1)
     figure, panels = start_panels(7.2, 1.4 + 2.6 * n, n, 1)
     for (axes,), quantity in zip(panels, quantities, strict=False):
-        unit = show_unit(quantity)
+        unit = comparison.error_units[quantity]
         for k, of_run in enumerate(errors):
             if (error := of_run.get(quantity)) is not None:
                 axes.bar(k, error.rms / unit.factor_to_si, 0.5, color=COLORS[k % len(COLORS)])
