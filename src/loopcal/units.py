@@ -118,8 +118,15 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     return known
 
 
-NUMBER = re.compile(r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|inf(?:inity)?|nan)", re.IGNORECASE)
-"""The number at the beginning of a quantity."""
+NUMBER = re.compile(
+    r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|inf(?:inity)?|nan)", re.ASCII | re.IGNORECASE
+)
+"""A number of a file. Python also reads `1_000` and digits of other alphabets."""
+
+
+def parse_number(text: str) -> float | None:
+    """Return the number that a text states, which may be infinite or NaN; None for other text."""
+    return float(text) if NUMBER.fullmatch(text.strip()) else None
 
 
 def parse_quantity(text: str, dimension: Dimension | None = None) -> float:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers in files have at most 17 significant digits, and read back as the same doubles."""
 
+import math
 import re
 from pathlib import Path
 
@@ -8,10 +9,19 @@ import numpy as np
 import pytest
 
 from loopcal.cli.entry_point import main
-from loopcal.io.core.csv_table import format_exact, format_scaled, parse_exact
+from loopcal.errors import FileError, UnitError
+from loopcal.io.core.csv_table import (
+    format_exact,
+    format_scaled,
+    parse_decimals,
+    parse_exact,
+    parse_finite,
+    read_table,
+)
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.robot.robot_file import load_robot, save_robot
 from loopcal.measure.simulation import sample_truth
+from loopcal.units import Dimension, parse_number, parse_quantity
 from tests.io.test_measurement_columns import draw_measurements
 
 FACTORS = (1.0, 1e-3, 1e-6, 1e-9, 0.0254, np.pi / 180, np.pi / 10800, np.pi / 648000)
@@ -83,3 +93,27 @@ def test_robot_files_and_exports_have_at_most_seventeen_digits(
     for file in ("truth.yaml", "out.txt"):
         longest = find_longest(Path(file).read_text())
         assert count_digits(longest) <= 17, longest
+
+
+@pytest.mark.parametrize("text", ["1_0", "\uff11\uff12", "1\u0663", "\u0967.5", "1e\u0663"])
+def test_files_state_numbers_in_ascii_digits(tmp_path, text) -> None:
+    """Python reads more texts as numbers; one definition holds for all files."""
+    float(text)
+    assert parse_number(text) is None
+    assert parse_finite(text) is None
+    assert math.isnan(parse_decimals(["1", text], 1e-3)[1])
+    assert math.isnan(parse_decimals(["1", text], math.pi / 180)[1])
+    with pytest.raises(UnitError):
+        parse_quantity(f"{text} mm")
+    for unit, dimension in (("mm", Dimension.LENGTH), ("deg", Dimension.ANGLE)):
+        (tmp_path / "data.csv").write_text(f"pose,a [{unit}]\n1,1\n2,{text}\n", encoding="utf-8")
+        with pytest.raises(FileError, match=r"but a number is needed"):
+            read_table(tmp_path / "data.csv").numbers("a", dimension)
+
+
+@pytest.mark.parametrize("radius", [0.9, 0.3])
+def test_a_workspace_of_less_than_a_millimeter_is_not_rounded_to_zero(tmp_path, radius) -> None:
+    path = tmp_path / "printer.gcode"
+    path.write_text(f"M665 L2.2 R{radius} H3 X0 Y0 Z0\nM666 X0 Y0 Z0\n")
+    assert main(["import", str(path), "-o", str(tmp_path / "printer.yaml")]) == 0
+    assert f"x: [-{radius / 2}, {radius / 2}]" in (tmp_path / "printer.yaml").read_text()

@@ -6,7 +6,7 @@ import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from itertools import cycle
+from itertools import chain, cycle
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,21 @@ from loopcal.errors import LoopcalError
 from loopcal.io.exports.conversion import convert_export, save_converted
 from loopcal.io.exports.profile import read_profile
 from loopcal.io.formats import FORMATS
+from loopcal.io.formats.delta_gcode import read_reports
 from loopcal.io.formats.import_export import export_robot, save_imported
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from tests.io.changed_documents import change_value, list_places
 from tools.fuzz.sources import SOURCES
 
+DIGITS = "0" * 5000
+"""More digits than Python turns into a whole number."""
 MOST = {"urdf": 4, "hangprinter": 4}
 """Places of each sort of damage, for files that are slow to read; 6 for others, twice as many in
 the evidence.
 """
 
 NUMBERS = ("1e300", "-1e160", "0", "-1", "nan", "inf", "x", "", "1,5", "1_0", "\uff11", "9" * 400)
+NUMBERS += ("1e400", "1e12", f"{DIGITS}1", f"0e{DIGITS}1")
 TEXTS = ("1e-320", "+5", "1e5", "'", "[", "#", ";", "\t", "\u202e", "=1+1", "{}", "*a")
 WRONG = (..., {}, [], [None], "x", 1e300, -1e160, None, True, [[1]], 0, 10**400)
 LINE_ENDS = ("\r\n", "\r", "\n\r", "\x0b", "\x0c", "\x85", "\u2028", " \n", "\n\n")
@@ -54,6 +58,8 @@ def damage(text: str, most: int = 12) -> Iterator[bytes]:
     numbers = list(re.finditer(r"-?\d+(\.\d+)?", text))
     for match, value in zip(choose(numbers, most), cycle(NUMBERS + TEXTS), strict=False):
         yield f"{text[: match.start()]}{value}{text[match.end() :]}".encode()
+    yield re.sub(r"(?<![\d.])(?=\d)", DIGITS, text).encode()
+    yield re.sub(r"(?<=\.\d\d)(?=[\s\"])", f"e{DIGITS}", text).encode()
     lines = text.splitlines(keepends=True)
     for place in choose(range(len(lines)), most // 3):
         yield "".join([*lines[:place], *lines[place + 1 :]]).encode()
@@ -149,6 +155,54 @@ def test_a_damaged_document_is_refused_or_read(files) -> None:
     damages = damage_json(text)
     refused, total = try_damages(damages, Path("s.json"), lambda f: import_file("hangprinter", f))
     assert refused > 0.5 * total
+
+
+HEIGHT_MAP = """\
+RepRapFirmware height map file v2
+axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1
+X,Y,-10,10,-10,10,-1,20,20,2,2
+0.1,0.2
+0.3,-0.4
+"""
+PROBED = "Bed X:1.00 Y:-2.00 Z:0.30\nok\n"
+POINTS = "G30 P0 X1.0 Y2.0 Z-99999\nG30 P1 X-1.0 Y2.0 Z-99999\n"
+REPORTS = {
+    "marlin": (
+        f"{PROBED}Checking... AC at radius:50 (DRY-RUN)\n.c:+0.10 x:-0.20 y:0.30\n.Height:250\n",
+        "X:1.00 Y:2.00 Z:3.00 E:0 Count X:1\n",
+    ),
+    "reprap": (HEIGHT_MAP, f"{POINTS}G32 bed probe heights: 0.1 -0.2, mean 0, deviation 0\n"),
+}
+
+
+@pytest.mark.parametrize(("firmware", "text"), [(f, t) for f in REPORTS for t in REPORTS[f]])
+def test_a_damaged_report_of_probed_points_is_refused_or_read(files, firmware, text) -> None:
+    """Also one that states more points, or larger numbers of points, than memory holds."""
+    path = Path("report.txt")
+
+    def read(path: Path) -> None:
+        points = read_reports([path], firmware)
+        assert np.isfinite([point[:3] for point in points]).all()
+        assert len(points) <= 10
+
+    path.write_text(text)
+    read(path)
+    damages = (damage(text, most) for most in (6, 20, 50))
+    refused, total = try_damages(chain.from_iterable(damages), path, read)
+    assert 0 < refused < total
+
+
+@pytest.mark.parametrize("value", ["255", "x", True, False, [255], None, {}])
+def test_a_number_of_samples_is_no_text_and_no_truth_value(files, value) -> None:
+    document = json.loads(Path("samples.json").read_text())
+    del document["_source"]
+    document["anchors"] = [[0.0, -1000.0, 0.0]] * 4
+    innermost = {place[0]: place for place in list_places(document)}
+    assert len(innermost) == 8
+    for key, place in innermost.items():
+        Path("s.json").write_text(json.dumps(change_value(document, place, value)))
+        with pytest.raises(LoopcalError, match=str(key)):
+            import_file("hangprinter", Path("s.json"))
 
 
 def convert(profile: Path, export: Path) -> None:

@@ -99,6 +99,8 @@ def test_other_files_and_settings_are_refused(folder) -> None:
     (folder / "plan.csv").write_text("pose,q1 [mm]\n1,2\n")
     with pytest.raises(FileError, match="name the folder of a plan"):
         read_stops("plan.csv", robot)
-    for feed, pause in ((0.0, None), (np.nan, None), (1.0, -1.0)):
-        with pytest.raises(DataError, match="finite number above 0"):
+    settings = ((0.0, None), (np.nan, None), (np.inf, None), (1.0, -1.0), (1e-9, None), (1.0, 4e-4))
+    for feed, pause in settings:  # also those that three decimals round to 0
+        with pytest.raises(DataError, match=r"finite number of at least 0\.001 (mm/min|s)"):
             format_gcode(robot, stops, np.zeros(6), feed, pause)
+    assert "F0.001\n" in format_gcode(robot, stops, np.zeros(6), 1e-3 / 6e4)

@@ -37,7 +37,7 @@ from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
-from loopcal.units import LARGEST, Dimension, find_unit
+from loopcal.units import LARGEST, Dimension, find_unit, parse_number
 
 
 def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
@@ -46,15 +46,17 @@ def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
     """
     exact = Decimal(repr(factor)).normalize()
     _, digits, exponent = exact.as_tuple()
+    text = "".join(cells)
+    is_plain = text.isascii() and "_" not in text
 
     def parse(cell: str) -> float:
         try:
             product = float(Decimal(cell) * exact)
         except (ValueError, InvalidOperation):
             return math.nan
-        return product if "_" not in cell else math.nan
+        return product if is_plain or parse_number(cell) is not None else math.nan
 
-    if digits == (1,) and "_" not in "".join(cells):  # a power of ten, such as of mm
+    if digits == (1,) and is_plain:  # a power of ten, such as of mm
         with suppress(ValueError):  # a cell is no plain decimal
             power = f"e{exponent}"
             return _keep_finite(np.array([float(cell + power) for cell in cells]))
@@ -102,11 +104,8 @@ def parse_exact(text: str, factor: float) -> float:
 
 def parse_finite(text: str) -> float | None:
     """Return the finite number that a text states; None for any other text."""
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) and text.isascii() and "_" not in text else None
+    value = parse_number(text)
+    return value if value is not None and math.isfinite(value) else None
 
 
 WHAT = "measurement file"
@@ -208,11 +207,8 @@ class Table:
             if empty:
                 return math.nan
             raise self.row_error(row, f"column {name!r} is empty, but required; write its value")
-        try:
-            value = float(cell)
-        except ValueError:
-            value = None
-        if value is None or "_" in cell:
+        value = parse_number(cell)
+        if value is None:
             sentence = f"column {name!r} is {quote(cell)}, but a number is needed"
             raise self.row_error(row, f"{sentence}, such as 12.5 or 1e-3")
         if not math.isfinite(value):

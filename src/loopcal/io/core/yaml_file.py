@@ -25,8 +25,7 @@ Location = tuple[str | int, ...]
 
 KEPT_TEXTS, KEPT_LENGTH = 32, 100_000
 """Texts whose trees are kept, and their largest length. A command reads the same text several times
-(it is looked at before it is used, and read back after it was written), which takes as long as a
-fit.
+(it is looked at before it is used), which takes as long as a fit.
 """
 
 _KNOWN_KEY = re.compile(
@@ -309,7 +308,7 @@ def _make_bounded_composer(loader: Any) -> Any:
             return node
 
         def _add(self, values: int, event: Any) -> None:
-            """Count values; raise LimitError where they are too many."""
+            """Count values; raise _RefusedError where they are too many."""
             self._count += values
             if self._count > YAML_NODES.count:
                 raise _RefusedError(YAML_NODES, event.start_mark.line)

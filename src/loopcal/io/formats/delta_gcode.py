@@ -48,6 +48,8 @@ from loopcal.io.formats.program_format import (
     format_number,
     get_record,
     is_same,
+    parse_number,
+    round_length,
     shorten_numbers,
 )
 from loopcal.io.robot.robot_file import build_robot
@@ -103,7 +105,7 @@ def format_robot(
         sentence = f"the delta radius is {geometry.radius:g} mm and the shortest arm"
         act = "the radius must be positive and every arm longer than it; correct them"
         raise FileError(f"{sentence} {min(geometry.arms):g} mm; {act}", path)
-    half = round(0.5 * geometry.radius)
+    half = round_length(0.5 * geometry.radius)
     is_taped = options.sigma_tape is not None
     head = format_head(path, program, "linear-delta", options.name, ("mm", "deg"))
     return head + ROBOT.format(
@@ -527,10 +529,11 @@ def import_probes(
     labels = tuple(f"{i}-{p.name}" if p.name else str(i) for i, p in enumerate(points, 1))
     offset = {"X": 0.0, "Y": 0.0}  # of the probe beside the nozzle [mm]
     for file in (path, *options.probes):
-        for line in read_text(file, GcodeFile.what).splitlines():
+        for i, line in enumerate(read_text(file, GcodeFile.what).splitlines(), 1):
             if match := OFFSETS[firmware].search(line.partition(";")[0].upper()):
-                words = {letter: re.search(rf"{letter}\s*{NUMBER}", match[1]) for letter in offset}
-                offset |= {letter: float(word[1]) for letter, word in words.items() if word}
+                for letter in offset:
+                    if word := re.search(rf"{letter}\s*{NUMBER}", match[1]):
+                        offset[letter] = parse_number(word[1], f"{letter} of the probe", file, i)
     robot = build_robot(parse_yaml(robot_text, path, "robot file"))
     target = [(p.x - offset["X"], p.y - offset["Y"], p.height) for p in points]
     solution = inverse(robot, MM * np.array(target))
@@ -560,9 +563,10 @@ def read_reports(paths: Sequence[Path], firmware: str) -> list[ProbedPoint]:
     return points
 
 
-def _parse_point(match: re.Match[str]) -> ProbedPoint:
+def _parse_point(match: re.Match[str], path: Path, line: int) -> ProbedPoint:
     """Return the point of a line."""
-    x, y, height = (float(cell) for cell in match.groups())
+    numbers = zip(("X", "Y", "Z"), match.groups(), strict=True)
+    x, y, height = (parse_number(text, name, path, line) for name, text in numbers)
     return ProbedPoint(x, y, height)
 
 
@@ -574,13 +578,13 @@ def _read_marlin(texts: Mapping[Path, str]) -> list[ProbedPoint]:
         radius: float | None = None
         for i, line in enumerate(text.splitlines(), 1):
             if match := SINGLE.search(line):
-                probed.append(_parse_point(match))
+                probed.append(_parse_point(match, path, i))
             elif CHECKING.search(line):
                 dry = DRY_RUN.search(line)
                 if dry is None or dry[1] is None:
                     reason = "calibrates" if dry is None else "radius"
                     raise FileError(report_finding("files.g33-unusable", reason=reason), path, i)
-                radius = float(dry[1])
+                radius = parse_number(dry[1], "the radius", path, i)
             elif TOUCH.search(line):
                 finding = report_finding("files.probe-line-unreadable", line=line.strip())
                 raise FileError(finding, path, i)
@@ -589,15 +593,15 @@ def _read_marlin(texts: Mapping[Path, str]) -> list[ProbedPoint]:
                     angle = math.radians(AROUND.get(name, 0.0))
                     r = 0.0 if name == "c" else radius
                     place = (r * math.cos(angle), r * math.sin(angle))
-                    probed.append(ProbedPoint(*place, float(height), name))
+                    probed.append(ProbedPoint(*place, parse_number(height, name, path, i), name))
             elif match := POSITION.match(line):
-                touched.append(_parse_point(match))
+                touched.append(_parse_point(match, path, i))
     return probed or touched
 
 
 def _read_reprap(texts: Mapping[Path, str]) -> list[ProbedPoint]:
     """Return the points of height maps, and of G32 with the points of bed.g."""
-    places: dict[int, tuple[float, float]] = {}
+    places: dict[float, tuple[float, float]] = {}
     reports: list[tuple[Path, int, str]] = []
     points: list[ProbedPoint] = []
     for path, text in texts.items():
@@ -608,7 +612,9 @@ def _read_reprap(texts: Mapping[Path, str]) -> list[ProbedPoint]:
             if match := HEIGHTS.search(line):
                 reports.append((path, i, match[1]))
             elif match := POINT.match(line.partition(";")[0].upper()):
-                places[int(match[1])] = (float(match[2]), float(match[3]))
+                names = zip(("P", "X", "Y"), match.groups(), strict=True)
+                key, x, y = (parse_number(text, name, path, i) for name, text in names)
+                places[key] = (x, y)
     for path, number, cells in reports:
         heights = cells.split()
         wanted, finding = set(range(len(heights))), None
@@ -627,28 +633,35 @@ def _read_reprap(texts: Mapping[Path, str]) -> list[ProbedPoint]:
             finding = report_finding("files.g32-too-few", count=len(heights), points=len(places))
         if finding is not None:
             raise FileError(finding, path, number)
-        points += [ProbedPoint(*places[k], float(height)) for k, height in enumerate(heights)]
+        points += [
+            ProbedPoint(*places[k], parse_number(height, f"height {k}", path, number))
+            for k, height in enumerate(heights)
+        ]
     return points
 
 
 def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:
     """Return the probed cells of a height map."""
     lines = [
-        [cell.strip() for cell in line.split(",")] for line in text.splitlines() if line.strip()
+        (i, [cell.strip() for cell in line.split(",")])
+        for i, line in enumerate(text.splitlines(), 1)
+        if line.strip()
     ]
     try:
-        stated = dict(zip(lines[1], lines[2], strict=True))
+        (_, header), (line, cells), *rows = lines[1:]
+        stated = dict(zip(header, cells, strict=True))
         names = ("min0", "min1", "spacing0", "spacing1", "num0", "num1")
         if "xmin" in stated:
             names = ("xmin", "ymin", "xspacing", "yspacing", "xnum", "ynum")
-        x0, y0, dx, dy, columns, rows = (float(stated[name]) for name in names)
-        if [len(row) for row in lines[3:]] != [int(columns)] * int(rows):
-            raise ValueError
-        return [
-            ProbedPoint(x0 + k * dx, y0 + j * dy, float(cell))
-            for j, row in enumerate(lines[3:])
-            for k, cell in enumerate(row)
-            if cell != UNPROBED
-        ]
-    except (IndexError, KeyError, ValueError):
+        numbers = [parse_number(stated[name], name, path, line) for name in names]
+    except (KeyError, ValueError):
         raise FileError(report_finding("files.height-map-damaged"), path) from None
+    x0, y0, dx, dy, width, count = numbers
+    if len(rows) != count or any(len(row) != width for _, row in rows):
+        raise FileError(report_finding("files.height-map-damaged"), path)
+    return [
+        ProbedPoint(x0 + k * dx, y0 + j * dy, parse_number(cell, "a height", path, line))
+        for j, (line, row) in enumerate(rows)
+        for k, cell in enumerate(row)
+        if cell != UNPROBED
+    ]

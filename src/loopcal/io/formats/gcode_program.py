@@ -12,6 +12,7 @@ move, as on the paths that a plan checks. Source: LinuxCNC, "G-Codes" (G4, G53, 
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Literal
@@ -33,6 +34,9 @@ WORDS = {"x": "X", "y": "Y", "z": "Z", "roll": "A", "pitch": "B", "yaw": "C"}
 
 DEFAULT_FEED = 0.005
 """Feed of moves [m/s], 300 mm per minute, whatever the unit of the program is."""
+
+SETTING_DECIMALS = 3
+"""Decimals of the feed and the pause in a program."""
 
 UNIT_CODES = {"mm": "G21", "in": "G20"}
 
@@ -76,12 +80,16 @@ def format_gcode(
     feed : of moves [m/s], and of moves that only rotate the same number in degrees per minute.
     pause : time at each pose [s], None until the operator continues. unit : of lengths.
     """
-    for name, value in (("feed", feed), ("pause", pause)):
-        if value is not None and not 0.0 < value < np.inf:
-            raise DataError(f"the {name} is {value:g}; give a finite number above 0")
+
+    def format_positive(name: str, value: float, unit: str) -> str:
+        if not 0.0 < round(value, SETTING_DECIMALS) < math.inf:
+            sentence = f"the {name} is {value:g} {unit}; give a finite number"
+            raise DataError(f"{sentence} of at least {10.0**-SETTING_DECIMALS:g} {unit}")
+        return format_short(value, SETTING_DECIMALS)
+
     poses = sum(use != VIA for use in stops[1])
-    shown_feed = format_short(feed * 60.0 / find_unit(unit).factor_to_si, 3)
-    wait = "M0" if pause is None else f"G4 P{format_short(pause, 3)}"
+    shown_feed = format_positive("feed", feed * 60.0 / find_unit(unit).factor_to_si, f"{unit}/min")
+    wait = "M0" if pause is None else f"G4 P{format_positive('pause', pause, 's')}"
 
     symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
     factors = [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]

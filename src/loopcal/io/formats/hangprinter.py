@@ -27,7 +27,14 @@ import numpy as np
 from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_json
-from loopcal.io.formats.program_format import MM, Format, Imported, ImportOptions, format_head
+from loopcal.io.formats.program_format import (
+    MM,
+    Format,
+    Imported,
+    ImportOptions,
+    format_head,
+    round_length,
+)
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST
 
@@ -195,10 +202,7 @@ def _parse_taped(content: dict[str, Any], path: Path, lines: int) -> FloatArray:
     if stated is None:
         return np.full(lines, np.nan)
     cells = stated if isinstance(stated, list) else []
-    is_number = [isinstance(v, int | float) and not isinstance(v, bool) for v in cells]
-    if len(cells) != lines or not all(
-        v is None or (ok and 0.0 <= v < math.inf) for v, ok in zip(cells, is_number, strict=True)
-    ):
+    if len(cells) != lines or not all(v is None or (_is_number(v) and v >= 0.0) for v in cells):
         finding = report_finding("files.taped-lengths", key=TAPED, value=str(stated), lines=lines)
         raise FileError(finding, path)
     return np.array([v or np.nan for v in cells], dtype=float)
@@ -267,7 +271,7 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
         )
         for name, anchor, length, sd in zip(samples.names, anchors, lengths, sd_length, strict=True)
     ]
-    side = round(0.25 * lengths.min())
+    side = round_length(0.25 * lengths.min())
     what, units = "samples of a hanging printer", ("mm", "deg")
     return format_head(path, what, "limbs", options.name, units, REMARK) + ROBOT.format(
         sigma=sigma,
@@ -277,7 +281,7 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
         limbs="\n".join(limbs),
         parameters="\n".join(_list_parameters(samples)),
         side=[-side, side],
-        top=round(0.5 * max(anchors[:, 2].max(), lengths.min())),
+        top=round_length(0.5 * max(anchors[:, 2].max(), lengths.min())),
     )
 
 
@@ -332,18 +336,21 @@ def _parse_numbers(
                 code = "files.row-incomplete"
                 finding = report_finding(code, key=key, row=number, length=length, usual=usual)
                 raise FileError(finding, path)
-    try:
-        values = np.array(content[key], dtype=float)
-    except (TypeError, ValueError):
-        values = np.full(1, np.nan)
-    has_shape = values.ndim == ndim and values.size and width in (None, *values.shape[-1:])
-    if not has_shape or not np.isfinite(values).all():
+    cells = np.array(rows, dtype=object)
+    has_shape = cells.ndim == ndim and cells.size and width in (None, *cells.shape[-1:])
+    if not has_shape or not all(map(_is_number, cells.flat)):
         raise FileError(f"{key!r} is not {wanted}; correct it", path)
+    values = cells.astype(float)
     if not (np.abs(values) <= LARGEST).all():
         raise FileError(f"{key!r} contains a number beyond {LARGEST:g}; correct it", path)
     if key in (*TEETH, *SPOOLS) and not (values > 0).all():
         raise FileError(f"{key!r} is {content[key]}; write positive numbers", path)
     return values
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a value of JSON is a number, which is finite."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _format(value: float, digits: int = 12) -> str:

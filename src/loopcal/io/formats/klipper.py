@@ -223,11 +223,12 @@ def get_step_distance(cfg: KlipperConfig, section: str) -> float:
 def _list_records(cfg: KlipperConfig, name: str, suffixes: Sequence[str]) -> list[str]:
     """Return the names of the records `height0`, `height1`, ... of which any part exists.
 
-    Klipper reads up to the first number that is missing, and ignores all records behind it.
+    Klipper reads up to the first number that is missing, and ignores all records behind it, and
+    numbers with zeros in front.
 
     FileError : a record lacks one of its parts (suffixes of its name), or a number is left out.
     """
-    pattern = re.compile(rf"{name}(\d+)({'|'.join(suffixes)})")
+    pattern = re.compile(rf"{name}(0|[1-9]\d{{0,8}})({'|'.join(suffixes)})")
     records: dict[int, list[str]] = {}
     for section, option in cfg.values:
         if section == PROBED and (match := pattern.fullmatch(option)):

@@ -392,6 +392,11 @@ def format_number(value: float) -> str:
     return f"{value:.{DECIMALS}f}"
 
 
+def round_length(value: float) -> float:
+    """Return a length in whole millimeters; as it is where it would be 0."""
+    return round(value) or value
+
+
 def is_same(*pairs: tuple[float, float]) -> bool:
     """Return whether the two numbers of each pair are written alike."""
     return all(format_number(a) == format_number(b) for a, b in pairs)

@@ -197,7 +197,7 @@ def _measure_rounding(
         units = []
         for number in " ".join(texts).lower().split():
             mantissa, _, exponent = number.partition("e")
-            decimals = len(mantissa.partition(".")[2]) - int(exponent or 0)
+            decimals = len(mantissa.partition(".")[2]) - float(exponent or 0)
             units.append(10.0**-decimals if decimals >= ROUNDED else 0.0)
         return math.hypot(*units)
 
