@@ -39,7 +39,7 @@ def test_index_of_a_parameter_is_its_place():
 
 def test_unknown_parameter_is_refused_with_similar_names():
     with pytest.raises(
-        MechanismError, match=r"unknown parameter 'leg1.base.z'; similar names are leg1.base.[xy]"
+        MechanismError, match=r"unknown parameter 'leg1.base.z' \(did you mean 'leg1.base.[xy]'"
     ):
         TABLE.index("leg1.base.z")
 

@@ -131,7 +131,7 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     >>> lc.write_report("report.html", report)  # doctest: +SKIP
     """
     path = as_path(path, "report")
-    _, data = name_files(path)
+    data = name_data(path)
     refuse_outputs((path, data), (), force=True)
     document = build_calibration_document(load_record(report))
     html, json_text = render_html(document), to_json({"format": 1, **json_fields(document)})
@@ -141,15 +141,15 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     return path
 
 
-def name_files(path: Path) -> tuple[Path, Path]:
-    """Return the HTML and the JSON file of a report.
+def name_data(path: Path) -> Path:
+    """Return the JSON file beside the HTML file of a report.
 
     Raises
     ------
     FileError : the name does not end in .html.
     """
     check_ending(path, "report")
-    return path, path.with_suffix(".json")
+    return path.with_suffix(".json")
 
 
 def check_ending(path: Path, what: str, endings: tuple[str, ...] = HTML) -> str:

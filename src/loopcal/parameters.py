@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.errors import MechanismError
+from loopcal.errors import MechanismError, suggest_names
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -147,8 +146,8 @@ class ParameterTable:
         """Return the position of a parameter; raises MechanismError with similar names."""
         if name in self._places:
             return self._places[name]
-        near = difflib.get_close_matches(name, self.names, n=3) or self.names[:3]
-        raise MechanismError(f"unknown parameter {name!r}; similar names are {', '.join(near)}")
+        hint = suggest_names(name, self.names) or f"; there are {', '.join(self.names[:3])}, ..."
+        raise MechanismError(f"unknown parameter {name!r}{hint}")
 
     def with_free(self, names: Iterable[str]) -> ParameterTable:
         """Return the same table with only these parameters free."""

@@ -93,7 +93,7 @@ def test_rows_of_pose_groups_equal_those_of_identification(name, kind, settings)
     data = lc.simulate(
         robot, sample_workspace(robot, 30, seed=2).coordinates, seen_by, seed=0, controller=robot
     )
-    prior = PriorInformation.from_tolerances(len(free), len(units.nuisance))
+    prior = PriorInformation.from_tolerances(len(free), units.n_nuisance)
     ours = factor_design(units.rows, prior, find_observable_space(units.rows, prior))
     theirs = collect_information(free, data)[0][0, :-1, :-1]
     theirs = np.concatenate([theirs, np.eye(len(free))])

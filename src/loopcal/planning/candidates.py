@@ -10,7 +10,7 @@ Candidates have an allowed straight path from home, so that every pose can be ap
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import POSITION
+from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.mechanism.workspace import (
     MIN_DRAWS,
@@ -38,9 +38,7 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
 
 HALVINGS = 12  # bisections of the line to the middle: the boundary is located to 1/4096 of it
-# Decimal places of the robot's size, in its unit, to which coordinates are commanded; the same of
-# a radian.
-DIGITS = 5
+DIGITS = 5  # decimal places to which coordinates are commanded, see `list_steps`
 ROUNDING = 1e-6  # part of a step that is the rounding of a bound's own number
 # Share of the coordinates of a boundary pose that are put to an end of their range.
 ON_BOUNDARY = 0.7
@@ -116,19 +114,23 @@ def check_listed_poses(
     return _keep_reachable(checker, good, np.ones(len(good), dtype=bool), excluded, len(poses))
 
 
+def list_steps(robot: Mechanism, dimensions: Sequence[Dimension], digits: int) -> FloatArray:
+    """Return the steps [m, rad] of numbers that a person can type: so many decimal places of the
+    robot's size and of a radian, in its units.
+    """
+    factors = np.array([find_unit(robot.units[d]).factor_to_si for d in dimensions])
+    scale = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions])
+    return 10.0 ** (np.floor(np.log10(scale / factors)) - digits) * factors
+
+
 def round_coordinates(
     robot: Mechanism, coordinates: FloatArray, towards: FloatArray | None = None
 ) -> FloatArray:
-    """Round coordinates (n, c) to steps that a person can type: DIGITS of the robot's size and of a
-    radian, in its units. `towards` (c,) is the place towards which everything is rounded.
+    """Round coordinates (n, c) to steps of DIGITS. `towards` (c,) is the place towards which
+    everything is rounded.
     """
-    steps = []
-    for name in robot.controlled:
-        dimension = Dimension.LENGTH if name in POSITION else Dimension.ANGLE
-        shown = find_unit(robot.units[dimension])
-        whole = (robot.size if name in POSITION else 1.0) / shown.factor_to_si
-        steps.append(10.0 ** (np.floor(np.log10(whole)) - DIGITS) * shown.factor_to_si)
-    counts = coordinates / np.array(steps)
+    steps = list_steps(robot, list_dimensions(robot.controlled), DIGITS)
+    counts = coordinates / steps
     if towards is None:
         return np.round(counts) * steps
     is_above = coordinates > towards

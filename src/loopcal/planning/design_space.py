@@ -194,6 +194,7 @@ class DesignProblem:
     criterion: Criterion
     prior: PriorInformation
     repeats: bool = False  # whether a group may be measured more than once
+    counted: str = "poses"  # plural noun for the groups
 
     @cached_property
     def space(self) -> ObservableSpace:
@@ -205,10 +206,10 @@ class DesignProblem:
         """Indices of the groups that may be chosen."""
         return np.flatnonzero(is_allowed(self.rows))
 
-    def evaluate(self, chosen: IntArray) -> float:
-        """Return the criterion of a design (n,)."""
+    def evaluate(self, chosen: IntArray, criterion: Criterion | None = None) -> float:
+        """Return a criterion of a design (n,); by default the one that makes a choice good."""
         factor = factor_design(self.rows[chosen], self.prior, self.space)
-        return evaluate_criterion(self.criterion, factor, self.space.machine)
+        return evaluate_criterion(criterion or self.criterion, factor, self.space.machine)
 
     def compare(self, value: float, best: float) -> float:
         """Return the efficiency of a value relative to the best possible one, 0 to 1: the ratio of
@@ -239,7 +240,7 @@ class DesignProblem:
         if len(self.space) == 0:
             raise EstimationError(report_finding("plan.no-direction-observable"))
         if n > count and not self.repeats:
-            counts = {"requested": n, "what": "poses", "available": count}
+            counts = {"requested": n, "what": self.counted, "available": count}
             raise EstimationError(report_finding("plan.too-few-candidates", **counts))
         if n < self.n_needed:
             raise EstimationError(

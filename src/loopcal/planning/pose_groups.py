@@ -62,7 +62,7 @@ class GroupRows:
     # (N, r, o + p) whitened, machine columns in tolerances; NaN where a pose is not reached
     rows: FloatArray
     members: IntArray  # (N, k) indices of the poses of each group
-    nuisance: tuple[str, ...]  # names of the o nuisance parameters of the instrument
+    n_nuisance: int  # number o of nuisance parameters of the instrument
     # (b, o + p) rows of their stated tolerances and of targets on the base, which do not depend
     # on the choice of poses
     nuisance_prior: FloatArray
@@ -75,7 +75,7 @@ class GroupRows:
         allowed = self.rows[is_allowed(self.rows)].reshape(-1, width)
         flat = np.concatenate([allowed, self.nuisance_prior])
         factor = engine.fold(empty_factor(1, width), with_zeros(flat))
-        return eliminate_from_factor(factor, len(self.nuisance)), len(flat)
+        return eliminate_from_factor(factor, self.n_nuisance), len(flat)
 
 
 def with_zeros(rows: FloatArray) -> FloatArray:
@@ -167,7 +167,7 @@ def linearize_groups(
     prior = np.zeros((len(nuisance), rows.shape[2]))
     prior[:, : len(nuisance)] = np.diag(weight)
     prior = np.concatenate([prior, _linearize_base(mounted, nuisance, rows.shape[2])])
-    return GroupRows(rows, members, nuisance.table.names, prior)
+    return GroupRows(rows, members, len(nuisance), prior)
 
 
 def combine_prior(
@@ -179,7 +179,7 @@ def combine_prior(
     measured : (p, p) factor of these, their nuisance parameters eliminated (the instrument was set
         up anew since).
     """
-    o = len(groups.nuisance)
+    o = groups.n_nuisance
     rows = free.prior_rows()
     stated = PriorInformation(np.concatenate([np.zeros((len(rows), o)), rows], axis=1), o)
     prior = stated.with_rows(groups.nuisance_prior)
@@ -207,7 +207,7 @@ def find_group_motions(
     """
     some = members[choose_evenly(len(members), ENOUGH)]
     groups = linearize_groups(free, instrument, readings, some, True)
-    of_frames = groups.rows[is_allowed(groups.rows)][:, :, len(groups.nuisance) :]
+    of_frames = groups.rows[is_allowed(groups.rows)][:, :, groups.n_nuisance :]
     return unfixed_motions(groups.fold()[0], float(np.linalg.norm(of_frames)))
 
 

@@ -22,8 +22,9 @@ from loopcal.measure.instrument import Instrument
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import inverse
+from loopcal.planning.candidates import list_steps
 from loopcal.planning.constraints import N_POSES, PlanOptions
-from loopcal.planning.design_space import Criterion, evaluate_criterion, factor_design, is_allowed
+from loopcal.planning.design_space import Criterion, is_allowed
 from loopcal.planning.exchange import EXCHANGES, choose_design
 from loopcal.planning.path import locate_home, order_poses
 from loopcal.planning.problem import (
@@ -39,7 +40,6 @@ from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import DrawnResult
 from loopcal.results.serialization import to_json
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
-from loopcal.units import Dimension, find_unit
 
 WEAK = 0.5  # efficiency below which the certificate guarantees little
 
@@ -279,7 +279,7 @@ def list_stops(plan: Plan) -> tuple[Stop, ...]:
 PERTURBATIONS = 10
 GAP = 5e-3  # gap of the efficiency up to which the bound is computed
 DRAWS = 20  # sets of evenly drawn poses that a plan is compared with
-# Decimal places of the robot's size, in its unit, or of a radian, to which readings are stated.
+# Decimal places to which readings are stated, see `list_steps`.
 DIGITS = 8
 # Largest number of times that poses are added where a goal is missed because some are held out.
 EXTENSIONS = 12
@@ -377,19 +377,14 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
     rows = np.array(groups.rows)
     rows[np.isin(groups.members, groups.members[held_out]).any(axis=1)] = np.nan
     design = problem.pose_design(rows)
-    left = len(design.allowed)
-    if left < n:
-        counts = {"requested": n, "what": problem.counted, "available": left}
-        raise EstimationError(report_finding("plan.too-few-candidates", **counts))
     best = choose_design(design, n, options.seed, PERTURBATIONS, gap=GAP, progress=progress)
     chosen = best.chosen
     after = problem.predict_errors(chosen)
     assert after is not None, "the exchange determines every direction"
-    by_error = problem.build_criterion("I")
-    random = None
+    whole, random = problem.pose_design(name="I"), None
     if len(uniform) >= n:  # the median, by I, of some sets of evenly drawn groups
         sets = [rng.choice(uniform, n, replace=False) for _ in range(DRAWS)]
-        values = [_evaluate(problem, by_error, drawn) for drawn in sets]
+        values = [whole.evaluate(drawn) for drawn in sets]
         random = problem.predict_errors(sets[int(np.argsort(values)[DRAWS // 2])])
     forecast = ErrorForecast(
         before=problem.predict_errors(np.zeros(0, dtype=np.int64)),
@@ -397,9 +392,11 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
         after=after,
         frame=problem.prediction.frame.describe(axes=""),
     )
-    criteria = (Criterion("D"), by_error, Criterion("A"), Criterion("E"))
+    criteria = (Criterion("D"), whole.criterion, Criterion("A"), Criterion("E"))
     quality = DesignQuality(
-        {c.name: _evaluate(problem, c, chosen) for c in criteria}, min(best.efficiency, 1.0), left
+        {c.name: whole.evaluate(chosen, c) for c in criteria},
+        min(best.efficiency, 1.0),
+        len(design.allowed),
     )
     poses, is_order_short = _arrange_poses(problem, chosen, held_out)
     notes = _collect_notes(problem)
@@ -409,12 +406,6 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
     if not is_order_short:
         notes.append(report_finding("plan.order-exhausted"))
     return Plan(robot, problem.instrument, options, poses, quality, forecast, tuple(notes))
-
-
-def _evaluate(problem: PlanningProblem, criterion: Criterion, chosen: IntArray) -> float:
-    """Return a criterion of groups (n,) in the directions that all candidates determine."""
-    factor = factor_design(problem.groups.rows[chosen], problem.prior, problem.space)
-    return evaluate_criterion(criterion, factor, problem.space.machine)
 
 
 def _draw_held_out(problem: PlanningProblem, count: int, drawn: IntArray) -> IntArray:
@@ -447,36 +438,27 @@ def _arrange_poses(
     """Return the poses of groups for the fit and for validation in the order of visiting, and
     whether the search for a short order came to its end.
     """
-    members, candidates = problem.groups.members, problem.candidates
+    robot, members, candidates = problem.robot, problem.groups.members, problem.candidates
     selected = members[np.concatenate([chosen, held_out])]
     poses = np.unique(selected)
     visit = order_poses(candidates.checker, candidates.coordinates[poses])
     ordered = poses[visit.order]
     place = np.empty(len(candidates), dtype=np.int64)
     place[ordered] = np.arange(len(ordered))
+    readings = candidates.solution.q[ordered]
+    # no instrument resolves the difference
+    steps = list_steps(robot, [a.dimension for a in robot.actuators], DIGITS)
     numbers = [int(name) for name in problem.used_names if name.isdecimal()]
     planned = PlannedPoses(
         tuple(str(max(numbers, default=0) + i) for i in range(1, len(ordered) + 1)),
         candidates.coordinates[ordered],
-        _round_readings(problem.robot, candidates.solution.q[ordered]),
+        np.round(readings / steps) * steps + 0.0,  # + 0: no reading is -0
         np.isin(ordered, members[held_out]),
         visit.via_home,
         place[selected],
         visit.length,
     )
     return planned, visit.is_converged
-
-
-def _round_readings(robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Round readings (m, a) to DIGITS in the robot's units: a person can type them, and no
-    instrument resolves the difference.
-    """
-    dimensions = [actuator.dimension for actuator in robot.actuators]
-    factors = np.array([find_unit(robot.units[d]).factor_to_si for d in dimensions])
-    scale = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions])
-    steps = 10.0 ** (np.floor(np.log10(scale / factors)) - DIGITS)
-    # + 0: no reading is -0
-    return np.round(readings / factors / steps) * steps * factors + 0.0
 
 
 def _collect_notes(problem: PlanningProblem) -> list[Finding]:

@@ -235,7 +235,7 @@ class PlanningProblem:
     def pose_design(self, rows: FloatArray | None = None, name: str | None = None) -> DesignProblem:
         """Return the choice of groups by a criterion of this name; by default from all rows."""
         rows = self.groups.rows if rows is None else rows
-        return DesignProblem(rows, self.build_criterion(name), self.prior)
+        return DesignProblem(rows, self.build_criterion(name), self.prior, counted=self.counted)
 
     def predict_errors(self, chosen: IntArray) -> ExpectedErrors | None:
         """Return the errors expected after measuring groups (n,), possibly none; None where nothing

@@ -410,10 +410,10 @@ def report(
       loopcal report run
       loopcal report run -o hexapod.html --pdf
     """
-    from loopcal.documents import check_browser, name_files, print_pdf
+    from loopcal.documents import check_browser, name_data, print_pdf
     from loopcal.io.core.outputs import refuse_outputs
 
-    files = [*name_files(output), *([output.with_suffix(".pdf")] if pdf else [])]
+    files = [output, name_data(output), *([output.with_suffix(".pdf")] if pdf else [])]
     calibrated = lc.load_run(run)
     refuse_outputs(files, [run / name for name in calibrated.result.get("files", {})], force)
     if pdf:
