@@ -11,7 +11,6 @@ import subprocess
 import sys
 import webbrowser
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -41,6 +40,7 @@ from loopcal.report.document.other_documents import (
 )
 from loopcal.report.validation_view import tabulate_comparison
 from loopcal.results.serialization import json_fields, restore_numbers
+from loopcal.version import __version__
 
 # Records of calibrations from reports in memory and from run folders, with controllers'
 # values.
@@ -199,7 +199,7 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
     path = as_path(path, "comparison")
     ending = check_ending(path, "comparison", ENDINGS)
     if ending in HTML:
-        document = build_comparison_document(comparison, f"loopcal {version('loopcal')}")
+        document = build_comparison_document(comparison, f"loopcal {__version__}")
         write_text(path, render_html(document))
     elif ending == ".json":
         write_text(path, to_json(comparison.to_dict()))

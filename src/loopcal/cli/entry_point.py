@@ -12,22 +12,19 @@ from __future__ import annotations
 import _thread
 import keyword
 import os
-import platform
 import shlex
 import signal
 import sys
-import tempfile
 import threading
 import time
-import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import click
 
+import loopcal
 from loopcal.cli import terminal
 from loopcal.cli.hints import find_hint, word_hint
 from loopcal.environment import THREADS
@@ -140,7 +137,7 @@ def _print_version(context: click.Context, _option: click.Parameter, is_asked: b
         return
     from loopcal.engine import get_current_engine
 
-    click.echo(f"loopcal {version('loopcal')}\nengine {get_current_engine()}")
+    click.echo(f"loopcal {loopcal.__version__}\nengine {get_current_engine()}")
     context.exit()
 
 
@@ -291,6 +288,10 @@ def describe_defect(error: BaseException, words: Sequence[str]) -> str:
     """Save a report of an exception that is no mistake of the user, and return the sentence for the
     screen.
     """
+    import platform
+    import traceback
+    from importlib.metadata import PackageNotFoundError, version
+
     package = Path(__file__).resolve().parents[1]
     frames = traceback.extract_tb(error.__traceback__, limit=-100)
     own = [frame for frame in frames if Path(frame.filename).is_relative_to(package)]
@@ -332,6 +333,8 @@ def save_report(text: str) -> Path | None:
     The name is unpredictable, and the file is made exclusively: nothing is replaced and no symbolic
     link is followed.
     """
+    import tempfile
+
     for folder in (None, "."):
         try:
             number, name = tempfile.mkstemp(".txt", "loopcal-defect-", folder)

@@ -101,13 +101,14 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     """
     from loopcal.measure.kinds import KINDS
 
-    name, known = node.get("kind"), ", ".join(KINDS)
+    name = node.get("kind")
     if name is None:
         example = "write '# kind: pose' at the top, or 'kind: pose' in a .yaml file of this name"
-        raise file.error(f"no kind of measurement is stated; {example} (kinds: {known})", location)
+        sentence = f"no kind of measurement is stated; {example} (kinds: {', '.join(KINDS)})"
+        raise file.error(sentence, location)
     if not isinstance(name, str) or name not in KINDS:
         sentence = f"{quote(name)} is not a kind of measurement{suggest_names(str(name), KINDS)}"
-        raise file.error(f"{sentence}; allowed: {known}", (*location, "kind"))
+        raise file.error(f"{sentence}; allowed: {', '.join(KINDS)}", (*location, "kind"))
     kind = KINDS[name]
     settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
     hints = get_field_types(_make_record(kind))
