@@ -15,8 +15,8 @@ files has the same readings in both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -69,7 +69,7 @@ ROUNDING = 1e-12
 T = TypeVar("T")
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _File:
     """One of the files that are read together.
 
@@ -77,7 +77,7 @@ class _File:
     measure the base and belong to no pose. `names` of the poses of each row, and the `first` row of
     each pose. `readings` and `sigma` (rows, a) [SI] are NaN where a row states none; `read` are the
     poses with readings in this file, `unread` those whose readings were not taken. `members` are
-    the poses of each row by index.
+    the poses of each row by index, known once the poses of all files are.
     """
 
     table: Table
@@ -85,12 +85,12 @@ class _File:
     context: Mapping[str, FloatArray]
     is_base: BoolArray
     names: tuple[str, ...]
+    first: Mapping[str, int]
     readings: FloatArray
     sigma: FloatArray
-    first: dict[str, int] = field(default_factory=dict)
     read: frozenset[str] = frozenset()
     unread: frozenset[str] = frozenset()
-    members: list[tuple[int, ...]] = field(default_factory=list)
+    members: Sequence[tuple[int, ...]] = ()
 
 
 def _check_base_targets(kinds: Sequence[tuple[Table, Sequence[KindRows]]]) -> None:
@@ -126,9 +126,8 @@ def _find_frame(kind: Kind) -> str:
 
 
 def _join_poses(files: Sequence[_File], robot: Mechanism) -> dict[str, tuple[int, int]]:
-    """Return pose -> number of the file and row with its readings, and enter the `members` of all
-    rows; FileError for a pose without readings or with contradicting ones, or an unknown pose in a
-    comparison.
+    """Return pose -> number of the file and row with its readings; FileError for a pose without
+    readings or with contradicting ones.
     """
     read = frozenset().union(*(file.read for file in files))
     origin: dict[str, tuple[int, int]] = {}
@@ -151,52 +150,82 @@ def _join_poses(files: Sequence[_File], robot: Mechanism) -> dict[str, tuple[int
             why = "all rows measure targets on the base, so that there is no pose"
             why += "; give the file of the poses, too"
         raise files[0].table.row_error(0, why)
-    number = {name: i for i, name in enumerate(origin)}
-    for file in files:
-        for row, (cell, is_base) in enumerate(zip(file.names, file.is_base.tolist(), strict=True)):
-            if is_base or cell in number:
-                file.members.append(() if is_base else (number[cell],))
-                continue
-            names = [part.strip() for part in cell.split(LINK)]
-            for name in (name for name in names if name not in number):
-                sentence = f"unknown pose {name!r}{suggest_names(name, number)}"
-                raise file.table.row_error(row, f"{sentence}; add a row with its readings")
-            file.members.append(tuple(number[name] for name in names))
     return origin
 
 
-def _enter(
-    stated: dict[int, tuple[T, Table, int]],
-    table: Table,
-    pairs: Iterable[tuple[int, int]],
-    cells: Sequence[T],
+def _find_members(file: _File, poses: Iterable[str]) -> list[tuple[int, ...]]:
+    """Return the poses of each row by index; FileError for an unknown pose in a comparison."""
+    number = {name: i for i, name in enumerate(poses)}
+    members: list[tuple[int, ...]] = []
+    for row, (cell, is_base) in enumerate(zip(file.names, file.is_base.tolist(), strict=True)):
+        if is_base or cell in number:
+            members.append(() if is_base else (number[cell],))
+            continue
+        names = [part.strip() for part in cell.split(LINK)]
+        for name in (name for name in names if name not in number):
+            sentence = f"unknown pose {name!r}{suggest_names(name, number)}"
+            raise file.table.row_error(row, f"{sentence}; add a row with its readings")
+        members.append(tuple(number[name] for name in names))
+    return members
+
+
+def _collect(
+    statements: Iterable[tuple[Table, Sequence[T], Iterable[tuple[int, int]]]],
     conflict: Callable[[int, T, T, str], str | Finding],
-) -> None:
-    """Enter what rows state of poses, from pairs of row and pose; FileError for another cell of a
-    pose than before.
+) -> dict[int, T]:
+    """Return pose -> what rows state of it, from the cells of each table and its pairs of row and
+    pose; FileError for another cell of a pose than before.
     """
-    for row, pose in pairs:
-        cell, other, place = stated.setdefault(pose, (cells[row], table, row))
-        if cell != cells[row]:
-            raise table.row_error(row, conflict(pose, cells[row], cell, other.place(place)))
+    stated: dict[int, tuple[T, Table, int]] = {}
+    for table, cells, pairs in statements:
+        for row, pose in pairs:
+            cell, other, place = stated.setdefault(pose, (cells[row], table, row))
+            if cell != cells[row]:
+                raise table.row_error(row, conflict(pose, cells[row], cell, other.place(place)))
+    return {pose: cell for pose, (cell, _, _) in stated.items()}
 
 
 def _read_pose_column(
     column: PoseColumn, files: Sequence[_File], labels: Sequence[str]
 ) -> np.ndarray:
     """Return the attribute (n,) that a column of poses states."""
-    stated: dict[int, tuple[str, Table, int]] = {}
-    for file in (file for file in files if column.name in file.table.units):
-        cells = column.parse(file.table)
-        pairs = [(row, i) for row, cell in enumerate(cells) if cell for i in file.members[row]]
-        if column.is_required:
-            pairs = [(row, file.members[row][0]) for row in file.first.values()]
-        for row, _ in pairs:
-            if not cells[row]:
+
+    def list_statements() -> Iterator[tuple[Table, Sequence[str], list[tuple[int, int]]]]:
+        for file in (file for file in files if column.name in file.table.units):
+            cells = column.parse(file.table)
+            pairs = [(row, i) for row, cell in enumerate(cells) if cell for i in file.members[row]]
+            if column.is_required:
+                pairs = [(row, file.members[row][0]) for row in file.first.values()]
+            for row in (row for row, _ in pairs if not cells[row]):
                 sentence = f"column {column.name!r} is empty; write a name or a number"
                 raise file.table.row_error(row, sentence)
-        _enter(stated, file.table, pairs, cells, lambda i, *what: column.conflict(labels[i], *what))
-    return column.encode([stated[i][0] if i in stated else "" for i in range(len(labels))])
+            yield file.table, cells, pairs
+
+    stated = _collect(list_statements(), lambda i, *what: column.conflict(labels[i], *what))
+    return column.encode([stated.get(i, "") for i in range(len(labels))])
+
+
+def _collect_pose_context(files: Sequence[_File], n: int) -> dict[str, FloatArray]:
+    """Return name -> (n,) times and temperatures of rows that only hold readings, else NaN."""
+
+    def list_statements(name: str) -> Iterator[tuple[Table, list[float], list[tuple[int, int]]]]:
+        for file in (file for file in files if name in file.context):
+            cells = file.context[name].tolist()
+            is_single = np.array([len(poses) == 1 for poses in file.members], dtype=bool)
+            alone = is_single & ~np.isnan(cells)
+            for entry in file.kinds:
+                links = entry.kind.poses_per_row
+                alone[[row for row in entry.rows if len(file.members[row]) == links]] = False
+            rows = np.flatnonzero(alone).tolist()
+            yield file.table, cells, [(row, file.members[row][0]) for row in rows]
+
+    found: dict[str, FloatArray] = {}
+    for name in dict.fromkeys(name for file in files for name in file.context):
+        fact = f"column {name!r} has another value in an earlier row of this pose; correct one"
+        stated = _collect(list_statements(name), lambda *_, fact=fact: fact)
+        if stated:
+            found[name] = np.array([stated.get(i, np.nan) for i in range(n)])
+    return found
 
 
 def _has_readings(table: Table, robot: Mechanism) -> bool:
@@ -213,9 +242,7 @@ def _read_file(table: Table, kinds: tuple[KindRows, ...], robot: Mechanism, seve
     for entry in (entry for entry in kinds if entry.kind.is_of_base):
         is_base[entry.rows] = True
     actuators = [actuator.name for actuator in robot.actuators]
-    nothing = np.full((len(table), len(actuators)), np.nan)
-    names = table.pose_names()
-    file = _File(table, kinds, read_context(table), is_base, names, nothing, nothing)
+    names = TextColumn("pose").parse(table) if "pose" in table.units else table.pose_names()
     of_pose = ("pose", *(column.name for column in POSE_COLUMNS), *actuators)
     for name in (*of_pose, *(COMMANDED + c for c in robot.controlled)):
         cells = table.text(name)
@@ -223,25 +250,25 @@ def _read_file(table: Table, kinds: tuple[KindRows, ...], robot: Mechanism, seve
             if cells[row]:
                 sentence = f"this row measures the base and belongs to no pose, but column {name!r}"
                 raise table.row_error(row, f"{sentence} is {cells[row]!r}; leave it empty")
-    if is_base.all() and len(is_base):
-        return file
-    if several and "pose" not in table.units:
+    first: dict[str, int] = {}
+    is_of_base = len(table) > 0 and bool(is_base.all())
+    if several and "pose" not in table.units and not is_of_base:
         sentence = "files are joined by the names of poses, and this file names none"
         raise table.header_error(f"{sentence}; add a column 'pose'")
-    if "pose" in table.units:
-        file.names = names = TextColumn("pose").parse(table)
     for row in np.flatnonzero(~is_base).tolist():
         if not names[row]:
             raise table.row_error(row, "column 'pose' is empty; write a name or a number")
         if LINK not in names[row]:
-            file.first.setdefault(names[row], row)
-    if not several or _has_readings(table, robot):
-        _read_readings(file, robot, several)
-    return file
+            first.setdefault(names[row], row)
+    nothing = np.full((len(table), len(actuators)), np.nan)
+    file = _File(table, kinds, read_context(table), is_base, names, first, nothing, nothing)
+    if is_of_base or (several and not _has_readings(table, robot)):
+        return file
+    return _read_readings(file, robot, several)
 
 
-def _read_readings(file: _File, robot: Mechanism, several: bool) -> None:
-    """Enter the readings of a file, which a controller computes from commanded coordinates."""
+def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
+    """Return a file with its readings, which a controller computes from commanded coordinates."""
     from loopcal.measure.readings import solve_commanded_poses
 
     table, names = file.table, file.names
@@ -272,19 +299,20 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> None:
             sentence = f"pose {names[row]!r} has other readings in line {table.lines[begin[row]]}"
             act = "correct them, or rename one of the two poses"
         raise table.row_error(row, f"{sentence}; {act}")
-    is_unread = absent.all(axis=1).tolist()
-    file.unread = frozenset(name for name, row in file.first.items() if is_unread[row])
-    file.read = frozenset(file.first) - file.unread
-    file.readings = rows
+    empty = set(np.flatnonzero(absent.all(axis=1)).tolist())
+    unread = frozenset(name for name, row in file.first.items() if row in empty)
+    read = frozenset(file.first) - unread
+    readings = rows
     if controller is not None:
-        file.readings = np.full(file.readings.shape, np.nan)
-        chosen = [row for name, row in file.first.items() if name in file.read]
+        readings = np.full(file.readings.shape, np.nan)
+        chosen = [row for name, row in file.first.items() if name in read]
         if chosen:
             poses, places = [names[row] for row in chosen], table.places(chosen)
             solution = solve_commanded_poses(controller, rows[chosen], poses, places)
-            file.readings[chosen] = solution.q
-    file.sigma = _read_reading_sigma(table, robot, file.readings)
-    file.unread = file.unread if may_be_absent else frozenset()
+            readings[chosen] = solution.q
+    sigma = _read_reading_sigma(table, robot, readings)
+    unread = unread if may_be_absent else frozenset[str]()
+    return replace(file, readings=readings, sigma=sigma, read=read, unread=unread)
 
 
 def _list_reading_columns(
@@ -468,6 +496,7 @@ def join_tables(
     files = [_read_file(*each, robot, several) for each in kinds]
     origin = _join_poses(files, robot)
     labels = tuple(origin)
+    files = [replace(file, members=_find_members(file, labels)) for file in files]
     readings = np.array([files[i].readings[row] for i, row in origin.values()])
     sigma = None
     if any(_states_reading_noise(table, robot) for table in tables):
@@ -523,39 +552,6 @@ def join_tables(
         if left or not file.kinds:
             is_named[[pose for members in file.members for pose in members]] = True
     return data if is_named.all() else data.take(is_named)
-
-
-def _collect_pose_context(files: Sequence[_File], n: int) -> dict[str, FloatArray]:
-    """Return name -> (n,) times and temperatures of rows that only hold readings, else NaN."""
-    stated: dict[str, dict[int, tuple[float, Table, int]]] = {}
-    for file in (file for file in files if file.context):
-        measuring = {
-            int(row)
-            for entry in file.kinds
-            for row in entry.rows
-            if len(file.members[row]) == entry.kind.poses_per_row
-        }
-        alone = [
-            (row, poses[0])
-            for row, poses in enumerate(file.members)
-            if row not in measuring and len(poses) == 1
-        ]
-        for name, values in file.context.items():
-            sentence = f"column {name!r} has another value in an earlier row of this pose"
-            pairs = [(row, pose) for row, pose in alone if not np.isnan(values[row])]
-            if pairs:
-                _enter(
-                    stated.setdefault(name, {}),
-                    file.table,
-                    pairs,
-                    values.tolist(),
-                    lambda *_, sentence=sentence: f"{sentence}; correct one",
-                )
-    nothing = (np.nan, None, 0)
-    return {
-        name: np.array([of_pose.get(i, nothing)[0] for i in range(n)])
-        for name, of_pose in stated.items()
-    }
 
 
 def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
