@@ -186,11 +186,11 @@ def test_an_even_choice_of_clusters_stands_for_all(monkeypatch) -> None:
     fit = identify(ROBOTS["linear-delta"], data)
     clusters = Clusters("pose", np.arange(240), 240)
     linear = linearize_fit(fit, data)
-    whole = compute_robust_spread(fit, clusters, linear)
+    whole = compute_robust_spread(linear, clusters)
     monkeypatch.setattr(cluster_covariance, "MOST_CLUSTERS", 80)
     chosen, times = choose_clusters(clusters)
     assert (chosen.count, times, int((chosen.member >= 0).sum())) == (80, 3.0, 80)
-    part = compute_robust_spread(fit, clusters, linear)
+    part = compute_robust_spread(linear, clusters)
     effect = np.eye(len(fit.names))
     all_ratio, ratio = whole.compare(effect), part.compare(effect)
     assert len(part.scores) == 80

@@ -192,7 +192,7 @@ def test_known_setup_is_what_remains_without_the_part_of_the_setup():
     known = replace(unknown, observations=(replace(rows, kind=replace(rows.kind, unknown=())),))
     fit = identify(robot, unknown, MAP())
     at_estimate = identify(robot, known, MAP(), options=FitOptions(start=fit.robot.values))
-    rest = split_covariance(fit, unknown, linearize_fit(fit, unknown))
+    rest = split_covariance(linearize_fit(fit, unknown))
     without = sum(
         (root**2).sum(axis=1)
         for source, root in zip(rest.sources, rest.roots, strict=True)

@@ -101,7 +101,7 @@ def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
     errors = draw_errors(14, 3, 3, 0.7)
     _, data = measure("linear-delta", "component", errors, 3)
     fit = identify(ROBOTS["linear-delta"], data)
-    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
+    rows = collect_residual_rows(linearize_fit(fit, data))
     assert rows is not None
     result = estimate_correlated_errors(rows, 8.0)
     # the likelihood of the rows A r that no parameter changes, A from the full QR of the basis
@@ -124,7 +124,7 @@ def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
 def test_exact_sigmas_are_the_limit_of_many_degrees_of_freedom():
     _, data = measure("linear-delta", "component", draw_errors(14, 3, 3, 0.7), 3)
     fit = identify(ROBOTS["linear-delta"], data)
-    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
+    rows = collect_residual_rows(linearize_fit(fit, data))
     assert rows is not None
     exact = estimate_correlated_errors(rows, np.inf)
     limit = estimate_correlated_errors(rows, 1e8)

@@ -59,7 +59,7 @@ def test_weighted_resamples_equal_their_own_fits(case) -> None:
     p, U = len(fit.names), len(fit.nuisance)
     equations = np.repeat(linear.linearization.equations, 3)
     fits = fit_resamples(
-        fit, linear, Resamples(weight, None, np.zeros((3, p)), None, np.zeros((3, U)), equations)
+        linear, Resamples(weight, None, np.zeros((3, p)), None, np.zeros((3, U)), equations)
     )
     assert fits.converged.all()
     for i in range(3):
@@ -79,7 +79,7 @@ def test_resampled_errors_equal_a_scipy_fit_to_changed_values() -> None:
     p = len(fit.names)
     equations = np.repeat(linear.linearization.equations, 2)
     fits = fit_resamples(
-        fit, linear, Resamples(None, (offset,), np.zeros((2, p)), None, np.zeros((2, 0)), equations)
+        linear, Resamples(None, (offset,), np.zeros((2, p)), None, np.zeros((2, 0)), equations)
     )
     (rows,) = data.observations
     places = fit.free_parameters.places

@@ -150,7 +150,7 @@ def test_covariance_and_degrees_equal_a_dense_computation(sensor, sessions, meth
     fit = identify(hexapod(), data, method, options=FitOptions(sigma_uncertainty=0.0))
     member = np.arange(24) * sessions // 24 if sessions else np.arange(24)
     clusters = Clusters("pose", member, int(member.max()) + 1)
-    spread = compute_robust_spread(fit, clusters, linearize_fit(fit, data))
+    spread = compute_robust_spread(linearize_fit(fit, data), clusters)
     J, r = stack_rows(fit, data)
     U, p = len(fit.nuisance), len(fit.names)
     prior = np.r_[np.zeros(U), np.full(p, 1.0 if isinstance(method, MAP) else 0.0)]

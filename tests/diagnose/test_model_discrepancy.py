@@ -222,7 +222,7 @@ def test_linearized_poses_are_those_of_the_forward_kinematics():
 def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:
     """Return a fit whose uncertainty includes the slow errors that its residuals show."""
     measured = locate_measured_poses(fit, data)
-    slow = find_slow_errors(fit, data, linearize_fit(fit, data), measured.T)
+    slow = find_slow_errors(linearize_fit(fit, data), measured.T)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 

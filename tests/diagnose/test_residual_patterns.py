@@ -30,7 +30,7 @@ def collect(robot, kind, errors, seed, method=None, **context):
     """Return the residual rows of a fit, and its data."""
     _, data = measure(robot, kind, errors, seed, **context)
     fit = identify(ROBOTS[robot], data, method)
-    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
+    rows = collect_residual_rows(linearize_fit(fit, data))
     assert rows is not None
     return rows, data
 
@@ -164,7 +164,7 @@ def test_rows_that_are_absent_are_left_out():
     measured[3, 1] = measured[7] = np.nan
     holes = replace(data, observations=(replace(rows, measured=measured),))
     fit = identify(ROBOTS["linear-delta"], holes)
-    collected = collect_residual_rows(fit, holes, linearize_fit(fit, holes))
+    collected = collect_residual_rows(linearize_fit(fit, holes))
     assert collected is not None
     assert len(collected.residual) == 60 - 4
     assert np.isfinite(compute_correlation(collected)[1])

@@ -158,7 +158,7 @@ def test_correlation_of_neighbors_agrees_with_draws_of_independent_errors(correl
 
     draws = correlate(np.random.default_rng(2).standard_normal((20_000, 3 * n)))
     observed = correlate(dense.b[None])[0]
-    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
+    rows = collect_residual_rows(linearize_fit(fit, data))
     assert rows is not None
     excess, p_value = measure_correlation(rows)
     tail = float((draws >= observed).mean())
@@ -170,7 +170,7 @@ def test_correlation_of_neighbors_agrees_with_draws_of_independent_errors(correl
 def test_covariance_by_correlated_errors_agrees_with_dense_generalized_least_squares():
     data = measure(Case("", correlation=0.6)).measurements[0]
     fit = identify(ROBOT, data, LeastSquares())
-    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
+    rows = collect_residual_rows(linearize_fit(fit, data))
     assert rows is not None
     errors = estimate_correlated_errors(rows, 8.0)
     dense, n = fit_densely(data, FINE), len(data.readings)

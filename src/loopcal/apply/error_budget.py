@@ -34,7 +34,6 @@ from loopcal.estimate.fit_linearization import (
     linearize_at_estimate,
     linearize_fit,
 )
-from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
@@ -111,25 +110,20 @@ class CovarianceSplit(NamedTuple):
     undetermined: BoolArray
 
 
-def split_covariance(
-    fit: Identification, data: Measurements, linear: FitLinearization
-) -> CovarianceSplit:
-    """Return the covariance of a fit by source.
-
-    fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses. linear : of both, see `linearize_fit`.
-    """
+def split_covariance(linear: FitLinearization) -> CovarianceSplit:
+    """Return the covariance of a fit with intervals by source."""
+    fit = linear.fit
     degrees = {part.source: part.degrees for part in reversed(fit.posterior.parts)}
     of_noise, of_size = (degrees.get(source, np.inf) for source in (NOISE, TOLERANCES))
     test = fit.residual_test
     evaluation = "A and B" if np.isfinite(of_noise) else "B"
     if test.noise == "estimated" or test.failed:
         evaluation = "A"
-    names, members = _number_sources(data, linear.problem)
+    names, members = _number_sources(linear)
     sources = [Source(kind, name, evaluation, of_noise) for kind, name in names]
     factors = list(fold_sources(linear.problem, linear.linearization, members, len(names)))
     U = factors[0].shape[1] - len(fit.names)
-    for kind, rows in _list_further_rows(fit, linear, U):
+    for kind, rows in _list_further_rows(linear, U):
         sources.append(Source(kind, "", "B", np.inf))
         factors.append(rows)
     own, moved = _propagate(linear, factors, U)
@@ -212,12 +206,11 @@ def _name(rows: Observations, session: str, data: Measurements) -> str:
     return f"{name}, {session}" if session else name
 
 
-def _number_sources(
-    data: Measurements, problem: Problem
-) -> tuple[list[tuple[str, str]], list[IntArray]]:
+def _number_sources(linear: FitLinearization) -> tuple[list[tuple[str, str]], list[IntArray]]:
     """Return kind and name of the sources of rows, and the number of the source of each row of
-    every kind of a problem.
+    every kind.
     """
+    data, problem = linear.data, linear.problem
     numbers: dict[tuple[str, str], int] = {}
     members = []
     for rows in (o for o in data.all_observations if len(o)):
@@ -229,11 +222,9 @@ def _number_sources(
     return list(numbers), members
 
 
-def _list_further_rows(
-    fit: Identification, linear: FitLinearization, U: int
-) -> list[tuple[str, FloatArray]]:
+def _list_further_rows(linear: FitLinearization, U: int) -> list[tuple[str, FloatArray]]:
     """Return rows (m, U + p) of the stated setup parameters, and of an earlier calibration."""
-    rows = []
+    rows, prior = [], linear.fit.options.prior
     problem, estimate = linear.problem, linear.linearization.nuisance
     if problem.nuisance is not None and estimate is not None and problem.nuisance.has_prior.any():
         stated = problem.nuisance.has_prior
@@ -241,11 +232,11 @@ def _list_further_rows(
         done = estimate.elimination
         both = np.concatenate([done.joint_root()[0], done.slope[0]], axis=1)[stated]
         rows.append((SETUP, both / sd[:, None]))
-    if fit.options.prior is not None:
+    if prior is not None:
         measured = problem.linearize(
             linear.linearization.deviation, linear.linearization.next_start
         )
-        slope = fit.options.prior.added(problem).list_slopes(measured)[0]
+        slope = prior.added(problem).list_slopes(measured)[0]
         rows.append((EARLIER, np.concatenate([np.zeros((len(slope), U)), slope], axis=1)))
     return rows
 
@@ -260,7 +251,7 @@ def _propagate(
     estimated has its tolerance. The penalty P is that of the fit times a weight.
     """
     used, noise = linear.is_estimated, float(np.sqrt(linear.sources.noise))
-    to_z = linear.decomposition.deviation(np.eye(len(used))).T
+    to_z = linear.decomposition.basis[0]
     penalty = np.diag(np.sqrt(weight * np.where(used, linear.penalty[0], 1.0)))
     spread = np.where(used, linear.spread, 1.0)
     own = [factor[:, U:] @ to_z * used for factor in factors]
@@ -427,20 +418,19 @@ def compute_error_budget(
     frame : in which the errors of poses are stated, see `choose_error_frame`; "relative" means
         relative to the home pose.
     """
-    data = prepare_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals):
         return None
+    linear = linearize_fit(fit, data)
     is_workspace = True
     try:
         drawn = sample_workspace(fit.robot, POSES, SEED).solution
         solution = drawn.take(np.flatnonzero(drawn.converged))
     except MechanismError:  # the robot states no workspace
-        solution, is_workspace = locate_measured_poses(fit, data, POSES), False
+        solution, is_workspace = locate_measured_poses(fit, linear.data, POSES), False
     if not len(solution.q):
         return None
     effects = linearize_tool_errors(fit.posterior, solution, frame)
-    linear = linearize_fit(fit, data)
-    split = split_covariance(fit, data, linear)
+    split = split_covariance(linear)
     lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)

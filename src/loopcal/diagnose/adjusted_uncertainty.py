@@ -36,7 +36,6 @@ from loopcal.diagnose.residual_patterns import (
     find_patterns,
 )
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
@@ -68,17 +67,16 @@ def adjust_uncertainty(
     Estimates stay, and no variance becomes smaller. A fit that did not converge, has no intervals,
     or has weights by a loss is returned as it is. `linear` : see `linearize_fit`.
     """
-    data = prepare_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
         return fit
-    linear = linearize_fit(fit, data) if linear is None else linear
-    rows = collect_residual_rows(fit, data, linear)
+    linear = linearize_fit(fit, data, linear)
+    data, rows = linear.data, collect_residual_rows(linear)
     if linear.solution.linearized is None or fit.poses is not None:
         T = locate_measured_poses(fit, data).T
     else:  # readings are exact, and the linearization has kept the poses
         poses = linear.solution.linearized
         T = poses.T[0, poses.is_reached[0]]
-    slow = find_slow_errors(fit, data, linear, T)
+    slow = find_slow_errors(linear, T)
     if rows is not None:
         fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
     return fit if slow is None else add_slow_errors(fit, slow)
@@ -257,14 +255,13 @@ def check_heavy_tails(
     reported = (f for f in fit.findings if f.severity is Severity.WARNING)
     if any(f.code.startswith(PATTERNS) and f.code != NO_PATTERN for f in reported):
         return HeavyTails()
-    data = prepare_fitted_data(fit, data)
-    linear = linearize_fit(fit, data) if linear is None else linear
-    rows = collect_residual_rows(fit, data, linear)
+    linear = linearize_fit(fit, data, linear)
+    rows = collect_residual_rows(linear)
     if rows is None:
         return HeavyTails()
-    is_named = np.isin(np.array(data.labels), list(outliers))
+    is_named = np.isin(np.array(linear.data.labels), list(outliers))
     is_wrong = np.zeros(len(rows.residual), dtype=bool)
-    for number, o in enumerate(o for o in data.observations if len(o)):
+    for number, o in enumerate(o for o in linear.data.observations if len(o)):
         own = rows.kind == number
         is_held = np.asarray(is_named[o.rows].reshape(len(o), -1).any(axis=1))
         is_wrong[own] = is_held[rows.row[own]]

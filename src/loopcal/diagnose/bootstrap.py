@@ -42,7 +42,6 @@ from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.errors import EstimationError
 from loopcal.estimate.elimination import spread_columns
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import linearize_rows
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.penalties import MAP
@@ -163,9 +162,8 @@ def compute_block_errors(
         have the residuals that the errors replace.
     """
     values = list_observed_values(linear, clusters)
-    V = linear.decomposition.scale[:, None] * linear.decomposition.directions[0]
-    total = linear.decomposition.singular_values[0] ** 2 + linear.penalty[0]
-    V = V[:, linear.is_estimated] / np.sqrt(total[linear.is_estimated])
+    used = linear.is_estimated
+    V = linear.decomposition.basis[0][:, used] / np.sqrt(linear.information[used])
     residual, error = values.residual.copy(), np.zeros(len(values.block))
     untested = []
     for g in range(clusters.count):
@@ -240,11 +238,9 @@ class BlockScatter:
         )
 
 
-def describe_scatter(
-    fit: Identification, blocks: Clusters, linear: FitLinearization
-) -> BlockScatter:
+def describe_scatter(linear: FitLinearization, blocks: Clusters) -> BlockScatter:
     """Return the scatter of blocks of a fit; without intervals its degrees are blocks - 1."""
-    p = len(fit.names)
+    fit, p = linear.fit, linear.problem.parameters
     nan = np.full(p, np.nan)
     d, penalty = linear.decomposition, linear.penalty
     unit_sd = d.standard_deviations(penalty)[0] * fit.tolerance
@@ -253,7 +249,7 @@ def describe_scatter(
     if not fit.residual_test.intervals:
         few = np.full(p, float(blocks.count - 1))
         return BlockScatter(nan, few, few, nan, unit_sd, noise)
-    spread = compute_robust_spread(fit, blocks, linear)
+    spread = compute_robust_spread(linear, blocks)
     ratio, degrees, share, tail = nan.copy(), nan.copy(), nan.copy(), nan.copy()
     tested_rows = spread.scaled_rows * spread.is_tested[:, None, :]
     total = (spread.root**2).sum(axis=1)
@@ -479,7 +475,6 @@ def bootstrap(
     EstimationError : the fit did not converge, the data have no such unit, or fewer than two
         resamples converged.
     """
-    data = prepare_fitted_data(fit, data)
     if scheme not in get_args(Scheme):
         raise EstimationError(f"scheme is {scheme!r}; it must be wild, pairs or normal")
     if count < 2:
@@ -490,7 +485,8 @@ def bootstrap(
         raise EstimationError(report_finding("sampling.without-intervals"))
     if scheme == "pairs" and isinstance(fit.method, MAP) and callable(fit.method.inflation):
         raise EstimationError(report_finding("sampling.pairs-with-rule"))
-    blocks, linear = choose_blocks(data, unit), linearize_fit(fit, data)
+    linear = linearize_fit(fit, data)
+    blocks = choose_blocks(linear.data, unit)
     rng, errors, batches = np.random.default_rng(np.random.SeedSequence(seed)), None, []
     if scheme != "pairs":
         # the penalty of a ridge or a truncation is no observation and stays as it is: the truth is
@@ -503,8 +499,8 @@ def bootstrap(
     for first in range(0, count, BATCH):
         progress(first, count, "fitting resamples")
         size = min(BATCH, count - first)
-        resamples = _draw_resamples(fit, linear, blocks, errors, scheme, size, rng)
-        batches.append(fit_resamples(fit, linear, resamples))
+        resamples = _draw_resamples(linear, blocks, errors, scheme, size, rng)
+        batches.append(fit_resamples(linear, resamples))
     progress(count, count, "fitting resamples")
     fits = ResampleFits.join(batches)
     kept = fits.take(np.flatnonzero(fits.converged))
@@ -520,12 +516,11 @@ def bootstrap(
         linear=nominal + unit_of * kept.linear,
         sd=unit_of * kept.sd * np.sqrt(kept.noise)[:, None],
         failed=count - len(kept.deviation),
-        scatter=describe_scatter(fit, blocks, linear),
+        scatter=describe_scatter(linear, blocks),
     )
 
 
 def _draw_resamples(
-    fit: Identification,
     linear: FitLinearization,
     blocks: Clusters,
     errors: BlockErrors | None,
@@ -538,7 +533,7 @@ def _draw_resamples(
     Priors scatter about the truth of the resamples where errors of rows are drawn, and about the
     given values where the residuals keep their bias.
     """
-    G, sigma = blocks.count, fit.residual_test.sigma_scale
+    fit, G, sigma = linear.fit, blocks.count, linear.fit.residual_test.sigma_scale
     equations = np.full(count, int(linear.linearization.equations[0]))
     weight, offset = None, None
     if errors is None:

@@ -165,8 +165,8 @@ def check_clusters(
         return ClusterCheck(few)
     if not fit.residual_test.intervals:
         return ClusterCheck(report_finding("residuals.clusters-without-intervals"))
-    linear = linearize_fit(fit, data) if linear is None else linear
-    checks = (_compare(fit, data, clusters, frame, linear) for clusters in units)
+    linear = linearize_fit(fit, data, linear)
+    checks = (_compare(linear, clusters, frame) for clusters in units)
     judged = (check for check in checks if check is not None)
     return next(judged, ClusterCheck(report_finding("residuals.clusters-not-judged")))
 
@@ -242,21 +242,17 @@ class RobustSpread(NamedTuple):
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
-def compute_robust_spread(
-    fit: Identification, clusters: Clusters, linear: FitLinearization
-) -> RobustSpread:
+def compute_robust_spread(linear: FitLinearization, clusters: Clusters) -> RobustSpread:
     """Return the cluster-robust covariance of a fit with intervals, beside the stated one. Of more
-    than `MOST_CLUSTERS` clusters, an even choice stands for all. `linear` : see `linearize_fit`.
+    than `MOST_CLUSTERS` clusters, an even choice stands for all.
     """
     clusters, times = choose_clusters(clusters)
-    d, p = linear.decomposition, len(fit.names)
-    used = linear.is_estimated
-    V = d.scale[:, None] * d.directions[0][:, used]
-    total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
+    p, used = linear.problem.parameters, linear.is_estimated
+    V, total = linear.decomposition.basis[0][:, used], linear.information[used]
     sd = np.sqrt(linear.variance[used])
-    sigma = fit.residual_test.sigma_scale
+    sigma = linear.fit.residual_test.sigma_scale
     setup = 0 if linear.problem.nuisance is None else len(linear.problem.nuisance)
-    width = setup + linear.problem.parameters + 1
+    width = setup + p + 1
     folded = np.zeros((1, clusters.count, 0, width))  # the rows of each cluster
     for rows_of_block in linear.problem.leverage_rows(linear.linearization, linear.solution):
         for part in rows_of_block:
@@ -292,16 +288,12 @@ def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:
     return replace(clusters, member=number[clusters.member], count=MOST_CLUSTERS), times
 
 
-def _compare(
-    fit: Identification,
-    data: Measurements,
-    clusters: Clusters,
-    frame: str,
-    linear: FitLinearization,
-) -> ClusterCheck | None:
+def _compare(linear: FitLinearization, clusters: Clusters, frame: str) -> ClusterCheck | None:
     """Return the comparison for clusters; None where residuals cannot judge the poses."""
-    spread, posterior = compute_robust_spread(fit, clusters, linear), fit.posterior
-    errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data, MOST_POSES), frame)
+    fit, posterior = linear.fit, linear.fit.posterior
+    spread = compute_robust_spread(linear, clusters)
+    solution = locate_measured_poses(fit, linear.data, MOST_POSES)
+    errors = linearize_tool_errors(posterior, solution, frame)
     root = _find_added_root(posterior.without_discrepancy) / posterior.unit[:, None]
     # variances of the poses beyond C, and their changes by deviations in tolerances
     beside = np.concatenate([errors.by_parameters @ root, errors.by_discrepancy], axis=2) ** 2

@@ -23,7 +23,7 @@ from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.identification import identify, prepare_fitted_data
+from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
@@ -216,12 +216,11 @@ def examine_fit(
         other tests begin.
     frame : in which expected errors are stated, see `choose_error_frame`.
     """
-    prepared = prepare_fitted_data(fit, data)
     outliers = find_outliers(fit, data, progress=progress)
     progress(0, 1, "testing for common errors and heavy tails")
     linear = None
     if fit.converged and fit.residual_test.intervals:
-        linear = linearize_fit(fit, prepared)
+        linear = linearize_fit(fit, data)
     return FitExamination(
         outliers,
         check_lack_of_fit(fit, data),

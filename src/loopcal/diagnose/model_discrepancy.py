@@ -82,16 +82,11 @@ class SlowErrors(NamedTuple):
     is_slow: bool = True  # whether neighboring poses share them; otherwise each pose has its own
 
 
-def find_slow_errors(
-    fit: Identification, data: Measurements, linear: FitLinearization, T: FloatArray
-) -> SlowErrors | None:
-    """Return the slow errors that the residuals of a fit show; None without any, or where nothing
-    can be tested.
-
-    fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses. linear : of both, see `linearize_fit`. T : (n, 4, 4) [m] measured poses.
+def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | None:
+    """Return the slow errors that the residuals of a fit with intervals show at its measured poses
+    T (n, 4, 4) [m]; None without any, or where nothing can be tested.
     """
-    tool = fit.robot.tool[:3, 3]
+    fit, tool = linear.fit, linear.fit.robot.tool[:3, 3]
     # deviations from nominal show errors, too, but only as far as the tolerances are right
     if len(T) < FEWEST_POSES or fit.residual_test.degrees < FEWEST_DEGREES:
         return None
@@ -99,7 +94,7 @@ def find_slow_errors(
         describe_smooth_errors(T, tool, fit.robot.size, length, by_rotation=by_rotation)
         for length, by_rotation in KERNELS
     )
-    projected = (project_slow_errors(fit, data, linear, errors) for errors in kernels)
+    projected = (project_slow_errors(linear, errors) for errors in kernels)
     tested = [rows for rows in projected if rows is not None]
     level = compute_single_level(LEVEL, len(tested))
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
@@ -107,23 +102,21 @@ def find_slow_errors(
     slow = [each for each in slow if each.components]
     if slow:
         return min(slow, key=lambda each: min(p for _, p in each.components.values()))
-    return find_rough_errors(fit, data, linear, T)
+    return find_rough_errors(linear, T)
 
 
-def find_rough_errors(
-    fit: Identification, data: Measurements, linear: FitLinearization, T: FloatArray
-) -> SlowErrors | None:
+def find_rough_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | None:
     """Return errors that every pose has of its own, where repeats of a pose agree much better with
     each other than with the fit; None elsewhere.
 
     With the variance sigma^2 of pure error, the residuals that such errors can change have the
     variance sigma^2 + tau^2 S S'.
     """
-    lack = check_lack_of_fit(fit, data)
+    robot, lack = linear.fit.robot, check_lack_of_fit(linear.fit, linear.data)
     if lack.is_explained is not False:
         return None
-    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], fit.robot.size, ROUGH, MOST_ROUGH)
-    rows = project_slow_errors(fit, data, linear, errors)
+    errors = describe_smooth_errors(T, robot.tool[:3, 3], robot.size, ROUGH, MOST_ROUGH)
+    rows = project_slow_errors(linear, errors)
     if rows is None:
         return None
     components = {}
@@ -197,18 +190,16 @@ def detect_slow_errors(
     return components
 
 
-def project_slow_errors(
-    fit: Identification, data: Measurements, linear: FitLinearization, errors: SmoothErrors
-) -> SlowErrorRows | None:
+def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowErrorRows | None:
     """Return residuals and slow errors without what the parameters explain; None where there are
     too few different poses or residuals.
     """
     if len(errors.centers) < FEWEST_POSES:
         return None
-    extended = linearize_smooth_errors(fit, data, errors, linear)
+    extended = linearize_smooth_errors(linear, errors)
     d, m, used = linear.decomposition, errors.count, linear.decomposition.used[0]
     k = int(used.sum())
-    to_z = d.deviation(np.eye(len(used)))[used].T
+    to_z = d.basis[0][:, used]
     penalty = np.where(np.isfinite(linear.penalty[0]), linear.penalty[0], 0.0)[used]
     prior = np.zeros((k, k + m + 1))
     prior[:, :k] = np.diag(np.sqrt(penalty))
@@ -221,7 +212,7 @@ def project_slow_errors(
     degrees = int(extended.equations[0] + (penalty > 0.0).sum()) - k
     if degrees < FEWEST_DEGREES:
         return None
-    slope = fit.tolerance[:, None] * (to_z @ np.linalg.solve(R[:k, :k], R[:k, k : k + m]))
+    slope = linear.fit.tolerance[:, None] * (to_z @ np.linalg.solve(R[:k, :k], R[:k, k : k + m]))
     triangle, residuals = R[k : k + m, k : k + m], R[k : k + m, k + m]
     size = np.linalg.norm(factor[:, p : p + m])
     if not np.linalg.norm(triangle) > UNSEEN * size:

@@ -100,7 +100,7 @@ def compute_influence(
     for penalty, solved in fits:
         variance = d.variances(penalty)[0]
         sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
-        roots.append(d.scale[:, None] * d.directions[0] * sd)
+        roots.append(d.basis[0] * sd)
         changes.append((solved - linearization.deviation)[0])
     results = [make_empty_influence(u) for _ in fits]
     total = problem.poses.count_rows(member, u)

@@ -29,7 +29,6 @@ from loopcal.diagnose.intervals import (
 )
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.prior import WithPrior
 from loopcal.estimate.resampling import repeat_trial, resample_rows
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
@@ -46,9 +45,7 @@ from loopcal.typing import FloatArray, Progress, report_no_progress
 class PosteriorDensity:
     """The posterior of a fit in the coordinates v = (y, w) of its linear approximation."""
 
-    # fit, linear: the fit and its rows
-    fit: Identification
-    linear: FitLinearization
+    linear: FitLinearization  # the fit and its rows
     prior: WithPrior | None  # rows of an earlier calibration with them, or None
     # decomposition, penalty: of rows divided by s; the penalty is that of a prior, or 0
     decomposition: Decomposition
@@ -122,11 +119,9 @@ class PosteriorDensity:
         return (self.penalty * self.decomposition.coordinates(z) ** 2).sum(axis=1)
 
 
-def describe_density(fit: Identification, linear: FitLinearization) -> PosteriorDensity:
-    """Return the posterior of a fit by least squares or MAP, with intervals.
-
-    `linear` are its rows, see `linearize_fit`.
-    """
+def describe_density(linear: FitLinearization) -> PosteriorDensity:
+    """Return the posterior of a fit by least squares or MAP, with intervals."""
+    fit = linear.fit
     scale, degrees = fit.residual_test.sigma_scale, fit.residual_test.noise_degrees
     stated, penalty = linear.decomposition, linear.prior_weight
     d = stated.divided(np.array([scale]))
@@ -135,7 +130,7 @@ def describe_density(fit: Identification, linear: FitLinearization) -> Posterior
     used = np.where(np.isfinite(penalty), finite, np.inf)[None]
     variance = d.variances(used)[0]
     is_known = np.isfinite(variance)
-    root = d.scale[:, None] * d.directions[0][:, is_known] * np.sqrt(variance[is_known])
+    root = d.basis[0][:, is_known] * np.sqrt(variance[is_known])
     mean = d.deviation(d.solution(used))[0]
     setup_root, rank = np.zeros((0, 0)), 0
     nuisance = linear.linearization.nuisance
@@ -146,7 +141,7 @@ def describe_density(fit: Identification, linear: FitLinearization) -> Posterior
     prior = None if fit.options.prior is None else fit.options.prior.added(linear.problem)
     directions = int(stated.used[0].sum()) + rank
     return PosteriorDensity(
-        fit, linear, prior, d, finite, mean, root, setup_root, scale, degrees, directions
+        linear, prior, d, finite, mean, root, setup_root, scale, degrees, directions
     )
 
 
@@ -272,7 +267,6 @@ def sample_posterior(
     EstimationError : the fit did not converge, has no intervals, or was made by a method that
         states no prior; or no draw is possible.
     """
-    data = prepare_fitted_data(fit, data)
     if count < 100:
         raise EstimationError(f"{count} draws: give at least 100")
     if not fit.converged:
@@ -282,7 +276,7 @@ def sample_posterior(
         raise EstimationError(report_finding("sampling.method-without-prior", method=name))
     if not fit.residual_test.intervals:
         raise EstimationError(report_finding("sampling.without-intervals"))
-    density = describe_density(fit, linearize_fit(fit, data))
+    density = describe_density(linearize_fit(fit, data))
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     # the linear posterior with heavier tails
     degrees = float(np.clip(density.size, SMALLEST_DEGREES, LARGEST_DEGREES))

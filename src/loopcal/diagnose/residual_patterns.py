@@ -24,7 +24,6 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.estimate.fit_linearization import FitLinearization
-from loopcal.estimate.result import Identification
 from loopcal.measure.kinds.kind import list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -112,18 +111,13 @@ def span_columns(columns: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > EXPLAINED])
 
 
-def collect_residual_rows(
-    fit: Identification, data: Measurements, linear: FitLinearization
-) -> ResidualRows | None:
-    """Return the residuals of a fit in the order of measurement; None where rows cannot be told
-    apart, because their readings are uncertain, or where there are none.
-
-    fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses. linear : of both, see `linearize_fit`.
+def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
+    """Return the residuals of a fit with intervals in the order of measurement; None where rows
+    cannot be told apart, because their readings are uncertain, or where there are none.
     """
     if linear.problem.is_uncertain:
         return None
-    observations = [rows for rows in data.observations if len(rows)]
+    observations = [rows for rows in linear.data.observations if len(rows)]
     groups: list[tuple[FloatArray, IntArray, IntArray, IntArray]] = []  # present rows
     for node_rows in linear.problem.leverage_rows(linear.linearization, linear.solution):
         for part in node_rows:
@@ -140,20 +134,17 @@ def collect_residual_rows(
     start = np.cumsum([0, *(len(o) for o in observations)])
     order = np.lexsort((place[start[kind] + row], series))
     rows, kind, row, column = rows[order], kind[order], row[order], column[order]
-    d, p = linear.decomposition, len(fit.names)
-    used = linear.is_estimated
-    V = d.scale[:, None] * d.directions[0][:, used]
-    by_direction = rows[:, -p - 1 : -1] @ V
-    total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
-    determined = d.scale[:, None] * d.directions[0][:, d.used[0]]
-    machine = rows[:, -p - 1 : -1] @ (determined / d.singular_values[0][d.used[0]])
+    d, p = linear.decomposition, len(linear.fit.names)
+    used, determined = linear.is_estimated, d.used[0]
+    by_direction = rows[:, -p - 1 : -1] @ d.basis[0]
+    machine = by_direction[:, determined] / d.singular_values[0][determined]
     basis = span_columns(np.concatenate([rows[:, : -p - 1], machine], axis=1))
     residual = rows[:, -1] - basis @ (basis.T @ rows[:, -1])
     return ResidualRows(
         basis=basis,
         residual=residual,
-        gain=by_direction / total,
-        root=fit.tolerance[:, None] * V,
+        gain=by_direction[:, used] / linear.information[used],
+        root=linear.fit.tolerance[:, None] * d.basis[0][:, used],
         kind=kind,
         row=row,
         column=column,

@@ -21,6 +21,7 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.elimination import NodeRows, divide_among_nodes
 from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import KindRows, Linearization, PoseSolution
 from loopcal.estimate.penalties import decompose_for
 from loopcal.estimate.pose_rows import PoseBlock, PoseRows, stack_rows
@@ -45,17 +46,25 @@ class FitLinearization(NamedTuple):
 
     Attributes
     ----------
+    fit : it. data : its measurements, with the sigma of their readings, without excluded poses.
     problem : without the rows of an earlier calibration. linearization : with them.
     solution : poses and nuisance parameters at which both are linearized.
     decomposition, penalty : of the fit. sources : of its variances.
     """
 
+    fit: Identification
+    data: Measurements
     problem: Problem
     solution: PoseSolution
     linearization: Linearization
     decomposition: Decomposition
     penalty: FloatArray
     sources: VarianceSources
+
+    @property
+    def information(self) -> FloatArray:
+        """(p,) s^2 + penalty of each direction; infinite where it is not used."""
+        return self.decomposition.singular_values[0] ** 2 + self.penalty[0]
 
     @property
     def variance(self) -> FloatArray:
@@ -88,11 +97,22 @@ class FitLinearization(NamedTuple):
         return np.isfinite(self.variance) & self.decomposition.used[0]
 
 
-def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
+def linearize_fit(
+    fit: Identification, data: Measurements, linear: FitLinearization | None = None
+) -> FitLinearization:
     """Linearize the rows of a fit that converged at its estimate.
 
-    `data` are its measurements, with the sigma of their readings, without excluded poses.
+    data : the measurements it was made from.
+    linear : the result for the same fit before findings widened its covariance, which is used
+        again.
+
+    Raises
+    ------
+    DataError : the measurements have another number of poses than the fit.
     """
+    if linear is not None:
+        return linear._replace(fit=fit)
+    data = prepare_fitted_data(fit, data)
     problem, solution, linearization = linearize_at_estimate(fit, data)
     method = fit.method
     d = decompose_for(
@@ -104,19 +124,17 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
     sources = find_variance_sources(d, penalty, fit.residual_test, method, fit.free_parameters)
-    return FitLinearization(problem, solution, linearization, d, penalty, sources)
+    return FitLinearization(fit, data, problem, solution, linearization, d, penalty, sources)
 
 
-def linearize_smooth_errors(
-    fit: Identification, data: Measurements, errors: SmoothErrors, linear: FitLinearization
-) -> Linearization:
+def linearize_smooth_errors(linear: FitLinearization, errors: SmoothErrors) -> Linearization:
     """Linearize the rows of a fit also by the coefficients of errors of the poses, whose columns
     follow those of the parameters. Poses and nuisance parameters stay those of `linear`.
     """
-    solution, free = linear.solution, replace(fit.free_parameters, errors=errors)
+    solution, free = linear.solution, replace(linear.fit.free_parameters, errors=errors)
     if solution.linearized is not None:
         solution = replace(solution, linearized=solution.linearized.with_errors(errors))
-    return linearize_at_estimate(fit, data, free, solution)[2]
+    return linearize_at_estimate(linear.fit, linear.data, free, solution)[2]
 
 
 def linearize_at_estimate(

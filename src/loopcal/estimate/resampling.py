@@ -131,11 +131,9 @@ def resample_rows(
     return replace(problem, poses=poses, trials=np.arange(len(prior_mean)))
 
 
-def fit_resamples(
-    fit: Identification, linear: FitLinearization, resamples: Resamples
-) -> ResampleFits:
+def fit_resamples(linear: FitLinearization, resamples: Resamples) -> ResampleFits:
     """Fit resamples of the rows of a fit that converged, each from its estimate."""
-    t, method = len(resamples), fit.method
+    fit, t, method = linear.fit, len(resamples), linear.fit.method
     changed = (resamples.weight, resamples.offset, resamples.nuisance)
     problem = resample_rows(linear.problem, *changed)
     if fit.options.prior is not None:

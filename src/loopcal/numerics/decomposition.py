@@ -139,6 +139,11 @@ class Decomposition(TrialBatch):
         """Return this decomposition with its dual stated, as one of trials of oblique V is."""
         return replace(self, dual=self.inverse)
 
+    @property
+    def basis(self) -> FloatArray:
+        """(t, p, p) columns scale * V: the deviation z that each coordinate y is."""
+        return self.scale[:, None] * self.directions
+
     def coordinates(self, deviation: FloatArray) -> FloatArray:
         """Return y = V' (z / scale), (t, p), of a deviation z (t, p)."""
         scaled = deviation / self.scale
