@@ -14,6 +14,7 @@ from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.plane_line_planning import SurfaceOptions
 from loopcal.studies.files.study_file import LEVELS
 from loopcal.studies.specification.levels import Question, Scores
+from loopcal.studies.specification.study import Study
 
 RECORDS: list[tuple[Any, dict[str, Any]]] = [
     *((record, {}) for record in (PlanOptions, SurfaceOptions, Scores, *LEVELS.values())),
@@ -46,6 +47,12 @@ def test_records_under_test_have_choices() -> None:
 def test_limits_are_of_settings_and_their_defaults_are_allowed(record, needed) -> None:
     assert record.LIMITS.keys() <= {item.name for item in fields(record)}
     record(**needed)
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"replicates": 0}, {"block": 0}, {"block": 2001}])
+def test_numbers_of_a_study_are_refused_as_those_of_its_file(wrong) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; it must be from"):
+        Study(title="wrong", robots={}, **wrong)
 
 
 def test_wrong_word_names_the_option_what_is_allowed_and_what_is_similar() -> None:

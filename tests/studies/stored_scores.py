@@ -30,7 +30,7 @@ def make_study(replicates: int = 400, questions: dict[str, Question] | None = No
     text = find_robot_file("five-bar").read_text("utf-8")
     return Study(
         "Stated scores",
-        {"five-bar": Robot("five-bar", text)},
+        robots={"five-bar": Robot("five-bar", text)},
         replicates=replicates,
         block=100,
         instruments={"tracker": InstrumentLevel(kinds=("position",))},

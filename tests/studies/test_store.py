@@ -354,7 +354,7 @@ def test_many_readers_and_a_writer_do_not_disturb_each_other(folder) -> None:
 
 STUDY = Study(
     "title",
-    {"r": Robot("five-bar", "text of the robot")},
+    robots={"r": Robot("five-bar", "text of the robot")},
     errors={"small": ErrorsLevel(1.0), "wide": ErrorsLevel(2.0)},
 )
 

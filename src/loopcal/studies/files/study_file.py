@@ -5,14 +5,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
-from loopcal.checks import Limit, Limited, whole_numbers
 from loopcal.errors import DataError, LoopcalError
-from loopcal.io.core import limits
 from loopcal.io.core.records import read_record
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import (
@@ -47,11 +45,9 @@ from loopcal.studies.specification.levels import (
     MethodLevel,
     NoiseLevel,
     PosesLevel,
-    Question,
     Robot,
-    Scores,
 )
-from loopcal.studies.specification.study import BLOCK, REPLICATES, Study, check_question
+from loopcal.studies.specification.study import BLOCK, Study, StudySettings, check_question
 
 LEVELS: Mapping[str, type] = {
     "instruments": InstrumentLevel,
@@ -64,36 +60,7 @@ LEVELS: Mapping[str, type] = {
 """Factor -> record of its levels."""
 
 
-MOST_TRIALS = 2000
-"""Largest number of trials of a block."""
-
-
-@dataclass(frozen=True)
-class StudySettings(Limited):
-    """The settings of a study file beside its factors.
-
-    Parameters
-    ----------
-    title : what the study is about. seed : of all random numbers, 0 or more.
-    replicates : trials of each cell. block : trials of a block, the unit of work; at most 2000, as
-        a block of a hexapod needs about half a megabyte of memory for each trial.
-    scores : what is computed of every trial. questions : name -> what the summary answers.
-    """
-
-    LIMITS: ClassVar[Mapping[str, Limit]] = {
-        "seed": whole_numbers(0, 2**63),
-        "replicates": whole_numbers(1, limits.REPLICATES.most),
-        "block": whole_numbers(1, MOST_TRIALS),
-    }
-    title: str
-    seed: int = 1
-    replicates: int = REPLICATES
-    block: int = BLOCK
-    scores: Scores = field(default_factory=Scores)
-    questions: dict[str, Question] = field(default_factory=dict)
-
-
-SETTINGS = ("title", "seed", "replicates", "block", "scores", "questions")
+SETTINGS = tuple(item.name for item in fields(StudySettings))
 QUICK = "quick"
 
 

@@ -518,31 +518,21 @@ def _write_parquet(study: Study, store: StudyStore, path: Path, progress: Progre
     parquet = import_optional("pyarrow.parquet", "tables", StudyError)
     names, count = tuple(study.levels), 0
     word = arrow.dictionary(arrow.int32(), arrow.string())
-    schema = arrow.schema(
-        [
-            *(arrow.field(name, word) for name in names),
-            arrow.field("trial", arrow.int64()),
-            *(
-                arrow.field(c.name, arrow.float64(), metadata={"unit": c.unit})
-                for c in study.columns
-            ),
-        ]
-    )
+    fields = [arrow.field(name, word) for name in names]
+    fields.append(arrow.field("trial", arrow.int64()))
+    fields += [
+        arrow.field(column.name, arrow.float64(), metadata={"unit": column.unit})
+        for column in study.columns
+    ]
+    schema = arrow.schema(fields)
     with parquet.ParquetWriter(path, schema) as writer:
         for cell in study.cells:
             progress(cell.number, len(study.cells), "writing trials")
-            tables = []
-            for first, scores in iterate_trials(study, store, cell):
-                rows = len(scores)
-                places = arrow.array([0] * rows, arrow.int32())
-                columns = [
-                    arrow.DictionaryArray.from_arrays(places, [cell.levels[name]]) for name in names
-                ]
-                columns.append(arrow.array(range(first, first + rows), arrow.int64()))
-                columns += [arrow.array(column) for column in scores.T.copy()]
-                tables.append(arrow.table(columns, schema=schema))
-            if tables:
-                table = arrow.concat_tables(tables).combine_chunks()
-                writer.write_table(table)
-                count += table.num_rows
+            if not (parts := list(iterate_trials(study, store, cell))):
+                continue
+            trials = np.concatenate([first + np.arange(len(scores)) for first, scores in parts])
+            scores = np.concatenate([scores for _, scores in parts])
+            levels = ([cell.levels[name]] * len(trials) for name in names)
+            writer.write_table(arrow.table([*levels, trials, *scores.T], schema=schema))
+            count += len(trials)
     return count

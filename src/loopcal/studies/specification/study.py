@@ -13,11 +13,13 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
+from loopcal.checks import Limit, Limited, whole_numbers
 from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.io.core import limits
 from loopcal.results.result import Result
 from loopcal.studies.specification.levels import (
     FACTORS,
@@ -222,23 +224,47 @@ BLOCK, REPLICATES = 50, 1000
 """Trials of a block, and of a cell, by default."""
 
 
+MOST_TRIALS = 2000
+"""Largest number of trials of a block."""
+
+
 @dataclass(frozen=True)
-class Study(Result):
+class StudySettings(Limited):
+    """The settings of a study file beside its factors.
+
+    Parameters
+    ----------
+    title : what the study is about. seed : of all random numbers, 0 or more.
+    replicates : trials of each cell. block : trials of a block, the unit of work; at most 2000, as
+        a block of a hexapod needs about half a megabyte of memory for each trial.
+    scores : what is computed of every trial. questions : name -> what the summary answers.
+    """
+
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "seed": whole_numbers(0, 2**63),
+        "replicates": whole_numbers(1, limits.REPLICATES.most),
+        "block": whole_numbers(1, MOST_TRIALS),
+    }
+    title: str
+    seed: int = 1
+    replicates: int = REPLICATES
+    block: int = BLOCK
+    scores: Scores = field(default_factory=Scores)
+    questions: dict[str, Question] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(StudySettings, Result):
     """The specification of a study; equal specifications give equal numbers.
 
     Parameters
     ----------
-    title, seed : of the study. replicates : trials of each cell. block : trials of a block.
+    title, seed, replicates, block, scores, questions : see `StudySettings`.
     robots, instruments, noise, poses, errors, methods, effects : name of a level -> level.
     order : names of the factors, in the order of the file; the last one varies fastest.
-    scores : what is computed of every trial. questions : name -> what the summary answers.
     """
 
-    title: str
     robots: Mapping[str, Robot]
-    seed: int = 1
-    replicates: int = REPLICATES
-    block: int = BLOCK
     instruments: Mapping[str, InstrumentLevel] = field(
         default_factory=lambda: {"pose": InstrumentLevel()}
     )
@@ -248,8 +274,6 @@ class Study(Result):
     methods: Mapping[str, MethodLevel] = field(default_factory=lambda: {"auto": MethodLevel()})
     effects: Mapping[str, EffectsLevel] = field(default_factory=lambda: {"none": EffectsLevel()})
     order: tuple[str, ...] = ("robot",)
-    scores: Scores = field(default_factory=Scores)
-    questions: Mapping[str, Question] = field(default_factory=dict)
 
     def _repr_html_(self) -> str:
         """Return title, size and factors as HTML."""
