@@ -15,7 +15,7 @@ from loopcal.io.runs.run_folder import (
     read_run_folder,
     write_run_folder,
 )
-from loopcal.io.runs.run_result import FIT, LATER
+from loopcal.io.runs.run_result import FORMS, GROUPS
 
 RESULT = {
     "format": 2,
@@ -29,10 +29,11 @@ RESULT = {
 """The least that result.json of a run states."""
 
 SIZES = {"p": 1, "a": 1, "u": 0, "s": 1, "c": 1}
-TYPES = {"f": "f8", "b": "?", "U": "U1", "i": "i8"}
+TYPES = {"finite": "f8", "number": "f8", "logical": "?", "text": "U1", "whole": "i8"}
 ARRAYS = {
-    name: np.ones([SIZES[size] for size in rule.sizes.split()]).astype(TYPES[rule.values.types])
-    for name, rule in {**FIT, **LATER}.items()
+    name: np.ones([SIZES[size] for size in form.split()[1:]]).astype(TYPES[form.split()[0]])
+    for name, form in FORMS.items()
+    if not name.startswith(GROUPS)
 }
 ARRAYS["posterior_part"] = np.zeros(1, dtype=int)
 """The arrays of a run with one parameter."""

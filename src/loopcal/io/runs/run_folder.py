@@ -330,7 +330,7 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     """Return the contents of result.json and arrays.npz of a run folder.
 
     FileError : not a run folder, made by a newer loopcal, or damaged; with the file and what is
-        wrong in it. What loopcal reads back is declared in `run_result` and `run_arrays`.
+        wrong in it. What loopcal reads back is declared in `run_result`.
     """
     path = as_path(path, "run folder")
     if not (path / RESULT).is_file():

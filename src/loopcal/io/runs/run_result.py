@@ -14,12 +14,12 @@ import re
 import struct
 import tokenize
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import astuple, make_dataclass
 from functools import cache
 from pathlib import Path
 from types import GenericAlias
-from typing import Any, BinaryIO, Literal, NamedTuple
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
@@ -283,110 +283,71 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarra
 
 # What loopcal reads back from the arrays.npz of a run: the declared form of its arrays.
 
-Test = Callable[[np.ndarray], Any]
-
-
-class Values(NamedTuple):
-    """What the entries of an array may be: letters of their types of numpy, words, and a test."""
-
-    types: str
-    words: str
-    test: Test = np.ones_like
-
-
-FINITE = Values("f", "finite numbers", np.isfinite)
-POSITIVE = Values("f", "finite positive numbers", lambda v: np.isfinite(v) & (v > 0.0))
-NOT_NEGATIVE = Values("f", "numbers that are not negative", lambda v: ~(v < 0.0))
-NUMBERS = Values("f", "numbers of double precision")
-WHOLE = Values("i", "whole numbers that are not negative", lambda v: v >= 0)
-LOGICAL = Values("b", "true or false")
-
-
-def _is_text(array: np.ndarray) -> bool:
-    """Return whether all characters are some that UTF-8 can hold; numpy stores any four bytes."""
-    if array.dtype.itemsize == 0 or array.size == 0:
-        return True
-    codes = np.ascontiguousarray(array).view(np.uint32)
-    return bool(np.all((codes < 0xD800) | ((codes > 0xDFFF) & (codes < 0x110000))))
-
-
-TEXT = Values("U", "text", _is_text)
-
-
-class ArrayRule(NamedTuple):
-    """Form of an array: its sizes, in words, and its values."""
-
-    sizes: str
-    values: Values = FINITE
-
-
-FIT: Mapping[str, ArrayRule] = {
-    "nominal": ArrayRule("p"),
-    "estimate": ArrayRule("p"),
-    "sd": ArrayRule("p", NOT_NEGATIVE),
+FORMS: Mapping[str, str] = {
+    "nominal": "finite p",
+    "estimate": "finite p",
+    "sd": "number p",
+    "covariance": "number p p",
+    "initial": "finite a",
+    "local_estimate": "finite u",
+    "local_start": "finite u",
+    "local_sd": "number u",
+    "local_slope": "finite u p",
+    "local_root": "finite u u",
+    "posterior_unit": "finite p",
+    "posterior_directions": "finite p p",
+    "posterior_variance": "number p",
+    "posterior_seen": "logical p",
+    "posterior_source": "text s",
+    "posterior_degrees": "number s",
+    "posterior_root": "number p c",
+    "posterior_part": "whole c",
+    "frames_unfixed": "finite 12 motions",
+    "frames_readings": "finite poses actuators",
+    "frames_names": "text i",
+    "frames_T": "finite i 4 4",
+    "frames_by_parameters": "finite i 6 p",
+    "frames_own": "finite i 6 6",
+    "discrepancy_root": "finite p 6k",
+    "discrepancy_degrees": "number 2",
+    "discrepancy_directions": "finite p p",
+    "discrepancy_variance": "number p",
+    "discrepancy_tool": "finite 3",
+    "discrepancy_rotation": "finite 3 3",
+    "discrepancy_origin": "finite 6",
+    "discrepancy_length": "number 6",
+    "discrepancy_centers": "finite k 6",
+    "discrepancy_whitening": "finite k k",
+    "discrepancy_amplitude": "number 6",
+    "posterior_shown_noise": "number 3",
+    "information_rows": "finite d p",
+    "information_deviations": "finite d",
+    "information_noise": "number 2",
+    "heights_poses": "text h",
+    "heights_points": "finite h 2",
+    "heights_before": "finite h",
+    "heights_after": "finite h",
+    "heights_held_out": "logical h",
 }
-LATER: Mapping[str, ArrayRule] = {
-    "covariance": ArrayRule("p p", NUMBERS),
-    "initial": ArrayRule("a"),
-    "local_estimate": ArrayRule("u"),
-    "local_start": ArrayRule("u"),
-    "local_sd": ArrayRule("u", NOT_NEGATIVE),
-    "local_slope": ArrayRule("u p"),
-    "local_root": ArrayRule("u u"),
-    "posterior_unit": ArrayRule("p", POSITIVE),
-    "posterior_directions": ArrayRule("p p"),
-    "posterior_variance": ArrayRule("p", NOT_NEGATIVE),
-    "posterior_seen": ArrayRule("p", LOGICAL),
-    "posterior_source": ArrayRule("s", TEXT),
-    "posterior_degrees": ArrayRule("s", NOT_NEGATIVE),
-    "posterior_root": ArrayRule("p c", NUMBERS),
-    "posterior_part": ArrayRule("c", WHOLE),
-}
-FRAMES: Mapping[str, ArrayRule] = {
-    "frames_unfixed": ArrayRule("12 motions"),
-    "frames_readings": ArrayRule("poses actuators"),
-    "frames_names": ArrayRule("i", TEXT),
-    "frames_T": ArrayRule("i 4 4"),
-    "frames_by_parameters": ArrayRule("i 6 columns"),
-    "frames_own": ArrayRule("i 6 6"),
-}
-DISCREPANCY: Mapping[str, ArrayRule] = {
-    "discrepancy_root": ArrayRule("p m"),
-    "discrepancy_degrees": ArrayRule("2", NOT_NEGATIVE),
-    "discrepancy_directions": ArrayRule("p p"),
-    "discrepancy_variance": ArrayRule("p", NOT_NEGATIVE),
-    "discrepancy_tool": ArrayRule("3"),
-    "discrepancy_rotation": ArrayRule("3 3"),
-    "discrepancy_origin": ArrayRule("6"),
-    "discrepancy_length": ArrayRule("6", NOT_NEGATIVE),
-    "discrepancy_centers": ArrayRule("k 6"),
-    "discrepancy_whitening": ArrayRule("k k"),
-    "discrepancy_amplitude": ArrayRule("6", NOT_NEGATIVE),
-}
-NOISE: Mapping[str, ArrayRule] = {"posterior_shown_noise": ArrayRule("3", NUMBERS)}
-INFORMATION: Mapping[str, ArrayRule] = {
-    "information_rows": ArrayRule("d p"),
-    "information_deviations": ArrayRule("d"),
-    "information_noise": ArrayRule("2", NUMBERS),
-}
-HEIGHTS: Mapping[str, ArrayRule] = {
-    "heights_poses": ArrayRule("h", TEXT),
-    "heights_points": ArrayRule("h 2"),
-    "heights_before": ArrayRule("h"),
-    "heights_after": ArrayRule("h"),
-    "heights_held_out": ArrayRule("h", LOGICAL),
-}
-FITTED = ArrayRule("rows values", NUMBERS)
-"""Rules of arrays by name. Runs of format 1 may lack LATER; of the other groups, a run holds all
-arrays or none. `fitted_<number>_<kind>` are the fitted rows, one array for each kind.
+"""Arrays by name: what each entry is, and the sizes of the axes; a letter is the same size in all
+arrays.
 """
+FITTED = "number rows values"
+"""Form of the fitted rows of a kind, `fitted_<number>_<kind>`."""
 
-RULES = {**FIT, **LATER, **FRAMES, **DISCREPANCY, **NOISE, **INFORMATION, **HEIGHTS}
+FIRST = ("nominal", "estimate", "sd")
+"""Arrays of every run; runs of format 1 may lack the others."""
+
+GROUPS = ("frames_", "discrepancy_", "information_", "heights_", "posterior_shown_")
+"""Beginnings of names of which a run has all arrays or none."""
+
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
+TYPES = {"finite": "f", "number": "f", "whole": "i", "logical": "b", "text": "U"}
+"""Word for an entry -> letter of its type in NumPy."""
 
 
 def read_run_arrays(path: Path, digest: str | None) -> dict[str, np.ndarray]:
-    """Return the arrays of a run by name, of which `RULES` are checked; FileError names the array.
+    """Return the arrays of a run by name; FileError for damage, or an array of another form.
 
     `digest` is the SHA-256 of arrays.npz that result.json states; None in format 1.
     """
@@ -402,69 +363,54 @@ def read_run_arrays(path: Path, digest: str | None) -> dict[str, np.ndarray]:
 
 
 def find_problem(arrays: Mapping[str, np.ndarray], is_complete: bool = True) -> str | None:
-    """Return what is wrong with the arrays of a run; None where nothing is.
+    """Return which array is missing or has another form, so that none of another version of
+    loopcal is computed with; None where all have theirs.
 
-    arrays : name -> array. is_complete : whether LATER are needed, as from format 2 on.
+    arrays : name -> array. is_complete : False for format 1.
     """
-    needed = [*FIT, *(LATER if is_complete else ())]
-    for group in (FRAMES, DISCREPANCY, NOISE, INFORMATION, HEIGHTS):
-        needed += group if any(name in arrays for name in group) else ()
-    if missing := [name for name in needed if name not in arrays]:
-        return f"the array {missing[0]!r} is missing"
-    sizes: dict[str, tuple[int, str]] = {}
-    for name, rule in RULES.items():
-        if name in arrays and (problem := _find_misfit(name, arrays[name], rule, sizes)):
-            return problem
-    for name in (name for name in arrays if name.startswith("fitted_")):
-        if FITTED_NAME.fullmatch(name) is None:
-            return f"the array {name!r} is unknown"
-        if problem := _find_misfit(name, arrays[name], FITTED, {}):
-            return problem
-        if not np.isfinite(arrays[name]).any(axis=1).all():
-            return f"a row of the array {name!r} holds no number"
-    return _find_array_contradiction(arrays)
-
-
-def _find_misfit(
-    name: str, array: np.ndarray, rule: ArrayRule, sizes: dict[str, tuple[int, str]]
-) -> str | None:
-    """Return how an array breaks its rule; None where it does not.
-
-    `sizes` are the numbers that letters stand for, with the array that showed each; the array adds
-    its own.
-    """
-    expected = rule.sizes.split()
-    if array.ndim != len(expected):
-        return f"the array {name!r} has {array.ndim} axes, but {len(expected)} are needed"
-    for size, symbol in zip(array.shape, expected, strict=True):
-        known, source = (int(symbol), "") if symbol.isdigit() else sizes.get(symbol, (size, ""))
-        if size != known:
-            by = f", as in {source!r}" if source else ""
-            return f"the array {name!r} has {size} entries on an axis, but {known} are needed{by}"
-        if len(symbol) == 1 and not symbol.isdigit():
-            sizes.setdefault(symbol, (size, name))
-    values = rule.values
-    if array.dtype.kind not in values.types or (values.types == "f" and array.dtype != float):
-        return f"the array {name!r} holds {array.dtype}, but {values.words} are needed"
-    if not np.all(values.test(array)):
-        return f"the array {name!r} holds something else than {values.words}"
+    present = tuple(group for group in GROUPS if any(name.startswith(group) for name in arrays))
+    for name in (name for name in FORMS if name not in arrays):
+        is_needed = name.startswith(present) if name.startswith(GROUPS) else is_complete
+        if is_needed or name in FIRST:
+            return f"the array {name!r} is missing"
+    fitted = {name: FITTED for name in arrays if name.startswith("fitted_")}
+    if unknown := [name for name in fitted if not FITTED_NAME.fullmatch(name)]:
+        return f"the array {unknown[0]!r} is unknown"
+    sizes: dict[str, int] = {}
+    for name, form in {**FORMS, **fitted}.items():
+        if name in arrays and not _has_form(arrays[name], form, sizes):
+            shape = " x ".join(map(str, arrays[name].shape)) or "one"
+            stated = f"{shape} of {arrays[name].dtype}"
+            return f"the array {name!r} ({stated}) has another form than {form!r}"
     return None
 
 
-def _find_array_contradiction(arrays: Mapping[str, np.ndarray]) -> str | None:
-    """Return which arrays of the right form cannot belong together; None where all can."""
-    part, source = arrays.get("posterior_part"), arrays.get("posterior_source")
-    if part is not None and source is not None and (part >= len(source)).any():
-        return "the array 'posterior_part' counts more sources than 'posterior_source'"
-    names = arrays.get("frames_names")
-    if names is not None and len(set(names.tolist())) < len(names):
-        return "the array 'frames_names' names an instrument twice"
-    if names is not None and len(names):
-        columns, p = arrays["frames_by_parameters"].shape[2], len(arrays["estimate"])
-        if columns != p:
-            return f"the array 'frames_by_parameters' has {columns} columns, but {p} are needed"
-    if "discrepancy_root" in arrays:
-        m, k = arrays["discrepancy_root"].shape[1], len(arrays["discrepancy_centers"])
-        if m != 6 * k:
-            return f"the array 'discrepancy_root' has {m} columns, but {6 * k} are needed"
-    return None
+def _has_form(array: np.ndarray, form: str, sizes: dict[str, int]) -> bool:
+    """Return whether an array has a form; `sizes` are those of letters, to which it adds its own.
+
+    Of an array without entries, only the first axis counts.
+    """
+    word, *axes = form.split()
+    if array.ndim != len(axes) or array.dtype.kind != TYPES[word]:
+        return False
+    if word == "text" and not _is_text(array):
+        return False
+    if array.dtype.kind == "f" and array.dtype != float:
+        return False
+    if word == "finite" and not np.isfinite(array).all():
+        return False
+    for size, axis in zip(array.shape, axes if array.size else axes[:1], strict=False):
+        if (match := re.fullmatch(r"(\d*)([a-z]?)", axis)) is None:
+            continue  # a word is any size
+        factor = int(match[1] or 1)
+        if size != factor * (sizes.setdefault(match[2], size // factor) if match[2] else 1):
+            return False
+    return True
+
+
+def _is_text(array: np.ndarray) -> bool:
+    """Return whether all characters are some that UTF-8 can hold; NumPy stores any four bytes."""
+    if array.dtype.itemsize == 0 or array.size == 0:
+        return True
+    codes = np.ascontiguousarray(array).view(np.uint32)
+    return bool(np.all((codes < 0xD800) | ((codes > 0xDFFF) & (codes < 0x110000))))
