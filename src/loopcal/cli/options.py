@@ -226,7 +226,8 @@ LENGTH, POSITIVE_LENGTH = (_quantity(Dimension.LENGTH, positive) for positive in
 ANGLE, POSITIVE_ANGLE = (_quantity(Dimension.ANGLE, positive) for positive in (False, True))
 GOAL = Parsed("quantity", _parse_goal)
 POSE_SHARE = Parsed("share", _parse_pose_share)
-OPEN_SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
+SHARE, OPEN_SHARE = (click.FloatRange(0, 1, is_open, is_open) for is_open in (False, True))
+SHARE.name = OPEN_SHARE.name = "share"
 
 
 class Count(click.IntRange):
@@ -238,6 +239,10 @@ class Count(click.IntRange):
     def __init__(self, limit: str, least: int | None = None) -> None:
         super().__init__(min=least)
         self.limit = limit
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """Return the word for a value in the help."""
+        return "N"
 
     def _describe_range(self) -> str:
         """Return the range for the help: click states one without a bound as "x<=None"."""
@@ -491,10 +496,7 @@ def read_fitted_measurements(
 _FIT = "loopcal.estimate.options:FitOptions"
 
 RANK_TOLERANCE: Any = option(
-    "Share of the largest singular value below which one counts as zero.",
-    of=_FIT,
-    type=OPEN_SHARE,
-    metavar="SHARE",
+    "Share of the largest singular value below which one counts as zero.", of=_FIT, type=OPEN_SHARE
 )
 
 
@@ -554,8 +556,7 @@ FIT: Any = Group(
         "Relative standard uncertainty of given sigmas, which the intervals account for; 0 "
         "takes them as exact.",
         of=_FIT,
-        type=click.FloatRange(0, 1),
-        metavar="SHARE",
+        type=SHARE,
     ),
     loss=option(
         "Reduce the weight of poses that are far from the fit.",
@@ -618,7 +619,6 @@ DRAW: Any = option(
     "Number of poses to draw evenly from the workspace where no poses are given.",
     of=f"{SIMULATION}:DRAWN",
     type=Count("DRAWN_POSES", 1),
-    metavar="N",
 )
 
 DISTRIBUTION: Any = option(

@@ -31,7 +31,6 @@ def calibrate(
         "0.25. The poses are those of data.split(hold_out=SHARE, seed=SEED) in Python.",
         of="loopcal.apply.calibration_options:CalibrationOptions",
         type=opt.POSE_SHARE,
-        metavar="SHARE",
     ),
     fit: lc.FitOptions = opt.FIT,
     choose_model: bool = opt.flag(
@@ -437,7 +436,6 @@ def regularize(
         "Number of folds of poses where frames, targets or surfaces are unknown.",
         of=REGULARIZATION,
         type=opt.Count("FOLDS", 2),
-        metavar="N",
     ),
     drop: tuple[str, ...] = opt.option(
         "Exclude this pose. May be given several times.", multiple=True, metavar="POSE"

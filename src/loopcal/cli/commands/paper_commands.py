@@ -32,10 +32,7 @@ def reproduce(
     ),
     seed: int = opt.option("Seed of all random choices.", of=RUN, type=int, metavar="N"),
     trials: int = opt.option(
-        "Number of trials behind each statistical number.",
-        of=RUN,
-        type=opt.Count("TRIALS"),
-        metavar="N",
+        "Number of trials behind each statistical number.", of=RUN, type=opt.Count("TRIALS")
     ),
     force: bool = opt.flag("Replace an earlier result in FOLDER."),
 ) -> Output:
@@ -89,7 +86,6 @@ def per_leg(
         "Gauss-Newton steps.",
         of="loopcal.studies.simulation.published_steps:identify_per_leg",
         type=opt.Count("STEPS", 1),
-        metavar="N",
     ),
     output: Path | None = opt.path("Robot file to write, with the identified values.", "-o"),
     force: bool = opt.force("the output file"),

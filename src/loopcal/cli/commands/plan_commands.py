@@ -46,7 +46,6 @@ def plan(
     poses: int | None = opt.option(
         lambda: f"Number of poses for the calibration.  [default: {opt.look_up(POSES)}]",
         type=opt.Count("PLANNED_POSES"),
-        metavar="N",
     ),
     accuracy: tuple[float, Literal["position", "orientation"]] | None = opt.option(
         "Instead of --poses: expected error to reach, such as 20um or 10urad.", type=opt.GOAL
@@ -61,7 +60,6 @@ def plan(
         "Number of further poses for validation, drawn evenly.  "
         "[default: one for four, at least 5]",
         type=opt.Count("PLANNED_POSES"),
-        metavar="N",
     ),
     like: Path | None = opt.data_option("Measurement file whose settings describe the instrument."),
     unknown: dict[str, Any] = opt.UNKNOWN,
@@ -70,13 +68,11 @@ def plan(
         "With --measure plane-line: number of planes with a line.",
         of=SURFACES,
         type=opt.Count("GROUPS"),
-        metavar="N",
     ),
     points: int = opt.option(
         "With --measure plane-line: number of points on each.",
         of=SURFACES,
         type=opt.Count("POINTS"),
-        metavar="N",
     ),
     allowed: Path | None = opt.path(
         "Poses to choose from; by default drawn from the workspace.", metavar="CSV"
@@ -90,7 +86,6 @@ def plan(
         "--candidates",
         of=OPTIONS,
         type=opt.Count("CANDIDATES", 10),
-        metavar="N",
     ),
     curve: bool = opt.flag("Also compute the expected errors by the number of poses."),
     frame: str = opt.frame(OPTIONS, "fitted, base, or relative (to home)"),

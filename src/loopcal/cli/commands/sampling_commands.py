@@ -23,10 +23,7 @@ BOOTSTRAP = "loopcal.diagnose.bootstrap"
 
 SOURCE: Any = opt.argument("RUN|ROBOT")
 LEVEL: Any = opt.option(
-    "Coverage of the intervals.",
-    of=f"{BOOTSTRAP}:Bootstrap.intervals",
-    type=opt.OPEN_SHARE,
-    metavar="SHARE",
+    "Coverage of the intervals.", of=f"{BOOTSTRAP}:Bootstrap.intervals", type=opt.OPEN_SHARE
 )
 FIT_NAMES = (*opt.FIT.members, *opt.ALLOWED.members)
 DRAWS: Any = opt.path("CSV file for the draws, one row each.", "-o", metavar="CSV")
@@ -64,10 +61,7 @@ def bootstrap(
     source: str = SOURCE,
     data: tuple[Path, ...] = opt.data("[DATA...]", required=False),
     count: int = opt.option(
-        "Number of resamples.",
-        of=f"{BOOTSTRAP}:bootstrap",
-        type=opt.Count("RESAMPLES", 2),
-        metavar="N",
+        "Number of resamples.", of=f"{BOOTSTRAP}:bootstrap", type=opt.Count("RESAMPLES", 2)
     ),
     scheme: Any = opt.option(
         "wild: errors of each block times a random factor. pairs: blocks drawn with replacement. "
@@ -127,7 +121,6 @@ def sample(
         "Number of draws.",
         of="loopcal.diagnose.posterior_sample:sample_posterior",
         type=opt.Count("DRAWS", 100),
-        metavar="N",
     ),
     region: bool = opt.flag(
         "Instead of drawing, show linear intervals that hold for several parameters at once; "

@@ -60,9 +60,7 @@ QUICK: Any = opt.flag("Use the quick tier of STUDY, which takes seconds.")
 WORK: Any = opt.Group(
     _choose_work,
     workers=opt.option(
-        "Processes that compute.  [default: the number of processors]",
-        type=opt.Count("WORKERS", 1),
-        metavar="N",
+        "Processes that compute.  [default: the number of processors]", type=opt.Count("WORKERS", 1)
     ),
     dask=opt.option("Use a dask cluster, by the address of its scheduler.", metavar="ADDRESS"),
     ray=opt.flag("Use the ray cluster of the variable RAY_ADDRESS, or one that is started here."),
@@ -227,7 +225,7 @@ def run(
 def extend(
     folder: Path = FOLDER,
     replicates: int = opt.option(
-        "Trials of a cell.", type=opt.Count("REPLICATES", 1), required=True, metavar="N"
+        "Trials of a cell.", type=opt.Count("REPLICATES", 1), required=True
     ),
     work: tuple[Executor, Share] = WORK,
 ) -> Output:
@@ -308,10 +306,7 @@ def ask(
         "Of the score, with its unit, such as 10um.", required=True, metavar="LIMIT"
     ),
     share: float = opt.option(
-        "Share of the machines that stay within the limit.",
-        type=opt.OPEN_SHARE,
-        default=0.95,
-        metavar="SHARE",
+        "Share of the machines that stay within the limit.", type=opt.OPEN_SHARE, default=0.95
     ),
 ) -> Output:
     """Find the smallest or largest level of a factor that reaches a limit on a share of machines.
