@@ -29,7 +29,7 @@ from loopcal.diagnose.error_frames import (
     ErrorFrame,
     choose_error_frame,
     fit_unfixed_frames,
-    list_error_twists,
+    linearize_tool_errors,
     solve_home,
 )
 from loopcal.diagnose.fit_examination import ROUNDING
@@ -53,7 +53,6 @@ from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions
-from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import resolve_poses
@@ -227,34 +226,25 @@ def _compute_covariance(
 
     H (n, 6, 6) takes twists in base axes to the wanted point and axes.
     """
-    robot = posterior.robot
-    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
-    p = len(posterior.unit)
-    D = list_error_twists(posterior, solution.T, S.parameters[0][:, :, posterior.places])
-    size = np.linalg.norm(D[..., :p] * twist_weights(robot)[:, None], axis=(1, 2))
-    D, by_discrepancy = np.split(H @ frame.relate(D, solution.T), [p], axis=2)
-    of_frame = H @ frame.own_errors(solution.T)
-    rest, squares = [of_frame, by_discrepancy], []
+    errors, squares = linearize_tool_errors(posterior, solution, frame, H), []
     if (slow := posterior.discrepancy) is not None:
-        rest.append(H @ slow.errors.rest(solution.T))
-        squares += slow.split_squares(by_discrepancy)
+        squares += slow.split_squares(errors.by_discrepancy[..., :-6])
         posterior = posterior.without_discrepancy
-    if robot.stated_sigma.any():
-        rest.append(H @ (S.readings[0] * robot.stated_sigma))
+    D, others = errors.by_parameters, (errors.by_frame, errors.by_discrepancy, errors.by_readings)
     covariance = combine_errors(
-        robot,
+        posterior.robot,
         D[None],
         posterior.directions[None],
         posterior.variance[None],
-        size[None],
-        tuple(part[None] for part in rest),
+        errors.size[None],
+        tuple(part[None] for part in others),
     )[0]
     covariance[~solution.converged] = np.nan
     # variances (n, 6) and degrees of freedom of the parts
     for part in posterior.parts:
         square = ((D @ (part.root / posterior.unit[:, None])) ** 2).sum(axis=2)
         if part.source == NOISE:  # errors of the frame itself count as noise
-            square += (of_frame**2).sum(axis=2)
+            square += (errors.by_frame**2).sum(axis=2)
         squares.append((square, part.degrees))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     position, orientation = (

@@ -337,36 +337,48 @@ MOST_POSES = 1000
 class ToolErrors(NamedTuple):
     """Twists (n, 6, ..) of the tool point in a frame: by the parameters in the units of the
     posterior without its discrepancy, by independent errors of the frame itself, by the readings in
-    their sigmas, and by independent errors of the model discrepancy.
+    their sigmas, and by independent errors of the model discrepancy, the last 6 of which are of
+    each pose alone.
     """
 
     by_parameters: FloatArray
     by_frame: FloatArray
     by_readings: FloatArray
     by_discrepancy: FloatArray
+    # (n,) of the effect of all parameters on the platform in the base frame, rotations times the
+    # robot's size
+    size: FloatArray
     reference: Finding
 
 
-def linearize_tool_errors(posterior: Posterior, solution: Solution, frame: str) -> ToolErrors:
+def linearize_tool_errors(
+    posterior: Posterior, solution: Solution, frame: str | ErrorFrame, H: FloatArray | None = None
+) -> ToolErrors:
     """Return the derivatives of the errors of the tool at poses that the robot reaches, and the
-    frame in words. `frame` : see `choose_error_frame`; "relative" means relative to the home pose.
+    frame in words.
+
+    frame : or its name, see `choose_error_frame`; "relative" means relative to the home pose.
+    H : (n, 6, 6) from twists of the platform origin in base axes to those of another point or of
+        other axes; default: to those of the tool.
     """
     robot = posterior.robot
-    chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")
+    if isinstance(frame, str):
+        frame = choose_error_frame(posterior, frame, solve_home(robot), "home")
     S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
     D = list_error_twists(posterior, solution.T, S.parameters[0][..., posterior.places])
-    H = geometry.transport_matrix(solution.T[:, :3, :3] @ robot.tool[:3, 3])
-    p, by_errors = len(posterior.unit), H @ chosen.relate(D, solution.T)
+    H = geometry.transport_matrix(solution.T[:, :3, :3] @ robot.tool[:3, 3]) if H is None else H
+    p, by_errors = len(posterior.unit), H @ frame.relate(D, solution.T)
     by_discrepancy = by_errors[..., p:]
     if posterior.discrepancy is not None:
         rest = H @ posterior.discrepancy.errors.rest(solution.T)
         by_discrepancy = np.concatenate([by_discrepancy, rest], axis=2)
     return ToolErrors(
         by_errors[..., :p],
-        H @ chosen.own_errors(solution.T),
+        H @ frame.own_errors(solution.T),
         H @ (S.readings[0] * robot.stated_sigma),
         by_discrepancy,
-        chosen.describe(axes=""),
+        np.linalg.norm(D[..., :p] * twist_weights(robot)[:, None], axis=(1, 2)),
+        frame.describe(axes=""),
     )
 
 
