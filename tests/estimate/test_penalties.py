@@ -34,7 +34,7 @@ def estimate(rows: np.ndarray, method) -> np.ndarray:
     d = decompose(
         fold_rows(rows),
         np.full(len(rows), rows.shape[1]),
-        scale=method.scale(P),
+        root=method.root(P),
         unpenalized=method.unpenalized(P),
     )
     return d.deviation(d.solution(method.penalty(d)))
@@ -71,7 +71,7 @@ def test_parameter_with_lambda_zero_is_unpenalized(rows):
     lam = np.array([1.0, 0.0, 20.0, 3.0, 0.0, 5.0])
     method = Ridge(tuple(lam))
     d = decompose(
-        fold_rows(rows), np.full(T, M), scale=method.scale(P), unpenalized=method.unpenalized(P)
+        fold_rows(rows), np.full(T, M), root=method.root(P), unpenalized=method.unpenalized(P)
     )
     penalty = method.penalty(d)
     np.testing.assert_allclose(
@@ -223,7 +223,7 @@ def test_rules_choose_for_each_trial_separately(rows):
         (lambda: MAP(0.0), "finite factor above 0"),
         (lambda: Ridge(float("nan")), "finite number >= 0"),
         (lambda: TruncatedSVD(-1), "integer >= 0"),
-        (lambda: Ridge((1.0, 2.0)).scale(3), "2 values of lam for 3"),
+        (lambda: Ridge((1.0, 2.0)).root(3), "2 values of lam for 3"),
     ],
 )
 def test_invalid_method_settings_are_refused(make, words):

@@ -251,7 +251,7 @@ def _propagate(
     estimated has its tolerance. The penalty P is that of the fit times a weight.
     """
     used, noise = linear.is_estimated, float(np.sqrt(linear.sources.noise))
-    to_z = linear.decomposition.basis[0]
+    to_z = linear.decomposition.directions[0]
     penalty = np.diag(np.sqrt(weight * np.where(used, linear.penalty[0], 1.0)))
     spread = np.where(used, linear.spread, 1.0)
     own = [factor[:, U:] @ to_z * used for factor in factors]

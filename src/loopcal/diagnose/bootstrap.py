@@ -163,7 +163,7 @@ def compute_block_errors(
     """
     values = list_observed_values(linear, clusters)
     used = linear.is_estimated
-    V = linear.decomposition.basis[0][:, used] / np.sqrt(linear.information[used])
+    V = linear.decomposition.directions[0][:, used] / np.sqrt(linear.information[used])
     residual, error = values.residual.copy(), np.zeros(len(values.block))
     untested = []
     for g in range(clusters.count):

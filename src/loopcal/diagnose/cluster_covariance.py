@@ -248,7 +248,7 @@ def compute_robust_spread(linear: FitLinearization, clusters: Clusters) -> Robus
     """
     clusters, times = choose_clusters(clusters)
     p, used = linear.problem.parameters, linear.is_estimated
-    V, total = linear.decomposition.basis[0][:, used], linear.information[used]
+    V, total = linear.decomposition.directions[0][:, used], linear.information[used]
     sd = np.sqrt(linear.variance[used])
     sigma = linear.fit.residual_test.sigma_scale
     setup = 0 if linear.problem.nuisance is None else len(linear.problem.nuisance)

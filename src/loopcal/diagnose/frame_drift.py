@@ -272,11 +272,11 @@ def _solve(A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, float]
     factor = engine.fold(empty_factor(1, A.shape[1]), rows[None])
     length = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(length > 0.0, length, 1.0)
-    decomposition = decompose(factor, np.array([len(A)]), scale=scale, tolerance=RANK)
+    decomposition = decompose(factor, np.array([len(A)]), root=np.diag(scale), tolerance=RANK)
     used = decomposition.used
     penalty = np.where(used, 0.0, np.inf)
     values = decomposition.deviation(decomposition.solution(penalty))[0]
-    root = scale[:, None] * decomposition.noise_roots(penalty)[0][:, used[0]]
+    root = decomposition.noise_roots(penalty)[0][:, used[0]]
     return values, root, float(decomposition.remaining(penalty)[0])
 
 

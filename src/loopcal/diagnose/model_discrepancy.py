@@ -199,7 +199,7 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     extended = linearize_smooth_errors(linear, errors)
     d, m, used = linear.decomposition, errors.count, linear.decomposition.used[0]
     k = int(used.sum())
-    to_z = d.basis[0][:, used]
+    to_z = d.directions[0][:, used]
     penalty = np.where(np.isfinite(linear.penalty[0]), linear.penalty[0], 0.0)[used]
     prior = np.zeros((k, k + m + 1))
     prior[:, :k] = np.diag(np.sqrt(penalty))

@@ -95,12 +95,12 @@ def compute_influence(
     weight : (u,) weight of each block in the fits.
     solution : poses and nuisance parameters of the rows, see `Problem.leverage_rows`.
     """
-    d, u, p = decomposition, len(weight), len(decomposition.scale)
+    d, u, p = decomposition, len(weight), decomposition.directions.shape[1]
     roots, changes = [], []
     for penalty, solved in fits:
         variance = d.variances(penalty)[0]
         sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
-        roots.append(d.basis[0] * sd)
+        roots.append(d.directions[0] * sd)
         changes.append((solved - linearization.deviation)[0])
     results = [make_empty_influence(u) for _ in fits]
     total = problem.poses.count_rows(member, u)

@@ -130,7 +130,7 @@ def describe_density(linear: FitLinearization) -> PosteriorDensity:
     used = np.where(np.isfinite(penalty), finite, np.inf)[None]
     variance = d.variances(used)[0]
     is_known = np.isfinite(variance)
-    root = d.basis[0][:, is_known] * np.sqrt(variance[is_known])
+    root = d.directions[0][:, is_known] * np.sqrt(variance[is_known])
     mean = d.deviation(d.solution(used))[0]
     setup_root, rank = np.zeros((0, 0)), 0
     nuisance = linear.linearization.nuisance

@@ -136,7 +136,7 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     rows, kind, row, column = rows[order], kind[order], row[order], column[order]
     d, p = linear.decomposition, len(linear.fit.names)
     used, determined = linear.is_estimated, d.used[0]
-    by_direction = rows[:, -p - 1 : -1] @ d.basis[0]
+    by_direction = rows[:, -p - 1 : -1] @ d.directions[0]
     machine = by_direction[:, determined] / d.singular_values[0][determined]
     basis = span_columns(np.concatenate([rows[:, : -p - 1], machine], axis=1))
     residual = rows[:, -1] - basis @ (basis.T @ rows[:, -1])
@@ -144,7 +144,7 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
         basis=basis,
         residual=residual,
         gain=by_direction[:, used] / linear.information[used],
-        root=linear.fit.tolerance[:, None] * d.basis[0][:, used],
+        root=linear.fit.tolerance[:, None] * d.directions[0][:, used],
         kind=kind,
         row=row,
         column=column,

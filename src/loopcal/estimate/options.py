@@ -35,7 +35,7 @@ Noise = Literal["given", "estimated"]
 Begin = Literal["kinematics", "closure"]
 """What is linearized first: the predicted poses, or the loop closure at the measured poses."""
 
-METHOD_PARTS = ("required_equations", "unpenalized", "scale", "penalty")
+METHOD_PARTS = ("required_equations", "unpenalized", "root", "penalty")
 """Attributes that make an object a method, see `loopcal.estimate.penalties.Method`."""
 
 

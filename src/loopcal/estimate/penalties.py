@@ -170,13 +170,9 @@ class Method(Protocol):
         """Return which parameters (p,) are never penalized; None where all are treated alike."""
         return None
 
-    def scale(self, parameters: int) -> FloatArray | None:
-        """Return factors (p,) for the tolerance-scaled columns; None for ones."""
-        return None
-
     def root(self, parameters: int) -> FloatArray | None:
-        """Return the root (p, p) of the correlation of the scaled columns; None where the method
-        takes them as independent.
+        """Return L (p, p) of z = L u, where the method penalizes u; None where it penalizes the
+        deviations z, in tolerances.
         """
         return None
 
@@ -310,11 +306,8 @@ class Ridge(Method):
             return np.array(self.lam) == 0.0
         return None
 
-    def scale(self, parameters: int) -> FloatArray | None:
-        """Return 1 / sqrt(lam) for one lam per parameter.
-
-        Penalty 1 on the rescaled deviation is lam on the original one.
-        """
+    def root(self, parameters: int) -> FloatArray | None:
+        """Return diag(1 / sqrt(lam)) for one lam per parameter: penalty 1 on u is lam on z."""
         if not isinstance(self.lam, tuple):
             return None
         if len(self.lam) != parameters:
@@ -323,7 +316,7 @@ class Ridge(Method):
                 "one value per parameter"
             )
         lam = np.asarray(self.lam)
-        return 1.0 / np.sqrt(np.where(lam > 0.0, lam, 1.0))
+        return np.diag(1.0 / np.sqrt(np.where(lam > 0.0, lam, 1.0)))
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return lam for every direction; with lam = 0 directions beyond the rank are not used."""
@@ -495,15 +488,7 @@ def decompose_for(
     the coordinates that a method penalizes.
     """
     p = deviation.shape[1]
-    return decompose(
-        factor,
-        equations,
-        deviation,
-        method.scale(p),
-        tolerance,
-        method.unpenalized(p),
-        method.root(p),
-    )
+    return decompose(factor, equations, deviation, tolerance, method.unpenalized(p), method.root(p))
 
 
 def make_default_method(inflation: By | Literal["none"] = "auto") -> Method | None:
@@ -604,12 +589,9 @@ def fix_penalty(method: Method, parameters: int) -> FloatArray | None:
         value = 1.0 / method.inflation**2
     else:
         return None
-    scale, root = method.scale(parameters), method.root(parameters)
-    unpenalized = method.unpenalized(parameters)
+    root, unpenalized = method.root(parameters), method.unpenalized(parameters)
     is_penalized = np.full(parameters, value > 0.0)
     if unpenalized is not None:
         is_penalized &= ~unpenalized
     matrix = np.sqrt(value) * np.eye(parameters)[is_penalized]
-    if root is not None:
-        matrix = np.linalg.solve(root.T, matrix.T).T
-    return matrix if scale is None else matrix / scale
+    return matrix if root is None else np.linalg.solve(root.T, matrix.T).T

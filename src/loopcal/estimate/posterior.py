@@ -149,8 +149,7 @@ def fold_information(
     """Return what the rows of trial 0 of a decomposition say, for this noise of a row."""
     d = decomposition.plain()
     is_used = d.used[0]
-    unit = free.tolerance * d.scale
-    rows = d.singular_values[0][is_used, None] * d.inverse[0][is_used] / unit
+    rows = d.singular_values[0][is_used, None] * d.inverse[0][is_used] / free.tolerance
     return DataInformation(rows, d.projections[0][is_used], variance, degrees)
 
 
@@ -419,12 +418,11 @@ def compute_posterior(
     `degrees` of freedom of the noise variance are infinite where it is known.
     """
     directions, variance, determined = decomposition.knowledge(penalty, *sources)
-    unit = tolerance * decomposition.scale
-    by_noise = unit[:, None] * decomposition.noise_roots(penalty, sources.noise)[0]
+    by_noise = tolerance[:, None] * decomposition.noise_roots(penalty, sources.noise)[0]
     return Posterior(
         robot=robot,
         places=places,
-        unit=unit,
+        unit=tolerance,
         directions=directions,
         variance=variance,
         determined=determined,

@@ -110,7 +110,7 @@ def predict(decomposition: Decomposition, factor: FloatArray) -> PredictedData:
     d = decomposition
     s = np.where(are_penalized(d), d.singular_values, 0.0)
     root = np.sqrt(1.0 + (factor[:, None] * s) ** 2)
-    rows = (s / root)[:, :, None] * d.inverse / d.scale
+    rows = (s / root)[:, :, None] * d.inverse
     score = np.matmul((d.projections / root)[:, None, :], rows)[:, 0]
     return PredictedData(np.matmul(rows.swapaxes(-1, -2), rows), score)
 
@@ -246,7 +246,9 @@ class ComponentSearch(NamedTuple):
     def _decompose(self, chosen: Mapping[int, float]) -> Decomposition:
         """Return the decomposition of the rows for the prior with the chosen components."""
         components = [replace(self.candidates[i], variance=v) for i, v in chosen.items()]
-        covariance = compute_prior_covariance(len(self.rows.scale), self.correlation, components)
+        covariance = compute_prior_covariance(
+            self.rows.directions.shape[1], self.correlation, components
+        )
         return restate(self.rows, covariance, self.unpenalized)
 
 
@@ -254,9 +256,9 @@ def restate(
     rows: Decomposition, covariance: FloatArray, unpenalized: np.ndarray | None
 ) -> Decomposition:
     """Return the decomposition of the same rows for a prior of another covariance (p, p)."""
-    p = len(rows.scale)
+    p = rows.directions.shape[1]
     factor = np.zeros((len(rows.rows), p + 1, p + 1))
-    factor[:, :p, :p] = rows.singular_values[:, :, None] * rows.inverse / rows.scale
+    factor[:, :p, :p] = rows.singular_values[:, :, None] * rows.inverse
     factor[:, :p, p] = rows.projections
     factor[:, p, p] = np.sqrt(rows.outside)
     return decompose(
@@ -440,7 +442,7 @@ def _estimate_factor_error(
     inverse = np.divide(1.0, penalty, out=np.zeros_like(penalty), where=penalty > 0.0)
     variance = inverse if prior is None else np.where(penalty > 0.0, prior, 0.0)
     left = (1.0 - d.filter_factors(penalty)) * np.sqrt(variance)
-    caused = d.scale[:, None] * d.directions[0] * left[0]
+    caused = d.directions[0] * left[0]
     return d.deviation(change * spread)[0], caused, spread
 
 
@@ -650,7 +652,7 @@ def _test_directions(free: FreeParameters, d: Decomposition) -> LargestDeviation
     testable = square / (1.0 + square) > TESTABLE
     values = np.where(testable, np.abs(d.projections[0]) / np.sqrt(1.0 + square), 0.0)
     worst = int(np.argmax(values))
-    part = np.where(free.assumed, 0.0, np.abs(d.scale * d.directions[0][:, worst]))
+    part = np.where(free.assumed, 0.0, np.abs(d.directions[0][:, worst]))
     order = np.argsort(-part)
     order = order[part[order] > MAIN_PART * part.max()]
     return _largest(values, testable, tuple(free.names[i] for i in order))
@@ -659,7 +661,7 @@ def _test_directions(free: FreeParameters, d: Decomposition) -> LargestDeviation
 def _test_parameters(free: FreeParameters, d: Decomposition) -> LargestDeviation:
     """Test the worst parameter (t = 1)."""
     square = np.where(are_penalized(d), d.singular_values**2, 0.0)[0]
-    basis = d.scale[:, None] * d.directions[0]
+    basis = d.directions[0]
     deviation = basis @ (np.sqrt(square) * d.projections[0] / (1.0 + square))
     variance = basis**2 @ (square / (1.0 + square))
     testable = (variance > TESTABLE) & ~free.assumed

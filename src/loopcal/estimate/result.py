@@ -885,14 +885,14 @@ def estimate_nuisance(
     begin = linearization.next_start.first_nuisance[0] if start is None else start
     units = [robot.get_unit(entry.dimension) for entry in table.entries]
     shown = tuple((unit.factor_to_si, unit.symbol) for unit in units)
-    U, p = len(table), len(decomposition.scale)
+    U, p = len(table), decomposition.directions.shape[1]
     if linearization.nuisance is None or not np.isfinite(linearization.cost[0]):
         estimate, nothing = linearization.next_start.nuisance[0].copy(), np.zeros(U)
         unobservable = np.zeros(U, dtype=bool)
         slope, root = np.zeros((U, p)), np.full((U, U), np.nan)
         return NuisanceEstimate(table, begin, estimate, nothing, slope, root, unobservable, shown)
     done, is_free = linearization.nuisance.elimination, nuisance.is_free
-    V = decomposition.scale[:, None] * decomposition.directions[0]
+    V = decomposition.directions[0]
     slope, is_unobservable = done.slope[0], done.is_unobservable[0]
     moved = slope[is_free] @ V
     unknown = np.isinf(variance)

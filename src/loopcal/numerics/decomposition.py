@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
@@ -54,18 +53,18 @@ def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) 
 
 @dataclass(frozen=True, eq=False)
 class Decomposition(TrialBatch):
-    """Singular value decomposition A diag(scale) = U diag(s) V' of folded rows [A | b].
+    """Singular value decomposition A = U diag(s) V' of folded rows [A | b].
 
-    A deviation z has the coordinates y = V' (z / scale); in them the least-squares sum is sum (s_i
-    y_i - c_i)^2 plus the part outside the range. A `penalty` (t, p) adds penalty_i y_i^2: zero for
-    plain least squares, infinite where a direction is not used at all. Its filter factors are f_i =
-    s_i^2 / (s_i^2 + penalty_i).
+    A deviation z has the coordinates y = V' z; in them the least-squares sum is sum (s_i y_i -
+    c_i)^2 plus the part outside the range. A `penalty` (t, p) adds penalty_i y_i^2: zero for plain
+    least squares, infinite where a direction is not used at all. Its filter factors are f_i = s_i^2
+    / (s_i^2 + penalty_i).
 
     Where some columns are never penalized, V holds two groups of columns: those of unpenalized
     parameters alone, and those of the others, each with the best change of the unpenalized ones.
     U stays orthonormal, and V'z of the second group depends on the penalized parameters alone, so
     that all formulas hold; V itself is oblique, and its inverse is kept as `dual`. V is oblique as
-    well where unknowns are correlated: with z / scale = L u its columns are L times those for u.
+    well where the penalty acts on other unknowns: with z = L u its columns are L times those for u.
 
     Attributes
     ----------
@@ -74,20 +73,16 @@ class Decomposition(TrialBatch):
     projections : (t, p) c = U'b.
     outside : (t,) squared length of the part of b outside the range of A.
     rows : (t,) number of equations folded (rows of weight zero not counted).
-    scale : (p,) by which the columns were multiplied.
     tolerance : singular values below tolerance * s_1 count as zero.
     dual : (t, p, p) inverse of V where V is oblique; None where it is V'.
     unpenalized : (t, p) directions of parameters that are never penalized; None without any.
     """
-
-    shared: ClassVar[tuple[str, ...]] = ("scale",)
 
     singular_values: FloatArray
     directions: FloatArray
     projections: FloatArray
     outside: FloatArray
     rows: IntArray
-    scale: FloatArray
     tolerance: float = RANK_TOLERANCE
     dual: FloatArray | None = None
     unpenalized: BoolArray | None = None
@@ -139,21 +134,15 @@ class Decomposition(TrialBatch):
         """Return this decomposition with its dual stated, as one of trials of oblique V is."""
         return replace(self, dual=self.inverse)
 
-    @property
-    def basis(self) -> FloatArray:
-        """(t, p, p) columns scale * V: the deviation z that each coordinate y is."""
-        return self.scale[:, None] * self.directions
-
     def coordinates(self, deviation: FloatArray) -> FloatArray:
-        """Return y = V' (z / scale), (t, p), of a deviation z (t, p)."""
-        scaled = deviation / self.scale
+        """Return y = V^-1 z, (t, p), of a deviation z (t, p)."""
         if self.dual is not None:
-            return np.matmul(self.dual, scaled[:, :, None])[:, :, 0]
-        return np.matmul(scaled[:, None, :], self.directions)[:, 0]
+            return np.matmul(self.dual, deviation[:, :, None])[:, :, 0]
+        return np.matmul(deviation[:, None, :], self.directions)[:, 0]
 
     def deviation(self, coordinates: FloatArray) -> FloatArray:
-        """Return z = scale * V y, (t, p), of coordinates y (t, p)."""
-        return self.scale * np.matmul(self.directions, coordinates[:, :, None])[:, :, 0]
+        """Return z = V y, (t, p), of coordinates y (t, p)."""
+        return np.matmul(self.directions, coordinates[:, :, None])[:, :, 0]
 
     def filter_factors(self, penalty: FloatArray) -> FloatArray:
         """Return f_i = s_i^2 / (s_i^2 + penalty_i), (t, p): the share of each least-squares
@@ -197,7 +186,7 @@ class Decomposition(TrialBatch):
         return np.where(cut, np.inf, (sigma2 * square + bias) / total**2)
 
     def noise_roots(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
-        """Return a square root (t, p, p) of the covariance of z / scale by the noise of the rows:
+        """Return a square root (t, p, p) of the covariance of z by the noise of the rows:
         V diag(sigma s_i / (s_i^2 + penalty_i)), zero in directions that are not used.
         """
         s = self.singular_values
@@ -217,7 +206,7 @@ class Decomposition(TrialBatch):
         variances = self.variances(penalty, noise, prior)
         infinite = np.isinf(variances)
         spread = self.directions * np.sqrt(np.where(infinite, 0.0, variances))[:, None, :]
-        covariance = np.matmul(spread, spread.swapaxes(-1, -2)) * self.scale[:, None] * self.scale
+        covariance = np.matmul(spread, spread.swapaxes(-1, -2))
         if infinite.any():
             unknown = self._touched(infinite)
             covariance[unknown[:, :, None] | unknown[:, None, :]] = np.nan
@@ -234,12 +223,12 @@ class Decomposition(TrialBatch):
         variances = self.variances(penalty, noise, prior)
         infinite = np.isinf(variances)
         finite = np.where(infinite, 0.0, variances)
-        result = np.sqrt(np.matmul(self.directions**2, finite[:, :, None])[:, :, 0]) * self.scale
+        result = np.sqrt(np.matmul(self.directions**2, finite[:, :, None])[:, :, 0])
         return np.where(self._touched(infinite), np.inf, result) if infinite.any() else result
 
     def null_space(self, trial: int = 0) -> FloatArray:
-        """Return a basis (p, d) of the scaled deviations that change no row, for one trial;
-        orthonormal without `unpenalized`.
+        """Return a basis (p, d) of the deviations that change no row, for one trial;
+        orthonormal where V is not oblique.
         """
         return self.directions[trial][:, ~self.used[trial]]
 
@@ -269,7 +258,7 @@ class Decomposition(TrialBatch):
         prior: FloatArray | None = None,
         trial: int = 0,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return orthonormal directions (p, p) of z / scale, the variance (p,) of each, and which
+        """Return orthonormal directions (p, p) of z, the variance (p,) of each, and which
         the rows see, of one trial.
 
         Where V is oblique these come from the singular values of diag(var)^(-1/2) V^-1.
@@ -286,7 +275,7 @@ class Decomposition(TrialBatch):
         return vt.T, variance, effect > self.tolerance * self.singular_values[trial].max()
 
     def mixed(self, root: FloatArray) -> Decomposition:
-        """Return the decomposition for z / scale = root u, where this is the one for u."""
+        """Return the decomposition for z = root u, where this is the one for u."""
         dual = np.linalg.solve(root.T, self.inverse.swapaxes(-1, -2)).swapaxes(-1, -2)
         return replace(self, directions=root @ self.directions, dual=dual)
 
@@ -314,7 +303,6 @@ def decompose(
     factor: FloatArray,
     rows: IntArray,
     about: FloatArray | None = None,
-    scale: FloatArray | None = None,
     tolerance: float = RANK_TOLERANCE,
     unpenalized: BoolArray | None = None,
     root: FloatArray | None = None,
@@ -328,25 +316,20 @@ def decompose(
     about : (t, p), optional. With it the last column is read as a residual r at the deviation z =
         `about`, and the problem becomes the one for the total deviation: |A z_new - b| with b = A z
         - r.
-    scale : (p,), optional. Factors for the columns before the decomposition; the penalty then acts
-        on z / scale.
     tolerance : relative rank tolerance.
     unpenalized : (p,), optional. Columns that no penalty may touch.
-    root : (p, p), optional. Symmetric root L of the correlation of z / scale, so that the penalty
-        acts on u = L^-1 z / scale. It must not mix unpenalized columns with others.
+    root : (p, p), optional. L of z = L u, where the penalty acts on u: a root of the prior
+        covariance of z. It must not mix unpenalized columns with others.
     """
     p = factor.shape[-1] - 1
     triangle, last = factor[:, :p, :p], factor[:, :p, p]
     if about is not None:
         last = np.matmul(triangle, about[:, :, None])[:, :, 0] - last
-    if scale is not None:
-        triangle = triangle * scale
     if root is not None:
         triangle = triangle @ root
-    factors = np.ones(p) if scale is None else scale
     outside = factor[:, p, p] ** 2
     if unpenalized is not None and unpenalized.any() and not unpenalized.all():
-        d = _split(triangle, last, outside, rows, factors, tolerance, unpenalized)
+        d = _split(triangle, last, outside, rows, tolerance, unpenalized)
     else:
         u, s, vt = np.linalg.svd(triangle)
         projections = np.matmul(last[:, None, :], u)[:, 0]
@@ -355,9 +338,7 @@ def decompose(
         directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
         is_all = unpenalized is not None and unpenalized.all()
         marked = np.ones(s.shape, dtype=bool) if is_all else None
-        d = Decomposition(
-            s, directions, projections, outside, rows, factors, tolerance, unpenalized=marked
-        )
+        d = Decomposition(s, directions, projections, outside, rows, tolerance, unpenalized=marked)
     return d if root is None else d.mixed(root)
 
 
@@ -366,7 +347,6 @@ def _split(
     last: FloatArray,
     outside: FloatArray,
     rows: IntArray,
-    scale: FloatArray,
     tolerance: float,
     unpenalized: BoolArray,
 ) -> Decomposition:
@@ -403,7 +383,7 @@ def _split(
     dual = np.take_along_axis(dual[:, :, back], by_size[:, :, None], axis=1)
     directions = np.take_along_axis(directions[:, back], by_size[:, None, :], axis=2)
     s, c = np.take_along_axis(s, by_size, axis=1), np.take_along_axis(c, by_size, axis=1)
-    return Decomposition(s, directions, c, outside, rows, scale, tolerance, dual, marked)
+    return Decomposition(s, directions, c, outside, rows, tolerance, dual, marked)
 
 
 # Systems with one triangular matrix and many right sides, by numpy.

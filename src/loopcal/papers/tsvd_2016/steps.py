@@ -517,7 +517,7 @@ def solve_normal_equations(study: Study) -> float:
     With a null direction H'H is singular up to rounding, and so its inverse is rounding.
     """
     d = linearize(study)
-    H = (d.singular_values[0][:, None] * d.directions[0].T) / d.scale
+    H = d.singular_values[0][:, None] * d.directions[0].T
     try:
         step = np.linalg.inv(H.T @ H) @ (H.T @ d.projections[0])
     except np.linalg.LinAlgError:

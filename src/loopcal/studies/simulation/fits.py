@@ -246,7 +246,7 @@ def _expand_errors(
 
     """
     robot, free = cell.robot, fits.free_parameters
-    unit = free.tolerance * fits.decomposition.scale
+    unit = free.tolerance
     slopes = differentiate_pose(robot, fits.values, cell.held_out.q[None], state)
     D = slopes.parameters[..., free.places] * unit
     size = np.linalg.norm(D * twist_weights(robot)[:, None], axis=(2, 3))
