@@ -193,7 +193,7 @@ PLAN = "plan hexapod-nategh-agheli -o out"
 @pytest.mark.parametrize(
     ("words", "name"),
     [
-        ("calibrate hexapod-42 data.csv -o out", "result.json"),
+        ("calibrate hexapod-42 data.csv -o out --hold-out 0.25", "result.json"),
         (f"{PLAN} --poses 30 --hold-out 0 --candidates 40", "plan.json"),
         (f"{PLAN} --measure plane-line --groups 9 --points 6", "plan.json"),
         ("regularize hexapod-42 data.csv -o out", "curves.json"),
