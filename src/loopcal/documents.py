@@ -58,27 +58,22 @@ def load_record(source: CalibrationReport | Run) -> CalibrationRecord:
     """
     if isinstance(source, Run):
         refuse_changed_run(source)
-        robot, initial, arrays = source.identified_robot, source.initial_robot, source.arrays
-        result, name, exported = source.result, str(source.path), build_source(source)
-    else:
-        fit = source.identification
-        robot, initial, arrays = fit.robot, fit.initial, source.arrays()
-        result, name = json.loads(to_json(build_document(source))), ""
-        intervals = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}
-        exported = ExportSource(robot, intervals)
-    content = restore_numbers(result)
+        run = source
+    else:  # as its run folder would be
+        fit, result = source.identification, json.loads(to_json(build_document(source)))
+        run = Run(Path(), result, fit.robot, fit.initial, arrays=source.arrays())
+    robot, arrays, content = run.identified_robot, run.arrays, restore_numbers(run.result)
     stored = content.get("validation")
     return CalibrationRecord(
-        source=name,
         result=content,
         arrays=arrays,
         robot=robot,
-        initial=initial,
+        initial=run.initial_robot,
         posterior=posterior_from_arrays(robot, arrays) if "posterior_unit" in arrays else None,
         validation=None if stored is None else restore_validation(stored, arrays, robot),
         heights=restore_heights(arrays, robot),
         residuals=residuals_from_arrays(arrays),
-        controllers=list_controllers(replace(exported, is_for_people=True)),
+        controllers=list_controllers(replace(build_source(run), is_for_people=True)),
     )
 
 

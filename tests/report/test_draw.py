@@ -3,13 +3,11 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import write_bytes
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism.solutions import inverse
 from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.pictures import save_figure
 from tests import zoo
@@ -39,15 +37,6 @@ def test_rods_are_drawn_from_base_to_platform_in_millimeters():
             line.shape == (2, 2) and np.allclose(line, [base[:2], top[:2]], atol=1e-6)
             for line in lines
         )
-
-
-def test_row_of_a_solution_sets_the_drawn_platform_pose():
-    robot = zoo.hexapod()
-    found = inverse(robot, np.array([[0.0, 0.0, 0.2, 0, 0, 0], [0.03, -0.02, 0.21, 0, 0, 0]]))
-    figure = draw_robot(robot, found, row=1)
-    star = [line for line in figure.axes[1].lines if line.get_marker() == "*"]
-    assert_allclose(np.array(star[0].get_data()).ravel(), [30.0, -20.0], atol=1e-9)  # [mm]
-    assert "at row 1" in figure.get_suptitle()
 
 
 def test_check_with_plot_writes_the_picture(tmp_path, capsys):

@@ -212,9 +212,6 @@ def test_validation_shows_errors_before_and_after_with_floor_and_limit(name, req
     assert legend == ["before, line: rms", "after, line: rms", "noise floor (rms)", "limit"]
     assert figure.get_suptitle().endswith(validation.frame)
     check(figure)
-    alone = draw_validation(validation, with_before=False)
-    assert not [line for line in alone.axes[0].lines if line.get_marker() == "s"]
-    check(alone)
 
 
 @pytest.mark.parametrize("name", ["five_bar", "linear_delta", "hexapod"])

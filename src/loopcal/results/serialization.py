@@ -42,10 +42,8 @@ def to_json(value: Any, nulls: dict[str, str] | None = None, path: tuple[str, ..
         return value
     if isinstance(value, Enum):
         return value.name.lower()
-    if value is None or isinstance(value, bool | str):
+    if isinstance(value, int | str):  # of a class of its own, as from YAML
         return value
-    if isinstance(value, int):
-        return int(value)
     if isinstance(value, float):
         return _finite(float(value), nulls, path)
     if (to_list := getattr(value, "tolist", None)) is not None:  # arrays and numbers of numpy

@@ -10,7 +10,7 @@ import base64
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -150,13 +150,9 @@ def _digest(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
-def _is_of(kind: type, element: Element) -> bool:
-    return isinstance(element, kind)
-
-
 @cache
 def _load_template() -> Template:
-    """Return the template, with its tests for elements; text is escaped."""
+    """Return the template, whose text is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -172,8 +168,6 @@ def _load_template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for kind in (Table, Picture, Listing, Code):
-        environment.tests[kind.__name__.lower()] = partial(_is_of, kind)
     return environment.get_template(TEMPLATE)
 
 
@@ -202,7 +196,6 @@ class CalibrationRecord:
 
     Attributes
     ----------
-    source : name of the run folder; empty for a report in memory.
     result : content of result.json, with numbers that are not finite.
     arrays : content of arrays.npz [SI].
     robot : the corrected robot, of which the identified parameters are free. initial : the robot
@@ -215,7 +208,6 @@ class CalibrationRecord:
     controllers : the values for controllers that can store them.
     """
 
-    source: str
     result: Mapping[str, Any] = field(repr=False)
     arrays: Mapping[str, np.ndarray] = field(repr=False)
     robot: Mechanism

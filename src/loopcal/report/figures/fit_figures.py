@@ -34,11 +34,11 @@ from loopcal.report.figures.style import (
     add_legend,
     finish_figure,
     label_axes,
-    label_logarithmic,
     label_poses,
     label_rows,
     label_sparsely,
     make_handle,
+    scale_logarithmically,
     shorten,
     start_figure,
     start_panels,
@@ -343,8 +343,7 @@ def _draw_uncertainties(
     axes.plot(half[drawn], y[drawn], "s", color=WIDTH, ms=DOT)
     if drawn.any():
         axes.set_xlim(0.6 * min(half[drawn].min(), 1.0), 1.7 * max(half[drawn].max(), 1.0))
-        axes.set_xscale("log")
-        label_logarithmic(axes.xaxis, FEW_TICKS)
+        scale_logarithmically(axes.xaxis, FEW_TICKS)
     else:
         axes.set_xticks([])
     numbers = []
@@ -393,7 +392,7 @@ def draw_correlation_matrix(robot: str, names: Sequence[str], covariance: FloatA
     words = f"correlation of {name_count(p, 'parameter')}"
     off = np.abs(np.nan_to_num(correlation - np.diag(np.diag(correlation))))
     if off.size and off.max() > 0.0:
-        i, j = np.unravel_index(int(off.argmax()), off.shape)
+        i, j = divmod(int(off.argmax()), p)
         pair = f"{shorten(names[j])} and {shorten(names[i])}"
         words += f"\nstrongest {correlation[i, j]:+.2f}: {pair}"
     if np.isnan(np.diag(correlation)).any():
@@ -428,8 +427,7 @@ def draw_convergence(fit: Identification) -> Figure:
         of_cost.axhline(degrees, **DASHED, label="expected from the noise")
         of_cost.legend(frameon=False, fontsize=SMALL)
     if (cost > 0.0).all():
-        of_cost.set_yscale("log")
-        label_logarithmic(of_cost.yaxis, decades=8)
+        scale_logarithmically(of_cost.yaxis, decades=8)
     distance = np.maximum(np.abs(history - history[-1])[:-1] / fit.tolerance, SMALLEST)
     if distance.size:
         steps = np.arange(len(distance))
@@ -437,8 +435,7 @@ def draw_convergence(fit: Identification) -> Figure:
         style = {"color": COLORS[1], "ms": DOT, "lw": LINE, "label": "largest"}
         of_parameters.plot(steps, distance.max(axis=1), "o-", **style)
         of_parameters.plot([], [], color=PALE, lw=THIN, label="each parameter")
-        of_parameters.set_yscale("log")
-        label_logarithmic(of_parameters.yaxis, decades=8)
+        scale_logarithmically(of_parameters.yaxis, decades=8)
         of_parameters.legend(frameon=False, fontsize=SMALL)
     for axes, count in ((of_cost, len(cost)), (of_parameters, len(history))):
         axes.set_xlim(-0.3, max(count - 1, 1) + 0.3)
@@ -498,10 +495,9 @@ def _draw_spectrum(axes: Axes, analysis: Identifiability) -> None:
     if rank < count:
         limit = max(analysis.tolerance * float(s[0]), floor)
         axes.axhline(limit, color=DARK, lw=THIN, ls=":", label="limit of the rank")
-    axes.set_yscale("log")
+    scale_logarithmically(axes.yaxis, (), decades=10)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high * 3.0)
-    label_logarithmic(axes.yaxis, (), decades=10)
     if 0 < rank < count:
         x, (above, below) = rank + 0.5, drawn[rank - 1 : rank + 1].tolist()
         arrow = {"arrowstyle": "<->", "color": DARK, "lw": THIN}
@@ -584,12 +580,11 @@ def draw_regularization(curves: RegularizationCurves) -> Figure:
         axes.grid(visible=True, lw=GRID)
         axes.legend(frameon=False, fontsize=SMALL)
     panels[0].set_xscale("log")
-    panels[0].set_yscale("log")
     ticks = np.unique(np.round(np.log10(curves.ridge.values[[0, -1]])))
     step = max(int(np.ceil((ticks[-1] - ticks[0]) / 7.0)), 1)
     powers = np.arange(np.ceil(ticks[0]), ticks[-1] + 1, step)
     panels[0].set_xticks(10.0**powers, [f"1e{int(power)}" for power in powers])
     panels[0].minorticks_off()
     panels[0].set_ylabel("held-out mean square over that of noise [1]")
-    label_logarithmic(panels[0].yaxis)
+    scale_logarithmically(panels[0].yaxis)
     return finish_figure(figure, f"{curves.robot}: n = {curves.poses} poses")

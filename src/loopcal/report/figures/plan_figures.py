@@ -29,9 +29,9 @@ from loopcal.report.figures.style import (
     add_legend,
     finish_figure,
     label_axes,
-    label_logarithmic,
     label_sparsely,
     make_handle,
+    scale_logarithmically,
     start_figure,
     start_panels,
 )
@@ -171,10 +171,8 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     if curve.goal is not None:
         goal = curve.goal / unit.factor_to_si
         axes.axhline(goal, color=VALIDATION, lw=1.0, label=f"goal: {goal:.3g} {unit.symbol}")
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    label_logarithmic(axes.xaxis)
-    label_logarithmic(axes.yaxis)
+    scale_logarithmically(axes.xaxis)
+    scale_logarithmically(axes.yaxis)
     words = f"expected {curve.target} error (rms)"
     words += ", rotations times robot size" if curve.target == "pose" else ""
     label_axes(axes, f"{curve.counted} for calibration [1]", f"{words} [{unit.symbol}]")

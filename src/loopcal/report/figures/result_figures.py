@@ -34,11 +34,11 @@ from loopcal.report.figures.style import (
     add_legend,
     finish_figure,
     label_axes,
-    label_logarithmic,
     label_poses,
     label_rows,
     make_handle,
     make_patch,
+    scale_logarithmically,
     shorten,
     start_figure,
     start_panels,
@@ -263,27 +263,21 @@ LOGARITHMIC = 8.0
 
 
 @register("figure", Validation)
-def draw_validation(validation: Validation, with_before: bool = True) -> Figure:
-    """Draw the errors of each quantity by pose, and those of all kinds over sigma.
-
-    Parameters
-    ----------
-    with_before : whether there is a geometry before calibration to compare with.
-    """
+def draw_validation(validation: Validation) -> Figure:
+    """Draw the errors of each quantity by pose, and those of all kinds over sigma."""
     quantities = validation.quantities
     has_kinds = validation.has_several_kinds or not quantities
     n = len(quantities) + has_kinds
     figure, panels = start_panels(9.5, 1.4 + 2.7 * n, n, 1)
     limits = {"position": validation.limit_position, "orientation": validation.limit_angle}
     for (axes,), quantity in zip(panels, quantities, strict=False):
-        _draw_quantity(axes, validation, quantity, limits.get(quantity), with_before)
+        _draw_quantity(axes, validation, quantity, limits.get(quantity))
     if has_kinds:
-        _draw_kinds(panels[-1, 0], validation, with_before)
+        _draw_kinds(panels[-1, 0], validation)
     before: dict[str, Any] = {"color": BEFORE, "marker": "s", "mfc": "none", "ms": DOT, "lw": LINE}
-    label = "after, line: rms" if with_before else "error, line: rms"
     handles = [
-        *([make_handle("before, line: rms", **before)] if with_before else []),
-        make_handle(label, color=AFTER, marker="o", ms=DOT, lw=LINE),
+        make_handle("before, line: rms", **before),
+        make_handle("after, line: rms", color=AFTER, marker="o", ms=DOT, lw=LINE),
         make_handle("noise floor (rms)", **DASHED),
     ]
     if any(limits.get(quantity) is not None for quantity in quantities):
@@ -293,20 +287,18 @@ def draw_validation(validation: Validation, with_before: bool = True) -> Figure:
     return finish_figure(figure, f"Errors at {poses}, {validation.frame}")
 
 
-def _draw_quantity(
-    axes: Axes, validation: Validation, quantity: str, limit: float | None, with_before: bool
-) -> None:
+def _draw_quantity(axes: Axes, validation: Validation, quantity: str, limit: float | None) -> None:
     """Draw the size of each error of one quantity at the place of its pose; the axis is logarithmic
     where errors before and after differ by much.
     """
     labels = tuple(dict.fromkeys(validation.poses))
     place = np.array([labels.index(label) + 1 for label in validation.poses], dtype=float)
     unit, after = validation.units[quantity], validation.after
-    drawn = [(after, "o", AFTER, AFTER)]
-    if with_before:
-        drawn.insert(0, (validation.before, "s", BEFORE, "none"))
     largest = []
-    for errors, marker, color, face in drawn:
+    for errors, marker, color, face in (
+        (validation.before, "s", BEFORE, "none"),
+        (after, "o", AFTER, AFTER),
+    ):
         size, x = errors[quantity].size / unit.factor_to_si, place[errors[quantity].rows]
         largest += [float(size[np.isfinite(size)].max())] if np.isfinite(size).any() else []
         axes.plot(x, size, marker, ls="none", color=color, mfc=face, ms=DOT + 0.5)
@@ -315,8 +307,7 @@ def _draw_quantity(
     if limit is not None:
         axes.axhline(limit / unit.factor_to_si, color=LIMIT, lw=LINE, ls="-.")
     if len(largest) == 2 and 0.0 < LOGARITHMIC * largest[1] < largest[0]:
-        axes.set_yscale("log")
-        label_logarithmic(axes.yaxis)
+        scale_logarithmically(axes.yaxis)
     else:
         axes.set_ylim(bottom=0.0)
     measured = after[quantity].measured
@@ -327,32 +318,28 @@ def _draw_quantity(
     label_poses(axes, labels)
 
 
-def _draw_kinds(axes: Axes, validation: Validation, with_before: bool) -> None:
+def _draw_kinds(axes: Axes, validation: Validation) -> None:
     """Draw the errors of each kind over sigma as bars, with their noise floor."""
     kinds = [k for k in validation.kinds if k.kind != "all" or validation.has_several_kinds]
     x = np.arange(len(kinds))
-    width, shift = (0.38, 0.19) if with_before else (0.6, 0.0)
-    drawn: list[tuple[str, float, dict[str, Any]]] = [("after", shift, {"color": AFTER})]
-    if with_before:
-        drawn.insert(0, ("before", -shift, {"ec": BEFORE, "fc": "none", "hatch": "//"}))
-    for name, by, style in drawn:
-        axes.bar(x + by, [getattr(k, name) for k in kinds], width, **style)
+    hatched: dict[str, Any] = {"ec": BEFORE, "fc": "none", "hatch": "//"}
+    above: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": SMALL}
+    filled: dict[str, Any] = {"color": AFTER}
+    for name, by, style in (("before", -0.19, hatched), ("after", 0.19, filled)):
+        axes.bar(x + by, [getattr(k, name) for k in kinds], 0.38, **style)
+        for place, kind in zip(x + by, kinds, strict=True):
+            if np.isfinite(value := getattr(kind, name)):
+                axes.annotate(f"{value:.3g}", (place, value), (0, 2), **above)
     for i, kind in enumerate(kinds):
         axes.hlines(kind.noise_floor, i - 0.45, i + 0.45, color=REFERENCE, lw=LINE, ls="--")
     names = ["all kinds" if k.kind == "all" else k.kind for k in kinds]
     axes.set_xticks(x, [f"{n}\n{k.count} values" for n, k in zip(names, kinds, strict=True)])
-    above: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": SMALL}
-    for name, by, _ in drawn:
-        for place, kind in zip(x + by, kinds, strict=True):
-            if np.isfinite(value := getattr(kind, name)):
-                axes.annotate(f"{value:.3g}", (place, value), (0, 2), **above)
     axes.set_xlim(-0.5 * max(FEWEST_BARS - len(kinds), 0) - 0.6, None)
     axes.set_xlim(right=len(kinds) - 1 - axes.get_xlim()[0])
     values = [v for k in kinds for v in (k.before, k.after) if np.isfinite(v) and v > 0.0]
-    if with_before and values and max(values) > LOGARITHMIC * min(values):
-        axes.set_yscale("log")
+    if values and max(values) > LOGARITHMIC * min(values):
         axes.set_ylim(0.5 * min(*values, 1.0), 2.0 * max(values))
-        label_logarithmic(axes.yaxis)
+        scale_logarithmically(axes.yaxis)
     elif values:
         axes.set_ylim(0.0, 1.15 * max(*values, 1.0))
     label_axes(axes, "", "rms error [sigma]", "by kind of measurement, over sigma")

@@ -15,7 +15,6 @@ import numpy as np
 
 from loopcal.findings.wording import name_count
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import Solution
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
@@ -54,13 +53,12 @@ VIEWS = {(0, 1): "from above", (0, 2): "from the side", (1, 2): "from the front"
 
 
 @register("figure", Mechanism)
-def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Figure:
-    """Draw a robot at home, or at a row of a solution, in the length unit of its file."""
-    state = robot.home_state if solution is None else solution.take(np.array([row])).state
+def draw_robot(robot: Mechanism) -> Figure:
+    """Draw a robot at home, in the length unit of its file."""
     length, limbs = find_unit(robot.units[Dimension.LENGTH]), robot.assembly.limbs
     strokes = [  # lines or points (n, 3), and the arguments of matplotlib's `plot`
         (part.points[0] / length.factor_to_si, _choose_style(part))
-        for part in list_parts(robot, state)
+        for part in list_parts(robot, robot.home_state)
     ]
     everything = np.concatenate([points for points, _ in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -87,8 +85,7 @@ def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0)
         "actuator": len(robot.actuators),
     }
     words = ", ".join(name_count(n, what) for what, n in counts.items() if n)
-    where = "at home" if solution is None else f"at row {row}"
-    return finish_figure(figure, f"{robot.name} {where}: {words}; lengths in {length.symbol}")
+    return finish_figure(figure, f"{robot.name} at home: {words}; lengths in {length.symbol}")
 
 
 def choose_view(robot: Mechanism) -> tuple[int, int]:

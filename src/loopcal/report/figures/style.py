@@ -173,12 +173,13 @@ def shorten(name: str, length: int = LONGEST) -> str:
     return f"{name[:half]}…{name[-half:]}"
 
 
-def label_logarithmic(axis: Any, numbers: Sequence[float] = TICKS, decades: int = 0) -> None:
-    """Write plain numbers at a logarithmic axis of matplotlib: these times powers of ten. On a
+def scale_logarithmically(axis: Any, numbers: Sequence[float] = TICKS, decades: int = 0) -> None:
+    """Make an axis of matplotlib logarithmic, with plain numbers: these times powers of ten. On a
     long axis, and without `numbers`, there are at most so many `decades`, where these are given.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
     low, high = axis.get_view_interval()
     is_short = high < VERY_WIDE * low
     if decades and not (is_short and numbers):

@@ -20,7 +20,7 @@ from loopcal.report.figures.style import (
     THIN,
     add_legend,
     finish_figure,
-    label_logarithmic,
+    scale_logarithmically,
     start_figure,
 )
 from loopcal.report.pictures import render_figure
@@ -191,8 +191,7 @@ def draw_score(
         axes.set_visible(False)
     ends = [interval.value for kind in kinds for _, interval in found[kind]]
     if ends and min(ends) > 0.0 and max(ends) > WIDE * min(ends) and "mean" not in kinds:
-        axes_grid[0, 0].set_yscale("log")
-        label_logarithmic(axes_grid[0, 0].yaxis)
+        scale_logarithmically(axes_grid[0, 0].yaxis)
     _label_places(axes_grid, layout)
     for axes in axes_grid[:, 0]:
         axes.set_ylabel(f"{score.replace('_', ' ')} [{unit.symbol}]", fontsize=LABEL)
