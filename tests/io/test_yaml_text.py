@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from loopcal.errors import FileError
 from loopcal.io.core.yaml_file import (
     add_key,
+    format_yaml,
     make_round_trip_yaml,
     parse_yaml,
     quote_scalar,
@@ -180,3 +181,29 @@ def test_any_mapping_takes_the_key_and_loses_it(content: dict, data) -> None:
     with_key = add_key(before, ENTRY)
     assert with_key.content == before.content | {"identified": [ROW]}
     assert remove_key(with_key, "identified").content == before.content
+
+
+SCALARS = (
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+)
+SCALARS |= st.text(st.characters(codec="utf-8"), max_size=40)
+KEYS = st.text(st.characters(codec="utf-8"), max_size=8)
+CONTENT = st.recursive(
+    SCALARS, lambda inner: st.lists(inner, max_size=5) | st.dictionaries(KEYS, inner, max_size=5)
+)
+
+
+@given(st.dictionaries(KEYS, CONTENT, min_size=1, max_size=5))
+@settings(max_examples=60, deadline=None)
+def test_written_content_reads_the_same(content) -> None:
+    comments = dict.fromkeys(content, "a comment: {of a key}")
+    read = parse_yaml(format_yaml(content, comments), "f.yaml", "file", has_names=False)
+    assert read.content == content
+
+
+def test_what_fits_into_a_line_is_in_one_line() -> None:
+    row = {"name": "y", "place": [0.1, -0.0]}
+    text = (
+        "a: {name: y, place: [0.1, 0.0]}     # one\nb:\n" + 7 * "  - {name: y, place: [0.1, 0.0]}\n"
+    )
+    assert format_yaml({"a": row, "b": [row] * 7}, {"a": "one"}) == text

@@ -335,6 +335,46 @@ def format_flow_mapping(texts: Mapping[str, str]) -> str:
     return f"{{{', '.join(f'{quote_scalar(name)}: {text}' for name, text in texts.items())}}}"
 
 
+def format_flow(value: Any) -> str:
+    """Return plain content as YAML in one line; numbers read back the same, -0 as 0."""
+    if isinstance(value, str):
+        return quote_scalar(value)
+    if isinstance(value, Mapping):
+        items: Mapping[str, Any] = value
+        return format_flow_mapping({name: format_flow(item) for name, item in items.items()})
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(format_flow, value))}]"
+    return repr(float(value) + 0.0) if isinstance(value, float) else json.dumps(value)
+
+
+WIDTH = 110
+"""Characters that a value in one line may fill."""
+
+
+def format_yaml(content: Mapping[str, Any], comments: Mapping[str, str] | None = None) -> str:
+    """Return a mapping as YAML, each key in lines of its own, some with a comment behind them;
+    below them, what fits into a line is in one line.
+    """
+    lines: list[str] = []
+    for key, value in content.items():
+        first, *others = _list_lines(key, value, WIDTH)
+        comment = f"     # {comments[key]}" if comments and key in comments else ""
+        lines += [first + comment, *others]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _list_lines(key: str | None, value: Any, width: int) -> list[str]:
+    """Return the lines of a value behind its key, or (None) behind the dash of a list."""
+    head, flow = "-" if key is None else f"{quote_scalar(key)}:", format_flow(value)
+    if not isinstance(value, dict | list | tuple) or len(head) + len(flow) < width:
+        return [f"{head} {flow}"]
+    items: Any = value.items() if isinstance(value, dict) else ((None, item) for item in value)
+    lines = [line for name, item in items for line in _list_lines(name, item, width - 2)]
+    if key is None:
+        return [f"- {lines[0]}", *(f"  {line}" for line in lines[1:])]
+    return [head, *(f"  {line}" for line in lines)]
+
+
 def add_key(file: YamlFile, entry: str, content: Mapping[str, Any] | None = None) -> YamlFile:
     """Return a file with one more key.
 

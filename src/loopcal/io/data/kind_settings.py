@@ -40,6 +40,7 @@ from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import (
     Location,
     YamlFile,
+    format_flow,
     format_flow_mapping,
     quote_scalar,
     refuse_unknown_keys,
@@ -428,9 +429,7 @@ def read_instrument(
 def format_instrument(record: InstrumentRecord) -> str:
     """Return the setting of an instrument as YAML text in one line."""
     stated = record.to_dict()
-    if list(stated) == ["name"]:
-        return quote_scalar(record.name)
-    return format_flow_mapping({name: quote_scalar(value) for name, value in stated.items()})
+    return format_flow(record.name if list(stated) == ["name"] else stated)
 
 
 # Errors that the rows of a session share, in the settings of a kind.

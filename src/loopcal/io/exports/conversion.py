@@ -13,14 +13,13 @@ row has the time of its first line.
 from __future__ import annotations
 
 import csv
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -44,7 +43,7 @@ from loopcal.io.core.limits import (
     make_name,
 )
 from loopcal.io.core.text_file import as_path, read_bytes, write_text
-from loopcal.io.core.yaml_file import quote_scalar
+from loopcal.io.core.yaml_file import format_flow
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.exports.profile import ColumnSource, PatternClock, Place, Profile, normalize_name
@@ -386,7 +385,7 @@ def convert_export(
     if misfits:
         lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
     lines += [f"## {format_comment(str(finding))}" for finding in findings]
-    lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
+    lines += [f"# {key}: {format_flow(value)}" for key, value in settings.items()]
     columns = list_headers(profile)
     # a target without a line has no covariance
     absent = {name: "0" if name.startswith(COVARIANCE) else "" for name in columns}
@@ -500,8 +499,3 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
     R = geometry.project_to_rotations(matrix)
     quaternion = (repr(float(q)) for q in geometry.matrix_to_quaternion(R))
     return dict(zip(QUATERNION, quaternion, strict=True))
-
-
-def _format_setting(value: Any) -> str:
-    """Return a setting on one line of YAML."""
-    return quote_scalar(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

@@ -26,14 +26,14 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_text
-from loopcal.io.core.yaml_file import parse_yaml
+from loopcal.io.core.yaml_file import format_yaml, parse_yaml
 from loopcal.io.formats.program_format import (
     MM,
     Exported,
@@ -80,17 +80,14 @@ class DeltaGeometry:
     stops: Triple
 
 
-ROBOT = """\
-radius: {radius}
-angles: {angles}     # of the towers; the third defines the x axis and stays fixed
-arms: {arms}
-stops: {stops}       # height of the nozzle, in the center, with the carriage at its end stop
-readings: drop       # carriage positions count down from the end stops
-home: {{z: 0}}
-workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # assumed; replace by the real workspace
-{arms_sd}{fixed}"""
-ARMS = "tolerances: {{arms: {{sd: {sd:.7g}}}}}     # measured by hand: prior knowledge\n"
-FIXED = "fixed: [arm*.length]     # heights alone do not determine the arms; distances do\n"
+COMMENTS = {
+    "angles": "of the towers; the third defines the x axis and stays fixed",
+    "stops": "height of the nozzle, in the center, with the carriage at its end stop",
+    "readings": "carriage positions count down from the end stops",
+    "workspace": "assumed; replace by the real workspace",
+    "tolerances": "measured by hand: prior knowledge",
+    "fixed": "heights alone do not determine the arms; distances do",
+}
 
 
 def format_robot(
@@ -106,18 +103,19 @@ def format_robot(
         act = "the radius must be positive and every arm longer than it; correct them"
         raise FileError(f"{sentence} {min(geometry.arms):g} mm; {act}", path)
     half = round_length(0.5 * geometry.radius)
-    is_taped = options.sigma_tape is not None
+    content: dict[str, Any] = {
+        **vars(geometry),
+        "readings": "drop",
+        "home": {"z": 0},
+        "workspace": {"x": [-half, half], "y": [-half, half], "z": [0, half]},
+    }
+    if options.sigma_tape is not None:
+        sd = float(f"{options.choose_noise('tape') * 1e3:.7g}")
+        content["tolerances"] = {"arms": {"sd": sd}}
+    elif not has_distances:
+        content["fixed"] = ["arm*.length"]
     head = format_head(path, program, "linear-delta", options.name, ("mm", "deg"))
-    return head + ROBOT.format(
-        radius=geometry.radius,
-        angles=list(geometry.angles),
-        arms=list(geometry.arms),
-        stops=list(geometry.stops),
-        side=[-half, half],
-        top=half,
-        arms_sd=ARMS.format(sd=options.choose_noise("tape") * 1e3) if is_taped else "",
-        fixed="" if has_distances or is_taped else FIXED,
-    )
+    return head + format_yaml(content, COMMENTS)
 
 
 def get_geometry(source: ExportSource, format_name: str, decimals: int) -> DeltaGeometry:

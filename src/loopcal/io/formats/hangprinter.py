@@ -27,14 +27,8 @@ import numpy as np
 from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_json
-from loopcal.io.formats.program_format import (
-    MM,
-    Format,
-    Imported,
-    ImportOptions,
-    format_head,
-    round_length,
-)
+from loopcal.io.core.yaml_file import format_yaml
+from loopcal.io.formats.program_format import MM, Format, Imported, ImportOptions, format_head
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST
 
@@ -61,27 +55,10 @@ FAR_OFF = 10.0
 """Ratio of a taped length to that of the known poses at which the unit is another one."""
 
 REMARK = "Readings are motor angles, zero at the origin; growing readings pay out line."
-ROBOT = """\
-freedoms: [x, y, z]
-controlled: [x, y, z]
-# radius: line paid out per radian of the motor; sigma: the motor angle of {sigma:g} mm of line
-actuators:
-{drives}
-# lengths at readings of zero{taped}; anchors are {anchors}
-limbs:
-{limbs}
-parameters:               # of the spools; buildup: growth of radius^2 for each length that is wound
-{parameters}
-home: {{z: 0}}
-workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # assumed; replace by the real workspace
-"""
-LIMB = (
-    "  - {{name: {name}, tip: {tip}, ending: distance, length: {length}, actuated: {drive}, "
-    "errors: [{{of: base, shift: [x, y, z], name: anchor, tolerance: {{sd: {sd_anchor}}}}}, "
-    "{{of: rod, shift: [length], tolerance: {{sd: {sd_length}}}}}]}}"
-)
-PARAMETER = "  - {{name: {name}, length: {nominal}, tolerance: {{sd: {sd}}}, maps: [{maps}]}}"
-MAP = "{{limb: {drive}, element: transmission, axis: {axis}, coefficient: {coefficient}}}"
+COMMENTS = {
+    "parameters": "of the spools; buildup: growth of radius^2 for each length that is wound",
+    "workspace": "assumed; replace by the real workspace",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,62 +225,94 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
 
 
 def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: ImportOptions) -> str:
-    """Return the robot file, one limb a line; spools of equal radius share one parameter."""
+    """Return the robot file; spools of equal radius share one parameter."""
     sigma = options.choose_noise("line") / MM
     is_taped, apart = samples.is_taped, np.linalg.norm(anchors, axis=1)
     lengths = np.where(is_taped, samples.taped, apart) if is_taped.any() else apart
     sd_length = np.where(is_taped, options.choose_noise("tape") / MM, WIDE)
     is_prior = samples.anchors is not None and options.sigma_anchor is not None
     sd_anchor = options.sigma_anchor / MM if is_prior and options.sigma_anchor else WIDE
-    drives = [
-        f"  {name.lower()}: {{reads: angle, radius: {_format(gain)}, "
-        f"sigma: {_format(sigma / gain / DEG, 7)}}}"
+    drives = {
+        name.lower(): {
+            "reads": "angle",
+            "radius": _round(gain),
+            "sigma": _round(sigma / gain / DEG, 7),
+        }
         for name, gain in zip(samples.names, samples.gain, strict=True)
-    ]
+    }
     limbs = [
-        LIMB.format(
-            name=name,
-            tip=[float(_format(v)) for v in anchor],
-            length=_format(length),
-            drive=name.lower(),
-            sd_anchor=_format(sd_anchor, 7),
-            sd_length=_format(sd, 7),
-        )
+        {
+            "name": name,
+            "tip": [_round(v) for v in anchor],
+            "ending": "distance",
+            "length": _round(length),
+            "actuated": name.lower(),
+            "errors": [
+                _describe_error("base", ["x", "y", "z"], sd_anchor, name="anchor"),
+                _describe_error("rod", ["length"], sd),
+            ],
+        }
         for name, anchor, length, sd in zip(samples.names, anchors, lengths, sd_length, strict=True)
     ]
-    side = round_length(0.25 * lengths.min())
+    side = round(0.25 * lengths.min())
+    content = {
+        "freedoms": ["x", "y", "z"],
+        "controlled": ["x", "y", "z"],
+        "actuators": drives,
+        "limbs": limbs,
+        "parameters": list(_list_parameters(samples)),
+        "home": {"z": 0},
+        "workspace": {
+            "x": [-side, side],
+            "y": [-side, side],
+            "z": [0, round(0.5 * max(anchors[:, 2].max(), lengths.min()))],
+        },
+    }
+    taped = ", measured by hand within their tolerances" if is_taped.any() else ""
+    origin = "prior knowledge" if is_prior else "first estimates with their tolerances"
+    comments = {
+        **COMMENTS,
+        "actuators": "radius: line paid out per radian of the motor; "
+        f"sigma: the motor angle of {sigma:g} mm of line",
+        "limbs": f"lengths at readings of zero{taped}; anchors are {origin}",
+    }
     what, units = "samples of a hanging printer", ("mm", "deg")
-    return format_head(path, what, "limbs", options.name, units, REMARK) + ROBOT.format(
-        sigma=sigma,
-        taped=", measured by hand within their tolerances" if is_taped.any() else "",
-        anchors="prior knowledge" if is_prior else "first estimates with their tolerances",
-        drives="\n".join(drives),
-        limbs="\n".join(limbs),
-        parameters="\n".join(_list_parameters(samples)),
-        side=[-side, side],
-        top=round_length(0.5 * max(anchors[:, 2].max(), lengths.min())),
-    )
+    head = format_head(path, what, "limbs", options.name, units, REMARK)
+    return head + format_yaml(content, comments)
 
 
-def _list_parameters(samples: Samples) -> Iterator[str]:
+def _describe_error(of: str, shift: list[str], sd: float, **name: str) -> dict[str, Any]:
+    """Return an entry of `errors:`."""
+    return {"of": of, "shift": shift, **name, "tolerance": {"sd": _round(sd, 7)}}
+
+
+def _list_parameters(samples: Samples) -> Iterator[dict[str, Any]]:
     """Yield spool radii, one where they are equal, and the build-up of each line."""
     slope = samples.gear * samples.share
     groups: dict[float, list[int]] = {}
     for i, radius in enumerate(samples.radius.tolist()):
         groups.setdefault(radius, []).append(i)
 
-    def format_map(i: int, axis: str, coefficient: float) -> str:
+    def describe_map(i: int, axis: str, coefficient: float) -> dict[str, Any]:
         drive = samples.names[i].lower()
-        return MAP.format(drive=drive, axis=axis, coefficient=_format(coefficient))
+        place = {"limb": drive, "element": "transmission", "axis": axis}
+        return {**place, "coefficient": _round(coefficient)}
 
     for radius, members in groups.items():
         group = "" if len(groups) == 1 else "-".join(samples.names[i] for i in members)
-        maps = ", ".join(format_map(i, "gain", slope[i]) for i in members)
-        name = f"spool{group}.radius"
-        yield PARAMETER.format(name=name, nominal=_format(radius), sd=3, maps=maps)
+        yield {
+            "name": f"spool{group}.radius",
+            "length": _round(radius),
+            "tolerance": {"sd": 3},
+            "maps": [describe_map(i, "gain", slope[i]) for i in members],
+        }
     for i, line in enumerate(samples.names):
-        curve = format_map(i, "curve", -samples.gear * slope[i] / 4)
-        yield PARAMETER.format(name=f"{line}.buildup", nominal=0, sd=0.3, maps=curve)
+        yield {
+            "name": f"{line}.buildup",
+            "length": 0,
+            "tolerance": {"sd": 0.3},
+            "maps": [describe_map(i, "curve", -samples.gear * slope[i] / 4)],
+        }
 
 
 def _report_ignored(content: dict[str, Any]) -> Iterator[Finding]:
@@ -353,9 +362,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _format(value: float, digits: int = 12) -> str:
-    """Return a number for a file."""
-    return f"{float(value):.{digits}g}"
+def _round(value: float, digits: int = 12) -> float:
+    """Return a number with so many digits."""
+    return float(f"{float(value):.{digits}g}")
 
 
 FORMAT = Format(

@@ -22,13 +22,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import format_scaled
+from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (
     DECIMALS,
     Exported,
@@ -52,25 +53,7 @@ ROUNDING = 1e-12
 """Relative difference of numbers that count as the same."""
 
 REMARK = "Readings are strut lengths, so the lengths at reading zero are 0."
-ROBOT = """\
-legs: {legs}
-base:
-{base}
-platform:
-{platform}
-lengths: 0
-home: {{z: {home}}}
-stored_parameters: [leg*.base.?, leg*.platform.?]     # what genhexkins stores
-{tolerances}{screw}"""
-TOLERANCES = "tolerances: {{base: {{sd: {sd}}}, platform: {{sd: {sd}}}}}     # measured by hand\n"
-SCREW = """\
-screw:
-  lead: {lead}
-  base_axes:
-{base}
-  platform_axes:
-{platform}
-"""
+COMMENTS = {"stored_parameters": "what genhexkins stores", "tolerances": "measured by hand"}
 
 
 @dataclass(frozen=True)
@@ -127,7 +110,17 @@ def read(path: Path, options: ImportOptions) -> Imported:
         findings = (report_finding("files.home-assumed", height=f"{home:g} {unit}"),)
     else:
         home = options.home_height / unit.factor_to_si
-    screw = ""
+    content: dict[str, Any] = {
+        "legs": "ups" if lead else "rod",
+        "base": base.tolist(),
+        "platform": platform.tolist(),
+        "lengths": 0,
+        "home": {"z": home},
+        "stored_parameters": ["leg*.base.?", "leg*.platform.?"],
+    }
+    if options.sigma_tape is not None:  # joint centers were measured by hand
+        sd = float(f"{options.sigma_tape / unit.factor_to_si:.7g}")
+        content["tolerances"] = {"base": {"sd": sd}, "platform": {"sd": sd}}
     if lead:
         low, high = hal.points("base-n"), hal.points("platform-n")
         struts = platform + home * UP - base
@@ -135,23 +128,14 @@ def read(path: Path, options: ImportOptions) -> Imported:
         across -= (low * struts).sum(1) * (high * struts).sum(1)
         # of the other hand where the axes are beyond a quarter turn about the strut at home
         hands = np.where(across < 0, -1.0, 1.0)
-        leads = lead if min(hands) > 0 else (hands * lead).tolist()
-        turned = hands[:, None] * high
-        screw = SCREW.format(
-            lead=leads, base=_format_list(low, 4), platform=_format_list(turned, 4)
-        )
+        content["screw"] = {
+            "lead": lead if min(hands) > 0 else (hands * lead).tolist(),
+            "base_axes": low.tolist(),
+            "platform_axes": (hands[:, None] * high).tolist(),
+        }
     what, units = "genhexkins settings of LinuxCNC", (unit.symbol, "deg")
     head = format_head(path, what, "gough", options.name, units, REMARK)
-    text = head + ROBOT.format(
-        legs="ups" if lead else "rod",
-        base=_format_list(base, 2),
-        platform=_format_list(platform, 2),
-        home=home,
-        tolerances=""  # only of joint centers that were measured by hand
-        if options.sigma_tape is None
-        else TOLERANCES.format(sd=f"{options.sigma_tape / unit.factor_to_si:.7g}"),
-        screw=screw,
-    )
+    text = head + format_yaml(content, COMMENTS)
     return Imported(text, None, findings)
 
 
@@ -221,10 +205,6 @@ def _read_hal(path: Path) -> HalFile:
         sentence = f"this file has no 'setp {COMPONENT}...'"
         raise FileError(f"{sentence}; name the HAL file that sets the geometry", path)
     return hal
-
-
-def _format_list(points: FloatArray, indent: int) -> str:
-    return "\n".join(f"{' ' * indent}- {point}" for point in (0.0 + points).tolist())
 
 
 FORMAT = Format(

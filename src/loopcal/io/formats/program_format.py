@@ -23,7 +23,7 @@ from loopcal.findings.wording import count_decimals
 from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.core.limits import format_comment
 from loopcal.io.core.text_file import read_bytes, read_text
-from loopcal.io.core.yaml_file import quote_scalar
+from loopcal.io.core.yaml_file import format_yaml
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
 from loopcal.units import LARGEST
@@ -192,16 +192,15 @@ def format_head(
 ) -> str:
     """Return the first lines of a robot file that is read from `path`, whose content is `what`."""
     origin = format_comment(f"{path.name}, {what}")
-    return "\n".join(
-        [
-            *(f"# {line}" for line in textwrap.wrap(f"Read from {origin}. {remark}", 98)),
-            "format: 1",
-            f"family: {family}",
-            f"name: {quote_scalar(name)}",
-            f"source: {quote_scalar(origin)}",
-            f"units: {{length: {units[0]}, angle: {units[1]}}}\n\n",
-        ]
-    )
+    remarks = textwrap.wrap(f"Read from {origin}. {remark}", 98)
+    content = {
+        "format": 1,
+        "family": family,
+        "name": name,
+        "source": origin,
+        "units": {"length": units[0], "angle": units[1]},
+    }
+    return "".join(f"# {line}\n" for line in remarks) + format_yaml(content) + "\n"
 
 
 def parse_number(text: str, what: str, path: Path, line: int) -> float:

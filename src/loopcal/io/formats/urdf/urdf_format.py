@@ -10,9 +10,8 @@ the text stays as it is.
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.io.core.yaml_file import quote_scalar
+from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (
     Exported,
     ExportSource,
@@ -209,7 +208,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
     family = choose_family(paths)
     remark = REMARKS[family]
     head = format_head(path, what, family, options.name, ("m", "rad"), remark)
-    text = head + format_robot(mechanism, paths, frame)
+    text = head + format_yaml(describe_robot(mechanism, paths, frame))
     findings = tuple(_report_structure(mechanism, paths, frame))
     return Imported(text, None, findings, _doubt_closures(mechanism, paths))
 
@@ -349,7 +348,7 @@ def _report_structure(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -
         )
 
 
-# The text of a robot file: of the family limbs for one stage, of the family stages for several,
+# The content of a robot file: of the family limbs for one stage, of the family stages for several,
 # whose serial joints have the names of the URDF; closed loops have the name of the link that
 # carries what follows. Its frame is the platform of the stage, for the last the platform frame.
 
@@ -358,36 +357,22 @@ ZERO = 1e-15
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 
-LIMB = """\
-  - name: {name}
-    chain:
-{chain}
-    ending: {ending}
-    tip: {tip}
-    attach: {attach}
-    errors:
-{errors}
-"""
+Content = dict[str, Any]
+"""Keys and values of a part of a robot file."""
 
 
-@dataclass(frozen=True)
-class LimbText:
-    """One limb of a robot file, and the entries of `parameters:` that it needs."""
-
-    text: str
-    parameters: str
-
-
-def format_limb(
+def describe_limb(
     paths: LimbPaths, limb: tuple[GraphJoint, ...], T_body_frame: FloatArray
-) -> LimbText:
-    """Return one limb of the robot file.
+) -> tuple[Content, list[Content]]:
+    """Return one limb of the robot file, and the entries of `parameters:` that it needs.
 
     It ends in a point where its last joint is a ball joint, and on a platform that does not turn.
     """
     turns = any(name.startswith("r") for name in paths.freedoms)
     name, last = limb[0].name, limb[-1]
-    chain, errors, parameters = [], [], []
+    chain: list[Content] = []
+    errors: list[Content] = []
+    parameters: list[Content] = []
     pending: FloatArray = np.eye(4)
     before: GraphJoint | None = None
     ends_in_point = last.kind == "S" or not turns
@@ -397,101 +382,71 @@ def format_limb(
         is_tip = joint is last and ends_in_point
         element = "tip" if is_tip else joint.name
         if before is not None and before.origin_b:
-            parameters += _format_far_shifts(name, before, element, place)
+            parameters += _list_far_shifts(name, before, element, place)
         if joint.origin_a:
-            errors.append(_format_shifts(element, joint.origin_a, joint.shifts))
+            errors.append(_describe_shifts(element, joint.origin_a, joint.shifts))
         if is_tip:
             tip = place
         else:
-            chain += _format_limb_joint(paths, joint, place)
+            chain.append(_describe_limb_joint(paths, joint, place))
         pending, before = geometry.invert_pose(joint.T_b), joint
     attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)
     if last.origin_b:
-        errors.append(_format_shifts("platform", last.origin_b, last.shifts))
+        errors.append(_describe_shifts("platform", last.origin_b, last.shifts))
     if not ends_in_point and not last.origin_b:
         tip, attach = pending @ T_body_frame, np.eye(4)
-    text = LIMB.format(
-        name=quote_scalar(name),
-        chain="\n".join(chain),
-        ending="ball" if ends_in_point else "rigid",
-        tip=format_pose(tip),
-        attach=format_pose(attach),
-        errors="\n".join(errors) or "      []",
-    )
-    return LimbText(text, "".join(parameters))
+    return {
+        "name": name,
+        "chain": chain,
+        "ending": "ball" if ends_in_point else "rigid",
+        "tip": describe_pose(tip),
+        "attach": describe_pose(attach),
+        "errors": errors,
+    }, parameters
 
 
-def format_pose(T: FloatArray) -> str:
-    """Return a pose as a flow mapping without zeros."""
+def describe_pose(T: FloatArray) -> Content | list[float]:
+    """Return a pose as a mapping without zeros."""
     values = [*T[:3, 3], *geometry.matrix_to_euler(T[:3, :3], "xyz")]
-    pairs = zip(POSE, values, strict=True)
-    shown = [f"{name}: {float(value)!r}" for name, value in pairs if abs(value) > ZERO]
-    return f"{{{', '.join(shown)}}}" if shown else "[0, 0, 0]"
+    shown = {n: v for n, v in zip(POSE, _clear(values), strict=True) if v}
+    return shown or [0.0, 0.0, 0.0]
 
 
-def _format_shifts(element: str, origin: str, axes: str) -> str:
+def _clear(numbers: Iterable[float]) -> list[float]:
+    """Return numbers without rounding near 0."""
+    return [float(v) if abs(v) > ZERO else 0.0 for v in numbers]
+
+
+def _describe_shifts(element: str, origin: str, axes: str) -> Content:
     """Return one entry of `errors:`."""
-    of = quote_scalar(element)
-    name = "" if element == origin else f", name: {quote_scalar(origin)}"
-    return f"      - {{of: {of}{name}, shift: [{', '.join(axes)}]}}"
+    name = {} if element == origin else {"name": origin}
+    return {"of": element, **name, "shift": list(axes)}
 
 
-def _format_far_shifts(limb: str, joint: GraphJoint, element: str, place: FloatArray) -> list[str]:
-    """Return entries of `parameters:`, the shifts of a far origin as shifts of the next place."""
-    entries = []
+def _list_far_shifts(
+    limb: str, joint: GraphJoint, element: str, place: FloatArray
+) -> Iterator[Content]:
+    """Yield entries of `parameters:`, the shifts of a far origin as shifts of the next place."""
     for axis in joint.shifts:
-        coefficients = -place["xyz".index(axis), :3]
-        maps = ", ".join(
-            f"{{limb: {quote_scalar(limb)}, element: {quote_scalar(element)}, axis: {letter}, "
-            f"coefficient: {float(coefficient)!r}}}"
-            for letter, coefficient in zip("xyz", coefficients, strict=True)
-            if abs(coefficient) > ZERO
-        )
-        name = quote_scalar(f"{limb}.{joint.origin_b}.{axis}")
-        entries.append(f"  - {{name: {name}, length: 0, maps: [{maps}]}}\n")
-    return entries
+        coefficients = zip("xyz", _clear(-place["xyz".index(axis), :3]), strict=True)
+        maps = [
+            {"limb": limb, "element": element, "axis": letter, "coefficient": coefficient}
+            for letter, coefficient in coefficients
+            if coefficient
+        ]
+        yield {"name": f"{limb}.{joint.origin_b}.{axis}", "length": 0, "maps": maps}
 
 
-def _format_limb_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray) -> list[str]:
+def _describe_limb_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray) -> Content:
     """Return a joint of a limb."""
-    name, where = quote_scalar(joint.name), f"at: {format_pose(place)}"
+    content = {"joint": joint.kind, "name": joint.name, "at": describe_pose(place)}
     if joint.kind == "S":
         R = measure_rotation(paths.graph, paths.home, joint)
         roll, pitch, yaw = geometry.matrix_to_euler(R, "xyz")
-        start = format_list((yaw, pitch, roll))
-        return [f"      - {{joint: S, name: {name}, {where}, start: {start}}}"]
-    motor = f", actuated: {name}" if joint.name in paths.graph.motors else ""
-    value = get_value(paths.graph, paths.home, joint)
-    axis = f"axis: {format_list(joint.axis)}, start: {value!r}"
-    return [f"      - {{joint: {joint.kind}, name: {name}, {where}, {axis}{motor}}}"]
-
-
-def format_list(vector: Any) -> str:
-    """Return numbers as a flow list."""
-    return f"[{', '.join(repr(float(v)) if abs(v) > ZERO else '0' for v in vector)}]"
-
-
-LIMBS = """\
-freedoms: [{freedoms}]
-controlled: [{controlled}]
-actuators:
-{actuators}
-limbs:
-{limbs}
-{parameters}home: {home}
-"""
-STAGES = """\
-controlled: [{controlled}]
-stages:
-{stages}"""
-JOINT = """\
-  - name: {name}
-    joint: {{{entries}}}
-"""
-LOOP = """\
-  - name: {name}
-{mount}    family: limbs
-{robot}"""
+        return {**content, "start": _clear((yaw, pitch, roll))}
+    start = get_value(paths.graph, paths.home, joint)
+    motor = {"actuated": joint.name} if joint.name in paths.graph.motors else {}
+    return {**content, "axis": _clear(joint.axis), "start": start, **motor}
 
 
 def choose_family(paths: StagePaths) -> str:
@@ -501,27 +456,32 @@ def choose_family(paths: StagePaths) -> str:
     return "limbs" if is_closed and not others else "stages"
 
 
-def format_robot(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> str:
+def describe_robot(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> Content:
     """Return a robot file without its head; `frame` is the link that is the platform frame."""
     urdf, T_body_frame = mechanism.urdf, mechanism.locate(frame)[1]
     tool = geometry.invert_pose(paths.stages[-1].frame) @ T_body_frame
     is_turned = not np.array_equal(paths.stages[-1].frame, T_body_frame)
-    ending = f"tool: {format_pose(tool)}\n" if is_turned else ""
+    ending = {"tool": describe_pose(tool)} if is_turned else {}
     if choose_family(paths) == "limbs":
         assert isinstance(paths.stages[0], ClosedStage)
-        return _format_limbs(urdf, paths.stages[0]) + ending
+        return _describe_limbs(urdf, paths.stages[0]) | ending
     carriers = [np.eye(4), *(geometry.invert_pose(stage.frame) for stage in paths.stages[:-1])]
     named = zip(list_stage_names(mechanism, paths), paths.stages, strict=True)
     stages = [
-        _format_joint(urdf, name, stage, before)
-        if isinstance(stage, SerialStage)
-        else _format_loop(urdf, name, stage, before)
+        {
+            "name": name,
+            **(
+                {"joint": _describe_joint(urdf, stage, before)}
+                if isinstance(stage, SerialStage)
+                else _describe_loop(urdf, stage, before)
+            ),
+        }
         for (name, stage), before in zip(named, carriers, strict=True)
     ]
     controlled = _choose_coordinates(
         paths.graph, paths.home, paths.platform, paths.stages[-1].frame
     )
-    return STAGES.format(controlled=controlled, stages="".join(stages)) + ending
+    return {"controlled": controlled, "stages": stages, **ending}
 
 
 def choose_link(mechanism: UrdfMechanism, body: str) -> str:
@@ -545,68 +505,64 @@ def list_stage_names(mechanism: UrdfMechanism, paths: StagePaths) -> tuple[str, 
 
 def _choose_coordinates(
     graph: JointGraph, q: FloatArray, platform: str, T_body_frame: FloatArray
-) -> str:
-    """Return the coordinates in which a frame of the platform is commanded, as a list."""
+) -> list[str]:
+    """Return the coordinates in which a frame of the platform is commanded."""
     home = graph.get_place(graph.place(q[None]), platform)[0] @ T_body_frame
     motions = graph.find_twists(q, platform, T_body_frame) @ graph.find_motions(q)
-    return ", ".join(choose_coordinates(home, motions))
+    return list(choose_coordinates(home, motions))
 
 
-def _format_limbs(urdf: Urdf, stage: ClosedStage) -> str:
+def _describe_limbs(urdf: Urdf, stage: ClosedStage) -> Content:
     """Return the keys of the family limbs."""
     paths, T_body_frame = stage.paths, stage.frame
     graph = paths.graph
     home = graph.get_place(graph.place(paths.home[None]), paths.platform)[0] @ T_body_frame
-    limbs = [format_limb(paths, limb, T_body_frame) for limb in paths.limbs]
-    parameters = "".join(limb.parameters for limb in limbs)
-    drives = (f"  {quote_scalar(n)}: {_format_drive(urdf.joints[n])}" for n in graph.motors)
-    return LIMBS.format(
-        freedoms=", ".join(paths.freedoms),
-        controlled=_choose_coordinates(graph, paths.home, paths.platform, T_body_frame),
-        actuators="\n".join(drives),
-        limbs="".join(limb.text for limb in limbs),
-        parameters=f"parameters:\n{parameters}\n" if parameters else "",
-        home=format_pose(home),
-    )
+    limbs = [describe_limb(paths, limb, T_body_frame) for limb in paths.limbs]
+    parameters = [entry for _, entries in limbs for entry in entries]
+    return {
+        "freedoms": list(paths.freedoms),
+        "controlled": _choose_coordinates(graph, paths.home, paths.platform, T_body_frame),
+        "actuators": {name: _describe_drive(urdf.joints[name]) for name in graph.motors},
+        "limbs": [limb for limb, _ in limbs],
+        **({"parameters": parameters} if parameters else {}),
+        "home": describe_pose(home),
+    }
 
 
-def _format_loop(urdf: Urdf, name: str, stage: ClosedStage, T_frame_body: FloatArray) -> str:
+def _describe_loop(urdf: Urdf, stage: ClosedStage, T_frame_body: FloatArray) -> Content:
     """Return a stage with closed loops.
 
     T_frame_body (4, 4) is the body that carries it in the platform of the stage before.
     """
     mount = T_frame_body @ stage.mount
     is_moved = not np.array_equal(mount, np.eye(4))
-    line = f"    mount: {format_pose(mount)}\n" if is_moved else ""
-    robot = textwrap.indent(_format_limbs(urdf, stage), "    ")
-    return LOOP.format(name=quote_scalar(name), mount=line, robot=robot)
+    moved = {"mount": describe_pose(mount)} if is_moved else {}
+    return {**moved, "family": "limbs", **_describe_limbs(urdf, stage)}
 
 
-def _format_joint(urdf: Urdf, name: str, stage: SerialStage, T_frame_body: FloatArray) -> str:
-    """Return a stage of one driven joint; arguments as those of `_format_loop`."""
-    joint, place = stage.joint, T_frame_body @ stage.joint.T_a
-    tip = geometry.invert_pose(joint.T_b) @ stage.frame
-
-    def list_entries() -> Iterator[str]:
-        yield f"kind: {joint.kind}"
-        yield f"at: {format_pose(place)}"
-        yield f"axis: {format_list(joint.axis)}"
-        if not np.array_equal(tip, np.eye(4)):
-            yield f"tip: {format_pose(tip)}"
-        yield f"drive: {quote_scalar(joint.name)}"
-        yield f"start: {stage.start!r}"
-        limits = urdf.joints[joint.name].limits
-        if limits is not None:
-            yield f"stroke: [{limits[0]!r}, {limits[1]!r}]"
-        yield f"errors: [{', '.join([*joint.shifts, 'offset'])}]"
-
-    return JOINT.format(name=quote_scalar(name), entries=", ".join(list_entries()))
+def _describe_joint(urdf: Urdf, stage: SerialStage, T_frame_body: FloatArray) -> Content:
+    """Return a driven joint; arguments as those of `_describe_loop`."""
+    joint, tip = stage.joint, geometry.invert_pose(stage.joint.T_b) @ stage.frame
+    return {
+        "kind": joint.kind,
+        "at": describe_pose(T_frame_body @ joint.T_a),
+        "axis": _clear(joint.axis),
+        **({} if np.array_equal(tip, np.eye(4)) else {"tip": describe_pose(tip)}),
+        "drive": joint.name,
+        "start": stage.start,
+        **_describe_stroke(urdf.joints[joint.name]),
+        "errors": [*joint.shifts, "offset"],
+    }
 
 
-def _format_drive(joint: UrdfJoint) -> str:
+def _describe_drive(joint: UrdfJoint) -> Content:
     """Return one drive of the robot file."""
-    stroke = "" if joint.limits is None else f", stroke: [{joint.limits[0]!r}, {joint.limits[1]!r}]"
-    return f"{{reads: {'angle' if joint.kind == 'R' else 'length'}, unknown: [offset]{stroke}}}"
+    reads = "angle" if joint.kind == "R" else "length"
+    return {"reads": reads, "unknown": ["offset"], **_describe_stroke(joint)}
+
+
+def _describe_stroke(joint: UrdfJoint) -> Content:
+    return {} if joint.limits is None else {"stroke": list(joint.limits)}
 
 
 FORMAT = Format(
