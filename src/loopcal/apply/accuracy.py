@@ -276,12 +276,14 @@ def combine_errors(
     known = directions * np.sqrt(np.where(is_infinite, 0.0, variance))[:, None, :]
     root = np.concatenate([D @ known[:, None], *others], axis=3)
     # such as at the pose to which errors are relative
-    is_rounding = np.linalg.norm(root, axis=3) < ROUNDING * twist_weights(robot)[[3, 3, 3, 0, 0, 0]]
+    is_rounding = (
+        np.linalg.norm(root, axis=3) < ROUNDING * twist_weights(robot.size)[[3, 3, 3, 0, 0, 0]]
+    )
     root[is_rounding] = 0.0
     covariance = root @ root.swapaxes(2, 3)
     if is_infinite.any():
         unknown = np.where(is_infinite[:, None, :], directions, 0.0)
-        moved = np.linalg.norm(D @ unknown[:, None], axis=3) * twist_weights(robot)
+        moved = np.linalg.norm(D @ unknown[:, None], axis=3) * twist_weights(robot.size)
         lost = moved > NO_MOTION * size[..., None]
         covariance[lost[..., :, None] | lost[..., None, :]] = np.nan
         trial, pose, component = np.nonzero(lost)

@@ -314,7 +314,7 @@ def _report_targets(
     not_compensable: FloatArray,
 ) -> tuple[Finding, ...]:
     """Return one finding for each target."""
-    distances = distances * twist_weights(robot) / robot.size
+    distances = distances * twist_weights(robot.size) / robot.size
     allowed, why = check_limits(robot, robot.values[None], final.q[None], final.state)
     first, last = np.linalg.norm(distances[[0, -1]], axis=2)
     is_loose = last > np.maximum(REDUCED * first, ROUNDING)

@@ -29,8 +29,10 @@ from loopcal import geometry
 from loopcal.diagnose.gauge_freedoms import (
     find_gauge_freedoms,
     find_moving_frames,
+    observe_motions,
     probe_readings,
     twist_weights,
+    weigh_motions,
 )
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.posterior import Posterior
@@ -38,11 +40,10 @@ from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import MOTIONS, frame_twists
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.mechanism.kinematics import compute_readings, forward_trials
+from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward
-from loopcal.mechanism.states import Status
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.typing import FloatArray
 
@@ -127,7 +128,7 @@ def fit_frames(robot: Mechanism, T: FloatArray, motions: FloatArray) -> FrameFit
     Rotations count times the robot's size, and displacements are those of the tool.
     """
     arm, m = T[:, :3, :3] @ robot.tool[:3, 3], len(T)
-    weight = twist_weights(robot)[:, None] * geometry.transport_matrix(arm)
+    weight = twist_weights(robot.size)[:, None] * geometry.transport_matrix(arm)
     by_frames = (weight @ frame_twists(T, robot.size)).reshape(6 * m, MOTIONS)
     u, s, vt = np.linalg.svd(by_frames @ motions, full_matrices=False)
     # where the orientation is constant, opposite motions of both frames move nothing
@@ -284,13 +285,8 @@ def reference_poses(posterior: Posterior) -> ReferencePoses:
         readings, where = frames.readings, "measured"
     else:
         readings, where = probe_readings(robot), "home"
-    state = forward_trials(robot, robot.values[None], readings[None])
-    reached = state.status[0] == Status.CONVERGED
-    D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
-    usable = reached & np.isfinite(D).all(axis=(1, 2))
-    T = state.T[0, usable]
-    twists = list_error_twists(posterior, T, D[usable][:, :, posterior.places])
-    return ReferencePoses(T, twists, where)
+    T, D = observe_motions(robot, readings)
+    return ReferencePoses(T, list_error_twists(posterior, T, D[:, :, posterior.places]), where)
 
 
 def list_error_twists(posterior: Posterior, T: FloatArray, D: FloatArray) -> FloatArray:
@@ -310,13 +306,10 @@ def _names_readings(posterior: Posterior) -> bool:
 
 def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tuple[str, ...]:
     """Return which frames a motion (12, p) that fits twists (m, 6, p) moves: the fewest."""
-    M = frame_twists(fit.poses, fit.size)
-    weight = np.array([fit.size] * 3 + [1.0] * 3)[:, None]
-    moved, base, platform = (
-        (weight * D).reshape(6 * len(M), -1) for D in (M @ motion, M[:, :, :6], M[:, :, 6:])
-    )
+    motions, base, platform = weigh_motions(fit.poses, fit.size, twists)
+    moved = np.concatenate([base, platform], axis=1) @ motion
     length = float(np.linalg.norm(moved))
-    if not length > FIT_TOLERANCE * np.linalg.norm(weight * twists):
+    if not length > FIT_TOLERANCE * np.linalg.norm(motions):
         return ()
     return find_moving_frames(moved, base, platform, FIT_TOLERANCE * length)
 
@@ -377,7 +370,7 @@ def linearize_tool_errors(
         H @ frame.own_errors(solution.T),
         H @ (S.readings[0] * robot.stated_sigma),
         by_discrepancy,
-        np.linalg.norm(D[..., :p] * twist_weights(robot)[:, None], axis=(1, 2)),
+        np.linalg.norm(D[..., :p] * twist_weights(robot.size)[:, None], axis=(1, 2)),
         frame.describe(axes=""),
     )
 

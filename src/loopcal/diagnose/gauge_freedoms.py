@@ -9,18 +9,18 @@ where its frames are placed. See docs/theory/gauge.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.information import ObservedPoses, observe_poses
 from loopcal.estimate.linearization import spread_states
 from loopcal.estimate.null_space import Combination
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
+from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
@@ -62,15 +62,12 @@ def find_gauge_freedoms(posterior: Posterior) -> GaugeFreedoms:
     null = posterior.directions[:, ~posterior.determined]
     if null.shape[1] == 0:
         return GaugeFreedoms(null, (), 0, np.zeros((12, 0)))
-    robot, values = posterior.robot, posterior.robot.values
-    readings = probe_readings(robot)
-    state = forward_trials(robot, values[None], readings[None], follow=False)
-    D = differentiate_pose(robot, values[None], readings[None], state).parameters[0]
-    usable = (state.status[0] == Status.CONVERGED) & np.isfinite(D).all(axis=(1, 2))
-    if not usable.any():
+    robot = posterior.robot
+    T, D = observe_motions(robot, probe_readings(robot))
+    if not len(T):
         return GaugeFreedoms(null, (), 0, np.zeros((12, 0)))
-    twists = D[usable][:, :, posterior.places] * posterior.unit
-    motions, base, platform = _weigh_motions(robot, state.T[0, usable], twists)
+    twists = D[:, :, posterior.places] * posterior.unit
+    motions, base, platform = weigh_motions(T, robot.size, twists)
     total = float(np.linalg.norm(motions))
     moved = motions @ null
     _, s, vt = np.linalg.svd(_without_span([base, platform], moved), full_matrices=False)
@@ -83,27 +80,31 @@ def find_gauge_freedoms(posterior: Posterior) -> GaugeFreedoms:
     frames = find_moving_frames(moving, base, platform, SAME_MOTION * total) if count else ()
     infinite = np.isinf(posterior.variance[~posterior.determined])
     kept = null @ _gauge_projector(gauge, infinite)
-    unit = np.array([1.0 / robot.size] * 3 + [1.0] * 3)
-    both = np.concatenate([base * unit, platform * unit], axis=1)
+    both = np.concatenate([base, platform], axis=1)
     motion = np.linalg.lstsq(both, moving, rcond=NO_MOTION)[0]
     explained = motion / np.linalg.norm(motion, axis=0)
-    growth = np.zeros((int(usable.sum()), 6, 1))
-    growth[:, 3:, 0] = state.T[0, usable, :3, 3]
+    growth = np.zeros((len(T), 6, 1))
+    growth[:, 3:, 0] = T[:, :3, 3]
     rest = _without_span([base, platform, growth.reshape(-1, 1)], moved)
     with_scale = np.linalg.svd(rest, compute_uv=False) <= SAME_MOTION * total
     return GaugeFreedoms(kept, frames, count, explained, bool(with_scale.sum() > gauge.shape[1]))
 
 
-def twist_weights(robot: Mechanism) -> FloatArray:
+def twist_weights(size: float) -> FloatArray:
     """Return (6,) factors that make rotations [rad] comparable with displacements [m]: the robot's
     size, and one.
     """
-    return np.array([robot.size] * 3 + [1.0] * 3)
+    return np.array([size] * 3 + [1.0] * 3)
 
 
-def probe_workspace(free: FreeParameters, joints: Iterable[str] = ()) -> ObservedPoses:
-    """Return poses about home with evenly spread readings, without those out of reach."""
-    return observe_poses(free, probe_readings(free.robot), joints)
+def observe_motions(robot: Mechanism, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the poses T (n, 4, 4) that a robot reaches at readings (m, a), and their twists
+    (n, 6, p) by all parameters [per SI].
+    """
+    state = forward_trials(robot, robot.values[None], readings[None])
+    D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
+    usable = (state.status[0] == Status.CONVERGED) & np.isfinite(D).all(axis=(1, 2))
+    return state.T[0, usable], D[usable]
 
 
 def interpret_combinations(
@@ -112,22 +113,18 @@ def interpret_combinations(
     """Return combinations with the motion of the robot that each of them stands for."""
     if not combinations:
         return combinations
-    poses = probe_workspace(free)
-    if not len(poses.readings):
+    robot = free.robot
+    T, D = observe_motions(robot, probe_readings(robot))
+    if not len(T):
         return combinations
-    usable = poses.is_reached & np.isfinite(poses.twists[0]).all(axis=(1, 2))
-    if not usable.any():
-        return combinations
-    motions, base, platform = _weigh_motions(
-        free.robot, poses.T[0, usable], poses.twists[0, usable]
-    )
+    motions, base, platform = weigh_motions(T, robot.size, D[:, :, free.places] * free.tolerance)
     frames = {"platform": platform, "base": base}
     limit = NO_MOTION * float(np.linalg.norm(motions))
     interpreted = []
     for combination in combinations:
         n = combination.direction
         moved = motions @ (n / np.linalg.norm(n))
-        motion = _describe_motion(moved, frames, limit, free.robot.size)
+        motion = _describe_motion(moved, frames, limit, robot.size)
         interpreted.append(replace(combination, meaning="" if motion is None else motion))
     return tuple(interpreted)
 
@@ -201,13 +198,13 @@ def _probe_redundant(robot: Mechanism) -> FloatArray:
     return readings[find_directly_reachable(robot, robot.values[None], readings[None])[0]]
 
 
-def _weigh_motions(
-    robot: Mechanism, T: FloatArray, twists: FloatArray
+def weigh_motions(
+    T: FloatArray, size: float, twists: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weighted motions at poses (n, 4, 4): (6 n, p) by `twists` (n, 6, p), (6 n, 6) by the
-    base frame and (6 n, 6) by the platform frame.
+    """Return motions at poses (n, 4, 4), rotations times the robot's size: (6 n, p) by `twists`
+    (n, 6, p), and (6 n, 6) by the base and by the platform frame, see `frame_twists`.
     """
-    M, weight = geometry.differentiate_by_frames(T), twist_weights(robot)[:, None]
+    M, weight = frame_twists(T, size), twist_weights(size)[:, None]
     motions, base, platform = (
         (weight * D).reshape(-1, D.shape[-1]) for D in (twists, M[:, :, :6], M[:, :, 6:])
     )
@@ -250,12 +247,13 @@ def _describe_motion(
 
 
 def _describe_frame_motion(frame: str, motion: FloatArray, size: float) -> Finding:
-    """Return a finding on a twist (6,): a translation, a rotation about an axis, or both.
+    """Return a finding on a twist (6,) as in `frame_twists`: a translation, a rotation about an
+    axis, or both.
 
     Data: `frame`; `motion`, a translation, rotation or screw; `axis`, its direction;
     `through_origin`, whether the axis of a rotation passes through the origin of the frame.
     """
-    w, c = motion[:3], motion[3:]
+    w, c = motion[:3] / size, motion[3:]
     turn = float(np.linalg.norm(w))
     if turn * size <= SAME_MOTION * np.linalg.norm(c):
         kind, axis, through_origin = "translation", c, True

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from loopcal.diagnose.gauge_freedoms import interpret_combinations, probe_workspace
+from loopcal.diagnose.gauge_freedoms import interpret_combinations, probe_readings
 from loopcal.errors import DataError, EstimationError, MechanismError
 from loopcal.estimate.free_parameters import FreeParameters, free_only, select_free_parameters
 from loopcal.estimate.information import (
@@ -488,7 +488,7 @@ def suggest_measurements(
         q = sample_workspace(free.robot, POSES, seed=0).solution.q
         scene = observe_poses(free, q, names)
     except MechanismError:  # no stated workspace
-        scene = probe_workspace(free, names)
+        scene = observe_poses(free, probe_readings(free.robot), names)
     for words, kind in _list_candidates(free.robot, joints):
         try:
             seen = _measure_at(scene, kind, SIGMA | (sigma or {}))

@@ -249,7 +249,7 @@ def _expand_errors(
     unit = free.tolerance
     slopes = differentiate_pose(robot, fits.values, cell.held_out.q[None], state)
     D = slopes.parameters[..., free.places] * unit
-    size = np.linalg.norm(D * twist_weights(robot)[:, None], axis=(2, 3))
+    size = np.linalg.norm(D * twist_weights(robot.size)[:, None], axis=(2, 3))
     if cell.motions.shape[1]:
         by_measured = differentiate_pose(robot, fits.values, cell.reference.q[None], measured)
         reference = by_measured.parameters[..., free.places] * unit
