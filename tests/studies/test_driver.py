@@ -10,10 +10,11 @@ import gc
 import json
 import shutil
 import tracemalloc
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from loopcal.studies.executors import Answer, Dask, Processes, Serial
 from loopcal.studies.files.store import (
     NAME,
     StudySource,
+    StudyStore,
     extend_study,
     merge_studies,
     open_store,
@@ -33,13 +35,12 @@ from loopcal.studies.files.store import (
 )
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.running import (
-    KEPT_POSES,
     MOST_WAITING,
-    Schedule,
     Share,
     count_blocks,
     count_stored,
     estimate_time,
+    list_missing_tasks,
     read_source,
     run_blocks,
     run_study,
@@ -55,7 +56,6 @@ from loopcal.studies.specification.levels import (
     NoiseLevel,
     PosesLevel,
 )
-from loopcal.studies.specification.study import Study, describe_cell
 from loopcal.typing import FloatArray
 from tests.findings.expectations import expect_refusal, list_codes
 from tests.studies.small_study import CELLS, write_study
@@ -270,7 +270,7 @@ def is_poses_of_twelve(task: BlockTask | PosesTask) -> bool:
 
 @pytest.mark.parametrize(
     ("is_given_up", "missing", "losses", "named"),
-    [(is_second_block, 4, 20, "cell 0, block 1"), (is_poses_of_twelve, 8, 10, "cell 2, poses")],
+    [(is_second_block, 4, 20, "cell 0, block 1"), (is_poses_of_twelve, 8, 5, "cell 2, poses")],
 )
 def test_tasks_that_are_given_up_are_reported_and_computed_the_next_time(
     tmp_path, is_given_up, missing, losses, named
@@ -399,104 +399,96 @@ POSES = CellPoses([[0.1, 0.2]], [[0.3, 0.4]])
 METHODS = {"LS": MethodLevel("least-squares"), "MAP": MethodLevel("map")}
 
 
-def list_missing(study: Study) -> Iterator[Iterator[tuple[int, dict[str, Any]]]]:
-    for cell in study.cells:
-        contents = [describe_cell(study, cell) | {"block": block} for block in range(study.blocks)]
-        yield iter([(cell.number, content) for content in contents])
-
-
 def make_poses(count: int) -> dict[str, PosesLevel]:
     return {str(n): PosesLevel(n) for n in range(4, 4 + count)}
 
 
-def make_schedule(**changes: Any) -> Schedule:
-    return Schedule(list_missing(make_study("five-bar", **changes)))
+class EmptyStore:
+    """A store without blocks."""
+
+    def count_blocks(self, _levels: Any, _blocks: Any) -> int:
+        return 0
+
+    def list_keys(self, _levels: Any, _blocks: Any) -> set[str]:
+        return set()
 
 
-def name(task: BlockTask | PosesTask | None) -> str:
-    """Return "poses", the cell and block, or "none"."""
-    if task is None:
-        return "none"
-    return "poses" if isinstance(task, PosesTask) else f"{task.cell}/{task.block}"
+class Tasks:
+    """The tasks of a study of which nothing is stored, by name."""
 
+    def __init__(self, **changes: Any) -> None:
+        self.poses: dict[str, CellPoses | None] = {}
+        self.given_up: list[str] = []
+        study, store = make_study("five-bar", **changes), cast(StudyStore, EmptyStore())
+        self.rest = list_missing_tasks(study, store, self.poses, self.given_up)
 
-def take_poses(schedule: Schedule) -> PosesTask:
-    task = next(schedule)
-    assert isinstance(task, PosesTask)
-    return task
+    def take(self, count: int) -> list[str]:
+        """Return "poses", the cell and block, or "none", of so many tasks."""
+        names = []
+        for task in islice(self.rest, count):
+            block = f"{task.cell}/{task.block}" if isinstance(task, BlockTask) else "poses"
+            names.append("none" if task is None else block)
+        return names
 
+    def take_poses(self) -> str:
+        """Return the key of the next task, which is one of poses."""
+        task = next(self.rest)
+        assert isinstance(task, PosesTask)
+        return task.key
 
-def take_names(schedule: Schedule, count: int) -> list[str]:
-    return [name(next(schedule)) for _ in range(count)]
-
-
-def count_poses(schedule: Schedule) -> int:
-    """Return how many poses are computed until the schedule ends."""
-    count = 0
-    for task in schedule:
-        if isinstance(task, PosesTask):
-            schedule.add_poses(task, POSES)
-            count += 1
-    return count
+    def count_poses(self) -> int:
+        """Return how many poses are computed until the tasks end."""
+        for task in self.rest:
+            if isinstance(task, PosesTask):
+                self.poses[task.key] = POSES
+        return len(self.poses)
 
 
 def test_one_worker_gets_the_tasks_of_the_study() -> None:
-    study = make_study("five-bar", replicates=12, poses=make_poses(2))
-    schedule, blocks = Schedule(list_missing(study)), []
-    for task in schedule:
+    changes = {"replicates": 12, "poses": make_poses(2)}
+    tasks, given = Tasks(**changes), []
+    for task in tasks.rest:
         if isinstance(task, PosesTask):
             poses = compute_task(task)
             assert isinstance(poses, CellPoses)
-            schedule.add_poses(task, poses)
+            tasks.poses[task.key] = poses
         else:
-            blocks.append(task)
-    assert blocks == list(list_tasks(study))
+            given.append(task)
+    assert given == list(list_tasks(make_study("five-bar", **changes)))
 
 
-def test_poses_of_the_next_cell_are_computed_beside_the_blocks_of_this_one() -> None:
-    schedule = make_schedule(replicates=18, poses=make_poses(3))
-    schedule.add_poses(take_poses(schedule), POSES)
-    assert take_names(schedule, 1) == ["0/0"]
-    second = take_poses(schedule)
-    assert take_names(schedule, 2) == ["0/1", "0/2"]
-    third = take_poses(schedule)  # rather than none
-    assert take_names(schedule, 2) == ["none", "none"]
-    schedule.add_poses(third, POSES)
-    schedule.add_poses(second, POSES)
-    assert take_names(schedule, 6) == ["2/0", "2/1", "2/2", "1/0", "1/1", "1/2"]
-    assert next(schedule, "end") == "end"
+def test_poses_of_a_cell_come_before_its_blocks_and_those_of_others_while_it_waits() -> None:
+    tasks = Tasks(replicates=18, poses=make_poses(3))
+    tasks.poses[tasks.take_poses()] = POSES
+    assert tasks.take(3) == ["0/0", "0/1", "0/2"]
+    second, third = tasks.take_poses(), tasks.take_poses()
+    assert tasks.take(2) == ["none", "none"]
+    tasks.poses[second] = POSES
+    assert tasks.take(4) == ["1/0", "1/1", "1/2", "none"]
+    tasks.poses[third] = POSES
+    assert tasks.take(4) == ["2/0", "2/1", "2/2"]
 
 
 def test_many_workers_compute_poses_of_many_cells_at_once() -> None:
-    schedule = make_schedule(poses=make_poses(MOST_WAITING + 5))
-    assert take_names(schedule, MOST_WAITING + 1) == [*["poses"] * MOST_WAITING, "none"]
+    tasks = Tasks(poses=make_poses(MOST_WAITING + 5))
+    assert tasks.take(MOST_WAITING + 1) == [*["poses"] * MOST_WAITING, "none"]
 
 
-def test_cells_with_the_same_poses_wait_for_one_task() -> None:
-    schedule = make_schedule(methods=METHODS, poses=make_poses(2))
-    first = take_poses(schedule)
-    second = take_poses(schedule)
-    assert name(next(schedule)) == "none"
-    schedule.add_poses(second, POSES)
-    assert take_names(schedule, 3) == ["2/0", "3/0", "none"]
-    schedule.add_poses(first, POSES)
-    assert take_names(schedule, 2) == ["0/0", "1/0"]
+def test_cells_with_the_same_poses_have_one_task() -> None:
+    tasks = Tasks(methods=METHODS, poses=make_poses(2))
+    first, second = tasks.take_poses(), tasks.take_poses()
+    tasks.poses[first] = POSES
+    assert tasks.take(3) == ["0/0", "1/0", "none"]
+    tasks.poses[second] = POSES
+    assert tasks.take(3) == ["2/0", "3/0"]
+    assert Tasks(methods=METHODS, poses=make_poses(3), order=("method", "poses")).count_poses() == 3
 
 
-def test_later_cells_take_the_poses_of_earlier_ones() -> None:
-    factors = {"methods": METHODS, "order": ("method", "poses")}
-    assert count_poses(make_schedule(poses=make_poses(3), **factors)) == 3
-    many = KEPT_POSES + 1  # the oldest ones are forgotten, one after the other
-    assert count_poses(make_schedule(poses=make_poses(many), **factors)) == 2 * many
-
-
-def test_cells_whose_poses_are_given_up_are_left_out() -> None:
-    schedule = make_schedule(methods=METHODS, poses=make_poses(2))
-    first, second = take_poses(schedule), take_poses(schedule)
-    schedule.add_poses(second, POSES)
-    assert schedule.give_up(first) == [0, 1]
-    assert take_names(schedule, 2) == ["2/0", "3/0"]
-    assert next(schedule, "end") == "end"
+def test_cells_whose_poses_are_given_up_are_left_out_and_named() -> None:
+    tasks = Tasks(methods=METHODS, poses=make_poses(2))
+    tasks.poses |= {tasks.take_poses(): None, tasks.take_poses(): POSES}
+    assert tasks.take(3) == ["2/0", "3/0"]
+    assert tasks.given_up == ["cell 0, poses", "cell 1, poses"]
 
 
 def test_poses_depend_on_what_determines_them_only() -> None:
@@ -512,13 +504,13 @@ def test_poses_depend_on_what_determines_them_only() -> None:
     for choice in ("random", "planned"):
         poses = {choice: PosesLevel(5, choice)}
         for factor, levels in factors.items():
-            counts[choice, factor] = count_poses(make_schedule(poses=poses, **{factor: levels}))
+            counts[choice, factor] = Tasks(poses=poses, **{factor: levels}).count_poses()
     assert {key for key, count in counts.items() if count == 2} == {
         ("planned", factor) for factor in ("instruments", "noise", "errors")
     }
     true_errors = {"1": ErrorsLevel(), "2": ErrorsLevel(error_factor=2.0)}
     planned = {"planned": PosesLevel(5, "planned")}
-    assert count_poses(make_schedule(poses=planned, errors=true_errors)) == 1
+    assert Tasks(poses=planned, errors=true_errors).count_poses() == 1
 
 
 @pytest.mark.slow

@@ -9,13 +9,14 @@ import json
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
@@ -50,81 +51,8 @@ from loopcal.studies.specification.levels import FACTORS, PER_LEG
 from loopcal.studies.specification.study import Cell, Study, compute_key, describe_cell
 from loopcal.typing import Progress, report_no_progress
 
-KEPT_POSES = 256
-"""Poses that are kept, because later cells have the same ones, such as those of other methods."""
-
 MOST_WAITING = 64
-"""Cells that may wait for poses which they have in common."""
-
-
-Blocks = Iterator[tuple[int, dict[str, Any]]]
-"""The missing blocks of one cell: its number, and what determines the numbers of each."""
-
-
-class Schedule(Iterator["BlockTask | PosesTask | None"]):
-    """Tasks, one by one: the poses of a cell, then its blocks; None while all that is left needs
-    poses that a worker computes.
-
-    cells : missing blocks of each cell. Few of them are taken ahead, so that memory does not grow
-    with the number of cells or blocks.
-    """
-
-    def __init__(self, cells: Iterable[Blocks]) -> None:
-        self._cells = iter(cells)
-        self._current: tuple[Blocks, CellPoses] | None = None
-        self._next: deque[tuple[Blocks, CellPoses]] = deque()  # not begun, poses are known
-        self._waiting: dict[str, list[tuple[int, Blocks]]] = {}  # by the task of their poses
-        self._poses: dict[str, CellPoses] = {}  # the latest ones, by their task
-
-    def __next__(self) -> BlockTask | PosesTask | None:
-        """Return the next task."""
-        if not self._next and not self._waiting and (task := self._look_ahead()) is not None:
-            return task
-        while True:
-            if self._current is not None:
-                blocks, poses = self._current
-                if (block := next(blocks, None)) is not None:
-                    return make_block_task(*block, poses)
-            self._current = None
-            if not self._next and (task := self._look_ahead()) is not None:
-                return task
-            if self._next:
-                self._current = self._next.popleft()
-            elif self._waiting:
-                return None
-            else:
-                raise StopIteration
-
-    def add_poses(self, task: PosesTask, poses: CellPoses) -> None:
-        """Accept the poses of a task; the blocks that wait for them come next."""
-        self._next.extend((blocks, poses) for _, blocks in self._waiting.pop(task.key))
-        self._poses[task.key] = poses
-        if len(self._poses) > KEPT_POSES:
-            del self._poses[next(iter(self._poses))]
-
-    def give_up(self, task: PosesTask) -> list[int]:
-        """Leave out the cells that wait for poses, and return their numbers."""
-        return [cell for cell, _ in self._waiting.pop(task.key)]
-
-    def _look_ahead(self) -> PosesTask | None:
-        """Take cells until one can begin, or needs poses that no worker has; return their task."""
-        while sum(map(len, self._waiting.values())) < MOST_WAITING:
-            blocks = next(self._cells, None)
-            if blocks is None:
-                return None
-            first = next(blocks, None)
-            if first is None:
-                continue
-            cell, content = first
-            blocks, task = chain((first,), blocks), make_poses_task(content)
-            if (poses := self._poses.get(task.key)) is not None:
-                self._next.append((blocks, poses))
-                return None
-            waiting = self._waiting.setdefault(task.key, [])
-            waiting.append((cell, blocks))
-            if len(waiting) == 1:
-                return task
-        return None
+"""Cells whose poses are asked for while the first of them waits for its own."""
 
 
 MOST_NAMED = 5
@@ -217,28 +145,25 @@ def run_blocks(
     begin = time.perf_counter()
     total, before = count_blocks(study, share), count_stored(study, store, share)
     computed = trials = losses = 0
-    seconds, given_up = 0.0, []
+    seconds, given_up, poses = 0.0, list[str](), dict[str, CellPoses | None]()
     progress(before, total, "computing blocks")
-    schedule = Schedule(_list_missing(study, store, share))
+    tasks = list_missing_tasks(study, store, poses, given_up, share)
     compute = compute_task if threads == 1 else partial(compute_task, threads=threads)
-    with closing(executor.map_blocks(compute, schedule)) as answers:
+    with closing(executor.map_blocks(compute, tasks)) as answers:
         for answer in answers:
             task, result = answer.task, answer.result
             losses, seconds = losses + answer.losses, seconds + answer.seconds
             if isinstance(task, PosesTask):
-                if isinstance(result, CellPoses):
-                    schedule.add_poses(task, result)
-                else:
-                    given_up += [f"cell {cell}, poses" for cell in schedule.give_up(task)]
-                continue
-            if result is None:
+                assert not isinstance(result, np.ndarray)
+                poses[task.key] = result
+            elif result is None:
                 given_up.append(f"cell {task.cell}, block {task.block}")
-                continue
-            assert not isinstance(result, CellPoses)
-            levels = study.cells[task.cell].levels
-            if store.add_block(task.key, levels, task.block, result, answer.seconds):
-                computed, trials = computed + 1, trials + len(result)
-            progress(before + computed, total, "computing blocks")
+            else:
+                assert isinstance(result, np.ndarray)
+                levels = study.cells[task.cell].levels
+                if store.add_block(task.key, levels, task.block, result, answer.seconds):
+                    computed, trials = computed + 1, trials + len(result)
+                progress(before + computed, total, "computing blocks")
     wall = time.perf_counter() - begin
     return RunReport(total, before, computed, trials, tuple(given_up), losses, wall, seconds)
 
@@ -254,22 +179,50 @@ def count_stored(study: Study, store: StudyStore, share: Share = WHOLE) -> int:
     return sum(store.count_blocks(cell.levels, blocks) for cell in share.select_cells(study))
 
 
-def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blocks]:
-    """Yield, for one cell after the other, its blocks that are not stored."""
-    blocks = share.select_blocks(study)
+def list_missing_tasks(
+    study: Study,
+    store: StudyStore,
+    poses: Mapping[str, CellPoses | None],
+    given_up: list[str],
+    share: Share = WHOLE,
+) -> Iterator[BlockTask | PosesTask | None]:
+    """Yield for each cell its poses, where no cell before it has the same, and then its blocks that
+    are not stored; None while the next cell needs poses that no worker has returned.
 
-    def list_blocks(cell: Cell) -> Blocks:
-        of_cell = describe_cell(study, cell)
-        for first in range(0, len(blocks), LISTED):
-            listed = blocks[first : first + LISTED]
-            stored = store.list_keys(cell.levels, listed)
-            for content in (of_cell | {"block": block} for block in listed):
-                if compute_key(content) not in stored:
-                    yield cell.number, content
-
-    for cell in share.select_cells(study):
-        if store.count_blocks(cell.levels, blocks) < len(blocks):
-            yield list_blocks(cell)
+    poses : by the key of their task, which the caller adds; None for those given up, whose
+        cells are named in given_up.
+    """
+    blocks, asked = share.select_blocks(study), set[str]()
+    cells = (
+        cell
+        for cell in share.select_cells(study)
+        if store.count_blocks(cell.levels, blocks) < len(blocks)
+    )
+    waiting = deque[tuple[Cell, dict[str, Any], str]]()
+    while True:
+        needs_more = not waiting or (waiting[0][2] not in poses and len(waiting) < MOST_WAITING)
+        if needs_more and (cell := next(cells, None)) is not None:
+            content = describe_cell(study, cell)
+            task = make_poses_task(content)
+            waiting.append((cell, content, task.key))
+            if task.key not in asked:
+                asked.add(task.key)
+                yield task
+        elif not waiting:
+            return
+        elif waiting[0][2] not in poses:
+            yield None
+        else:
+            cell, content, key = waiting.popleft()
+            if (known := poses[key]) is None:
+                given_up.append(f"cell {cell.number}, poses")
+                continue
+            for first in range(0, len(blocks), LISTED):
+                listed = blocks[first : first + LISTED]
+                stored = store.list_keys(cell.levels, listed)
+                for of_block in (content | {"block": block} for block in listed):
+                    if compute_key(of_block) not in stored:
+                        yield make_block_task(cell.number, of_block, known)
 
 
 MOST_BLOCKS = 4
