@@ -16,7 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretations import list_orders, permute_columns, with_measured
+from loopcal.diagnose.conventions.interpretations import (
+    FACTORS,
+    list_orders,
+    permute_columns,
+    with_measured,
+)
 from loopcal.diagnose.outliers import (
     BlockSearch,
     Influence,
@@ -231,11 +236,6 @@ UNUSED: dict[str, Any] = {
     "factor": 1.0,
     "column": "",
     "left_out": "",
-}
-# Factors by which values in another unit differ.
-FACTORS: dict[Dimension, tuple[float, ...]] = {
-    Dimension.LENGTH: (1e3, 1e-3, 10.0, 0.1, 25.4, 1.0 / 25.4),
-    Dimension.ANGLE: (180.0 / np.pi, np.pi / 180.0, 1e3, 1e-3, 60.0, 1.0 / 60.0),
 }
 
 
