@@ -174,19 +174,27 @@ class Table:
         FileError : no unit or one of another dimension, a cell that is not a finite number (or
         `inf`, where `infinite` cells are allowed), or is empty where it must not be.
         """
-        factor, cells = self.factor(name, dimension), self.text(name)
-        values = parse_decimals(cells, factor)
-        for row in np.flatnonzero(np.isnan(values)).tolist():
-            cell, value = cells[row], math.inf
-            if not infinite or cell != "inf":
-                value = self.number(name, row, cell, empty)
-            values[row] = parse_exact(cell, factor) if math.isfinite(value) else value
+        factor = self.factor(name, dimension)
+        values = self.scaled_numbers(name, factor, empty, infinite)
         beyond = np.flatnonzero((np.abs(values) > LARGEST) & np.isfinite(values))
         if len(beyond):
             row = int(beyond[0])
             allowed = f"{LARGEST / factor:g} [{self.units[name]}]"
-            sentence = f"column {name!r} is {cells[row]}, beyond {allowed}"
+            sentence = f"column {name!r} is {self.text(name)[row]}, beyond {allowed}"
             raise self.row_error(row, f"{sentence}; correct the number or the unit")
+        return values
+
+    def scaled_numbers(
+        self, name: str, factor: float, empty: bool = True, infinite: bool = False
+    ) -> FloatArray:
+        """Return the products (n,) of the cells of a column with a factor; see `numbers`."""
+        cells = self.text(name)
+        values = parse_decimals(cells, factor)
+        for row in np.flatnonzero(np.isnan(values)).tolist():
+            if infinite and cells[row] == "inf":
+                values[row] = math.inf
+            elif cells[row] or not empty:
+                raise self._refuse_cell(name, row, cells[row])
         return values
 
     def factor(self, name: str, dimension: Dimension, symbol: str | None = None) -> float:
@@ -201,21 +209,15 @@ class Table:
         except UnitError as error:
             raise self.header_error(f"column {name!r}: {error}") from None
 
-    def number(self, name: str, row: int, cell: str, empty: bool = True) -> float:
-        """Return one cell as a number, NaN for an empty one."""
+    def _refuse_cell(self, name: str, row: int, cell: str) -> FileError:
+        """Return why a cell is not a finite number."""
         if not cell:
-            if empty:
-                return math.nan
-            raise self.row_error(row, f"column {name!r} is empty, but required; write its value")
-        value = parse_number(cell)
-        if value is None:
+            return self.row_error(row, f"column {name!r} is empty, but required; write its value")
+        if parse_number(cell) is None:
             sentence = f"column {name!r} is {quote(cell)}, but a number is needed"
-            raise self.row_error(row, f"{sentence}, such as 12.5 or 1e-3")
-        if not math.isfinite(value):
-            sentence = f"column {name!r} is {quote(cell)}, which is not finite"
-            act = "leave the cell empty where nothing was measured"
-            raise self.row_error(row, f"{sentence}; {act}")
-        return value
+            return self.row_error(row, f"{sentence}, such as 12.5 or 1e-3")
+        sentence = f"column {name!r} is {quote(cell)}, which is not finite"
+        return self.row_error(row, f"{sentence}; leave the cell empty where nothing was measured")
 
     def header_error(self, sentence: str) -> FileError:
         """Return an error at the header line."""

@@ -26,8 +26,6 @@ from loopcal.io.core.csv_table import (
     Table,
     format_exact,
     format_scaled,
-    parse_decimals,
-    parse_exact,
     suggest_header,
 )
 from loopcal.mechanism.model import Mechanism
@@ -150,11 +148,7 @@ class ProductColumn(Column):
             table.factor(self.name, dimension, symbol.strip())
             for symbol, dimension in zip(symbols, self.dimensions, strict=True)
         )
-        cells = table.text(self.name)
-        numbers = parse_decimals(cells, 1.0)
-        for row in np.flatnonzero(np.isnan(numbers)).tolist():
-            numbers[row] = table.number(self.name, row, cells[row], empty=False)
-        return numbers * (a * b)
+        return table.scaled_numbers(self.name, 1.0, empty=False) * (a * b)
 
     def format(self, value: Any) -> str:
         """Return a covariance [SI] in the unit."""
@@ -190,14 +184,11 @@ class ContextColumn(Column):
             allowed = ", ".join(f"[{s}]" for s in self.units)
             raise table.header_error(f"column {self.name!r} has {stated}; write one of {allowed}")
         factor, offset = self.units[symbol]
-        values = parse_decimals(cells, factor) + offset
+        values = table.scaled_numbers(self.name, factor) + offset
         lowest = -math.inf if self.name == TIME else ABSOLUTE_ZERO - ROUNDING
-        for row in np.flatnonzero(~(values >= lowest)).tolist():
-            is_empty = math.isnan(table.number(self.name, row, cells[row]))
-            values[row] = math.nan if is_empty else parse_exact(cells[row], factor) + offset
-            if values[row] < lowest:
-                sentence = f"column {self.name!r} is {cells[row]} {symbol}, below absolute zero"
-                raise table.row_error(row, f"{sentence}; correct it, or leave the cell empty")
+        for row in np.flatnonzero(values < lowest).tolist():
+            sentence = f"column {self.name!r} is {cells[row]} {symbol}, below absolute zero"
+            raise table.row_error(row, f"{sentence}; correct it, or leave the cell empty")
         return values
 
     @staticmethod
