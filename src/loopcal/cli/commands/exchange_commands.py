@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,7 +20,6 @@ from loopcal.errors import DataError
 from loopcal.units import Dimension, find_unit, list_symbols
 
 if TYPE_CHECKING:
-    from loopcal.io.formats.program_format import Format
     from loopcal.results.tables import Block
 
 
@@ -305,10 +304,18 @@ def import_(
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """
     from loopcal.diagnose.fit_examination import compare_stored_geometry
+    from loopcal.findings import report_finding
     from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.formats.import_export import choose_format, list_formats, save_imported
-    from loopcal.io.formats.program_format import ImportOptions
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.formats.import_export import (
+        choose_format,
+        export_robot,
+        list_formats,
+        save_imported,
+    )
+    from loopcal.io.formats.program_format import ExportSource, ImportOptions
+    from loopcal.io.runs.run_folder import list_reasons
 
     settings |= {"probes": probes}
     if profile is not None:
@@ -335,79 +342,45 @@ def import_(
                 f"{opt.name_option(key)} does not belong to the format {source.name}; leave it out"
             )
     imported = source.read(file, ImportOptions(make_name(output.stem), **stated))
+    report, changes, failures = None, [], []
     with restore_on_failure((output, data)):
         robot = save_imported(file, imported, output, data)
         noted = list(imported.findings)
         if source.stores_fit and imported.measurements is not None:
             stored = compare_stored_geometry(robot, imported.measurements)
             noted += [] if stored is None else [stored.finding]
-        correction = None
         if corrected is not None and data is not None:
-            correction = _correct_file(source, robot, file, data, corrected, force)
+            report = lc.calibrate(robot, opt.read_measurements([data], robot))
+            opt.print_convention_note(report.conventions, [data])
+            is_written = force or not report.failures
+            if report.failures:
+                facts = {"reasons": list_reasons(report.failures), "is_written": is_written}
+                failure = report_finding(
+                    "gates.correction-not-written", file=str(corrected), **facts
+                )
+                failures.append(with_hint(failure))
+            if is_written:
+                exported = export_robot(ExportSource(report.robot), source, file)
+                write_text(corrected, exported.text)
+                changes = [str(finding) for finding in exported.findings]
+            else:
+                corrected = None
     document: dict[str, Any] = {
         "robot": output,
         "data": data,
-        "corrected": corrected if correction is not None and correction.is_written else None,
+        "corrected": corrected,
         "notes": [str(finding) for finding in noted],
         "findings": imported.findings,
-        "fit": correction and correction.report.identification,
-        "verdict": correction and correction.report.verdict,
-        "reasons": correction and correction.report.failures,
-        "changes": correction and correction.changes,
+        "fit": report and report.identification,
+        "verdict": report and report.verdict,
+        "reasons": report and report.failures,
+        "changes": report and changes,
     }
-    failure = None if correction is None else correction.failure
-    return Output(
-        document,
-        lambda: _view_import(robot, document, noted, correction),
-        [] if failure is None else [with_hint(failure)],
-    )
-
-
-@dataclass(frozen=True)
-class _Correction:
-    """A calibration with imported measurements, and what it changed in the file.
-
-    `failure` : why it failed; then the file is only written where that was demanded.
-    """
-
-    report: lc.CalibrationReport
-    failure: lc.Finding | None
-    changes: tuple[str, ...]
-    is_written: bool
-
-
-def _correct_file(
-    source: Format, robot: lc.Mechanism, file: Path, data: Path, output: Path, force: bool
-) -> _Correction:
-    """Calibrate with the imported measurements, and write the corrected file."""
-    from loopcal.findings import report_finding
-    from loopcal.io.core.text_file import write_text
-    from loopcal.io.formats.import_export import export_robot
-    from loopcal.io.formats.program_format import ExportSource
-    from loopcal.io.runs.run_folder import list_reasons
-
-    report = lc.calibrate(robot, opt.read_measurements([data], robot))
-    opt.print_convention_note(report.conventions, [data])
-    failure, is_written = None, force or not report.failures
-    if report.failures:
-        failure = report_finding(
-            "gates.correction-not-written",
-            file=str(output),
-            reasons=list_reasons(report.failures),
-            is_written=is_written,
-        )
-    if not is_written:
-        return _Correction(report, failure, (), is_written)
-    exported = export_robot(ExportSource(report.robot), source, file)
-    write_text(output, exported.text)
-    return _Correction(report, failure, tuple(map(str, exported.findings)), is_written)
+    return Output(document, lambda: _view_import(robot, document, noted), failures)
 
 
 def _view_import(
-    robot: lc.Mechanism,
-    document: dict[str, Any],
-    noted: Sequence[lc.Finding],
-    correction: _Correction | None,
+    robot: lc.Mechanism, document: Mapping[str, Any], noted: Sequence[lc.Finding]
 ) -> list[Block]:
     """Return what was read, what was identified, and which lines were changed."""
     from loopcal.findings.wording import name_count
@@ -415,18 +388,15 @@ def _view_import(
 
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
     actuators, parameters = name_count(len(robot.actuators), "actuator"), name_count(n, "parameter")
-    counts = f"{actuators}, {parameters}, {free} free"
-    page: list[Block] = [f"{document['robot']}: {counts}"]
+    page: list[Block] = [f"{document['robot']}: {actuators}, {parameters}, {free} free"]
     if document["data"] is not None:
         page.append(f"{document['data']}: the measurements of the file")
     page += [f"note: {with_hint(finding)}" for finding in noted]
-    files = shlex.join((str(document["robot"]), str(document["data"] or "DATA")))
-    following = f"Next: loopcal calibrate {files} -o run"
-    if correction is None:
-        return [*page, following]
-    page += [*view_fit(correction.report.identification), *correction.changes]
-    if not correction.is_written:
-        return [*page, following]
+    if document["fit"] is not None:
+        page += [*view_fit(document["fit"]), *document["changes"]]
+    if document["corrected"] is None:
+        files = shlex.join((str(document["robot"]), str(document["data"] or "DATA")))
+        return [*page, f"Next: loopcal calibrate {files} -o run"]
     return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
 
 
