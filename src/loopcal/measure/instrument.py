@@ -13,7 +13,6 @@ from loopcal.measure.array_checks import (
     check_array,
     check_seed,
     check_type,
-    describe,
     refuse_first,
     set_fields,
 )
@@ -216,10 +215,6 @@ class Instrument:
     sensors: tuple[Sensor, ...]
 
     def __post_init__(self) -> None:
-        if isinstance(self.sensors, (str, Sensor)):
-            raise DataError(
-                f"sensors: got {describe(self.sensors)}; give a tuple of sensors, such as (sensor,)"
-            )
         set_fields(self, sensors=tuple(self.sensors))
         if not self.sensors:
             raise DataError("an instrument needs at least one sensor: a kind and its noise")

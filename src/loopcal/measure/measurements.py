@@ -16,7 +16,6 @@ from loopcal.measure.array_checks import (
     check_array,
     check_seed,
     check_type,
-    describe,
     refuse_first,
     set_fields,
 )
@@ -129,18 +128,15 @@ class Measurements(TableResult):
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(measured_pose="labels")
 
     def __post_init__(self) -> None:
-        is_uncertain = self.reading_sigma is not None  # then NaN stands for a missing reading
-        if isinstance(self.readings, str):
-            raise DataError(
-                f"readings: got {describe(self.readings)}; give an array (n, a) in SI units; "
-                "loopcal.load_measurements reads a file"
+        readings = check_array(self.readings, "readings", (None, None), allow_nan=True)
+        if self.reading_sigma is None:
+            refuse_first(
+                np.isnan(readings),
+                lambda i, j: (
+                    f"readings: row {i + 1}, column {j + 1} is nan; give a finite number, or "
+                    "reading_sigma = inf where it is missing"
+                ),
             )
-        try:
-            readings = check_array(self.readings, "readings", (None, None), allow_nan=is_uncertain)
-        except DataError as error:
-            if not is_uncertain and np.isnan(np.asarray(self.readings, dtype=float)).any():
-                raise DataError(f"{error}, or reading_sigma = inf where it is missing") from None
-            raise
         n = len(readings)
         if n == 0:
             raise DataError("the measurements have no pose; give at least one row of readings")
@@ -154,10 +150,6 @@ class Measurements(TableResult):
         labels = tuple(self.labels) or tuple(str(i + 1) for i in range(n))
         if len(labels) != n:
             raise DataError(f"{len(labels)} labels for {n} poses; give one for each")
-        if isinstance(self.observations, Observations):
-            raise DataError(
-                "observations: got a single Observations; give a tuple, such as (observations,)"
-            )
         for rows in self.observations:
             check_type(
                 rows, Observations, "observations", "such as loopcal.Observations.from_sigma(...)"

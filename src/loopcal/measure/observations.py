@@ -18,7 +18,6 @@ from loopcal.measure.array_checks import (
     broadcast_array,
     check_array,
     check_type,
-    describe,
     refuse_first,
     set_fields,
 )
@@ -224,10 +223,8 @@ class Observations:
             raise DataError(f"the kind {kind.name!r} has no tool; use kind.with_tool(robot.tool)")
         rows = check_rows(self.rows, kind)
         rows = np.zeros_like(rows) if kind.is_of_base else rows
-        c, m, r = len(kind.columns), len(kind.noise_columns), len(rows)
-        measured = check_array(
-            self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True
-        )
+        m, r = len(kind.noise_columns), len(rows)
+        measured = check_measured(self.measured, kind, r)
         wanted = f"one number for each of {r} rows"
         weights = broadcast_array(self.weight, (r,), "the weight", wanted)
         weight = check_array(weights, "the weight", (r,))
@@ -279,19 +276,7 @@ class Observations:
         session, group : text or (r,) text.
         """
         check_type(kind, Kind, "kind", "such as loopcal.Pose()")
-        try:
-            values = np.asarray(measured, dtype=float)
-        except (TypeError, ValueError):
-            raise DataError(
-                f"measured: got {describe(measured)}; give an array of numbers (r, "
-                f"{len(kind.columns)}) in SI units; loopcal.load_measurements reads files"
-            ) from None
-        if values.ndim != 2 or values.shape[1] != len(kind.columns):
-            columns = ", ".join(column.name for column in kind.columns)
-            raise DataError(
-                f"measured values of kind {kind.name!r} have shape {values.shape}; give (r, "
-                f"{len(kind.columns)}): {columns}"
-            )
+        values = check_measured(measured, kind)
         names = ", ".join(column.name for column in kind.noise_columns)
         shape = (len(values), len(kind.noise_columns))
         sd = broadcast_array(sigma, shape, "sigma", f"one number, or one for each of {names}")
@@ -355,6 +340,13 @@ class Observations:
     def with_weights(self, weight: ArrayLike) -> Self:
         """Return the same rows with other weights (r,)."""
         return replace(self, weight=np.asarray(weight, dtype=float))
+
+
+def check_measured(measured: ArrayLike, kind: Kind, r: int | None = None) -> FloatArray:
+    """Return measured values as a read-only array (r, c) of any number of rows, or of `r`."""
+    names = ", ".join(column.name for column in kind.columns)
+    what = f"measured values of kind {kind.name!r} ({names})"
+    return check_array(measured, what, (r, len(kind.columns)), allow_nan=True)
 
 
 def check_rows(rows: ArrayLike, kind: Kind) -> IntArray:

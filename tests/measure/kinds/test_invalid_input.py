@@ -141,7 +141,7 @@ REFUSED = {
         lambda: observe([0.0, 1.6], kind=Autocollimation())
     ),
     # shapes and numbers of observations
-    r"measured values of kind 'component' has shape \(2, 4\); give .*\(2, 3\)": (
+    r"measured values of kind 'component' \(x, y, z\) has shape \(2, 4\); give .*\(2, 3\)": (
         lambda: observe_points(measured=np.zeros((2, 4)))
     ),
     "row 1, column 2 is inf; give a finite number or NaN": (
@@ -169,7 +169,9 @@ REFUSED = {
     r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z": (
         lambda: observe([0.0] * 6, kind=POSE, sigma=[1.0, 2.0])
     ),
-    r"give \(r, 6\): rx, ry, rz, x, y, z": lambda: observe([0.0] * 5, kind=POSE),
+    r"\(rx, ry, rz, x, y, z\) has shape \(1, 5\); .* \(any, 6\)": lambda: observe(
+        [0.0] * 5, kind=POSE
+    ),
     # measurements and their readings
     "readings: row 1, column 2 is nan; give a finite number": (
         lambda: record(readings=[[1.0, np.nan], [0.0, 0.0]])
@@ -200,19 +202,16 @@ REFUSED = {
         lambda: Sensor(BAR, Gaussian(np.ones(1))).assign_rows(1)
     ),
     # arguments of another type
-    "'data.csv'.*load_measurements": lambda: record(readings="data.csv"),
+    "readings: got the text 'data.csv'; give an array": lambda: record(readings="data.csv"),
     "observations: got the text 'rows.csv'; give Observations": (
         lambda: record(observations=("rows.csv",))
     ),
     "kind: got the text 'pose'; give Kind, such as": lambda: observe_points(kind="pose"),
-    "measured: got the text 'data.csv'; give an array": (
+    r"\(x, y, z\): got the text 'data.csv'; give an array": (
         lambda: Observations.from_sigma(POINTS, [0], "data.csv", 1.0)
     ),
     "noise: got a float; give Noise, such as": (
         lambda: Sensor(POSE, 1e-5)  # type: ignore[arg-type]
-    ),
-    "give a tuple": (
-        lambda: Instrument(Sensor(POSE, Gaussian(np.ones(6))))  # type: ignore[arg-type]
     ),
     "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot": (
         lambda: sample_truth("hexapod-42", 1, 0)  # type: ignore[arg-type]
