@@ -123,7 +123,7 @@ def test_compensation_from_a_fit_gives_the_uncertainty_of_each_target():
 
 def test_invalid_compensation_arguments_are_refused():
     robot = load_robot("3-prs")
-    with pytest.raises(DataError, match="mode is 'poses'; it must be 'readings' or 'commands'"):
+    with pytest.raises(DataError, match=r"mode is 'poses'.*must be one of 'readings', 'commands'"):
         compensate(robot, [[0.7, 0, 0]], "poses")  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match="steps is 0; it must be 1 or more"):
         compensate(robot, [[0.7, 0, 0]], "commands", steps=0)

@@ -191,7 +191,7 @@ def test_wrong_input_is_refused_with_what_is_allowed() -> None:
     robot, data = linear_delta()
     fit = identify(robot, data)
     for arguments, text in (
-        ({"scheme": "jackknife"}, "wild, pairs or normal"),
+        ({"scheme": "jackknife"}, "one of 'wild', 'pairs', 'normal'"),
         ({"count": 1}, "at least 2"),
         ({"unit": "day"}, "14 poses"),
         ({"unit": 14}, "at least 5 blocks of the unit '14-pose run'"),

@@ -105,7 +105,7 @@ def test_names_are_patterns_and_unknown_ones_are_refused(fit) -> None:
         lc.compute_joint_region(fit, ["leg1.base.w"])
     with pytest.raises(EstimationError, match="between 0 and 1"):
         lc.compute_joint_region(fit, NAMES, 95)
-    with pytest.raises(EstimationError, match="must be one of maximum"):
+    with pytest.raises(EstimationError, match="must be one of 'maximum'"):
         lc.compute_simultaneous_intervals(fit, NAMES, rule="tukey")  # pyright: ignore[reportArgumentType]
 
 

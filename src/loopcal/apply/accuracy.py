@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal import geometry
+from loopcal.checks import check_choice
 from loopcal.diagnose.error_frames import (
     FITTED,
     RELATIVE,
@@ -198,11 +199,8 @@ def pose_uncertainty(
     ------
     EstimationError : an option that is not allowed, or an unreachable `origin`.
     """
-    for name, value, allowed in (("axes", axes, Axes), ("point", point, Point)):
-        if value not in get_args(allowed):
-            raise EstimationError(
-                f"{name} is {value!r}; it must be one of {', '.join(map(repr, get_args(allowed)))}"
-            )
+    check_choice("axes", axes, get_args(Axes))
+    check_choice("point", point, get_args(Point))
     posterior = fit.posterior if isinstance(fit, Identification) else fit
     robot = posterior.robot
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)

@@ -18,9 +18,10 @@ from loopcal.apply.verdict import (
     report_unexplained,
     report_validation,
 )
+from loopcal.checks import check_choice
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
+from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
@@ -96,7 +97,7 @@ def calibrate(
     check_types(robot, data)
     check_type(options, CalibrationOptions, "options", "such as CalibrationOptions(hold_out=0.25)")
     instruments = (name for name, *_ in list_instrument_frames(data))
-    check_frame(options.frame, (FITTED, BASE, RELATIVE, *instruments))
+    check_choice("frame", options.frame, (FITTED, BASE, RELATIVE, *instruments))
     kept = exclude_poses(data, options.fit.excluded_poses)
     if options.prior is not None:
         filled = exclude_poses(fill_in_reading_sigma(robot, data), options.fit.excluded_poses)

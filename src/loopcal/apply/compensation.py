@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
+from loopcal.checks import check_choice
 from loopcal.diagnose.error_frames import FITTED, fit_unfixed_frames
 from loopcal.diagnose.gauge_freedoms import twist_weights
 from loopcal.errors import DataError
@@ -198,8 +199,7 @@ def compensate(
         labels.
     EstimationError : no such frame.
     """
-    if mode not in get_args(Mode):
-        raise DataError(f"mode is {mode!r}; it must be 'readings' or 'commands'")
+    check_choice("mode", mode, get_args(Mode), DataError)
     if steps < 1:
         raise DataError(f"steps is {steps}; it must be 1 or more, and 3 are usually enough")
     source = fit.posterior if isinstance(fit, Identification) else fit

@@ -21,6 +21,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from loopcal.checks import check_choice
 from loopcal.diagnose.cluster_covariance import (
     FEWEST_CLUSTERS,
     FEWEST_DEGREES,
@@ -381,9 +382,7 @@ class Bootstrap(TableResult):
             "bias-corrected": quantiles shifted by the share of resamples below the estimate (Efron,
             1981). "studentized": quantiles of (resample - estimate) / sd, each with its own noise.
         """
-        if kind not in get_args(IntervalKind):
-            words = ", ".join(get_args(IntervalKind))
-            raise EstimationError(f"kind of interval is {kind!r}; it must be one of {words}")
+        check_choice("kind of interval", kind, get_args(IntervalKind))
         estimate, weight = self.fit.estimate, np.full(len(self.draws), 1.0 / len(self.draws))
         quantile, linear, error = compare_ends(self.draws, weight, self.linear, weight, level)
         half = 0.5 * (linear[1] - linear[0])
@@ -475,8 +474,7 @@ def bootstrap(
     EstimationError : the fit did not converge, the data have no such unit, or fewer than two
         resamples converged.
     """
-    if scheme not in get_args(Scheme):
-        raise EstimationError(f"scheme is {scheme!r}; it must be wild, pairs or normal")
+    check_choice("scheme", scheme, get_args(Scheme))
     if count < 2:
         raise EstimationError(f"{count} resamples: give at least 2")
     if not fit.converged:

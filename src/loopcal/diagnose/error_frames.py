@@ -19,13 +19,13 @@ Derivation: docs/theory/gauge.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from loopcal import geometry
+from loopcal.checks import check_choice
 from loopcal.diagnose.gauge_freedoms import (
     find_gauge_freedoms,
     find_moving_frames,
@@ -34,7 +34,7 @@ from loopcal.diagnose.gauge_freedoms import (
     twist_weights,
     weigh_motions,
 )
-from loopcal.errors import EstimationError, suggest_names
+from loopcal.errors import EstimationError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import MOTIONS, frame_twists
@@ -163,7 +163,7 @@ def choose_error_frame(
     """
     robot = posterior.robot
     instruments = {} if posterior.frames is None else posterior.frames.instruments
-    check_frame(frame, (FITTED, BASE, RELATIVE, *instruments))
+    check_choice("frame", frame, (FITTED, BASE, RELATIVE, *instruments))
     motions = list_unfixed_motions(posterior)
     if frame in (FITTED, BASE) and not motions.shape[1]:
         own = posterior.discrepancy
@@ -253,15 +253,6 @@ def follow_pose(
 def solve_home(robot: Mechanism) -> Solution:
     """Return the home pose (1,) of a robot, to which errors may be relative."""
     return forward(robot, compute_readings(robot, robot.values[None], robot.home_state)[0])
-
-
-def check_frame(frame: str, allowed: Sequence[str]) -> None:
-    """Raise EstimationError for a frame that does not exist."""
-    if frame not in allowed:
-        raise EstimationError(
-            f"frame is {frame!r}{suggest_names(frame, allowed)}; it must be one of "
-            f"{', '.join(map(repr, allowed))}"
-        )
 
 
 def list_unfixed_motions(posterior: Posterior) -> FloatArray:

@@ -27,6 +27,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from loopcal.checks import check_choice
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
@@ -394,8 +395,7 @@ def compute_simultaneous_intervals(
     ------
     EstimationError : as `compute_joint_region`, or an unknown rule.
     """
-    if rule not in get_args(Rule):
-        raise EstimationError(f"rule is {rule!r}; it must be one of {', '.join(get_args(Rule))}")
+    check_choice("rule", rule, get_args(Rule))
     chosen = _select(fit, names, level, combinations)
     q = len(chosen.names)
     degrees = chosen.posterior.count_degrees(chosen.effect[:, None, :])
