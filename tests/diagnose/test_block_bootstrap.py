@@ -202,7 +202,7 @@ def test_wrong_input_is_refused_with_what_is_allowed() -> None:
     ):
         with pytest.raises(EstimationError, match=text):
             lc.bootstrap(fit, data, **{"count": 10, **arguments})
-    with pytest.raises(EstimationError, match="one of widened, percentile"):
+    with pytest.raises(EstimationError, match="one of 'widened', 'percentile'"):
         lc.bootstrap(fit, data, 10).intervals(kind="normal")  # pyright: ignore[reportArgumentType]
     stopped = identify(robot, data, options=FitOptions(control=lc.StepControl(iterations=0)))
     with pytest.raises(EstimationError, match="did not converge"):
