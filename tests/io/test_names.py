@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.core.csv_table import read_settings, read_table
+from loopcal.io.core.csv_table import read_table
 from loopcal.io.core.limits import (
     LONGEST_COMPOSED,
     LONGEST_NAME,
@@ -155,7 +155,7 @@ def test_settings_file_and_profile_with_such_names_are_refused(tmp_path) -> None
     (tmp_path / "data.csv").write_text("pose,x [mm]\np,1\n")
     (tmp_path / "data.yaml").write_text('kind: position\nframe: "\\e[31m"\n')
     with pytest.raises(FileError, match=r"data.yaml:2: the name '\\x1b\[31m' contains U\+001B"):
-        read_settings(tmp_path / "data.csv")
+        read_table(tmp_path / "data.csv")
     profile = tmp_path / "profile.yaml"
     profile.write_text('columns: {pose: {from: "=A(1)", match: "=(?P<pose>.*)"}, "=x|": {from: 1}}')
     with pytest.raises(FileError, match=r"a spreadsheet computes the name '=x\|'"):

@@ -10,7 +10,7 @@ import pytest
 import loopcal as lc
 from loopcal.apply.calibration_options import split_data
 from loopcal.errors import DataError, FileError
-from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements
+from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements, read_tables
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
@@ -160,7 +160,7 @@ def test_partly_held_out_block_is_refused(files, robot, data):
 def test_joined_empty_sheet_does_not_change_the_errors_before(files, robot, paths):
     alone = lc.calibrate(robot, load_measurements(["poses.csv", "values.csv"], robot))
     data = load_measurements(paths, robot)
-    assert list_unfilled_files(paths, data) == (Path("sheet.csv"),)
+    assert list_unfilled_files(read_tables(paths), data) == (Path("sheet.csv"),)
     assert len(data.observations) == 1
     joined = lc.calibrate(robot, data)
     assert alone.validation is not None
@@ -184,7 +184,7 @@ def test_poses_that_only_an_empty_sheet_names_are_ignored(files, robot):
         data = load_measurements(paths, robot)
         assert sorted(data.labels) == sorted(alone.labels)
         assert data.is_held_out.sum() == len(HELD_OUT)
-        assert list_unfilled_files(paths, data) == (Path("other.csv"),)
+        assert list_unfilled_files(read_tables(paths), data) == (Path("other.csv"),)
     report = lc.calibrate(robot, data)
     assert report.headline.endswith(f"from {POSES - len(HELD_OUT)} poses.")
 

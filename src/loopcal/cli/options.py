@@ -429,12 +429,13 @@ def read_measurements(
     no measured value.
     """
     from loopcal.diagnose.conventions.convention_check import explain_outside_strokes
-    from loopcal.io.core.csv_table import read_settings
     from loopcal.io.core.yaml_file import list_absolute_references
-    from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements
+    from loopcal.io.data.measurement_file import join_tables, list_unfilled_files, read_tables
 
-    for path in paths:
-        settings = read_settings(path)
+    with terminal.TerminalProgress("reading the measurements"):
+        tables = read_tables(paths)
+    for path, table in zip(paths, tables, strict=False):  # files that they name follow
+        settings = table.settings
         for finding in list_absolute_references(settings):
             terminal.print_note(finding)
         stated = str(settings.content.get("robot") or "").strip()
@@ -443,17 +444,16 @@ def read_measurements(
             terminal.print_finding("workflow.robot-of-other-name", **facts)
     try:
         with terminal.TerminalProgress("reading the measurements"):
-            data = load_measurements(paths, robot, **allowed)
-            unfilled = list_unfilled_files(paths, data)
+            data = join_tables(tables, robot, **allowed)
     except DataError as error:
         if error.finding is not None and error.finding.code == "data.outside-stroke":
-            accepted = load_measurements(paths, robot, **{**allowed, "allow_outside_stroke": True})
+            accepted = join_tables(tables, robot, **{**allowed, "allow_outside_stroke": True})
             explained = explain_outside_strokes(robot, accepted, error.finding.data)
             if explained is not None:
                 text = f"{' and '.join(map(str, paths))}: {explained}"
                 raise DataError(text) from DataError(explained)
         raise
-    for file in unfilled:
+    for file in list_unfilled_files(tables, data):
         terminal.print_finding("files.no-measured-value", file=str(file))
     return data
 

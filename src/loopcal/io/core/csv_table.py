@@ -331,11 +331,6 @@ def format_columns(columns: Mapping[str, Iterable[str]]) -> str:
     return "".join(format_row(cells) + "\n" for cells in (columns, *rows))
 
 
-def read_settings(path: str | Path) -> YamlFile:
-    """Return the settings of a measurement file; raise FileError as `read_table`."""
-    return _read_settings(as_path(path, WHAT), _read_lines(path))[0]
-
-
 def _read_lines(path: str | Path) -> list[str]:
     text = read_text(path, WHAT, CONVERT_HINT, TABLE_SIZE)
     TABLE_LINES.check(text.count("\n"), WHAT, path)

@@ -481,7 +481,10 @@ def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) ->
 
 
 def join_tables(
-    tables: Sequence[Table], robot: Mechanism, allow_outside_stroke: bool, allow_duplicates: bool
+    tables: Sequence[Table],
+    robot: Mechanism,
+    allow_outside_stroke: bool = False,
+    allow_duplicates: bool = False,
 ) -> Measurements:
     """Return the measurements of some tables; arguments as of `load_measurements`."""
     from loopcal.measure.data_checks import check_duplicates, check_strokes
@@ -554,11 +557,11 @@ def join_tables(
     return data if is_named.all() else data.take(is_named)
 
 
-def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
+def list_unfilled_files(tables: Sequence[Table], data: Measurements) -> tuple[Path, ...]:
     """Return the files that state a kind, but only hold poses and readings."""
     sources = {rows.source for rows in data.all_observations}
-    tables = (table for table in read_tables(path) if has_measured_values(table))
-    return tuple(table.path for table in tables if str(table.path) not in sources)
+    measured = (table.path for table in tables if has_measured_values(table))
+    return tuple(path for path in measured if str(path) not in sources)
 
 
 def list_measurement_files(path: Paths) -> dict[str, Path]:
