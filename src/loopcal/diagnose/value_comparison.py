@@ -38,7 +38,12 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.numerics.decomposition import NULL_COMPONENT, are_nonzero
+from loopcal.numerics.decomposition import (
+    NULL_COMPONENT,
+    are_nonzero,
+    find_null_space,
+    intersect_spaces,
+)
 from loopcal.numerics.statistics import (
     compute_averaged_tail,
     compute_chi_square_quantile,
@@ -410,8 +415,6 @@ def _find_complement(columns: FloatArray) -> FloatArray:
 # square; the noise of both is estimated, see `compute_averaged_tail`. Other errors enter the
 # covariance of u.
 
-# Sine of the angle up to which null directions of two linearizations are the same direction.
-PARALLEL = 1e-2
 # Share of the largest singular value above which a column of both data sets is independent.
 INDEPENDENT = 1e-9
 OF_NOISE = 2  # parts of the errors that are the noise of the two calibrations
@@ -558,17 +561,7 @@ def _remove_common_null(first: FloatArray, second: FloatArray) -> tuple[FloatArr
     """Return both sets of rows without the directions that neither determines: each has them at its
     own linearization, and the small angle between the two would count as information.
     """
-    bases = []
-    for rows in (first, second):
-        _, s, vt = np.linalg.svd(rows, full_matrices=True)
-        bases.append(vt[int(are_nonzero(s).sum()) if len(s) else 0 :].T)
-    null, other = bases
-    if not null.shape[1] or not other.shape[1]:
-        return first, second
-    outside = null - other @ (other.T @ null)
-    _, sine, combine = np.linalg.svd(outside, full_matrices=True)
-    sine = np.r_[sine, np.zeros(len(combine) - len(sine))]
-    common = null @ combine[sine < PARALLEL].T
+    common = intersect_spaces(find_null_space(first), find_null_space(second))
     return first - (first @ common) @ common.T, second - (second @ common) @ common.T
 
 

@@ -201,8 +201,8 @@ class ModelDiscrepancy:
         ]
 
 
-COMMON = 1.0 - 1e-9
-"""Cosine of the angle above which motions of two sets are the same motion."""
+SAME_MOTION = 4e-5
+"""Sine of the angle up to which motions of two sets are the same motion."""
 
 
 class InstrumentFrame(NamedTuple):
@@ -269,12 +269,6 @@ def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> FrameKnowledge | Non
     instruments = map(InstrumentFrame, *stacked)
     frames = dict(zip(map(str, labels.tolist()), instruments, strict=True))
     return FrameKnowledge(unfixed, readings, frames)
-
-
-def intersect_motions(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (12, k) of the motions that two bases (12, ..) have in common."""
-    u, cosine, _ = np.linalg.svd(first.T @ second, full_matrices=False)
-    return first @ u[:, cosine > COMMON]
 
 
 @dataclass(frozen=True, eq=False)

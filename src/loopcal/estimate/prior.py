@@ -27,11 +27,8 @@ from loopcal.measure.array_checks import check_type
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.decomposition import are_nonzero
+from loopcal.numerics.decomposition import find_null_space, intersect_spaces
 from loopcal.typing import FloatArray, IntArray
-
-PARALLEL = 1e-2
-"""Sine of the angle up to which null directions of two estimates are the same direction."""
 
 ELIMINATED = 1e-11
 """Share of the largest singular value below which an eliminated column depends on the others."""
@@ -134,7 +131,7 @@ class WithPrior:
         self.constant = np.atleast_2d(B @ (free.values(self.center)[0] - mean))
         if errors is not None:
             self.constant = self.constant + errors
-        self.unknown = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
+        self.unknown = find_null_space(self.slope)
 
     def start(self, deviation: FloatArray) -> Start:
         """Return the warm start of the measurements."""
@@ -185,12 +182,7 @@ class WithPrior:
         """
         if not np.isfinite(triangle).all():
             return self.slope
-        _, s, vt = np.linalg.svd(triangle)
-        null = vt[~are_nonzero(s)].T
-        outside = null - self.unknown @ (self.unknown.T @ null)
-        _, sine, combine = np.linalg.svd(outside, full_matrices=True)
-        sine = np.r_[sine, np.zeros(len(combine) - len(sine))]
-        common = null @ combine[sine < PARALLEL].T
+        common = intersect_spaces(find_null_space(triangle), self.unknown)
         return self.slope - (self.slope @ common) @ common.T
 
 

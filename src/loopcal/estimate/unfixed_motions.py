@@ -25,14 +25,14 @@ from loopcal.estimate.elimination import (
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import Linearization, LinearizedPoses, Start, linearize_rows
 from loopcal.estimate.observation_rows import ObservationRows
-from loopcal.estimate.posterior import FrameKnowledge, InstrumentFrame, intersect_motions
+from loopcal.estimate.posterior import SAME_MOTION, FrameKnowledge, InstrumentFrame
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.problem import Problem
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
-from loopcal.numerics.decomposition import empty_factor
+from loopcal.numerics.decomposition import empty_factor, intersect_spaces
 from loopcal.numerics.elimination import NodeFactors
 from loopcal.numerics.statistics import choose_evenly, find_distinct
 from loopcal.typing import FloatArray, IntArray
@@ -182,7 +182,7 @@ def describe_frames(
     if unfixed is None:
         return FrameKnowledge(np.zeros((MOTIONS, 0)), readings)
     if prior is not None and prior.unfixed is not None:
-        unfixed = intersect_motions(unfixed, prior.unfixed)
+        unfixed = intersect_spaces(unfixed, prior.unfixed, SAME_MOTION)
     is_known = np.isfinite(noise)  # not that of a fit that did not converge
     eliminated = None if linearization is None or not is_known else linearization.nuisance
     local = None if problem.nuisance is None else problem.nuisance.local

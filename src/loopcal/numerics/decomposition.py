@@ -294,6 +294,25 @@ class Decomposition(TrialBatch):
         return part > NULL_COMPONENT**2
 
 
+PARALLEL = 1e-2
+"""Sine of the angle up to which null directions of two linearizations are the same direction."""
+
+
+def find_null_space(rows: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (p, k) of the vectors that rows (m, p) do not see."""
+    _, s, vt = np.linalg.svd(rows, full_matrices=True)
+    return vt[int(are_nonzero(s).sum()) :].T
+
+
+def intersect_spaces(first: FloatArray, second: FloatArray, sine: float = PARALLEL) -> FloatArray:
+    """Return an orthonormal basis (p, k) of the directions in the span of `first` (p, a) whose
+    angle to the span of `second` (p, b) has at most this sine; both have orthonormal columns.
+    """
+    outside = first - second @ (second.T @ first)
+    _, sines, vt = np.linalg.svd(outside, full_matrices=False)
+    return first @ vt[sines < sine].T
+
+
 def empty_factor(trials: int, parameters: int) -> FloatArray:
     """Return the factor of no rows, zeros (t, p + 1, p + 1), into which rows are folded."""
     return np.zeros((trials, parameters + 1, parameters + 1))

@@ -31,7 +31,7 @@ from loopcal.diagnose.error_frames import (
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.information import collect_information, count_equations, observe_poses
-from loopcal.estimate.posterior import intersect_motions
+from loopcal.estimate.posterior import SAME_MOTION
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, Quantity, report_finding
@@ -42,7 +42,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.numerics.decomposition import Decomposition, are_nonzero
+from loopcal.numerics.decomposition import Decomposition, are_nonzero, intersect_spaces
 from loopcal.planning.candidates import Candidates, check_listed_poses, draw_candidates
 from loopcal.planning.constraints import N_POSES, Constraints, PlanOptions, Target
 from loopcal.planning.design_space import (
@@ -318,7 +318,7 @@ def prepare_problem(
         observable, labels = decompose_information(groups, earlier), measured.labels
         problem, z = problem_of(free, measured), free.deviation(robot.values[None])
         known = find_frame_knowledge(problem, measured, z, problem.start(z))
-        unfixed = intersect_motions(unfixed, known.unfixed)
+        unfixed = intersect_spaces(unfixed, known.unfixed, SAME_MOTION)
     return PlanningProblem(
         free,
         mounted,
