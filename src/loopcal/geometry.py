@@ -421,59 +421,50 @@ def _nonzero(divisor: FloatArray) -> FloatArray:
     return np.where(divisor == 0.0, 1e-100, divisor)
 
 
-def tilt_torsion_to_matrix(
-    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
-) -> FloatArray:
+TO_ZYZ = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+"""Matrix from tilt and torsion (phi, theta, psi) to Euler angles "ZYZ" (phi, theta, psi - phi)."""
+
+
+def tilt_torsion_to_matrix(angles: FloatArray) -> FloatArray:
     """Return the rotation of azimuth, tilt and torsion: `R = Rz(phi) Ry(theta) Rz(psi - phi)`.
 
     The platform normal leans by theta towards the azimuth phi; psi rotates about the normal.
     Source: I. A. Bonev, J. Ryu, "A new approach to orientation workspace analysis of 6-DOF parallel
     manipulators", DOI 10.1016/S0094-114X(00)00032-X.
     """
-    return (
-        rotation_about_axis(phi, 2)
-        @ rotation_about_axis(theta, 1)
-        @ rotation_about_axis(psi - phi, 2)
-    )
+    return euler_to_matrix(angles @ TO_ZYZ.T, "ZYZ")
 
 
-def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def matrix_to_tilt_torsion(rotation: FloatArray) -> FloatArray:
     """Return azimuth, tilt and torsion of a rotation, the inverse of `tilt_torsion_to_matrix`.
 
     phi and psi are in (-pi, pi], theta in [0, pi]. At zero tilt phi is undefined and returned as
     zero; psi is defined.
     """
     angles = matrix_to_euler(rotation, "ZYZ")
-    phi, theta = angles[..., 0], angles[..., 1]
-    return phi, theta, wrap_angle(phi + angles[..., 2])
+    psi = wrap_angle(angles[..., 0] + angles[..., 2])
+    return np.stack([angles[..., 0], angles[..., 1], psi], axis=-1)
 
 
-def tilt_torsion_rates(
-    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
-) -> FloatArray:
+def tilt_torsion_rates(angles: FloatArray) -> FloatArray:
     """Return E (..., 3, 3) with `omega = E d(phi, theta, psi)`; singular at zero tilt.
 
-    Its columns are `ez - R ez`, `Rz(phi) ey`, `R ez`. psi has no effect, since the torsion comes
-    first; it makes all rates have equal arguments.
+    Its columns are `ez - R ez`, `Rz(phi) ey`, `R ez`.
     """
-    cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
-    nx, ny, nz = cphi * stheta, sphi * stheta, ctheta + 0.0 * psi
-    return stack_matrix(((-nx, -sphi, nx), (-ny, cphi, ny), (1.0 - nz, 0.0, nz)))
+    return euler_rates(angles @ TO_ZYZ.T, "ZYZ") @ TO_ZYZ
 
 
-def tilt_torsion_rates_inverse(
-    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
-) -> FloatArray:
+def tilt_torsion_rates_inverse(angles: FloatArray) -> FloatArray:
     """Return the inverse of `tilt_torsion_rates`, `d(phi, theta, psi) = E^-1 omega`.
 
     With the normal n and its derivative e in theta, which with `Rz(phi) ey` are three orthogonal
     directions: `dphi = -e . omega / sin(theta)`, `dtheta = Rz(phi) ey . omega`, `dpsi = (n -
     tan(theta/2) e) . omega`. The first row alone is huge at zero tilt.
     """
+    phi, theta = angles[..., 0], angles[..., 1]
     cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
-    half = np.tan(0.5 * theta) + 0.0 * psi
+    half, sine = np.tan(0.5 * theta), _nonzero(stheta)
     ex, ey, ez = cphi * ctheta, sphi * ctheta, -stheta
-    sine = _nonzero(stheta)
     return stack_matrix(
         (
             (-ex / sine, -ey / sine, -ez / sine),
@@ -517,16 +508,6 @@ class OrientationForm:
     angles: bool = field(default=False, compare=False)
 
 
-def _split(convert: Callable[..., FloatArray], values: FloatArray) -> FloatArray:
-    """Convert azimuth, tilt and torsion (..., 3) by a function of the three."""
-    return convert(values[..., 0], values[..., 1], values[..., 2])
-
-
-def _stack_tilt_torsion(rotation: FloatArray) -> FloatArray:
-    """Return azimuth, tilt and torsion (..., 3) [rad] of rotations."""
-    return np.stack(matrix_to_tilt_torsion(rotation), axis=-1)
-
-
 _SIMPLE = {
     form.name: form
     for form in (
@@ -551,10 +532,10 @@ _SIMPLE = {
             ("phi", "theta", "psi"),
             ("phi", "theta", "psi"),
             Dimension.ANGLE,
-            partial(_split, tilt_torsion_to_matrix),
-            _stack_tilt_torsion,
-            partial(_split, tilt_torsion_rates),
-            partial(_split, tilt_torsion_rates_inverse),
+            tilt_torsion_to_matrix,
+            matrix_to_tilt_torsion,
+            tilt_torsion_rates,
+            tilt_torsion_rates_inverse,
             angles=True,
         ),
     )

@@ -80,18 +80,19 @@ def test_unknown_euler_order_is_refused_with_the_allowed_ones():
 
 @given(phi=turn, theta=st.floats(1e-3, np.pi - 1e-3), psi=turn)
 def test_tilt_and_torsion_round_trip(phi, theta, psi):
-    back = geometry.matrix_to_tilt_torsion(geometry.tilt_torsion_to_matrix(phi, theta, psi))
+    angles = np.array([phi, theta, psi])
+    back = geometry.matrix_to_tilt_torsion(geometry.tilt_torsion_to_matrix(angles))
     assert_allclose(
-        geometry.wrap_angle(np.array(back) - [phi, theta, psi]), np.zeros(3), atol=5e-12
+        geometry.wrap_angle(back - angles), np.zeros(3), atol=5e-12
     )  # [rad], ulps / sin
 
 
 @given(phi=turn, theta=st.floats(-200.0, -3.0).map(lambda e: 10.0**e), psi=st.floats(-3.1, 3.1))
 def test_tilt_and_torsion_stay_exact_at_vanishing_tilt(phi, theta, psi):
-    R = geometry.tilt_torsion_to_matrix(phi, theta, psi)
+    R = geometry.tilt_torsion_to_matrix(np.array([phi, theta, psi]))
     back = geometry.matrix_to_tilt_torsion(R)
     assert_allclose(back[1:], [theta, psi], atol=ROUNDING)
-    assert_allclose(geometry.tilt_torsion_to_matrix(*back), R, atol=ROUNDING)
+    assert_allclose(geometry.tilt_torsion_to_matrix(back), R, atol=ROUNDING)
 
 
 def test_zero_tilt_has_zero_azimuth_and_torsion_equal_to_the_rotation():
@@ -111,22 +112,22 @@ def test_tilt_torsion_matrix_has_the_printed_entries():
         [sp * ct * c + cp * s, -sp * ct * s + cp * c, sp * s_t],
         [-s_t * c, s_t * s, ct],
     ]
-    assert_allclose(geometry.tilt_torsion_to_matrix(phi, theta, psi), expected, atol=ROUNDING)
+    R = geometry.tilt_torsion_to_matrix(np.array([phi, theta, psi]))
+    assert_allclose(R, expected, atol=ROUNDING)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("theta", [0.02, 0.6, 2.8])
 def test_tilt_torsion_rates_are_the_derivative_and_have_the_stated_inverse(theta):
     angles = np.array([2.4, theta, -0.8])
-    base = geometry.tilt_torsion_to_matrix(*angles).T
+    base = geometry.tilt_torsion_to_matrix(angles).T
 
     def turned(x):
-        phi, tilt, psi = (angles[i] + x[i] for i in range(3))
-        return geometry.log_so3(geometry.tilt_torsion_to_matrix(phi, tilt, psi) @ base)
+        return geometry.log_so3(geometry.tilt_torsion_to_matrix(angles + x) @ base)
 
-    rates = geometry.tilt_torsion_rates(*angles)
+    rates = geometry.tilt_torsion_rates(angles)
     check_jacobian(turned, rates, np.zeros(3), scale=0.3, automatic=turned)
-    product = geometry.tilt_torsion_rates_inverse(*angles) @ rates
+    product = geometry.tilt_torsion_rates_inverse(angles) @ rates
     assert_allclose(product, np.eye(3), atol=ROUNDING / np.sin(theta))
 
 

@@ -30,7 +30,7 @@ SIZE = 0.3
 def random_poses(n, tilt=1.2, seed=3):
     rng = np.random.default_rng(seed)
     angles = rng.uniform([-3.0, 0.05, -3.0], [3.0, tilt, 3.0], (n, 3))
-    return geometry.make_pose(geometry.tilt_torsion_to_matrix(*angles.T), rng.normal(size=(n, 3)))
+    return geometry.make_pose(geometry.tilt_torsion_to_matrix(angles), rng.normal(size=(n, 3)))
 
 
 @pytest.mark.slow
@@ -71,7 +71,9 @@ def test_derivatives_of_every_coordinate_agree_with_differences(names, off):
 @pytest.mark.parametrize("names", [("x", "y", "z", "phi", "theta", "psi"), ("z", "phi", "theta")])
 @pytest.mark.parametrize("phi", [0.0, 2.0])
 def test_coordinate_derivatives_are_regular_at_zero_tilt(names, phi):
-    T = geometry.make_pose(geometry.tilt_torsion_to_matrix(phi, 0.0, 0.4), np.ones(3))[None]
+    T = geometry.make_pose(geometry.tilt_torsion_to_matrix(np.array([phi, 0.0, 0.4])), np.ones(3))[
+        None
+    ]
     values = {"x": 1.0, "y": 1.0, "z": 1.0, "phi": phi, "theta": 0.0, "psi": 0.4}
     target = np.array([[values[n] for n in names]])
     residual, columns = compare_coordinates(T, target, names, SIZE)

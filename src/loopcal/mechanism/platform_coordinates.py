@@ -52,7 +52,8 @@ def read_coordinates(T: FloatArray, names: tuple[str, ...]) -> FloatArray:
     """Return these coordinates (.., c) of poses T (.., 4, 4) [m, rad]."""
     values = {name: T[..., i, 3] for i, name in enumerate(POSITION)}
     if set(names) & set(TILT):
-        values |= dict(zip(TILT, geometry.matrix_to_tilt_torsion(T[..., :3, :3]), strict=True))
+        angles = geometry.matrix_to_tilt_torsion(T[..., :3, :3])
+        values |= {name: angles[..., i] for i, name in enumerate(TILT)}
     if set(names) & set(EULER):
         angles = geometry.matrix_to_euler(T[..., :3, :3], "xyz")
         values |= {name: angles[..., i] for i, name in enumerate(EULER)}
@@ -70,7 +71,8 @@ def pose_from_coordinates(
             T[..., i, 3] = given[name]
     zero = np.zeros(values.shape[:-1])
     if set(names) & set(TILT):
-        T[..., :3, :3] = geometry.tilt_torsion_to_matrix(*(given.get(name, zero) for name in TILT))
+        angles = np.stack([given.get(name, zero) for name in TILT], axis=-1)
+        T[..., :3, :3] = geometry.tilt_torsion_to_matrix(angles)
     if set(names) & set(EULER):
         angles = np.stack([given.get(name, zero) for name in EULER], axis=-1)
         T[..., :3, :3] = geometry.euler_to_matrix(angles, "xyz")
@@ -143,4 +145,4 @@ def _torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     # about
     normal = rotation[:, :, 2]
     row = (normal + np.array([0.0, 0.0, 1.0])) / (1.0 + normal[:, 2:])
-    return geometry.matrix_to_tilt_torsion(rotation)[2], row
+    return geometry.matrix_to_tilt_torsion(rotation)[..., 2], row

@@ -15,7 +15,8 @@ FIVE = Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", T_platform_too
 
 def make_poses(phi, theta, psi):
     return geometry.make_pose(
-        geometry.tilt_torsion_to_matrix(*np.broadcast_arrays(phi, theta, psi)), np.zeros(3)
+        geometry.tilt_torsion_to_matrix(np.stack(np.broadcast_arrays(phi, theta, psi), axis=-1)),
+        np.zeros(3),
     )[None]
 
 

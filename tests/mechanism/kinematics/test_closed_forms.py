@@ -219,7 +219,7 @@ def test_readings_and_poses_agree_with_closed_forms(name):
         half = {"3-prs": zoo.PRS_A, "3-rps": 0.15}[name] / 2 * (1 - np.cos(theta))
         N = np.stack([-half * np.cos(2 * phi), half * np.sin(2 * phi), z], axis=1)
         assert_allclose(sol.T[:, :3, 3], N, atol=1e-13)
-        R = geometry.tilt_torsion_to_matrix(phi, theta, 0.0 * phi)
+        R = geometry.tilt_torsion_to_matrix(np.stack([phi, theta, 0.0 * phi], axis=1))
         assert_allclose(sol.T[:, :3, :3], R, atol=1e-13)
     if name == "agile-eye":
         assert_allclose(sol.T[:, :3, 3], 0.0, atol=1e-15)

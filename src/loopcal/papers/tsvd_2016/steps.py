@@ -200,10 +200,8 @@ def _compare_poses(T: FloatArray, reference: FloatArray) -> FloatArray:
     """Return rms differences (a, 3) of poses (a, n, 4, 4): the first three MEASURES."""
     position = np.sum((T[..., :3, 3] - reference[..., :3, 3]) ** 2, axis=-1) / MM**2
     first, second = (geometry.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, reference))
-    angles = sum(
-        np.rad2deg(geometry.wrap_angle(a - b)) ** 2
-        for a, b in zip(first[:2], second[:2], strict=True)
-    )
+    turned = np.rad2deg(geometry.wrap_angle(first - second))[..., :2]
+    angles = np.sum(turned**2, axis=-1)
     normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - reference[..., :3, 2]) ** 2, axis=-1)
     return np.sqrt(np.stack([np.mean(x, axis=1) for x in (position, angles, normal)], axis=1))
 
