@@ -18,6 +18,7 @@ import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.documents import load_record
 from loopcal.errors import DataError, FileError
+from loopcal.report.calibration_view import build_budget_table, build_share_table
 from loopcal.report.document import figures
 from loopcal.report.document.calibration_document import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Picture, render_html
@@ -279,6 +280,18 @@ def test_report_of_a_printer_shows_the_heights_over_the_bed(root, tmp_path) -> N
         assert isinstance(picture, Picture)
         assert picture.name == "height-figure"
         assert len(by_point.rows) == 13
+
+
+def test_budget_of_a_platform_that_does_not_rotate_states_no_orientation(root) -> None:
+    """Its orientation has an uncertainty of 6e-19 rad by rounding."""
+    robot = lc.load_robot(root / "examples" / "delta-printer" / "printer.yaml")
+    data = lc.load_measurements(root / "examples" / "delta-printer" / "heights.csv", robot)
+    report = lc.calibrate(robot, data)
+    budget = report.budget.to_dict()
+    assert 0.0 < report.budget.orientation.rms < 1e-15
+    for table in (build_share_table(budget), build_budget_table(budget, robot)):
+        assert "position" in [column.title for column in table.columns]
+        assert not any("orientation" in column.title for column in table.columns)
 
 
 def test_noise_floor_of_uncertain_readings_is_called_a_lower_bound(page, root) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.error_budget import LENGTHS, Source
+from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, report_finding
@@ -360,7 +361,8 @@ def build_share_table(budget: Mapping[str, Any]) -> Table:
 
 def _list_kinds(budget: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the errors of poses: those of orientation only where the platform rotates."""
-    return tuple(LENGTHS)[: 1 if budget["orientation"]["rms"] == 0.0 else 2]
+    rms = budget["orientation"]["rms"]
+    return tuple(LENGTHS)[: 1 if rms is not None and rms <= ROUNDING else 2]
 
 
 def _show_share(variance: float | None, total: float) -> str:

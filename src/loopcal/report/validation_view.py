@@ -171,7 +171,7 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
     numbers = map(Column, ("count", *(metric.words for metric in METRICS.values())))
     caption = f"Error statistics (rows x targets), {validation.frame}"
-    table = make_table(caption, ("error", "of", *numbers, "unit"), rows)
+    table = make_table(caption, ("error", "quantity", *numbers, "unit"), rows)
     if with_before and is_correctable:
         return [table, "The actuators can correct all of the measured error."]
     return [table]

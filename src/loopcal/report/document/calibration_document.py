@@ -99,8 +99,12 @@ CONFORMITY = "conformity."
 
 OPEN = ("fit.unidentifiable", "fit.hardly", "workflow.undetermined", "workflow.frame", "setup.")
 OUTLYING = ("outliers.", "validation.blunder", "validation.unreachable", "fit.excluded", "fit.low")
-OF_RESIDUALS = ("noise.", "residuals.", "prior.")
-"""Beginnings of the codes of findings that other sections list."""
+OF_PARAMETERS = ("prior.", "residuals.correlated-parameters")
+OF_RESIDUALS = ("noise.", "residuals.")
+"""Beginnings of the codes of findings that other sections list, each in the first that has it."""
+
+ELSEWHERE = (CONFORMITY, *OPEN, *OUTLYING, *OF_PARAMETERS, *OF_RESIDUALS)
+"""Beginnings of the codes of all findings that have a section."""
 
 TOP = 3
 """Findings that this section shows, beside all failures and warnings."""
@@ -137,9 +141,8 @@ def select_important(findings: Iterable[Mapping[str, Any]]) -> list[Mapping[str,
     other section lists as make up TOP.
     """
     listed = list(findings)
-    elsewhere = (CONFORMITY, *OPEN, *OUTLYING, *OF_RESIDUALS)
     urgent = [finding for finding in listed if finding["severity"] in IMPORTANT]
-    others = [f for f in listed if f not in urgent and not f["code"].startswith(elsewhere)]
+    others = [f for f in listed if f not in urgent and not f["code"].startswith(ELSEWHERE)]
     return [*urgent, *others[: max(TOP - len(urgent), 0)]]
 
 
@@ -249,7 +252,8 @@ def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
         p_value = format_number(fit["p_value"], 2)
         yield f"Chi-square is {square} with {degrees} degrees of freedom (p = {p_value})."
     yield None
-    yield from select_findings(record, OF_RESIDUALS)
+    of_residuals = (f for f in record.findings if not f["code"].startswith(OF_PARAMETERS))
+    yield from list_findings(f for f in of_residuals if f["code"].startswith(OF_RESIDUALS))
 
 
 @describes_section("workspace", "Measured poses and accuracy over the workspace")
@@ -268,10 +272,9 @@ TERMS = (
     "divided by the tolerance (a standard deviation)."
 )
 BUDGET_TERMS = (
-    "The budget lists standard uncertainties (k = 1). Evaluation of type A uses the scatter of "
-    "these data, type B uses stated values such as the sigma of the instrument and the tolerances. "
-    "A position or orientation error is the length of a vector, so the table states no coverage "
-    "factor for it. The parameters above have one."
+    "Evaluation of type A uses the scatter of these data, type B uses stated values such as the "
+    "sigma of the instrument and the tolerances. A position or orientation error is the length of "
+    "a vector, so the table states no coverage factor for it. The parameters above have one."
 )
 NOT_TRACEABLE = (
     "The data state no serial number, certificate or date of calibration of the instrument, so "
@@ -281,18 +284,22 @@ NO_BUDGET = "This fit has no intervals, so there is no uncertainty budget."
 
 
 @describes_section("parameters", "Parameters")
-def describe_parameters(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield the parameters, the setup parameters, and figures of shifts and correlations."""
+def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
+    """Yield the parameters, the setup parameters, figures of shifts and correlations, and what was
+    found about tolerances and correlations.
+    """
     fit = record.result["fit"]
     if not record.converged:
         yield build_last_value_table(fit["parameters"])
-        return
-    yield TERMS
-    yield build_parameter_table("Identified parameters", fit["parameters"], is_complete=True)
-    if fit.get("interval_note"):
-        yield fit["interval_note"]
-    if fit.get("local"):
-        yield build_parameter_table("Setup parameters", fit["local"])
+    else:
+        yield TERMS
+        yield build_parameter_table("Identified parameters", fit["parameters"], is_complete=True)
+        if fit.get("interval_note"):
+            yield fit["interval_note"]
+        if fit.get("local"):
+            yield build_parameter_table("Setup parameters", fit["local"])
+    yield None
+    yield from select_findings(record, OF_PARAMETERS)
 
 
 @describes_section("budget", "Uncertainty budget")
@@ -360,9 +367,8 @@ def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
 @describes_section("findings", "Other findings")
 def describe_other_findings(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the findings that no other section shows."""
-    elsewhere = (CONFORMITY, *OPEN, *OUTLYING, *OF_RESIDUALS)
     top = [finding["text"] for finding in select_important(record.findings)]
-    rest = (f for f in record.findings if not f["code"].startswith(elsewhere))
+    rest = (f for f in record.findings if not f["code"].startswith(ELSEWHERE))
     yield from list_findings(f for f in rest if f["text"] not in top)
 
 

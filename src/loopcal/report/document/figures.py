@@ -203,7 +203,7 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
     count = f" of the {MOST_ROWS:,} that are compared" if is_part else ""
     yield (
         f"The standard uncertainty of the pose was computed at {len(accuracy.coordinates)} poses "
-        f"of the workspace, {accuracy.uncertainty.frame}. {less} of these poses are less certain "
+        f"of the workspace ({accuracy.uncertainty.frame}). {less} of these poses are less certain "
         f"than every measured pose{count}."
     )
     yield make_picture(
@@ -253,6 +253,5 @@ def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
             draw_correlation_matrix(record.robot.name, names, record.arrays["covariance"]),
             "correlation-figure",
             "Correlations of the parameters.",
-            "The matrix shows the correlation of each pair of parameters by color. The findings of "
-            "the residuals name the pairs that are strongly correlated.",
+            "The matrix shows the correlation of each pair of parameters by color.",
         )

@@ -311,9 +311,11 @@ def draw_parameter_rows(
     handles = [
         make_handle("shift, 95 % interval", color=SHIFT, marker="o", ms=DOT, lw=1.2),
         make_handle("uncertainty (95 %)", color=WIDTH, marker="s", ms=DOT, ls="none"),
-        make_handle("without an interval", color=SHIFT, marker="x", ms=DOT + 1, ls="none"),
         make_handle("one tolerance", color=PALE, lw=6, alpha=0.5),
     ]
+    if not np.isfinite(half).all():
+        cross: dict[str, Any] = {"color": SHIFT, "marker": "x", "ms": DOT + 1, "ls": "none"}
+        handles.append(make_handle("without an interval", **cross))
     add_legend(figure, handles)
     status = "" if converged else "; not converged: last values, no estimates"
     n_assumed = sum(row["tolerance_assumed"] for row in rows)

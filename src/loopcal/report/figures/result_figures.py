@@ -14,6 +14,7 @@ from loopcal.apply.height_errors import HeightErrors
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import Validation
+from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.findings.wording import count_decimals, name_count
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
 from loopcal.report.figures.style import (
@@ -105,7 +106,7 @@ def draw_budget(budget: ErrorBudget) -> Figure:
     """
     lines = budget.lines
     kinds = [("position", DISPLAY_UNITS[Dimension.LENGTH])]
-    if budget.orientation.rms > 0.0:
+    if budget.orientation.rms > ROUNDING:
         kinds.append(("orientation", DISPLAY_UNITS[Dimension.ANGLE]))
     width, height = 4.8 * len(kinds) + 1.5, 1.9 + 0.38 * len(lines)
     figure, (panels,) = start_panels(width, height, 1, len(kinds), sharey=True)
