@@ -180,7 +180,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(loopcal,
             for option in NO_PLANE_LINE
         ),
         ("--measure plane-line --hold-out 0", "plane-line, where every point is fitted"),
-        ("--measure plane-line --points 3", "give at least 4"),
+        ("--measure plane-line --points 3", "it must be at least 4"),
         ("--min-margin 2", "share of the median"),
         ("--max-tilt -3deg", "angle above 0"),
         ("--seen-from 1m,2m", "give three numbers"),

@@ -225,6 +225,7 @@ FILE = click.Path(path_type=Path)
 LENGTH, POSITIVE_LENGTH = (_quantity(Dimension.LENGTH, positive) for positive in (False, True))
 ANGLE, POSITIVE_ANGLE = (_quantity(Dimension.ANGLE, positive) for positive in (False, True))
 GOAL = Parsed("quantity", _parse_goal)
+NAMES = Parsed("names", lambda text: tuple(text.split(",")), ",".join)
 POSE_SHARE = Parsed("share", _parse_pose_share)
 SHARE, OPEN_SHARE = (click.FloatRange(0, 1, is_open, is_open) for is_open in (False, True))
 SHARE.name = OPEN_SHARE.name = "share"
@@ -578,13 +579,15 @@ SIMULATION = "loopcal.apply.simulated_measurements"
 _INSTRUMENT = f"{SIMULATION}:InstrumentDescription"
 
 INSTRUMENT: Any = Group(
-    kind=option(
+    kinds=option(
         "Kind of measurement: pose, component, position, bearing, ...; or several, such "
         "as position,inclination.",
-        default="pose",
+        "--kind",
+        of=_INSTRUMENT,
+        type=NAMES,
     ),
     components=option(
-        "Coordinates that the kind 'component' measures, such as z or x,y,z.", metavar="NAMES"
+        "Coordinates that the kind 'component' measures, such as z or x,y,z.", type=NAMES
     ),
     orientation=option(
         "Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...",
@@ -601,16 +604,16 @@ INSTRUMENT: Any = Group(
 
 UNKNOWN: Any = Group(
     measure=option(
-        "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.",
-        metavar="NAMES",
+        "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.", type=NAMES
     ),
-    frames=option(
+    unknown_frames=option(
         "Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
-        metavar="NAMES",
+        "--frames",
+        type=NAMES,
     ),
     targets=option(
         "Targets at unknown places on the platform, of a kind such as position: SMR1,SMR2,SMR3.",
-        metavar="NAMES",
+        type=NAMES,
     ),
 )
 """The short form of components, and unknown frames and targets, for `make_instrument`."""
@@ -637,34 +640,23 @@ SIGMA_READING: Any = option(
 
 def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None) -> lc.Instrument:
     """Return the instrument of `INSTRUMENT`, and of `UNKNOWN` and the distribution where they are
-    stated.
+    stated: fields of the library's `InstrumentDescription`.
 
     `robot` : gives targets of unknown place an assumed one; only needed where there are targets.
     """
     from loopcal.apply import simulated_measurements
 
-    kind, components = stated["kind"], stated["components"]
-    orientation, measure = stated["orientation"], stated.get("measure")
-    if measure is not None:
-        if components is not None or kind != "pose":
+    described = {key: value for key, value in stated.items() if value is not None}
+    if (components := described.pop("measure", None)) is not None:
+        if "components" in described or described["kinds"] != ("pose",):
             raise DataError(
                 "--measure is short for --kind component --components; give one or the other"
             )
-        kind, components = "component", measure
-        if orientation is None and {"phi", "theta", "psi"} & set(measure.split(",")):
-            orientation = "tilt-torsion"
-    frames, targets = stated.get("frames"), stated.get("targets")
+        described |= {"kinds": ("component",), "components": components}
+        if {"phi", "theta", "psi"}.intersection(components):
+            described = {"orientation": "tilt-torsion", **described}
     instrument = simulated_measurements.build_instrument(
-        simulated_measurements.InstrumentDescription(
-            kinds=tuple(kind.split(",")),
-            components=tuple(components.split(",")) if components else (),
-            orientation=orientation,
-            sigma_position=stated["sigma_position"],
-            sigma_angle=stated["sigma_angle"],
-            unknown_frames=tuple(frames.split(",")) if frames is not None else (),
-            targets=tuple(targets.split(",")) if targets is not None else (),
-            distribution=stated.get("distribution", "normal"),
-        )
+        simulated_measurements.InstrumentDescription(**described)
     )
     return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)
 

@@ -29,11 +29,11 @@ _HELD = "where a measuring machine holds x, y or z to --sigma-position"
 _CHOSEN = "which moves points within the workspace and chooses by criterion D"
 EXCLUDED_BY_PLANE_LINE = {
     **dict.fromkeys(("poses", "accuracy", "curve"), _COUNTED),
-    **dict.fromkeys(("like", "kind", "components", "orientation", "sigma_angle"), _HELD),
+    **dict.fromkeys(("like", "kinds", "components", "orientation", "sigma_angle"), _HELD),
     **dict.fromkeys(("criterion", "n_candidates", "allowed"), _CHOSEN),
     "hold_out": "where every point is fitted",
     "measured": "which plans without earlier measurements",
-    "frames": "whose surfaces are unknown in every group",
+    "unknown_frames": "whose surfaces are unknown in every group",
     "targets": "which checks the tool",
 }
 """Options that have no effect with --measure plane-line, and why."""
@@ -118,7 +118,7 @@ def plan(
     inputs = {role: path for role, path in files.items() if path is not None}
     refuse_folder(output, PLAN, force, list(inputs.values()))
     machine = lc.load_robot(robot)
-    if unknown["measure"] == PLANE_LINE:
+    if unknown["measure"] == (PLANE_LINE,):
         for name, reason in EXCLUDED_BY_PLANE_LINE.items():
             sentence = (
                 "{option} cannot be combined with --measure plane-line, {reason}; leave it out"
