@@ -139,6 +139,14 @@ def test_stated_anchors_are_used_and_need_no_known_pose(tmp_path) -> None:
     )  # 21 less six of the frame and one of the scale
 
 
+def test_workspace_of_a_small_machine_is_not_rounded_to_nothing(tmp_path) -> None:
+    anchors = [[0, -1.5, -0.1], [1.2, 0.7, -0.1], [-1.2, 0.6, -0.1], [0, 0, 0.9]]
+    _, imported = read(tmp_path, simulate_example() | {"anchors": anchors, "xyz_of_samp": []})
+    assert (
+        "workspace: {x: [-0.225, 0.225], y: [-0.225, 0.225], z: [0, 0.45]}" in imported.robot_text
+    )
+
+
 def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
     more = {
         "springKPerUnitLength": 2e4,

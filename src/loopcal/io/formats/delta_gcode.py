@@ -49,6 +49,7 @@ from loopcal.io.formats.program_format import (
     get_record,
     is_same,
     parse_number,
+    round_digits,
     round_length,
     shorten_numbers,
 )
@@ -110,7 +111,7 @@ def format_robot(
         "workspace": {"x": [-half, half], "y": [-half, half], "z": [0, half]},
     }
     if options.sigma_tape is not None:
-        sd = float(f"{options.choose_noise('tape') * 1e3:.7g}")
+        sd = round_digits(options.choose_noise("tape") / MM)
         content["tolerances"] = {"arms": {"sd": sd}}
     elif not has_distances:
         content["fixed"] = ["arm*.length"]

@@ -28,7 +28,15 @@ from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_json
 from loopcal.io.core.yaml_file import format_yaml
-from loopcal.io.formats.program_format import MM, Format, Imported, ImportOptions, format_head
+from loopcal.io.formats.program_format import (
+    MM,
+    Format,
+    Imported,
+    ImportOptions,
+    format_head,
+    round_digits,
+    round_length,
+)
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST
 
@@ -55,6 +63,9 @@ FAR_OFF = 10.0
 """Ratio of a taped length to that of the known poses at which the unit is another one."""
 
 REMARK = "Readings are motor angles, zero at the origin; growing readings pay out line."
+DIGITS = 12
+"""Digits of the geometry in the robot file."""
+
 COMMENTS = {
     "parameters": "of the spools; buildup: growth of radius^2 for each length that is wound",
     "workspace": "assumed; replace by the real workspace",
@@ -235,17 +246,17 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
     drives = {
         name.lower(): {
             "reads": "angle",
-            "radius": _round(gain),
-            "sigma": _round(sigma / gain / DEG, 7),
+            "radius": round_digits(gain, DIGITS),
+            "sigma": round_digits(sigma / gain / DEG),
         }
         for name, gain in zip(samples.names, samples.gain, strict=True)
     }
     limbs = [
         {
             "name": name,
-            "tip": [_round(v) for v in anchor],
+            "tip": [round_digits(v, DIGITS) for v in anchor],
             "ending": "distance",
-            "length": _round(length),
+            "length": round_digits(length, DIGITS),
             "actuated": name.lower(),
             "errors": [
                 _describe_error("base", ["x", "y", "z"], sd_anchor, name="anchor"),
@@ -254,7 +265,7 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
         }
         for name, anchor, length, sd in zip(samples.names, anchors, lengths, sd_length, strict=True)
     ]
-    side = round(0.25 * lengths.min())
+    side = round_length(0.25 * lengths.min())
     content = {
         "freedoms": ["x", "y", "z"],
         "controlled": ["x", "y", "z"],
@@ -265,7 +276,7 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
         "workspace": {
             "x": [-side, side],
             "y": [-side, side],
-            "z": [0, round(0.5 * max(anchors[:, 2].max(), lengths.min()))],
+            "z": [0, round_length(0.5 * max(anchors[:, 2].max(), lengths.min()))],
         },
     }
     taped = ", measured by hand within their tolerances" if is_taped.any() else ""
@@ -283,7 +294,7 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
 
 def _describe_error(of: str, shift: list[str], sd: float, **name: str) -> dict[str, Any]:
     """Return an entry of `errors:`."""
-    return {"of": of, "shift": shift, **name, "tolerance": {"sd": _round(sd, 7)}}
+    return {"of": of, "shift": shift, **name, "tolerance": {"sd": round_digits(sd)}}
 
 
 def _list_parameters(samples: Samples) -> Iterator[dict[str, Any]]:
@@ -296,13 +307,13 @@ def _list_parameters(samples: Samples) -> Iterator[dict[str, Any]]:
     def describe_map(i: int, axis: str, coefficient: float) -> dict[str, Any]:
         drive = samples.names[i].lower()
         place = {"limb": drive, "element": "transmission", "axis": axis}
-        return {**place, "coefficient": _round(coefficient)}
+        return {**place, "coefficient": round_digits(coefficient, DIGITS)}
 
     for radius, members in groups.items():
         group = "" if len(groups) == 1 else "-".join(samples.names[i] for i in members)
         yield {
             "name": f"spool{group}.radius",
-            "length": _round(radius),
+            "length": round_digits(radius, DIGITS),
             "tolerance": {"sd": 3},
             "maps": [describe_map(i, "gain", slope[i]) for i in members],
         }
@@ -360,11 +371,6 @@ def _parse_numbers(
 def _is_number(value: Any) -> bool:
     """Return whether a value of JSON is a number, which is finite."""
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _round(value: float, digits: int = 12) -> float:
-    """Return a number with so many digits."""
-    return float(f"{float(value):.{digits}g}")
 
 
 FORMAT = Format(

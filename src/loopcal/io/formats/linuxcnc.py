@@ -41,6 +41,7 @@ from loopcal.io.formats.program_format import (
     ValueFile,
     format_head,
     get_record,
+    round_digits,
 )
 from loopcal.mechanism.families.gough import Gough
 from loopcal.typing import FloatArray
@@ -119,7 +120,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
         "stored_parameters": ["leg*.base.?", "leg*.platform.?"],
     }
     if options.sigma_tape is not None:  # joint centers were measured by hand
-        sd = float(f"{options.sigma_tape / unit.factor_to_si:.7g}")
+        sd = round_digits(options.sigma_tape / unit.factor_to_si)
         content["tolerances"] = {"base": {"sd": sd}, "platform": {"sd": sd}}
     if lead:
         low, high = hal.points("base-n"), hal.points("platform-n")

@@ -391,6 +391,11 @@ def format_number(value: float) -> str:
     return f"{value:.{DECIMALS}f}"
 
 
+def round_digits(value: float, digits: int = 7) -> float:
+    """Return a number with so many significant digits."""
+    return float(f"{float(value):.{digits}g}")
+
+
 def round_length(value: float) -> float:
     """Return a length in whole millimeters; as it is where it would be 0."""
     return round(value) or value
