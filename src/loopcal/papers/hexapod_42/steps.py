@@ -186,22 +186,17 @@ def iterate(
     is_renewed : whether the matrix is computed anew at every corrected machine. The paper does not
     say. False keeps the matrix of the nominal machine throughout.
     """
-    data = to_measurements(setup, measured)
-    nominal, machine = LegForm.at(setup.robot, setup.commanded), setup.robot
-    values, errors = [machine.values], [subtract_poses(measured, setup.poses)]
-    conditions = np.zeros(0)
-    for k in range(limit):
-        if is_renewed or k == 0:
-            estimate = identify_per_leg(machine, data, steps=1)
-            conditions = estimate.conditions if k == 0 else conditions
-            machine = estimate.robot
-        else:
-            change = nominal.fit(to_twists(errors[-1], measured))
-            machine = machine.with_values(machine.values + change)
-        values.append(machine.values)
-        errors.append(subtract_poses(measured, setup.compute_reached(machine)))
+    robot, data = setup.robot, to_measurements(setup, measured)
+    nominal = LegForm.at(robot, setup.commanded)
+    values = list(identify_per_leg(robot, data, limit if is_renewed else 1).estimate_history)
+    errors = [subtract_poses(measured, setup.poses)]
+    for k in range(1, limit + 1):
+        if k == len(values):
+            values.append(values[-1] + nominal.fit(to_twists(errors[-1], measured)))
+        reached = setup.compute_reached(robot.with_values(values[k]))
+        errors.append(subtract_poses(measured, reached))
     stacked = np.stack(errors)
-    return Iterations(np.stack(values), stacked, integrate_errors(stacked), conditions)
+    return Iterations(np.stack(values), stacked, integrate_errors(stacked), nominal.conditions)
 
 
 def integrate_errors(errors: FloatArray) -> FloatArray:
