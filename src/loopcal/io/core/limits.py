@@ -31,7 +31,7 @@ MEGABYTE = 10**6
 
 @dataclass(frozen=True)
 class FileLimit:
-    """The most that a file may contain of one thing: `most` times `scale` of it, in `unit`.
+    """The most that a file may contain of one thing: `most` of it, in `unit`; sizes are in MB.
 
     `of` and `meaning` say what is limited and where, for documentation; `action` is what a user
     who meets the limit does.
@@ -42,10 +42,14 @@ class FileLimit:
     unit: str
     meaning: str
     action: str = ""
-    scale: int = 1
 
     def __str__(self) -> str:
         return f"{_format(self.most)} {self.unit}"
+
+    @property
+    def scale(self) -> int:
+        """How many of what is counted a unit is: bytes, or one."""
+        return MEGABYTE if self.unit == "MB" else 1
 
     @property
     def count(self) -> int:
@@ -86,7 +90,6 @@ YAML_SIZE = FileLimit(
     "MB",
     "robot files, settings, profiles, lists of loop closures; front matter with its remarks",
     "shorten its comments, or remove what does not belong there",
-    MEGABYTE,
 )
 YAML_NODES = FileLimit(
     "values in YAML text",
@@ -132,7 +135,6 @@ TABLE_SIZE = FileLimit(
     "MB",
     "measurement files, exports of instruments, `result.json` of a run",
     "divide it into several files",
-    MEGABYTE,
 )
 TABLE_ROWS = FileLimit(
     "rows of a measurement file",
@@ -188,7 +190,6 @@ PROGRAM_SIZE = FileLimit(
     "MB",
     "files that `loopcal import` and `loopcal export` read",
     "check that this is the file that was meant, or remove what does not belong there",
-    MEGABYTE,
 )
 JSON_VALUES = FileLimit(
     "values in JSON text",
@@ -231,7 +232,6 @@ ARRAYS_SIZE = FileLimit(
     "MB",
     "arrays of a run folder, as a file and in memory; they are never compressed",
     "repeat the calibration with fewer poses",
-    MEGABYTE,
 )
 ARRAYS_COUNT = FileLimit(
     "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"

@@ -34,6 +34,7 @@ from loopcal.io.core.text_file import (
     format_content,
     read_json,
     report_write_errors,
+    resolve_links,
     resolve_target,
     sha256,
 )
@@ -106,16 +107,6 @@ def _is_same_file(path: Path, other: Path) -> bool:
     return os.path.realpath(path) == os.path.realpath(other)
 
 
-def resolve_folder(path: Path) -> Path:
-    """Return the folder that a write to `path` makes or replaces, without links and dots;
-    FileError for a circular link.
-    """
-    try:
-        return path.resolve()
-    except (OSError, RuntimeError):
-        raise FileError("this symbolic link has no target; choose another name", path) from None
-
-
 @contextmanager
 def replace_folder(path: Path, check: Callable[[Path], None] | None = None) -> Iterator[Path]:
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
@@ -125,7 +116,7 @@ def replace_folder(path: Path, check: Callable[[Path], None] | None = None) -> I
     does.
     """
     with report_write_errors(path):
-        target = resolve_folder(path)
+        target = resolve_links(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         with create_temporary(target, is_folder=True) as temporary:
             yield temporary
@@ -164,7 +155,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
     in use (without `force`), or protected; or it contains an input of the command, or anything but
     an unchanged result of this kind.
     """
-    target = resolve_folder(path)
+    target = resolve_links(path)
     with report_write_errors(path):
         # what killed commands left beside a folder; one that was set aside is renamed back
         remove_leftovers(target, lambda folder: _is_own(folder, kind))
@@ -265,7 +256,7 @@ def write_result_folder(
 
 def describe_leftover(path: Path, document: str) -> str:
     """Return a sentence on a folder that a killed command set aside; empty where there is none."""
-    for folder in list_leftovers(resolve_folder(path)):
+    for folder in list_leftovers(resolve_links(path)):
         if (folder / document).is_file():
             return f"an interrupted command left it as {folder}; rename this folder"
     return ""

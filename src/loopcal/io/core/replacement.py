@@ -223,19 +223,6 @@ def _take_free_name(temporary: Path, target: Path) -> bool:
 
 
 @contextmanager
-def _hold(path: Path) -> Iterator[None]:
-    """Lock a file or folder, so that no other command takes it for a leftover."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except OSError:
-        descriptor = None
-    with _opened(descriptor):
-        if descriptor is not None:
-            lock(descriptor)
-        yield
-
-
-@contextmanager
 def restore_files(targets: Sequence[Path]) -> Iterator[None]:
     """Restore files, or their absence, where the body fails: all of them or none."""
     for target in targets:
@@ -248,7 +235,7 @@ def restore_files(targets: Sequence[Path]) -> Iterator[None]:
                     aside.hardlink_to(target)
                 except OSError:  # the file system has no second names
                     shutil.copy2(target, aside)
-                locks.enter_context(_hold(aside))
+                locks.enter_context(_lock_leftover(aside))
             try:
                 yield
             except BaseException:
@@ -310,7 +297,9 @@ def remove_leftovers(target: Path, is_own: Callable[[Path], bool]) -> None:
 
 @contextmanager
 def _lock_leftover(path: Path) -> Iterator[bool]:
-    """Yield whether a leftover has no living writer; it is locked meanwhile."""
+    """Yield whether a leftover has no living writer; it is locked meanwhile, so that no other
+    command takes it for its own.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except (OSError, AttributeError):

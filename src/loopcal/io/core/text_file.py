@@ -134,8 +134,11 @@ def resolve_target(path: str | Path) -> Path:
         raise FileError("this is a folder; add the name of the file to write", path)
     if path.exists() and not path.is_file():
         raise FileError("this is a device or a pipe; name an ordinary file", path)
-    if not path.is_symlink():
-        return path
+    return resolve_links(path) if path.is_symlink() else path
+
+
+def resolve_links(path: Path) -> Path:
+    """Return a path without links and dots; FileError for a circular link."""
     try:
         return path.resolve()
     except (OSError, RuntimeError):

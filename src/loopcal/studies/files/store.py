@@ -32,9 +32,9 @@ from loopcal.engine import get_current_engine
 from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
-from loopcal.io.core.outputs import replace_folder, resolve_folder
+from loopcal.io.core.outputs import replace_folder
 from loopcal.io.core.replacement import lock, open_folder, remove_leftovers
-from loopcal.io.core.text_file import read_bytes
+from loopcal.io.core.text_file import read_bytes, resolve_links
 from loopcal.studies.specification.study import NUMERICS, Study, list_conflicts
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.version import __version__
@@ -476,7 +476,7 @@ def _make_folder(folder: Path, source: StudySource) -> None:
     def is_ours(left: Path) -> bool:
         return left.is_dir() and all(path.name in names for path in left.iterdir())
 
-    remove_leftovers(resolve_folder(folder), is_ours)
+    remove_leftovers(resolve_links(folder), is_ours)
     _refuse_content(folder)
     files = {name: read_bytes(path, "file", YAML_SIZE) for name, path in _list_files(source)}
     with replace_folder(folder, check=_refuse_content) as temporary:
@@ -493,7 +493,7 @@ def _make_folder(folder: Path, source: StudySource) -> None:
 
 def _refuse_content(folder: Path) -> None:
     """Raise FileError where a folder contains something, or where its name is that of a file."""
-    target = resolve_folder(folder)
+    target = resolve_links(folder)
     if target.exists() and not target.is_dir():
         sentence = "this is a file, but a study is a folder; choose another name"
         raise FileError(sentence, folder)
