@@ -151,7 +151,7 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
 
 
 def _halve_sigma(
-    fit: Identification, data: Measurements, linear: FitLinearization, source: Source
+    linear: FitLinearization, source: Source
 ) -> tuple[FloatArray, Linearization, Problem] | None:
     """Return a root (p, k) [SI] of the covariance without added parts if the sigma of a source of
     rows or of the tolerances were half as large, with its linearization; None for other sources.
@@ -159,6 +159,7 @@ def _halve_sigma(
     Every weight is that of the smaller sigma. Estimates stay, and so does a scale of the noise that
     the residuals gave.
     """
+    fit, data = linear.fit, linear.data
     changed, other, weight = data, fit, 1.0
     if source.kind == TOLERANCES:
         weight = 4.0
@@ -434,7 +435,7 @@ def compute_error_budget(
     lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)
-    halved = [_halve(fit, data, linear, each, lines, solution, frame, effects) for each in lines]
+    halved = [_halve(linear, each, lines, solution, frame, effects) for each in lines]
     lines = [replace(line, halved=of_line) for line, of_line in zip(lines, halved, strict=True)]
     position, orientation = _add_kinds(lines)
     n = len(solution.q)
@@ -481,8 +482,6 @@ def _list_sources(
 
 
 def _halve(
-    fit: Identification,
-    data: Measurements,
     linear: FitLinearization,
     line: SourceBudget,
     lines: list[SourceBudget],
@@ -491,17 +490,18 @@ def _halve(
     effects: ToolErrors,
 ) -> HalvedErrors | None:
     """Return the errors from all sources with half the sigma of one."""
+    fit = linear.fit
     position, orientation = (sum(getattr(each, name) for each in lines) for name in LENGTHS)
     parameters = sum(each.parameters for each in lines)
     if line.source.kind in OF_ROWS:
-        halved = _halve_sigma(fit, data, linear, line.source)
+        halved = _halve_sigma(linear, line.source)
         if halved is None:
             return None
         root, linearization, problem = halved
         if frame not in (FITTED, BASE, RELATIVE):
             frames = find_frame_knowledge(
                 problem,
-                data,
+                linear.data,
                 linearization.deviation,
                 linearization.next_start,
                 fit.options.prior,
