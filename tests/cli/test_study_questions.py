@@ -69,4 +69,4 @@ def test_wrong_questions_get_a_sentence(loopcal, folder, words, sentence) -> Non
 
 
 def test_figures_against_an_unknown_factor_are_refused(loopcal, folder) -> None:
-    loopcal(f"study summary {folder} --against pose", "'pose' is not a factor", code=1)
+    loopcal(f"study summary {folder} --against pose", "factor is 'pose'", code=1)

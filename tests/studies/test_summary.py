@@ -147,7 +147,7 @@ def test_the_page_explains_failed_trials(result: StudyResult) -> None:
     assert "poses  noise  method" in page
     assert "without motions of frames that the measurements do not fix" in " ".join(page.split())
     assert list_shown(result.study, summary) == ("position", "orientation", "covered_parameters")
-    with pytest.raises(DataError, match=r"'positon' is not a score .did you mean 'position'"):
+    with pytest.raises(DataError, match=r"score is 'positon' .did you mean 'position'"):
         list_shown(result.study, summary, ["positon"])
 
 
@@ -196,7 +196,7 @@ def test_figures_are_written_by_level_and_refused_where_there_are_too_many_panel
     assert figures["covered_parameters.png"].startswith(b"\x89PNG")
     labels = [text.get_text() for text in result.draw(factor="method").axes[0].get_xticklabels()]
     assert labels == ["map", "least-squares"]
-    with pytest.raises(DataError, match=r"'pose' is not a factor .did you mean 'poses'"):
+    with pytest.raises(DataError, match=r"factor is 'pose' .did you mean 'poses'"):
         result.draw("position", "pose")
 
 

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.checks import check_choice
 from loopcal.environment import import_optional
-from loopcal.errors import DataError, StudyError, suggest_names
+from loopcal.errors import DataError, StudyError
 from loopcal.io.core.text_file import replace_file
 from loopcal.results.result import TableResult
 from loopcal.results.tables import Block, Column, build_table, word_column
@@ -195,9 +196,7 @@ def find_columns(study: Study, names: Sequence[str] | None = None) -> tuple[int,
     """
     known = [column.name for column in study.columns]
     for name in names or ():
-        if name not in known:
-            hint = suggest_names(name, known)
-            raise DataError(f"{name!r} is not a score{hint}; scores: {', '.join(known)}")
+        check_choice("score", name, known, DataError)
     return tuple(range(len(known)) if names is None else (known.index(name) for name in names))
 
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.errors import DataError, suggest_names
+from loopcal.checks import check_choice
+from loopcal.errors import DataError
 from loopcal.report.figures.style import (
     COLORS,
     GRID,
@@ -101,9 +102,8 @@ def choose_layout(study: Study, factor: str | None = None) -> Layout:
     Raises DataError: an unknown factor.
     """
     factors, varied = tuple(study.levels), study.varied_factors
-    if factor is not None and factor not in factors:
-        hint = suggest_names(factor, factors)
-        raise DataError(f"{factor!r} is not a factor{hint}; factors: {', '.join(factors)}")
+    if factor is not None:
+        check_choice("factor", factor, factors, DataError)
 
     def count_ordered(name: str) -> int:
         return max(len(c.levels) * bool(c.quantity) for c in list_chains(study, name))

@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from loopcal.checks import Limit, Limited, whole_numbers
-from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.checks import Limit, Limited, check_choice, whole_numbers
+from loopcal.errors import DataError, UnitError
 from loopcal.io.core import limits
 from loopcal.results.result import Result
 from loopcal.studies.specification.levels import (
@@ -105,11 +105,7 @@ def check_question(study: Study, question: Question) -> float:
     no order, a score of which more is better, or a limit in another unit.
     """
     factors = tuple(FACTORS.values())
-    if question.factor not in factors:
-        raise DataError(
-            f"factor is {question.factor!r}{suggest_names(question.factor, factors)}; it must be "
-            f"one of {', '.join(factors)}"
-        )
+    check_choice("factor", question.factor, factors, DataError)
     chains = list_chains(study, question.factor)
     if len(chains) > 1 and all(len(chain.levels) == 1 for chain in chains):
         named = ", ".join(chain.levels[0] for chain in chains)
@@ -122,11 +118,7 @@ def check_question(study: Study, question: Question) -> float:
         for column in list_columns(study.scores)[1:]
         if not column.name.startswith(MORE_IS_BETTER)
     }
-    if question.score not in columns:
-        raise DataError(
-            f"score is {question.score!r}{suggest_names(question.score, columns)}; it must be one "
-            f"of {', '.join(columns)}"
-        )
+    check_choice("score", question.score, columns, DataError)
     unit = columns[question.score].unit
     try:
         if unit == SI_SYMBOLS[Dimension.RATIO]:
