@@ -23,18 +23,18 @@ from loopcal.measure.measurements import Measurements
 from loopcal.units import Dimension
 
 # Findings that ask for more or other held-out poses.
-TOO_FEW_HELD_OUT = (
+TOO_FEW_HELD_OUT = {
     "workflow.few-held-out-poses",
     "workflow.held-out-setup",
     "workflow.nothing-to-validate",
-)
+}
 BLUNDER = "validation.blunder"  # finding on held-out poses that do not fit
 # Findings that leave the verdict open.
-TOO_LITTLE_VALIDATION = (
+TOO_LITTLE_VALIDATION = {
     "workflow.no-held-out-poses",
     *TOO_FEW_HELD_OUT,
     "validation.blunders-dominate",
-)
+}
 LIMIT_EXCEEDED = "gates.limit-exceeded"  # finding that an error is above a stated limit
 # Finding that a limit was stated for something that no row measures.
 LIMIT_NOT_MEASURED = "gates.limit-not-measured"
@@ -49,9 +49,9 @@ NEXT_WITH_VALUES = {
     "values.keep-not-confirmed": "workflow.next-keep-values",
 }
 # Findings that an instrument or a target on the base moved.
-BASE_MOVED = ("residuals.frame-moved", "residuals.base-targets-moved")
+BASE_MOVED = {"residuals.frame-moved", "residuals.base-targets-moved"}
 # Findings that residuals are not independent: a cause of large residuals other than sigma.
-DEPENDENT = (
+DEPENDENT = {
     "residuals.drift",
     "residuals.trend",
     "residuals.sessions-differ",
@@ -60,7 +60,7 @@ DEPENDENT = (
     "residuals.correlated",
     "residuals.common-errors",
     "residuals.model-discrepancy",
-)
+}
 # Finding that a calibration is not expected to improve on the tolerances.
 NO_GAIN = "model.no-expected-gain"
 ON_BASE = (*BASE_MOVED, "data.base-session-unused")  # findings on targets on the base
@@ -216,11 +216,12 @@ def decide_verdict(findings: Iterable[Finding]) -> Verdict:
     The first rule that applies decides.
     """
     findings = tuple(findings)
-    if any(finding.severity is Severity.FAILURE for finding in findings):
+    severities, codes = {f.severity for f in findings}, {f.code for f in findings}
+    if Severity.FAILURE in severities:
         return Verdict.NOT_CALIBRATED
-    if any(finding.code in TOO_LITTLE_VALIDATION for finding in findings):
+    if codes & TOO_LITTLE_VALIDATION:
         return Verdict.UNDECIDED
-    if any(finding.severity is Severity.WARNING for finding in findings):
+    if Severity.WARNING in severities:
         return Verdict.RESERVATIONS
     return Verdict.CALIBRATED
 
@@ -238,32 +239,34 @@ def choose_next_step(
     recommendation : code of the finding that recommends the identified or the current values.
     repeatability : its share of the variance of the expected error, by quantity.
     """
+    codes = {finding.code for finding in findings}
     is_applied = verdict is not Verdict.NOT_CALIBRATED and recommendation.startswith("values.apply")
-    if is_applied and any(finding.code == SIGN_UNDECIDED for finding in findings):
+    if is_applied and SIGN_UNDECIDED in codes:
         return report_finding("workflow.next-check-height-sign")
     if verdict is Verdict.CALIBRATED:
         return report_finding(NEXT_WITH_VALUES.get(recommendation, "workflow.next-use-result"))
-    if any(finding.code in BASE_MOVED for finding in findings):
+    if codes & BASE_MOVED:
         return report_finding("workflow.next-check-base-targets")
-    wrong = [f.data["poses"] for f in findings if f.code == BLUNDER]
+    wrong = dict.fromkeys(label for f in findings if f.code == BLUNDER for label in f.data["poses"])
     if wrong and verdict is not Verdict.RESERVATIONS:
-        labels = tuple(dict.fromkeys(label for poses in wrong for label in poses))
-        return report_finding(
-            "workflow.next-check-held-out", poses=tuple(f"pose {label}" for label in labels)
-        )
+        poses = tuple(f"pose {label}" for label in wrong)
+        return report_finding("workflow.next-check-held-out", poses=poses)
     if verdict is Verdict.UNDECIDED:
-        return report_finding(_choose_validation(findings, recommendation))
+        if recommendation == "values.keep-doubtful-residuals":  # too few poses to hold any out
+            return report_finding("workflow.next-measure-more")
+        if codes & TOO_FEW_HELD_OUT:
+            return report_finding("workflow.next-hold-out-more")
+        return report_finding("workflow.next-hold-out")
     if outliers:
-        return report_finding(
-            "workflow.next-check-outliers", poses=tuple(f"pose {label}" for label in outliers)
-        )
+        poses = tuple(f"pose {label}" for label in outliers)
+        return report_finding("workflow.next-check-outliers", poses=poses)
     if verdict is Verdict.RESERVATIONS:
         return report_finding("workflow.next-resolve-warnings")
     failed = {f.code for f in findings if f.severity is Severity.FAILURE}
     if any(code.startswith("fit.") for code in failed) or "gates.poses-unreachable" in failed:
         return report_finding("workflow.next-check-data")
     if any(code.startswith("noise.") for code in failed):
-        if any(finding.code in DEPENDENT for finding in findings):
+        if codes & DEPENDENT:
             return report_finding("workflow.next-check-residuals")
         return report_finding("workflow.next-check-noise")
     limits = _choose_limit_step(failed, findings, repeatability or {})
@@ -291,15 +294,6 @@ def _choose_limit_step(
         if share > 0.5:
             return report_finding("workflow.next-improve-machine", share=share, quantity=quantity)
     return None
-
-
-def _choose_validation(findings: Sequence[Finding], recommendation: str) -> str:
-    """Return the code of the next step where the verdict is undecided."""
-    if recommendation == "values.keep-doubtful-residuals":  # too few poses to hold any out
-        return "workflow.next-measure-more"
-    if any(finding.code in TOO_FEW_HELD_OUT for finding in findings):
-        return "workflow.next-hold-out-more"
-    return "workflow.next-hold-out"
 
 
 # Whether a machine is given the identified values or keeps its current ones.
