@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from typing import Any, Self
@@ -85,6 +84,14 @@ def _refuse(wrong: BoolArray, what: str) -> None:
     )
 
 
+def is_date(text: str) -> bool:
+    """Return whether a text is a date of the form 2026-01-31."""
+    try:
+        return date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
+
+
 @dataclass(frozen=True)
 class InstrumentRecord:
     """An instrument and its calibration; a text that is empty is not stated.
@@ -116,10 +123,8 @@ class InstrumentRecord:
     def __post_init__(self) -> None:
         for key in DATES:
             text = getattr(self, key)
-            with suppress(ValueError):
-                if not text or date.fromisoformat(text).isoformat() == text:
-                    continue
-            raise DataError(f"{key} is {text!r}; write a date as 2026-05-31")
+            if text and not is_date(text):
+                raise DataError(f"{key} is {text!r}; write a date as 2026-05-31")
         if self.due and self.calibrated and self.due < self.calibrated:
             raise DataError(
                 f"due is {self.due}, which is before calibrated, {self.calibrated}; correct one"

@@ -12,9 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields
-from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from xml.etree.ElementTree import Element, indent, register_namespace, tostring
@@ -23,6 +21,7 @@ from loopcal.errors import DataError
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.runs.run_folder import refuse_changed_run
+from loopcal.measure.observations import is_date
 from loopcal.plain_text import escape
 from loopcal.units import Dimension, find_unit
 
@@ -47,17 +46,10 @@ persons:                      # who answers for it; the signer first
 """The file to fill in."""
 
 
-def _is_date(text: str) -> bool:
-    """Return whether a text is a date of the form 2026-01-31."""
-    with suppress(ValueError):
-        return date.fromisoformat(text).isoformat() == text
-    return False
-
-
 FORMS: Mapping[str, tuple[Callable[[str], Any], str]] = {
     "country": (re.compile("[A-Z]{2}").fullmatch, "two capital letters, as DE"),
     "language": (re.compile("[a-z]{2}").fullmatch, "two lower-case letters, as en"),
-    **dict.fromkeys(("begin", "end", "issued"), (_is_date, "a date as 2026-01-31")),
+    **dict.fromkeys(("begin", "end", "issued"), (is_date, "a date as 2026-01-31")),
 }
 """Key -> whether a text has its form, and the form in words."""
 
