@@ -319,9 +319,13 @@ def _make_bounded_composer(loader: Any) -> Any:
 # Text of YAML: names in quotes where they need them, and one key added to or removed from a
 # file.
 
-PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*", re.IGNORECASE)
-"""Text that YAML 1.2, and the readers of YAML 1.1 in use, read as the same text without quotes. To
-them y and n are no truth values, and y is the name of a column.
+PLAIN = re.compile(
+    r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*"
+    r"|-?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)? [a-z1]+",
+    re.IGNORECASE,
+)
+"""Text, or a number with its unit, that YAML 1.2, and the readers of YAML 1.1 in use, read as the
+same text without quotes. To them y and n are no truth values, and y is the name of a column.
 """
 
 
@@ -330,18 +334,13 @@ def quote_scalar(text: str) -> str:
     return text if PLAIN.fullmatch(text) else _escape(json.dumps(text, ensure_ascii=False))
 
 
-def format_flow_mapping(texts: Mapping[str, str]) -> str:
-    """Return a mapping in one line, from names and the YAML texts of their values."""
-    return f"{{{', '.join(f'{quote_scalar(name)}: {text}' for name, text in texts.items())}}}"
-
-
 def format_flow(value: Any) -> str:
     """Return plain content as YAML in one line; numbers read back the same, -0 as 0."""
     if isinstance(value, str):
         return quote_scalar(value)
     if isinstance(value, Mapping):
         items: Mapping[str, Any] = value
-        return format_flow_mapping({name: format_flow(item) for name, item in items.items()})
+        return f"{{{', '.join(f'{quote_scalar(k)}: {format_flow(v)}' for k, v in items.items())}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(format_flow, value))}]"
     return repr(float(value) + 0.0) if isinstance(value, float) else json.dumps(value)

@@ -17,7 +17,6 @@ numbers, too, unless they state another dimension, as Annotated[float, Dimension
 from __future__ import annotations
 
 import dataclasses
-import json
 import operator
 import types
 import typing
@@ -37,14 +36,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, format_scaled, require_columns
 from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import name_files
-from loopcal.io.core.yaml_file import (
-    Location,
-    YamlFile,
-    format_flow,
-    format_flow_mapping,
-    quote_scalar,
-    refuse_unknown_keys,
-)
+from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.data.columns import (
     ROW_COLUMNS,
     SIGMA,
@@ -182,14 +174,15 @@ def _read_sd(
     return sd
 
 
-def format_kind(
+def describe_kind(
     kind: Kind, noise: Mapping[str, float], tool: FloatArray, is_noise_assumed: bool = False
-) -> dict[str, str]:
-    """Return key -> text of the settings of a kind.
+) -> dict[str, Any]:
+    """Return the settings of a kind as a file states them.
 
     Keyword-only settings are left out where they are the default, or the robot's `tool`.
     """
-    texts, hints = {"kind": kind.name}, get_field_types(_make_record(type(kind)))
+    hints = get_field_types(_make_record(type(kind)))
+    settings: dict[str, Any] = {"kind": kind.name}
     for setting in dataclasses.fields(cast(Any, kind)):
         if not setting.init or (value := getattr(kind, setting.name)) is None:
             continue
@@ -200,23 +193,23 @@ def format_kind(
             usual = setting.default_factory()
         is_usual = usual is not dataclasses.MISSING and bool(np.array_equal(value, usual))
         if not is_usual or (not setting.kw_only and isinstance(value, str | tuple)):
-            texts[setting.name] = _format_setting(value, hints[setting.name])
+            settings[setting.name] = _describe_setting(value, hints[setting.name])
     if noise:
         units = {column.name: NOISE_UNITS[column.dimension] for column in kind.noise_columns}
         # nine digits: more would be rounding
         sigmas = {name: f"{s / units[name][1]:.9g} {units[name][0]}" for name, s in noise.items()}
         if len(sigmas) > MANY_SIGMAS and len(set(sigmas.values())) == 1:
             sigmas = {"*": next(iter(sigmas.values()))}
-        texts["noise"] = format_flow_mapping(sigmas)
-    return {**texts, "noise_source": ASSUMED} if is_noise_assumed else texts
+        settings["noise"] = sigmas
+    return {**settings, "noise_source": ASSUMED} if is_noise_assumed else settings
 
 
-def format_quantity(value: float, dimension: Dimension) -> str:
+def describe_quantity(value: float, dimension: Dimension) -> str | float:
     """Return a number with its unit, in SI where only that reads back as the same double; a ratio
     without a unit.
     """
     if dimension is Dimension.RATIO:
-        return repr(value)
+        return value
     shown = DISPLAY_UNITS[dimension]
     text = format_scaled(value, shown.factor_to_si)
     if float(text) * shown.factor_to_si == value:
@@ -254,16 +247,15 @@ def _is_array(value: list[Any]) -> bool:
     return len(lengths) == 1 and all(_is_array(item) for item in value)
 
 
-def _format_setting(value: Any, annotation: Any) -> str:
-    """Return a setting as text that `read_kind` reads, by its annotation in files."""
+def _describe_setting(value: Any, annotation: Any) -> Any:
+    """Return a setting as `read_kind` reads it, by its annotation in files."""
     if annotation is PoseRecord:
         angles = geometry.matrix_to_euler(value[:3, :3], "xyz")
         numbers = [float(v) + 0.0 for v in (*value[:3, 3], *angles)]
         names = ("x", "y", "z", "roll", "pitch", "yaw")
         units = [Dimension.LENGTH] * 3 + [Dimension.ANGLE] * 3
-        texts = map(format_quantity, numbers, units)
-        return format_flow_mapping(dict(zip(names, texts, strict=True)))
-    return _format_items(value, _find_dimension(annotation))
+        return dict(zip(names, map(describe_quantity, numbers, units), strict=True))
+    return _describe_items(value, _find_dimension(annotation))
 
 
 def _find_dimension(annotation: Any) -> Dimension | None:
@@ -272,14 +264,14 @@ def _find_dimension(annotation: Any) -> Dimension | None:
     return next((mark for mark in marks if isinstance(mark, Dimension)), None)
 
 
-def _format_items(value: Any, dimension: Dimension | None) -> str:
-    """Return a value, or a list or array of values, as YAML; numbers have the dimension."""
-    if isinstance(value, str):
-        return quote_scalar(value)
+def _describe_items(value: Any, dimension: Dimension | None) -> Any:
+    """Return a value, or a list or array of values; numbers have the dimension."""
     items = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     if isinstance(items, list | tuple):
-        return f"[{', '.join(_format_items(item, dimension) for item in items)}]"
-    return json.dumps(items) if dimension is None else format_quantity(float(items), dimension)
+        return [_describe_items(item, dimension) for item in items]
+    if dimension is None or isinstance(items, str):
+        return items
+    return describe_quantity(float(items), dimension)
 
 
 # Prior knowledge of setup parameters (frames, targets, surfaces, offsets).
@@ -345,20 +337,23 @@ def read_stated_values(
     return tuple(value for value, _, _ in known.values())
 
 
-def format_stated_values(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
-    """Return the setting `unknowns` as text, for the parameters among `entries`."""
+def describe_stated_values(
+    known: Sequence[StatedValue], entries: Sequence[Parameter]
+) -> dict[str, Any]:
+    """Return the setting `unknowns`, for the parameters among `entries`."""
     dimensions = {entry.name: entry.dimension for entry in entries}
-    texts: dict[str, str] = {}
+    content: dict[str, Any] = {}
     for value in known:
         if value.name not in dimensions:
             continue
-        numbers = {"start": value.nominal, "sd": value.sd or None}
-        dimension = dimensions[value.name]
-        stated = {k: format_quantity(v, dimension) for k, v in numbers.items() if v is not None}
+        dimension, stated = dimensions[value.name], dict[str, Any]()
+        for key, number in (("start", value.nominal), ("sd", value.sd or None)):
+            if number is not None:
+                stated[key] = describe_quantity(number, dimension)
         if stated and not value.sd:
-            stated[FIXED] = "true"
-        texts[value.name] = format_flow_mapping(stated) if stated else FIXED
-    return format_flow_mapping(texts) if texts else ""
+            stated[FIXED] = True
+        content[value.name] = stated or FIXED
+    return content
 
 
 def _match(file: YamlFile, entries: Sequence[Parameter], stated: str) -> list[Parameter]:
@@ -426,10 +421,10 @@ def read_instrument(
         raise file.error(str(error), place) from None
 
 
-def format_instrument(record: InstrumentRecord) -> str:
-    """Return the setting of an instrument as YAML text in one line."""
+def describe_instrument(record: InstrumentRecord) -> str | dict[str, str]:
+    """Return the setting of an instrument: its name, or its facts where there are others."""
     stated = record.to_dict()
-    return format_flow(record.name if list(stated) == ["name"] else stated)
+    return record.name if list(stated) == ["name"] else stated
 
 
 # Errors that the rows of a session share, in the settings of a kind.

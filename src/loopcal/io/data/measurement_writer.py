@@ -15,7 +15,7 @@ from loopcal.errors import DataError
 from loopcal.io.core.csv_table import format_row, refuse_settings_beside
 from loopcal.io.core.limits import find_fault, format_comment
 from loopcal.io.core.text_file import write_text
-from loopcal.io.core.yaml_file import format_flow_mapping, quote_scalar
+from loopcal.io.core.yaml_file import format_flow, quote_scalar
 from loopcal.io.data.columns import (
     COVARIANCE,
     LINK,
@@ -32,10 +32,10 @@ from loopcal.io.data.columns import (
     name_measured,
 )
 from loopcal.io.data.kind_settings import (
-    format_instrument,
-    format_kind,
-    format_quantity,
-    format_stated_values,
+    describe_instrument,
+    describe_kind,
+    describe_quantity,
+    describe_stated_values,
 )
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.mechanism.model import Mechanism
@@ -111,15 +111,15 @@ def format_measurements(
     labels, known = _label_kinds(kinds), list_columns(robot, kinds)
     tables = [_tabulate_rows(rows, robot) for rows in observations]
     reading_noise, readings = _tabulate_readings(data, robot)
-    texts = [
-        format_kind(rows.kind, noise, robot.tool, rows.is_noise_assumed)
-        | ({} if rows.instrument is None else {"instrument": format_instrument(rows.instrument)})
+    settings = [
+        describe_kind(rows.kind, noise, robot.tool, rows.is_noise_assumed)
+        | ({} if rows.instrument is None else {"instrument": describe_instrument(rows.instrument)})
         for rows, (noise, _) in zip(observations, tables, strict=True)
     ]
-    lines = _format_settings(robot, list(zip(labels, texts, strict=True)), remark)
-    knowledge = format_stated_values(data.stated_values, data.nuisance_parameters.table.entries)
-    for key, text in (("unknowns", knowledge), ("reading_noise", reading_noise)):
-        lines += [f"# {key}: {text}"] if text else []
+    lines = _format_settings(robot, list(zip(labels, settings, strict=True)), remark)
+    knowledge = describe_stated_values(data.stated_values, data.nuisance_parameters.table.entries)
+    for key, content in (("unknowns", knowledge), ("reading_noise", reading_noise)):
+        lines += [f"# {key}: {format_flow(content)}"] if content else []
 
     uses = {
         column.name: column.decode(values)
@@ -177,8 +177,8 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
         for label, kind in zip(labels, kinds, strict=True)
         if kind.poses_per_row > 1
     ]
-    texts = [format_kind(kind, of, robot.tool) for kind, of in zip(kinds, noise, strict=True)]
-    settings = _format_settings(robot, list(zip(labels, texts, strict=True)), "")
+    contents = (describe_kind(kind, of, robot.tool) for kind, of in zip(kinds, noise, strict=True))
+    settings = _format_settings(robot, list(zip(labels, contents, strict=True)), "")
     unknown = [(kind, getattr(kind, "unknown", ())) for kind in kinds]
     frames = [getattr(kind, "frame", "") for kind, names in unknown if "frame" in names]
     remarks = [UNKNOWN_FRAME.format(quote_scalar(name)) for name in dict.fromkeys(frames)]
@@ -254,23 +254,25 @@ def _refuse_names(data: Measurements) -> None:
         raise DataError(f"two poses are named {name!r}, but names must differ; rename one")
 
 
-def _tabulate_readings(data: Measurements, robot: Mechanism) -> tuple[str, dict[str, FloatArray]]:
+def _tabulate_readings(
+    data: Measurements, robot: Mechanism
+) -> tuple[dict[str, Any], dict[str, FloatArray]]:
     """Return the setting of reading noise, and column -> (n,) readings and other noise [SI].
 
     The noise of an actuator is in the setting where it is the same in all poses.
     """
     columns = {a.name: data.readings[:, i] for i, a in enumerate(robot.actuators)}
     if data.reading_sigma is None:
-        return "", columns
-    stated: dict[str, str] = {}
+        return {}, columns
+    stated: dict[str, Any] = {}
     for i, actuator in enumerate(robot.actuators):
         sigma = np.where(np.isnan(data.readings[:, i]), np.nan, data.reading_sigma[:, i])
         values = np.unique(sigma[~np.isnan(sigma)])
         if len(values) == 1 and np.isfinite(values[0]):
-            stated[actuator.name] = format_quantity(float(values[0]), actuator.dimension)
+            stated[actuator.name] = describe_quantity(float(values[0]), actuator.dimension)
         elif len(values):
             columns[SIGMA + actuator.name] = sigma
-    return format_flow_mapping(stated), columns
+    return stated, columns
 
 
 def _tabulate_rows(
@@ -300,12 +302,15 @@ def _tabulate_rows(
 
 
 def _format_settings(
-    robot: Mechanism, settings: Sequence[tuple[str, Mapping[str, str]]], remark: str
+    robot: Mechanism, settings: Sequence[tuple[str, Mapping[str, Any]]], remark: str
 ) -> list[str]:
     """Return the front matter, from the label and the settings of each kind."""
     lines = [f"## {format_comment(remark)}"] if remark else []
-    lines += [f"# format: {FORMAT}", f"# robot: {quote_scalar(robot.name)}"]
+    content: dict[str, Any] = {"format": FORMAT, "robot": robot.name}
     if len(settings) == 1:
-        return lines + [f"# {key}: {text}" for key, text in settings[0][1].items()]
-    labeled = (f"#   {quote_scalar(label)}: {format_flow_mapping(of)}" for label, of in settings)
+        content |= settings[0][1]
+    lines += [f"# {key}: {format_flow(value)}" for key, value in content.items()]
+    if len(settings) == 1:
+        return lines
+    labeled = (f"#   {quote_scalar(label)}: {format_flow(of)}" for label, of in settings)
     return [*lines, "# kinds:", *labeled]
