@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopcal.apply.error_budget import compute_error_budget
 from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
 from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
 from loopcal.diagnose.value_comparison import compare_with_values
@@ -27,6 +28,7 @@ from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
+from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from tests.cable_robot import (
     NAMES,
@@ -516,3 +518,16 @@ def test_intervals_of_40_machines_contain_the_truth_as_often_as_stated(tmp_path)
         total += float(error @ np.linalg.solve(fit.covariance, error))
     assert 652.0 < total < 972.0
     assert held.min() >= 32
+
+
+def test_budget_says_what_better_readings_leave_where_the_robot_states_their_sigma(printer):
+    robot, data = printer
+    assert data.reading_sigma is None
+    fit = identify(robot, data)
+    budget = compute_error_budget(fit, data)
+    stated = compute_error_budget(fit, fill_in_reading_sigma(robot, data))
+    assert budget is not None
+    assert stated is not None
+    assert "readings" in {line.source.kind for line in budget.lines}
+    assert budget.to_dict() == stated.to_dict()
+    assert all(line.halved is not None for line in budget.lines if line.source.kind == "readings")

@@ -28,12 +28,7 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.errors import MechanismError
-from loopcal.estimate.fit_linearization import (
-    FitLinearization,
-    fold_sources,
-    linearize_at_estimate,
-    linearize_fit,
-)
+from loopcal.estimate.fit_linearization import FitLinearization, fold_sources, linearize_fit
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
@@ -159,41 +154,31 @@ def _halve_sigma(
     Every weight is that of the smaller sigma. Estimates stay, and so does a scale of the noise that
     the residuals gave.
     """
-    fit, data = linear.fit, linear.data
-    changed, other, weight = data, fit, 1.0
+    fit, problem, weight = linear.fit, linear.problem, 1.0
+    nuisance, (of_rows, members) = problem.nuisance, _number_sources(linear)
     if source.kind == TOLERANCES:
         weight = 4.0
-    elif source.kind == READINGS and data.reading_sigma is not None:
-        changed = replace(data, reading_sigma=0.5 * data.reading_sigma)
-    elif source.kind == INSTRUMENT:
-        of_poses, of_base = (
-            tuple(_halve_instrument(rows, source.name, data) for rows in observations)
-            for observations in (data.observations, data.base_observations)
-        )
-        changed = replace(data, observations=of_poses, base_observations=of_base)
-    elif source.kind == SETUP and any(
-        p.free and p.tolerance is not None for p in fit.nuisance.table.entries
-    ):
-        setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
-        for entry in setup.table.entries:
+    elif (named := (source.kind, source.name)) in of_rows:
+        chosen = (member == of_rows.index(named) for member in members)
+        factors = (np.where(rows, 2.0, 1.0)[:, None, None] for rows in chosen)
+        pairs = zip(problem.rows, factors, strict=True)
+        problem = problem.with_rows(replace(r, whitener=factor * r.whitener) for r, factor in pairs)
+    elif source.kind == SETUP and nuisance is not None and nuisance.has_prior.any():
+        local = nuisance.local
+        for entry in local.table.entries:
             if entry.free and entry.tolerance is not None:
-                setup = setup.with_prior(entry.name, 0.5 * entry.tolerance)
-        other = replace(fit, options=replace(fit.options, nuisance=setup))
+                local = local.with_prior(entry.name, 0.5 * entry.tolerance)
+        poses = replace(problem.poses, nuisance=replace(nuisance, local=local))
+        problem = replace(problem, poses=poses)
     else:
         return None
-    problem, _, linearization = linearize_at_estimate(other, changed)
+    at = linear.linearization
+    linearization = problem.linearize(at.deviation, at.next_start)
+    if fit.options.prior is not None:
+        linearization = fit.options.prior.added(problem).append(linearization)
     p = len(fit.names)
     own, _ = _propagate(linear, [linearization.factor[0, :p, :p]], 0, weight)
     return fit.tolerance[:, None] * np.concatenate(own, axis=1), linearization, problem
-
-
-def _halve_instrument(rows: Observations, name: str, data: Measurements) -> Observations:
-    """Return rows, those of an instrument with half their sigma."""
-    if not len(rows):
-        return rows
-    chosen = np.array([_name(rows, session, data) == name for session in rows.session.tolist()])
-    factor = np.where(chosen, 0.25, 1.0)[:, None, None]
-    return replace(rows, covariance=rows.covariance * factor)
 
 
 def _name(rows: Observations, session: str, data: Measurements) -> str:
