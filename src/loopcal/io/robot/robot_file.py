@@ -45,9 +45,7 @@ from loopcal.io.data.columns import find_column_fault
 from loopcal.mechanism.assembly import Assembly
 from loopcal.mechanism.compilation import build, find_impossible_values
 from loopcal.mechanism.families import FAMILIES
-from loopcal.mechanism.families.limb_records import SumError
-from loopcal.mechanism.families.records import RobotRecord, match_parameter_names
-from loopcal.mechanism.families.stages import PlacedStages, StageError, StageRecord, Stages
+from loopcal.mechanism.families.records import RecordError, RobotRecord, match_parameter_names
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit, to_si
@@ -329,10 +327,8 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     """
     try:
         expanded = record.expand()
-    except StageError as error:
-        raise file.error(str(error), (KEY, error.index)) from None
-    except SumError as error:
-        raise file.error(str(error), ("actuators", error.actuator)) from None
+    except RecordError as error:
+        raise file.error(str(error), error.location) from None
     parameters = expanded.parameters
     names = [parameter.name for parameter in parameters]
     for key in ("fixed", "stored_parameters"):
@@ -353,10 +349,12 @@ OWN_KEYS = ("on", "mount", "joint", "family")
 """Keys of a stage that are not those of its family; both have a name."""
 
 
-def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> PlacedStages:
+def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> RobotRecord:
     """Return a chain with the records of its stages: each is a serial joint (None), or a robot of
     another family. FileError : it is neither, or a key of it does not fit; at its line.
     """
+    from loopcal.mechanism.families.stages import PlacedStages, StageRecord, Stages
+
     assert isinstance(chain, Stages)
     families = {name: record for name, record in FAMILIES.items() if record is not Stages}
     robots: list[RobotRecord | None] = []

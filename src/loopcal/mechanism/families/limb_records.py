@@ -26,6 +26,7 @@ from loopcal.mechanism.families.records import (
     Point,
     PoseRecord,
     RatioTolerance,
+    RecordError,
     join_errors,
     single_error,
     standard_deviation,
@@ -561,12 +562,11 @@ def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
 WEIGHT = "weight"
 
 
-class SumError(MechanismError):
+class SumError(RecordError):
     """An impossible sum; `actuator` is the name under which a file states it."""
 
     def __init__(self, sentence: str, actuator: str) -> None:
-        super().__init__(sentence)
-        self.actuator = actuator
+        super().__init__(sentence, "actuators", actuator)
 
 
 def has_sums(actuators: Mapping[str, object]) -> bool:

@@ -37,6 +37,14 @@ from loopcal.units import SD_RANGE, Angle, Dimension, Length, Ratio, is_sd
 EX, EY, EZ = np.eye(3)
 
 
+class RecordError(MechanismError):
+    """An impossible content of a robot file; `location` is the path of keys to it."""
+
+    def __init__(self, sentence: str, *location: str | int) -> None:
+        super().__init__(sentence)
+        self.location = location
+
+
 @dataclass(frozen=True, eq=False)
 class JointPlacement:
     """A joint of a limb, and where it is; the link before it has its name.

@@ -45,6 +45,7 @@ from loopcal.mechanism.families.records import (
     PlacedLimb,
     PoseRecord,
     RatioTolerance,
+    RecordError,
     RobotRecord,
     displacement_error,
     get_axis_dimension,
@@ -61,12 +62,11 @@ from loopcal.units import Angle, Dimension, Length, Ratio
 # The assembly of a chain: those of its stages, with the stage before each name.
 
 
-class StageError(MechanismError):
+class StageError(RecordError):
     """An impossible stage of a chain; `index` is its place in the list of stages."""
 
     def __init__(self, sentence: str, index: int) -> None:
-        super().__init__(sentence)
-        self.index = index
+        super().__init__(sentence, "stages", index)
 
 
 @dataclass(frozen=True)
