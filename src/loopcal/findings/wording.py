@@ -59,7 +59,19 @@ def round_to_digits(value: float, digits: int = 3) -> str:
         return "unknown"
     if math.isinf(value):
         return "unbounded"
-    return f"{value:.{digits}g}"
+    return write_small(f"{value:.{digits}g}")
+
+
+SMALLEST = 7
+"""Largest negative power of ten that is written as zeros, as beside larger numbers."""
+
+
+def write_small(number: str) -> str:
+    """Return a number as text with zeros in place of a power of ten, such as 0.0000828."""
+    digits, _, power = number.partition("e-")
+    if not power or int(power) > SMALLEST:
+        return number
+    return f"{float(number):.{len(digits.partition('.')[2]) + int(power)}f}"
 
 
 def name_count(count: float, singular: str, plural: str = "") -> str:

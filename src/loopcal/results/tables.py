@@ -13,7 +13,7 @@ from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
-from loopcal.findings.wording import count_decimals
+from loopcal.findings.wording import count_decimals, write_small
 from loopcal.plain_text import escape
 from loopcal.results.description import Field, look_up
 from loopcal.units import Dimension, Unit
@@ -243,7 +243,7 @@ def format_number(value: float, digits: int = 6) -> str:
 
 def format_in(unit: Unit, value: float, digits: int = 6) -> str:
     """Return a number in SI as one in a unit, without its symbol."""
-    return format_number(float(value) / unit.factor_to_si, digits)
+    return write_small(format_number(float(value) / unit.factor_to_si, digits))
 
 
 def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -> str:
