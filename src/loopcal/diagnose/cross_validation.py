@@ -30,6 +30,7 @@ from loopcal.diagnose.row_errors import (
     join_errors,
 )
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.fit_descent import sum_squares
 from loopcal.estimate.free_parameters import free_only, select_free_parameters
 from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.information import collect_information
@@ -256,12 +257,8 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
     """
     problem = problem_of(select_free_parameters(robot), data)
     z = problem.free.deviation(robot.values[None])
-    linearization = problem.linearize(z, problem.start(z))
-    residuals = problem.residuals(z, problem.solve(z, linearization.next_start))
-    pairs = zip(problem.rows, residuals, strict=True)
-    total = sum(float((r.whitened[0] ** 2)[rows.is_present[0]].sum()) for rows, r in pairs)
-    equations = int(linearization.equations[0])
-    return total / equations if np.isfinite(total) and equations else np.inf
+    equations = int(problem.linearize(z, problem.start(z)).equations[0])
+    return sum_squares(problem, z) / equations if equations else np.inf
 
 
 # Names of parameters that shift an actuator reading.
