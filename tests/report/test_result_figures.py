@@ -38,6 +38,17 @@ def test_figure_of_repeatability_has_both_numbers_of_every_pose(repeatability) -
     assert "6 visits" in figure.get_suptitle()
 
 
+def test_figure_of_repeatability_names_the_axes_of_several_gauges() -> None:
+    robot = lc.load_robot("hexapod-42")
+    poses = np.repeat(lc.sample_workspace(robot, 2, seed=1).coordinates, 4, axis=0)
+    gauges = (lc.Component(("x",)), lc.Component(("y", "z")))
+    sensors = (lc.Sensor(g, lc.Gaussian(np.full(len(g.columns), 1e-5))) for g in gauges)
+    data = lc.simulate(robot, poses, lc.Instrument(tuple(sensors)), seed=2)
+    axes = lc.assess_repeatability(robot, data).plot().axes[0]
+    names = [label.get_text() for label in axes.get_xticklabels()]
+    assert names == ["1 x", "5 x", "1 y z", "5 y z"]
+
+
 def test_table_of_repeatability_has_whole_positions_and_components(repeatability) -> None:
     table = repeatability.to_frame()
     assert len(table) == 3 * 4 + 3 * 3

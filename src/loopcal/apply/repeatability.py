@@ -185,6 +185,7 @@ def assess_repeatability(
     """Compute pose accuracy and repeatability by ISO 9283 from repeated visits.
 
     Visits of a pose have the same readings, as they have where a file states commanded coordinates.
+    Each instrument is assessed on its own, such as gauges of one axis each.
 
     Parameters
     ----------

@@ -92,10 +92,13 @@ def _draw_visits(
         axes.set_ylim(bottom=0.0)
     else:
         axes.axhline(0.0, **ZERO)
-    is_whole = poses[0].accuracy is not None
-    of = "" if is_whole else f" of {', '.join(poses[0].components)} (left to right)"
+    is_whole, differ = poses[0].accuracy is not None, len({pose.components for pose in poses}) > 1
+    components = "their components" if differ else ", ".join(poses[0].components)
+    of = "" if is_whole else f" of {components} (left to right)"
     label_axes(axes, "", f"{quantity} [{unit.symbol}]", f"{name}{of}")
-    named = ((pose.pose, pose.target, pose.direction) for pose in poses)
+    named = [(pose.pose, pose.target, pose.direction) for pose in poses]
+    if differ:  # instruments that measure different components of one pose
+        named = [(*names, *pose.components) for names, pose in zip(named, poses, strict=True)]
     label_poses(axes, [" ".join(filter(None, names)) for names in named])
 
 
