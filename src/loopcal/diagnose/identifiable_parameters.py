@@ -36,7 +36,7 @@ from loopcal.estimate.null_space import (
 )
 from loopcal.estimate.pose_estimate import find_unclosed_poses
 from loopcal.estimate.posterior import Posterior, compute_posterior
-from loopcal.estimate.tolerance_components import compute_symmetric_root
+from loopcal.estimate.prior_inflation import restate
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import effect
 from loopcal.findings.wording import list_names, round_to_digits
@@ -302,10 +302,7 @@ class Identifiability(DrawnResult):
         """What is known of the parameters with the tolerances as a prior."""
         free, d = self.free_parameters, self.decomposition
         if free.correlation is not None:
-            rows = np.zeros((1, len(free) + 1, len(free) + 1))
-            rows[0, :-1, :-1] = self.factor
-            root = compute_symmetric_root(free.correlation)
-            d = decompose(rows, d.rows, tolerance=d.tolerance, root=root)
+            d = restate(d, free.correlation)
         penalty = np.ones_like(d.singular_values)
         return compute_posterior(free.robot, free.places, free.tolerance, d, penalty)
 

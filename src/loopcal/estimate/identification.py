@@ -58,8 +58,8 @@ from loopcal.estimate.pose_estimate import (
 from loopcal.estimate.posterior import (
     Posterior,
     VarianceSources,
-    collect_information,
     compute_posterior,
+    describe_information,
     find_shown_noise,
     find_variance_sources,
 )
@@ -365,11 +365,12 @@ def identify(
     if unclosed.poses:
         findings.append(unclosed.report("fit.poses-open-at-start"))
     d, test = fit.decomposition, result.residual_test
+    shown = find_shown_noise(d, test)
     posterior = replace(
         result.posterior,
         fitted_rows=rows,
-        shown_noise=find_shown_noise(d, test),
-        information=collect_information(free, d, test),
+        shown_noise=shown,
+        information=describe_information(free, d, test, shown),
     )
     return replace(result, posterior=posterior, findings=tuple(findings))
 

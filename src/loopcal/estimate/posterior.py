@@ -131,11 +131,12 @@ class DataInformation:
         return f"<DataInformation: {len(self.rows)} rows on {self.rows.shape[1]} parameters>"
 
 
-def collect_information(
-    free: FreeParameters, decomposition: Decomposition, test: ResidualTest
+def describe_information(
+    free: FreeParameters, decomposition: Decomposition, test: ResidualTest, shown: ShownNoise | None
 ) -> DataInformation:
-    """Return what the rows of a fit (t = 1), which follow no penalty, say of the parameters."""
-    shown = find_shown_noise(decomposition, test)
+    """Return what the rows of a fit (t = 1), which follow no penalty, say of the parameters;
+    `shown` is the noise that its residuals show.
+    """
     variance = test.sigma_scale**2 if test.intervals else np.nan
     degrees = test.noise_degrees
     if shown is not None and shown.is_known:

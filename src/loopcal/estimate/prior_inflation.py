@@ -253,7 +253,7 @@ class ComponentSearch(NamedTuple):
 
 
 def restate(
-    rows: Decomposition, covariance: FloatArray, unpenalized: np.ndarray | None
+    rows: Decomposition, covariance: FloatArray, unpenalized: BoolArray | None = None
 ) -> Decomposition:
     """Return the decomposition of the same rows for a prior of another covariance (p, p)."""
     p = rows.directions.shape[1]

@@ -238,7 +238,7 @@ class Decomposition(TrialBatch):
         It is this object where no columns are unpenalized.
         """
         if self.dual is None:
-            return replace(self, unpenalized=None)
+            return self if self.unpenalized is None else replace(self, unpenalized=None)
         u, s, vt = np.linalg.svd(self.singular_values[:, :, None] * self.dual)
         projections = np.matmul(self.projections[:, None, :], u)[:, 0]
         directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
