@@ -58,6 +58,12 @@ def test_new_file_leads_to_results_by_the_commands_that_each_step_names(loopcal,
     assert float(low) <= float(median) <= float(high)
 
 
+def test_named_command_has_quotes_where_a_shell_needs_them(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["study", "new", "my study.yaml"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "Next: loopcal study check 'my study.yaml'"
+
+
 @pytest.mark.parametrize("robot", ["five-bar", "hexapod-42"])
 def test_template_is_valid_for_other_robots(loopcal, tmp_path, robot) -> None:
     loopcal(f"new study.yaml --robot {robot}")

@@ -74,6 +74,13 @@ def name_options(option: str, values: Iterable[str]) -> str:
     return " ".join(f"{option} {shlex.quote(value)}" for value in values)
 
 
+def suggest_command(*words: object) -> str:
+    """Return a line with the command to type next, to copy."""
+    from loopcal.results.tables import COMMAND
+
+    return f"{COMMAND}{shlex.join(map(str, words))}"
+
+
 def with_hint(finding: Finding) -> str:
     """Return the text of a finding, with the hint for the command that runs."""
     from loopcal.findings.wording import add_advice

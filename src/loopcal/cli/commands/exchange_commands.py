@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ import click
 import loopcal as lc
 from loopcal.cli import options as opt
 from loopcal.cli import terminal
-from loopcal.cli.hints import with_hint
+from loopcal.cli.hints import suggest_command, with_hint
 from loopcal.cli.terminal import Output
 from loopcal.errors import DataError
 from loopcal.units import Dimension, find_unit, list_symbols
@@ -145,7 +144,7 @@ def fill(
         f"{output}: {first}",
         *(f"note: {text}" for text in others),
         *_note_misfits(filled.misfits),
-        f"Next: loopcal calibrate {shlex.join((robot, str(output)))} -o run",
+        suggest_command("calibrate", robot, output, "-o", "run"),
     ]
     return Output(document, lambda: page)
 
@@ -395,8 +394,8 @@ def _view_import(
     if document["fit"] is not None:
         page += [*view_fit(document["fit"]), *document["changes"]]
     if document["corrected"] is None:
-        files = shlex.join((str(document["robot"]), str(document["data"] or "DATA")))
-        return [*page, f"Next: loopcal calibrate {files} -o run"]
+        files = document["robot"], document["data"] or "DATA"
+        return [*page, suggest_command("calibrate", *files, "-o", "run")]
     return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,7 @@ import click
 import loopcal as lc
 from loopcal.cli import options as opt
 from loopcal.cli import terminal
-from loopcal.cli.hints import list_hints
+from loopcal.cli.hints import list_hints, suggest_command
 from loopcal.cli.terminal import Output
 from loopcal.errors import DataError
 
@@ -88,7 +87,9 @@ def plan(
         type=opt.Count("CANDIDATES", 10),
     ),
     curve: bool = opt.flag("Also compute the expected errors by the number of poses."),
-    frame: str = opt.frame(OPTIONS, "fitted, base, or relative (to home)"),
+    frame: Literal["fitted", "base", "relative"] = opt.frame(
+        OPTIONS, "fitted, base, or relative (to home)"
+    ),
     seed: int = opt.seed("all random choices", OPTIONS),
     force: bool = opt.force("the plan"),
 ) -> Output:
@@ -167,13 +168,13 @@ def plan(
     made_by = collect_provenance(opt.list_words(), inputs, {"plan": seed})
     document = {"format": FORMAT, **result.to_dict(), "made_by": made_by}
     written = _write_plan(output, result, document, force)
-    data = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
+    data = (*measured, output / "measurements.csv")
     page = [
         str(result),
         *list_hints(result.findings),
         "",
         f"Written to {output}: {written}",
-        f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
+        suggest_command("calibrate", robot, *data, "-o", "run"),
     ]
     return Output(document, lambda: page)
 

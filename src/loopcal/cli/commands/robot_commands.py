@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import click
 
 from loopcal.cli import options as opt
 from loopcal.cli import terminal
+from loopcal.cli.hints import suggest_command
 from loopcal.cli.terminal import Output
 
 if TYPE_CHECKING:
@@ -61,12 +61,12 @@ def new(
             write_text(measurements, template)
     page = [
         f"{output}: a complete robot. Replace its numbers with yours.",
-        f"Next: loopcal check {shlex.quote(str(output))}",
+        suggest_command("check", output),
     ]
     if measurements is not None:
         page += [
             f"{measurements}: columns without rows. Fill in your measurements.",
-            f"Next: loopcal calibrate {shlex.join(map(str, (output, measurements)))} -o run",
+            suggest_command("calibrate", output, measurements, "-o", "run"),
         ]
     return Output({"robot": output, "measurements": measurements}, lambda: page)
 

@@ -15,6 +15,7 @@ import loopcal as lc
 from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.entry_point import CommandGroup
+from loopcal.cli.hints import hint_for, suggest_command
 from loopcal.cli.terminal import Output
 from loopcal.errors import StudyError
 
@@ -97,7 +98,7 @@ def run_and_report(
     stored = f"{report.before + report.computed} of {report.total} blocks are stored in {folder}"
     spent = f"{report.trials} trials in {round_duration(report.seconds)}"
     page = [f"{stored}: {report.computed} new, {spent}"]
-    page += [f"Next: loopcal study summary {folder}"] if report.is_complete else []
+    page += [suggest_command("study", "summary", folder)] if report.is_complete else []
     document = {**to_json(report), "is_complete": report.is_complete, "folder": str(folder)}
     return Output(document, lambda: page, exit_code=0 if report.is_complete else INCOMPLETE)
 
@@ -152,6 +153,7 @@ def new(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.studies.files.study_file import write_template
 
+    following = suggest_command("study", "check", study_file)
     if paper is not None:
         from loopcal.papers.paper import find_paper, make_paper_study
 
@@ -162,7 +164,7 @@ def new(
         if made.replaced:
             keys = " and ".join(made.replaced)
             page.append(f"The {keys} of the paper belong to its robot and were replaced, too.")
-        page.append(f"Next: loopcal study check {study_file}")
+        page.append(following)
         written = [str(path) for path in made.outputs]
         return Output(
             {"written": written, "paper": paper, "robot": made.robot, "replaced": made.replaced},
@@ -171,7 +173,7 @@ def new(
     robot = "linear-delta" if robot is None else robot
     refuse_outputs((study_file,), (), force)
     write_template(study_file, robot)
-    page = [f"Written: {study_file}", f"Next: loopcal study check {study_file}"]
+    page = [f"Written: {study_file}", following]
     return Output({"written": str(study_file), "robot": robot}, lambda: page)
 
 
@@ -188,7 +190,7 @@ def check(study_file: Path = STUDY, quick: bool = QUICK) -> Output:
     chosen = read_source(study_file, quick).study
     with terminal.TerminalProgress() as progress:
         estimate = estimate_time(chosen, count_processors(), progress)
-    following = f"Next: loopcal study run {study_file} -o FOLDER"
+    following = suggest_command("study", "run", study_file, "-o", "FOLDER")
     return Output(estimate, lambda: [*view_estimate(chosen, estimate, round_duration), following])
 
 
@@ -400,7 +402,6 @@ def replay(
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", trial)
     if match is None:
         raise click.BadParameter(f"{trial!r} is not CELL/TRIAL, such as 3/17")
-    from loopcal.cli.hints import hint_for
     from loopcal.report.calibration_view import view_calibration
 
     with terminal.TerminalProgress() as progress:
