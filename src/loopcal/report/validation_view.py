@@ -326,7 +326,7 @@ def build_shifts(comparison: RunComparison) -> Table:
                 continue
             factor = unit.factor_to_si
             cells.append(format_with_uncertainty(shift / factor, sd / factor))
-            cells.append(f"{shift / sd:.1f}{'*' if is_significant else ' '}")
+            cells.append(f"{round(shift / sd, 1) + 0.0:.1f}{'*' if is_significant else ' '}")
         rows.append((*cells, unit.symbol))
     of_pairs = (Column(title) for pair in comparison.pairs for title in (pair.second, "in sd"))
     caption = SHIFTS.format(first=comparison.runs[0].name)

@@ -452,7 +452,7 @@ def draw_run_shifts(comparison: RunComparison) -> Figure:
     label_axes(axes, f"shift from {first} [standard deviations]", "")
     handles += [
         make_handle("95 % of a single shift", color=PALE, lw=6, alpha=0.5),
-        make_handle("filled: significant at 5 % of all", color=DARK, marker="o", ls="none"),
+        make_handle("filled: significant", color=DARK, marker="o", ls="none"),
     ]
     add_legend(figure, handles)
     lines += [f"the first {MOST_ROWS} of {total} parameters"] if total > MOST_ROWS else []
