@@ -145,6 +145,14 @@ def test_noise_of_readings_is_read_and_an_empty_cell_is_a_missing_reading(tmp_pa
     assert kept.reading_sigma[:, 5].tolist() == [np.inf, np.inf]
 
 
+def test_patterns_state_the_noise_of_several_readings(tmp_path, robot) -> None:
+    stated = READINGS.replace("{q1: 5 um, q2: 0 mm}", '{"q*": 5 um, "q[23]": 1 um}')
+    data = load_measurements(write(tmp_path, stated), robot)
+    assert data.reading_sigma is not None
+    expected = np.array([5e-6, 1e-6, 1e-6, 5e-6, 5e-6])
+    np.testing.assert_allclose(data.reading_sigma[0, :5], expected, rtol=1e-15)  # one rounding
+
+
 CONTEXT = """# kind: component
 # components: [z]
 # noise: {z: 1 um}

@@ -147,12 +147,12 @@ def read_noise(
         raise file.error(f"{sentence}; write 'noise: {{{example}}}'", place)
     return {
         column: _read_sd(file, text, dimensions[column], at, f"the noise of {at[-1]!r}")
-        for text, names, at in _match_names(file, stated, list(dimensions), place)
+        for text, names, at in match_names(file, stated, list(dimensions), place)
         for column in names
     }
 
 
-def _match_names(
+def match_names(
     file: YamlFile, stated: Mapping[str, Any], names: list[str], place: Location
 ) -> Iterator[tuple[Any, list[str], Location]]:
     """Yield what is stated by names or patterns, the names that each denotes, and its place."""
@@ -462,7 +462,7 @@ def read_shared_errors(
         if stated == UNKNOWN:
             continue
         priors |= {name_shared_error(kind, item, name): 0.0 for name in components}
-        for text, names, at in _match_names(file, stated, list(components), place):
+        for text, names, at in match_names(file, stated, list(components), place):
             for name in names:
                 parameter = name_shared_error(kind, item, name)
                 priors.pop(parameter, None)
@@ -492,8 +492,8 @@ SETTINGS: Mapping[str, str] = {
     "offset), or `fixed`",
     "session": "session of all rows whose column states none",
     "group": "group of all rows whose column states none",
-    "reading_noise": "standard deviation of the readings: one for all, or actuator -> one; that of "
-    "the robot file by default",
+    "reading_noise": "standard deviation of the readings: one for all, or actuator or pattern -> "
+    "one; that of the robot file by default",
     "poses": "another file, in the same folder, with the readings of the poses",
 }
 KIND_SETTINGS = ("noise", "noise_source", "instrument", *SHARED_ERRORS)

@@ -26,7 +26,7 @@ from loopcal.errors import DataError, FileError, suggest_names
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import Table, read_table, read_template, require_columns
 from loopcal.io.core.text_file import as_path, name_files
-from loopcal.io.core.yaml_file import Location, find_reference, refuse_unknown_keys
+from loopcal.io.core.yaml_file import find_reference
 from loopcal.io.data.columns import (
     COMMANDED,
     LINK,
@@ -42,6 +42,7 @@ from loopcal.io.data.columns import (
 from loopcal.io.data.kind_settings import (
     KindRows,
     has_measured_values,
+    match_names,
     read_kinds,
     read_observations,
     read_stated_values,
@@ -370,19 +371,17 @@ def _read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) ->
     """
     file, node = table.settings, table.settings.content.get(READING_NOISE, {})
     dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
-    places: dict[str, Location] = {name: (READING_NOISE, name) for name in dimensions}
-    if not isinstance(node, dict):
-        node = dict.fromkeys(dimensions, node)
-        places = dict.fromkeys(dimensions, (READING_NOISE,))
-    refuse_unknown_keys(file, list(node), list(dimensions), (READING_NOISE,))
-    stated: dict[str, float] = {}
-    for name, text in node.items():
-        stated[name] = file.quantity(text, dimensions[name], places[name])
-        if stated[name] != 0.0 and (fault := find_sd_fault(stated[name])):
-            sentence = f"the noise of readings is {text}; {fault}, or 0 where exact"
-            raise file.error(sentence, places[name])
-    usual = [stated.get(actuator.name, np.nan) for actuator in robot.actuators]
-    sigma = np.tile(usual, (len(readings), 1))
+    stated = dict.fromkeys(dimensions, np.nan)
+    entries = [(node, list(dimensions), (READING_NOISE,))]
+    if isinstance(node, dict):
+        entries = match_names(file, node, list(dimensions), (READING_NOISE,))
+    for text, names, place in entries:
+        for name in names:
+            stated[name] = file.quantity(text, dimensions[name], place)
+            if stated[name] != 0.0 and (fault := find_sd_fault(stated[name])):
+                sentence = f"the noise of readings is {text}; {fault}, or 0 where exact"
+                raise file.error(sentence, place)
+    sigma = np.tile(list(stated.values()), (len(readings), 1))
     known = list_columns(robot, ())
     for i, actuator in enumerate(robot.actuators):
         name = SIGMA + actuator.name
