@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.apply.validation import check_limit
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.options import OBJECT, FitOptions, check_labels
@@ -32,6 +31,12 @@ def describe_wrong_share(share: float) -> str:
         f"{fault}; write {share / 100:g} for {share:g} %, or the number of poses to hold out "
         "divided by that of all poses"
     )
+
+
+def check_limit(name: str, limit: float | None) -> None:
+    """Refuse a limit below 0, or NaN: no error could keep it, or exceed it."""
+    if limit is not None and not limit >= 0.0:
+        raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from loopcal.apply.calibration_options import check_limit
 from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
 from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows, name_blunders
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
@@ -427,12 +428,6 @@ def find_error_units(robot: Mechanism, errors: PoseErrors) -> dict[str, Unit]:
 
 
 # Limits.
-
-
-def check_limit(name: str, limit: float | None) -> None:
-    """Refuse a limit below 0, or NaN: no error could keep it, or exceed it."""
-    if limit is not None and not limit >= 0.0:
-        raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
 
 
 def _check_limits(errors: Validation, limits: Mapping[str, float | None]) -> list[Finding]:
