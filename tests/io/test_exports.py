@@ -192,7 +192,12 @@ BAD_PROFILES = {
     "an unknown column": ("  z:", "  zz:", 8, "'zz' is not a column of .* the kind 'position'"),
     "a missing column": ("  z: {from: Z, unit: mm}\n", "", 4, "states 0 sources of 'z'"),
     "no unit": ("Z, unit: mm", "Z", 8, "'z' has no unit"),
-    "an unknown unit": ("Z, unit: mm", "Z, unit: mmm", 8, "'mmm' is not .*did you mean 'mm'"),
+    "an unknown unit": (
+        "Z, unit: mm",
+        "Z, unit: mmm",
+        8,
+        "'z': unknown unit 'mmm' .did you mean 'mm'",
+    ),
     "a unit of text": ("Name", "Name, unit: mm", 5, "'pose' is text and has no unit"),
     "an invalid column number": ("from: Z", "from: 0", 8, "0 is neither a name in .* nor a place"),
     "no source": ("{from: Z, unit: mm}", "Z", 8, "'columns.z' is the text 'Z'"),
@@ -203,7 +208,12 @@ BAD_PROFILES = {
     "a matrix of four": ("decimal", "matrix: [1, 2, 3, 4]\ndecimal", 3, "matrix has nine columns"),
     "no kind": ("kind: position, ", "", 9, "no kind of measurement is stated"),
     "a newer format": ("format: 1", "format: 7", 1, "this file has format 7"),
-    "an angle for a length": ("X, unit: mm", "X, unit: deg", 6, "'deg' is not a unit of 'x'"),
+    "an angle for a length": (
+        "X, unit: mm",
+        "X, unit: deg",
+        6,
+        "'x': 'deg' is a unit of angle, but a length is needed",
+    ),
     "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 8, "not a unit"),
     "an unknown sigma": (
         "  z:",

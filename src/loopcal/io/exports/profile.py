@@ -493,11 +493,8 @@ def _check_unit(
     for factor, dimension in zip(factors, needed, strict=True):
         try:
             find_unit(factor, dimension)
-        except UnitError:
-            allowed = list_symbols(dimension)
-            hint = "" if factor in list_symbols() else suggest_names(factor, allowed)
-            sentence = f"{factor!r} is not a unit of {name!r}{hint}; allowed: {', '.join(allowed)}"
-            raise file.error(sentence, place) from None
+        except UnitError as error:
+            raise file.error(f"{name!r}: {error}", place) from None
 
 
 def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -> None:
