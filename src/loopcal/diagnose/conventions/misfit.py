@@ -18,11 +18,14 @@ import numpy as np
 from loopcal import engine
 from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.descent import StepControl, descend
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
+from loopcal.estimate.penalties import Ridge
 from loopcal.estimate.problem import Problem, make_exact_problem, make_problem, problem_of
+from loopcal.estimate.resampling import CenteredProblem
 from loopcal.findings import Quantity
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.measurements import Measurements
@@ -30,7 +33,7 @@ from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.mechanism.kinematics import find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
-from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -408,79 +411,42 @@ def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
     return np.where(is_changed, np.nanmedian(new, axis=0), new) if is_changed.any() else new
 
 
-# Gauss-Newton steps by which the stated convention and the best other one are compared finally; a
-# step that does not lower the cost ends them.
-REFINEMENT = Halving(steps=3, attempts=1)
+# Steps by which the stated convention and the best other one are compared finally.
+REFINEMENT = 3
 LARGEST_STEP = 30.0  # tolerances that a parameter may leave its value in these steps
 # Factor by which the deviations of a robot far from nominal may exceed its tolerances, and the
 # steps of its fit.
-FAR_AWAY, FIT = 30.0, Halving(steps=12, attempts=5)
+FAR_AWAY, FIT = 30.0, 12
 
 
 def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
-    """Return the misfit of the first interpretation after Gauss-Newton steps within the tolerances,
-    or to first order where that is smaller, and its nuisance parameters (U,) there.
+    """Return the misfit of the first interpretation after steps of a fit within the tolerances, or
+    to first order where that is smaller, and its nuisance parameters (U,) there.
     """
     if not comparison.is_finite:
         return comparison.misfit, comparison.data.nuisance_parameters.values()
-    end = _minimize(comparison, 1.0, REFINEMENT)
-    nuisance = end.linearization.nuisance
-    values = np.zeros(0) if nuisance is None else nuisance.values[0]
-    return min(comparison.misfit, end.misfit), values
+    misfit, end = _fit(comparison, 1.0, REFINEMENT)
+    return min(comparison.misfit, misfit), end.nuisance[0]
 
 
 def explains_after_fit(comparison: Comparison) -> bool:
     """Return whether a robot far from nominal explains the first interpretation: after a fit with
     tolerances `FAR_AWAY` times as large.
     """
-    return comparison.is_finite and _minimize(comparison, FAR_AWAY, FIT).misfit <= ALLOWED
+    return comparison.is_finite and _fit(comparison, FAR_AWAY, FIT)[0] <= ALLOWED
 
 
-def _minimize(comparison: Comparison, scale: float, control: Halving) -> _Point:
-    """Minimize the cost of the first interpretation with tolerances `scale` times as large."""
+def _fit(comparison: Comparison, scale: float, steps: int) -> tuple[float, Start]:
+    """Return the misfit of the first interpretation after steps of a fit with tolerances `scale`
+    times as large, infinite where a parameter leaves them by far, and where the fit ended.
+    """
     assert comparison.linearization is not None
     first = np.arange(1)
-    problem, linearization = comparison.problem.take(first), comparison.linearization.take(first)
-    z, p = linearization.deviation, problem.parameters
-
-    def propose(point: _Point) -> _Step:
-        prior = np.concatenate([np.eye(p), point.step.T], axis=1) / scale
-        whole = engine.fold(point.linearization.factor, prior[None])[0]
-        direction = -np.linalg.solve(whole[:p, :p], whole[:p, p])[None]
-        largest = np.abs(point.step + direction).max(initial=0.0)
-        share = np.full((1, 1), float(largest <= LARGEST_STEP * scale))
-        return _Step(direction, np.sum(whole[:p, p] ** 2, keepdims=True), share)
-
-    def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
-        if not share.any():
-            return point
-        total = point.step + share * step.direction
-        return _Point(total, problem.linearize(z + total, point.linearization.next_start), scale)
-
-    start = _Point(np.zeros_like(z), linearization, scale)
-    return minimize_by_halving(start, propose, move, control)[0]
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A step from the robot's values, and the linearization there."""
-
-    step: FloatArray  # (1, p) in tolerances
-    linearization: Linearization
-    scale: float  # factor by which tolerances are larger
-
-    @property
-    def cost(self) -> FloatArray:
-        return self.linearization.cost + ((self.step / self.scale) ** 2).sum(axis=1)
-
-    @property
-    def misfit(self) -> float:
-        return float(_compute_misfit(self.linearization, self.cost)[0])
-
-
-class _Step(NamedTuple):
-    """A full Gauss-Newton step (1, p)."""
-
-    direction: FloatArray
-    change: FloatArray
-    share: FloatArray
+    problem, at = comparison.problem.take(first), comparison.linearization.take(first)
+    centered = CenteredProblem(problem, at.deviation, at.equations)
+    control, start = StepControl(steps), at.next_start
+    end = descend(centered, np.zeros_like(at.deviation), Ridge(scale**-2), control, start=start)
+    if np.abs(end.deviation).max(initial=0.0) > LARGEST_STEP * scale:
+        return np.inf, start
+    cost = end.cost + ((end.deviation / scale) ** 2).sum(axis=1)
+    return float(_compute_misfit(at, cost)[0]), end.start
