@@ -31,7 +31,6 @@ from loopcal.studies.simulation.published_steps import (
     EPSILON,
     LIMIT,
     RawSteps,
-    penalize_none,
     penalize_ridge,
     penalize_truncated,
 )
@@ -135,14 +134,14 @@ def test_repeated_ridge_steps_reduce_the_effect_of_lambda() -> None:
 def test_exact_measurements_give_the_true_parameters() -> None:
     truth = steps.draw_true_values(steps.load_machine("3-PRS"), 2, 0)
     exact = steps.measure_machines("3-PRS", truth).with_noise(EXACT)
-    run = steps.iterate(exact, penalize_none(33), np.arange(2))
+    run = steps.iterate(exact, np.zeros((1, 33)), np.arange(2))
     assert run.is_converged.all()
     # [m, rad], rounding times 1 / 4e-4
     np.testing.assert_allclose(run.values, truth, rtol=0, atol=1e-9)
 
 
 def test_tsvd_with_all_singular_values_equals_ls_in_a_batch_of_settings(tripod) -> None:
-    ls, truncated = penalize_none(33), penalize_truncated(np.array([33, 22]), 33)
+    ls, truncated = np.zeros((1, 33)), penalize_truncated(np.array([33, 22]), 33)
     both = steps.iterate(tripod, np.concatenate([ls, truncated])).values
     np.testing.assert_array_equal(both[0], both[1])
     alone = steps.iterate(tripod, truncated[1:]).values[0]
@@ -189,7 +188,7 @@ def test_ridge_runs_until_its_steps_are_small(tripod) -> None:
 
 
 def test_diverged_iteration_has_no_values_after_its_last_step(tripod) -> None:
-    run = steps.iterate(tripod.five, penalize_none(33))
+    run = steps.iterate(tripod.five, np.zeros((1, 33)))
     assert run.is_diverged.all()
     assert np.isfinite(run.history[0]).all()
     for lost in (run.values, run.history[-1], run.steps[-1]):

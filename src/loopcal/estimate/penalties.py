@@ -412,15 +412,10 @@ class MAP(Method):
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return sigma^2 / inflation^2, with sigma = 1 where the noise is given."""
-        factor = self.sigma(decomposition) / self.compute_inflation(decomposition)
-        return _penalize(decomposition, factor**2)
-
-    def compute_inflation(self, decomposition: Decomposition) -> FloatArray:
-        """Return the factor (t,) on all tolerances."""
-        rule = self.inflation
-        if not callable(rule):
-            return np.full(len(decomposition.rows), rule)
-        return _apply_rule(rule, decomposition.divided(self.sigma(decomposition)))
+        sigma, inflation = self.sigma(decomposition), self.inflation
+        if callable(inflation):
+            inflation = _apply_rule(inflation, decomposition.divided(sigma))
+        return _penalize(decomposition, (sigma / inflation) ** 2)
 
     def read_inflation(self, decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
         """Return the factor (t,) on all tolerances that the penalty (t, p) of a fit contains; 1

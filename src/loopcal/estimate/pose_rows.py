@@ -313,12 +313,6 @@ class PoseRows:
             for rows in block.rows
         ]
 
-    def poses_of(self, block: PoseBlock, part: NodeRows) -> IntArray:
-        """Return the first pose of each of the rows of a part, or of each of its components."""
-        if part.kind < 0:
-            return self.first_pose[part.numbers]
-        return block.poses[block.rows[part.kind].first_poses[part.numbers]]
-
     def count_rows(self, block_of_pose: IntArray, count: int) -> IntArray:
         """Return how many rows `iterate_rows` gives of each of `count` blocks of poses, without
         those of targets on the base; `block_of_pose` (n,) is the block of each pose.

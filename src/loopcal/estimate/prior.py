@@ -170,20 +170,15 @@ class WithPrior:
         )
 
     def list_slopes(self, measured: Linearization) -> FloatArray:
-        """Return the rows (t, r, p) of the prior beside those of the measurements."""
-        if not self.unknown.shape[1]:
-            return np.broadcast_to(self.slope, (len(measured.deviation), *self.slope.shape))
-        triangles = measured.factor[:, :-1, :-1]
-        return np.stack([self._consistent_slope(triangle) for triangle in triangles])
-
-    def _consistent_slope(self, triangle: FloatArray) -> FloatArray:
-        """Return the rows of the prior without the null directions of the measured rows that it
-        does not know either.
+        """Return the rows (t, r, p) of the prior, without the null directions of the measured rows
+        that it does not know either.
         """
-        if not np.isfinite(triangle).all():
-            return self.slope
-        common = intersect_spaces(find_null_space(triangle), self.unknown)
-        return self.slope - (self.slope @ common) @ common.T
+        slopes = np.repeat(self.slope[None], len(measured.deviation), axis=0)
+        for i, triangle in enumerate(measured.factor[:, :-1, :-1]):
+            if self.unknown.shape[1] and np.isfinite(triangle).all():
+                common = intersect_spaces(find_null_space(triangle), self.unknown)
+                slopes[i] -= (slopes[i] @ common) @ common.T
+        return slopes
 
 
 def prior_from(earlier: Posterior) -> Prior:

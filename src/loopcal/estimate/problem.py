@@ -103,7 +103,9 @@ def spread_rows(
             rows[..., -p - 1 : -1] += whitened[..., :w] @ slope
             k, m = np.ogrid[: len(whitened), : whitened.shape[1]]
             rows[k[..., None], m[..., None], path[:, None, :]] = whitened[..., :w] @ root
-        yield LeverageRows(poses.poses_of(block, part), rows, part.kind, part.numbers)
+        is_left = part.kind < 0  # rows of components, whose poses are eliminated
+        first = poses.first_pose if is_left else block.poses[block.rows[part.kind].first_poses]
+        yield LeverageRows(first[part.numbers], rows, part.kind, part.numbers)
 
 
 CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9, stuck=1e-3)

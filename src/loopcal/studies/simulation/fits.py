@@ -38,7 +38,6 @@ from loopcal.studies.simulation.published_steps import (
     identify_from_rows,
     identify_per_leg,
     make_raw_problem,
-    penalize_none,
     penalize_ridge,
     penalize_truncated,
     take_steps,
@@ -169,7 +168,8 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
                 iterations[i] = len(fit.estimate_history) - 1
     else:
         raw = make_raw_problem(robot, trials)
-        p, penalty = raw.problem.parameters, penalize_none(raw.problem.parameters)
+        p = raw.problem.parameters
+        penalty = np.zeros((1, p))
         if method.method == "ridge":
             penalty = penalize_ridge(np.array([method.lam]), p)
         elif method.method == "truncated-svd":

@@ -217,11 +217,6 @@ def list_raw_units(dimensions: Sequence[Dimension]) -> FloatArray:
     return np.where([d is Dimension.LENGTH for d in dimensions], MM, 1.0)
 
 
-def penalize_none(parameters: int) -> FloatArray:
-    """Return the penalties (1, p) of least squares: none."""
-    return np.zeros((1, parameters))
-
-
 def penalize_ridge(lam: FloatArray, parameters: int) -> FloatArray:
     """Return the penalties (l, p) of ridge for each lam (l,)."""
     return np.repeat(np.asarray(lam, dtype=np.float64)[:, None], parameters, axis=1)
