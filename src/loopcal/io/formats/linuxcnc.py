@@ -186,10 +186,12 @@ def _report_inexpressible(source: ExportSource, factor: float, symbol: str) -> I
     """Yield what has no pin: lengths at reading zero, and further parameters."""
     values = source.values()
     for n in range(6):
-        length = values.pop(f"leg{n + 1}.length", 0.0) / factor
+        name = f"leg{n + 1}.length"
+        length = values.pop(name, 0.0) / factor
         if abs(length) > ROUNDING:
-            text = f"{length:.{DECIMALS}f} {symbol}"
-            yield report_finding("files.strut-length", strut=n, length=text)
+            shown = source.round_number(length, name, factor, DECIMALS)
+            text = f"{shown:.{DECIMALS}f}".rstrip("0").rstrip(".")
+            yield report_finding("files.strut-length", strut=n, length=f"{text} {symbol}")
     expressed = re.compile(r"leg\d\.(base|platform)\.[xyz]$")
     table = source.robot.parameters
     changed = zip(table.names, source.robot.values, table.nominal, strict=True)

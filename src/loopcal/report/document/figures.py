@@ -203,8 +203,8 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
     count = f" of the {MOST_ROWS:,} that are compared" if is_part else ""
     yield (
         f"The standard uncertainty of the pose was computed at {len(accuracy.coordinates)} poses "
-        f"of the workspace ({accuracy.uncertainty.frame}). {less} of these poses are less certain "
-        f"than every measured pose{count}."
+        f"of the workspace. {less} of these poses are less certain than every measured pose"
+        f"{count}. Frame: {accuracy.uncertainty.frame}."
     )
     yield make_picture(
         draw_accuracy_map(accuracy),

@@ -114,7 +114,7 @@ def test_export_reports_strut_lengths_without_a_pin() -> None:
     found = hal_file.write(ExportSource(load_robot("hexapod-42")), None)
     sentences = [str(f) for f in found.findings if f.code == "files.strut-length"]
     assert len(sentences) == 6
-    assert "strut 0 is 233.238076 mm long at reading zero" in sentences[0]
+    assert "Strut 0 is 233.238076 mm longer than its reading" in sentences[0]
     assert "HOME_OFFSET of [JOINT_0]" in sentences[0]
 
 
