@@ -7,6 +7,7 @@ python -m tools.structure            print a table
 from __future__ import annotations
 
 import ast
+import inspect
 import io
 import subprocess
 import sys
@@ -152,7 +153,8 @@ def profile_calls(work: Any) -> tuple[int, int]:
         nonlocal depth, deepest
         if event not in {"call", "return"} or "/loopcal/" not in frame.f_code.co_filename:
             return
-        if frame.f_code.co_name.startswith("<"):
+        is_function = frame.f_code.co_flags & inspect.CO_OPTIMIZED  # not the body of a class
+        if not is_function or frame.f_code.co_name.startswith("<"):
             return
         if event == "call":
             entered.add(frame.f_code)

@@ -222,7 +222,7 @@ methods:
         ("method: least-squares", "method: ridge, rows: raw", 9, "needs lam"),
         ("method: least-squares", "method: map, epsilon: 1", 9, "rows: raw"),
         ("method: least-squares", "method: per-leg, epsilon: 0", 9, "must be above 0"),
-        ("method: least-squares", "method: per-leg, steps: 0", 9, "must be 1 to"),
+        ("method: least-squares", "method: per-leg, steps: 0", 9, "must be from 1 to"),
         ("method: least-squares", "method: per-leg, loss: huber", 9, "has no loss"),
         ("method: least-squares", "method: per-leg, rows: raw", 9, "remove 'rows'"),
         ("method: least-squares", "method: map, rows: products", 9, "choice: plane-line"),
