@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from loopcal.apply.error_budget import compute_error_budget
 from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
@@ -23,6 +24,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.result import Identification
+from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
@@ -396,18 +398,15 @@ def build_machine_with_spools(
     # radii that differ are parameters of their own
     guess = [75.0 + (1e-3 * i if radii == 4 else 0.0) for i in range(4)]
     read = import_samples(folder, samples | {"spool_r_in_origin_first_guess": guess}, SIGMA)
-    lines = read.robot_text.splitlines(keepends=True)
-    own = {line.split("name: ")[1][0]: line for line in lines if ".buildup" in line}
-    maps = {name: line[line.index("maps: [") + 7 : line.rindex("]")] for name, line in own.items()}
-    shared = [
+    content = YAML(typ="safe").load(read.robot_text)
+    rows = content["parameters"]
+    own = {row["name"][0]: row for row in rows if row["name"].endswith(".buildup")}
+    content["parameters"] = [row for row in rows if row not in own.values()] + [
         own[group[0]]
-        .replace(f"{group[0]}.buildup", f"{group}.buildup")
-        .replace(maps[group[0]], ", ".join(maps[i] for i in group))
+        | {"name": f"{group}.buildup", "maps": [own[line]["maps"][0] for line in group]}
         for group in buildups
     ]
-    text = "".join(line for line in lines if ".buildup" not in line).replace(
-        "home:", "".join(shared) + "home:"
-    )
+    text = format_yaml(content)
     assert read.measurements is not None
     return build_imported_robot(folder / "samples.json", Imported(text)), read.measurements
 

@@ -287,6 +287,8 @@ def test_budget_of_a_platform_that_does_not_rotate_states_no_orientation(root) -
     robot = lc.load_robot(root / "examples" / "delta-printer" / "printer.yaml")
     data = lc.load_measurements(root / "examples" / "delta-printer" / "heights.csv", robot)
     report = lc.calibrate(robot, data)
+    assert report.budget is not None
+    assert report.budget.orientation is not None
     budget = report.budget.to_dict()
     assert 0.0 < report.budget.orientation.rms < 1e-15
     for table in (build_share_table(budget), build_budget_table(budget, robot)):
