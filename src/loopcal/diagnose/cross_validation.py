@@ -234,7 +234,9 @@ def score_leave_one_out(
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
         H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))
         remaining = np.eye(A.shape[1]) - H
-        singular = np.linalg.eigvalsh(remaining)[..., 0] <= TESTABLE
+        # eigenvalues lie in 0 to 1: the smallest is no smaller than the determinant, which is cheap
+        singular = np.linalg.det(remaining) <= TESTABLE
+        singular[singular] = np.linalg.eigvalsh(remaining[singular])[..., 0] <= TESTABLE
         remaining = np.where(singular[..., None, None], np.eye(A.shape[1]), remaining)
         deleted = np.linalg.solve(remaining, residual[..., None])[..., 0]
         square[numbers] = np.where(singular, np.inf, (deleted**2).sum(axis=2)).T
