@@ -387,10 +387,10 @@ def _read_errors(run: Run, poses: Sequence[str] | None = None) -> PoseErrors:
     validation = stored and restore_validation(stored, run.arrays, run.robot)
     if not validation:
         return PoseErrors()
+    labels = validation.poses
+    chosen = set(labels if poses is None else poses)
     rows = [
-        i
-        for i, label in enumerate(validation.poses)
-        if poses is None or label in poses or set(label.split("/")) <= set(poses)
+        i for i, each in enumerate(labels) if each in chosen or chosen.issuperset(each.split("/"))
     ]
     return validation.after.take(np.array(rows, dtype=np.intp))
 
