@@ -37,7 +37,7 @@ def test_page_shows_published_and_computed_numbers_and_marks_differences() -> No
         ),
         (
             "## Our own checks\n\n1. **Not confirmed:** It holds.\n"
-            "   True in 0 of 2 draws. It does not."
+            "   True in 0 of 2 draws (95 % interval of the share: 0 to 84 %). It does not."
         ),
         "| q | - |",
         "The first 2 of 3 rows",
@@ -62,9 +62,14 @@ def test_statements_of_the_paper_and_own_checks_have_two_lists() -> None:
         (np.False_, False, "Does not agree", "x is 0.5."),
         (decide(False, np.False_), None, "Undecided", "x is 0.5."),
         (decide(False, True), False, "Does not agree", "x is 0.5."),
-        ([True, False, True, True, True], None, "Depends on the draw",
-         "True in 4 of 5 draws. x is 0.5."),
-        (np.zeros(2, dtype=bool), False, "Does not agree", "True in 0 of 2 draws. x is 0.5."),
+        ([True, False, True, True, True], None, "Undecided",
+         "True in 4 of 5 draws (95 % interval of the share: 28 to 99 %). x is 0.5."),
+        ([True] * 18 + [False] * 2, True, "Agrees",
+         "True in 18 of 20 draws (95 % interval of the share: 68 to 99 %). x is 0.5."),
+        (np.zeros(6, dtype=bool), False, "Does not agree",
+         "True in 0 of 6 draws (95 % interval of the share: 0 to 46 %). x is 0.5."),
+        ([None, None], None, "Undecided",
+         "True in 0 of 2 draws (95 % interval of the share: 0 to 100 %). x is 0.5."),
     ],
 )  # fmt: skip
 def test_claim_is_judged_by_one_decision_or_by_that_of_each_draw(
@@ -74,6 +79,29 @@ def test_claim_is_judged_by_one_decision_or_by_that_of_each_draw(
     (tmp_path / "text.yaml").write_text(f"claims:\n  small: {record}\n")
     judged = PaperText(str(tmp_path / "results.py")).judge("small", agrees, x=0.5)
     assert (judged.agrees, judged.word, judged.reason) == (verdict, word, reason)
+
+
+def test_claim_about_one_machine_is_not_refuted_by_other_dimensions(tmp_path) -> None:
+    record = "{claim: x., where: section 1, of: these machines, evidence: 'It is {x}.'}"
+    (tmp_path / "text.yaml").write_text(f"claims:\n  small: {record}\n")
+    text = PaperText(str(tmp_path / "results.py"))
+    elsewhere, there = (text.judge("small", False, elsewhere=e, x=1) for e in (True, False))
+    assert (elsewhere.word, there.word) == ("Undecided", "Does not agree")
+    assert elsewhere.reason == "The claim is about machines of other dimensions. It is 1."
+    assert text.judge("small", True, x=1).word == "Agrees"
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_sizes_that_another_robot_replaces_are_stated(paper, tmp_path) -> None:
+    robot = tmp_path / "mine.yaml"
+    text = (ROOT / "src/loopcal/robots/hexapod-42.yaml").read_text()
+    robot.write_text(text)
+    case = PAPERS[paper].make_case(robot)
+    sentences = case.list_replaced()
+    assert sentences[0].startswith("The robot is ")
+    assert any("standard deviations" in sentence for sentence in sentences)
+    assert PAPERS[paper].make_case(next(iter(PAPERS[paper].studies))).list_replaced() == ()
+    assert [level.text for level in case.load_study().robots.values()] == [text]
 
 
 @pytest.mark.slow
@@ -176,7 +204,7 @@ def test_reproduce_prints_tables_and_statements(capsys, monkeypatch) -> None:
     assert main(["reproduce", "hexapod-42"]) == 0
     printed = capsys.readouterr().out
     for part in ("small: A title", "Extra", "Our own checks", "NOT CONFIRMED: It holds.",
-                 "True in 0 of 2 draws. It does not.", "Add -o FOLDER"):  # fmt: skip
+                 "True in 0 of 2 draws (95 %", "Add -o FOLDER"):  # fmt: skip
         assert part in printed
 
 

@@ -4,8 +4,9 @@
 A further paper is one more folder and its entry in PAPERS. The folder has `published.yaml` (the
 printed numbers and statements, with their place), `sizes.yaml` (sizes that are ours), `text.yaml`
 (claims, captions, sentences), `study.yaml` (its simulation as a study file), `steps.py` (what the
-paper does), and `results.py` with compute(seed, trials, progress) -> results, of which
-compare_tables, make_tables, judge_claims and make_figures yield what a page shows.
+paper does), and `results.py` with compute(seed, trials, progress, case) -> results, of which
+compare_tables, make_tables, judge_claims, make_figures and list_replaced (sizes that another robot
+replaces) yield what a page shows.
 """
 
 from __future__ import annotations
@@ -19,9 +20,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, suggest_names
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.findings.wording import list_names, round_to_digits
+from loopcal.io.robot.robot_file import find_robot_file, load_robot
 
 if TYPE_CHECKING:
+    from loopcal.mechanism.model import Mechanism
     from loopcal.papers.reproduction import Reproduction
+    from loopcal.studies.specification.levels import ErrorsLevel
     from loopcal.studies.specification.study import Study
 
 TRIALS = 50
@@ -48,26 +54,44 @@ class Paper:
         return f"loopcal.papers.{self.name.replace('-', '_')}"
 
     def run(
-        self, seed: int = 0, trials: int = TRIALS, progress: Callable[[str], None] | None = None
+        self,
+        seed: int = 0,
+        trials: int = TRIALS,
+        progress: Callable[[str], None] | None = None,
+        robot: str | Path | None = None,
     ) -> Reproduction:
         """Repeat the study.
 
         trials : drawings behind each statistical number. progress : receives a few words on each
-        step. DataError for a seed below zero or fewer than 2 trials.
+        step. robot : another robot, or its file, that takes the place of those of the paper.
+
+        Raises
+        ------
+        DataError : a seed below zero, fewer than 2 trials, or a robot that does not fit the study.
+        FileError : the robot cannot be read.
         """
         if seed < 0 or trials < 2:
             raise DataError(
                 f"seed {seed} with {trials} trials: give a seed of 0 or more, and 2 trials or more"
             )
-        compute = import_module(f"{self.package}.results").compute
-        return self.present(compute(seed, trials, progress or (lambda _: None)), seed, trials)
+        compute, case = import_module(f"{self.package}.results").compute, self.make_case(robot)
+        results = compute(seed, trials, progress or (lambda _: None), case)
+        return self.present(results, seed, trials, case)
 
-    def present(self, results: Any, seed: int, trials: int) -> Reproduction:
-        """Return computed results as tables, verdicts and figures."""
+    def make_case(self, robot: str | Path | None = None) -> StudyCase:
+        """Return the study of a robot, or its file; by default that of the robots of the paper."""
+        if robot is None or str(robot) in self.studies:
+            return StudyCase(self)
+        return StudyCase(self, str(robot), load_robot(robot))
+
+    def present(
+        self, results: Any, seed: int, trials: int, case: StudyCase | None = None
+    ) -> Reproduction:
+        """Return computed results as tables, verdicts and figures; case : that they belong to."""
         from loopcal.papers.published import PaperText
         from loopcal.papers.reproduction import Content, Reproduction
 
-        module = import_module(f"{self.package}.results")
+        module, case = import_module(f"{self.package}.results"), case or StudyCase(self)
         parts = (
             module.compare_tables,
             module.make_tables,
@@ -79,8 +103,9 @@ class Paper:
             self.title,
             self.source,
             PaperText(str(module.__file__)).about(),
-            {"seed": seed, "trials": trials},
+            {"seed": seed, "trials": trials} | ({"robot": case.source} if case.robot else {}),
             Content(*(tuple(part(results)) for part in parts)),
+            (*case.list_replaced(), *module.list_replaced(results)),
         )
 
     def load_study(self, robot: str = "") -> Study:
@@ -93,6 +118,69 @@ class Paper:
     def read_file(self, name: str) -> str:
         """Return the text of a file of the paper."""
         return (files(self.package) / name).read_text("utf-8")
+
+
+@dataclass(frozen=True)
+class StudyCase:
+    """The study of a paper with its own robots, or with another one.
+
+    source : name or file of the other robot, "" for those of the paper. robot : it, None for those
+    of the paper.
+    """
+
+    paper: Paper
+    source: str = ""
+    robot: Mechanism | None = None
+
+    def load_study(self, name: str = "") -> Study:
+        """Return the study of the robot; name : which robot of the paper, by default the first."""
+        from loopcal.io.core.yaml_file import parse_yaml
+        from loopcal.studies.files.study_file import parse_study
+
+        if self.robot is None:
+            return self.paper.load_study(name)
+        path = find_robot_file(self.source).parent / "study.yaml"  # is not written
+        made = make_paper_study(self.paper, path, self.source)
+        return parse_study(parse_yaml(made.files[path], path, "study file"))
+
+    def list_replaced(self) -> tuple[str, ...]:
+        """Return sentences that state which sizes of the study the other robot replaces."""
+        if self.robot is None:
+            return ()
+        first, other = self.paper.load_study(), self.load_study()
+        (of_paper,) = first.robots.values()
+        nominal, robot = load_robot(of_paper.source), self.robot
+        sentences = [f"The robot is {robot.name} in place of {nominal.name}."]
+        for level, of_other in zip(first.poses.values(), other.poses.values(), strict=True):
+            if level.coordinates and not of_other.coordinates:
+                sentences.append(
+                    f"{of_other.count} poses are drawn from the workspace of {robot.name} in place "
+                    f"of the {level.count} of the study."
+                )
+        for name, level, (of_robot, of_other) in zip(
+            first.errors, first.errors.values(), other.errors.items(), strict=True
+        ):
+            before, after = describe_errors(nominal, level), describe_errors(robot, of_other)
+            sentences.append(
+                f"Errors {of_robot!r} have the standard deviations {after}, in place of "
+                f"{before} of {name!r}."
+            )
+        return tuple(sentences)
+
+
+def describe_errors(robot: Mechanism, level: ErrorsLevel) -> str:
+    """Return the standard deviations of the errors of a level, such as `0.1 to 1 mm`."""
+    if level.deviations:
+        return "the errors of one machine"
+    free = select_free_parameters(robot)
+    factor, symbols = free.display()
+    sd = free.tolerance * level.tolerance_factor * level.error_factor / factor
+    parts = []
+    for unit in dict.fromkeys(symbols):
+        of_unit = sd[[symbol == unit for symbol in symbols]]
+        ends = dict.fromkeys(round_to_digits(value) for value in (of_unit.min(), of_unit.max()))
+        parts.append(f"{' to '.join(ends)} {unit}".rstrip())
+    return list_names(parts)
 
 
 PAPERS: Mapping[str, Paper] = {
@@ -189,6 +277,9 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
         changes["errors"] = ANY_ERRORS
     for key, content in changes.items():
         text = _replace_key(text, key, content)
+    # a factor of tolerances is no size of the paper
+    text = re.sub(r"^  [^:\n]+: (\{tolerance_factor: ([\d.]+)\})$", r"  \2 tolerances: \1", text,
+                  flags=re.MULTILINE)  # fmt: skip
     return PaperStudyFile({path: text}, wanted, tuple(changes)[1:])
 
 

@@ -10,6 +10,7 @@ yardstick: a computed number agrees if it is within one unit of it ("0.0352" has
       NAME:
         claim: a sentence
         where: place in the paper; a claim without it is a check of our own
+        of: "these machines" for a claim about the machines of the paper alone
         evidence: sentences that show the numbers
     tables:
       NAME: {title: ..., columns: [...], formats: [...], note: ..., shown: rows on a page}
@@ -31,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.findings.wording import fill_template
+from loopcal.studies.results.study_result import Interval, compute_binomial_interval
 from loopcal.typing import BoolArray, FloatArray
 
 Cell = str | float | int | bool | None
@@ -222,6 +224,10 @@ OWN_CHECK = "our own check, not a statement of the paper"
 """Place of a claim that the paper does not make."""
 
 
+THESE_MACHINES = "these machines"
+"""Of a claim that holds for the machines of the paper only."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """The judgement of one claim."""
@@ -234,6 +240,7 @@ class Verdict:
     name: str = ""  # in text.yaml
     # whether each repeated draw of a random study supports the claim (None: cannot decide)
     draws: tuple[bool | None, ...] = ()
+    is_elsewhere: bool = False  # contradicted by machines other than those it speaks about
 
     @property
     def is_own_check(self) -> bool:
@@ -243,8 +250,6 @@ class Verdict:
     @property
     def word(self) -> str:
         """The judgement as a word: a claim of the paper agrees, a check of ours is confirmed."""
-        if len(set(self.draws)) > 1:
-            return "Depends on the draw"
         if self.agrees is None:
             return "Undecided"
         if self.is_own_check:
@@ -254,12 +259,35 @@ class Verdict:
     @property
     def reason(self) -> str:
         """How many of the repeated draws support the claim, and the evidence."""
-        if not self.draws:
-            return self.why
-        return f"True in {sum(map(bool, self.draws))} of {len(self.draws)} draws. {self.why}"
+        sentences = [self.why]
+        if self.is_elsewhere:
+            sentences.insert(0, "The claim is about machines of other dimensions.")
+        if self.draws:
+            share, count = estimate_share(self.draws), sum(map(bool, self.draws))
+            sentences.insert(
+                0, f"True in {count} of {len(self.draws)} draws (95 % interval of the share: "
+                f"{100 * share.low:.0f} to {100 * share.high:.0f} %)."
+            )  # fmt: skip
+        return " ".join(sentences)
 
 
 Decision = bool | np.bool_ | None
+
+
+def estimate_share(draws: Sequence[bool | None]) -> Interval:
+    """Return the share of draws that support a claim, with its exact 95 % interval; draws that
+    decide nothing (None) do not count.
+    """
+    decided = [draw for draw in draws if draw is not None]
+    return compute_binomial_interval(sum(decided), len(decided))
+
+
+def decide_share(draws: Sequence[bool | None]) -> bool | None:
+    """Return whether draws support a claim: the 95 % interval of their share lies above one half;
+    False where it lies below, None where it contains one half.
+    """
+    share = estimate_share(draws)
+    return decide(share.low > 0.5, share.high < 0.5)
 
 
 def decide(agrees: Decision, disagrees: Decision) -> bool | None:
@@ -282,16 +310,25 @@ class PaperText:
         return tuple(fill_template(text, source=source) for text in self._find("about"))
 
     def judge(
-        self, name: str, agrees: Decision | Sequence[Decision] | BoolArray, /, **data: Any
-    ) -> Verdict:
-        """Return the verdict on a claim; agrees : one decision, or that of each repeated draw."""
+        self, name: str, agrees: Decision | Sequence[Decision] | BoolArray, /,
+        *, elsewhere: bool = True, **data: Any,
+    ) -> Verdict:  # fmt: skip
+        """Return the verdict on a claim.
+
+        agrees : one decision, or that of each repeated draw, see `decide_share`. elsewhere :
+        whether the machines have other dimensions than those of the paper. They do not refute a
+        claim that is marked with `of: these machines`.
+        """
         record, draws = self._find("claims", name), ()
         if isinstance(agrees, (Sequence, np.ndarray)):
             draws = tuple(None if a is None else bool(a) for a in agrees)
-            agrees = draws[0] if len(set(draws)) == 1 else None
+            agrees = decide_share(draws)
         claim, why = (fill_template(record[key], **data) for key in ("claim", "evidence"))
         agrees = None if agrees is None else bool(agrees)
-        return Verdict(claim, agrees, why, record.get("where", OWN_CHECK), name, draws)
+        is_elsewhere = agrees is False and elsewhere and record.get("of") == THESE_MACHINES
+        agrees = None if is_elsewhere else agrees
+        where = record.get("where", OWN_CHECK)
+        return Verdict(claim, agrees, why, where, name, draws, is_elsewhere)
 
     def table(
         self, name: str, rows: Iterable[Row | Sequence[Any]], file_name: str = "",

@@ -55,12 +55,15 @@ class Reproduction:
     about: tuple[str, ...]  # paragraphs on what was done
     settings: Mapping[str, Any]  # seed and sizes of this run
     content: Content  # its results
+    replaced: tuple[str, ...] = ()  # sizes of the study that another robot replaces, in sentences
 
     @property
     def verdict_groups(self) -> dict[str, tuple[tuple[int, Verdict], ...]]:
         """Verdicts with their numbers on a page, by title: statements of the paper, own checks."""
         ordered = sorted(self.content.verdicts, key=lambda verdict: verdict.is_own_check)
-        titles = {False: "Statements of the paper", True: "Our own checks"}
+        robot = self.settings.get("robot")
+        on = f", tested on {robot}" if robot else ""
+        titles = {False: f"Statements of the paper{on}", True: f"Our own checks{on}"}
         groups = groupby(enumerate(ordered, 1), lambda pair: pair[1].is_own_check)
         return {titles[is_own]: tuple(group) for is_own, group in groups}
 

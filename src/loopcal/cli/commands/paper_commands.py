@@ -34,23 +34,29 @@ def reproduce(
     trials: int = opt.option(
         "Number of trials behind each statistical number.", of=RUN, type=opt.Count("TRIALS")
     ),
+    robot: str | None = opt.option(
+        "Robot, or its file, in place of those of the paper.", metavar="ROBOT"
+    ),
     force: bool = opt.flag("Replace an earlier result in FOLDER."),
 ) -> Output:
     """Repeat the study PAPER; without PAPER, list the studies.
 
     Every number called computed comes from this run. Statements of the paper that it does not
-    confirm are listed with the reason.
+    confirm are listed with the reason. With --robot the study is that of another robot; sizes that
+    it replaces are stated first.
 
     Examples:
       loopcal reproduce
       loopcal reproduce hexapod-42
       loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
+      loopcal reproduce tsvd-2016 --robot mine.yaml -o study
     """
     from loopcal.papers.paper import PAPERS, find_paper
 
     if paper is None:
         opt.refuse_given(
-            ("output", "seed", "trials", "force"), "without the name of a study, which is repeated"
+            ("output", "seed", "trials", "robot", "force"),
+            "without the name of a study, which is repeated",
         )
         rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
         lines = [
@@ -69,7 +75,7 @@ def reproduce(
         if sys.stderr.isatty():
             terminal.print_message(text)
 
-    result = chosen.run(seed, trials, print_step)
+    result = chosen.run(seed, trials, print_step, robot)
     made_by = collect_provenance(opt.list_words(), {}, {"seed": seed})
     last = "Add -o FOLDER for all tables and figures."
     if output is not None:
@@ -136,8 +142,9 @@ def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> lis
 
 def _view_reproduction(result: Reproduction) -> list[Block]:
     """Return the summary, the tables and the statements of the paper."""
-    page: list[Block] = [f"{result.paper}: {result.title}"]
-    page += [_make_table(table) for table in (result.summary(), *result.content.tables)]
+    page: list[Block] = [f"{result.paper}: {result.title}", *result.replaced]
+    summary = (result.summary(),) if result.content.comparisons else ()
+    page += [_make_table(table) for table in (*summary, *result.content.tables)]
     for title, verdicts in result.verdict_groups.items():
         page += ["", title]
         for number, verdict in verdicts:

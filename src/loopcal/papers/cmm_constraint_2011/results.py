@@ -28,6 +28,7 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     Draw,
     Stated,
 )
+from loopcal.papers.paper import StudyCase
 from loopcal.typing import FloatArray
 
 TEXT = published.PaperText(__file__)
@@ -68,8 +69,8 @@ class Results:
 
 
 def compute(
-    seed: int, trials: int, progress: Callable[[str], None], draws: int = 0,
-    sweeps: tuple[int | None, int] = (None, 1),
+    seed: int, trials: int, progress: Callable[[str], None], case: StudyCase | None = None,
+    draws: int = 0, sweeps: tuple[int | None, int] = (None, 1),
 ) -> Results:  # fmt: skip
     """Compute everything.
 
@@ -454,3 +455,8 @@ def _judge_forms(results: Results) -> tuple[published.Verdict, published.Verdict
               ranks=sorted({rank for row in forms for rank in row["ranks"]}),
               noises=[f"{noise:g}" for noise in noises]),
     )  # fmt: skip
+
+
+def list_replaced(results: Results) -> tuple[str, ...]:
+    """Return sentences on further sizes that another robot replaces."""
+    return ()

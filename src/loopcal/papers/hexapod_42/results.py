@@ -24,6 +24,7 @@ from loopcal.papers.hexapod_42.steps import (
     compute_rms,
     find_places,
 )
+from loopcal.papers.paper import StudyCase
 from loopcal.typing import BoolArray, FloatArray
 
 TEXT = published.PaperText(__file__)
@@ -48,7 +49,9 @@ class Results:
     noise: FloatArray  # (n, 6) [m, rad] that Tables 5 and 6 imply
 
 
-def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
+def compute(
+    seed: int, trials: int, progress: Callable[[str], None], case: StudyCase | None = None
+) -> Results:
     """Compute everything."""
     threshold, used = find_rule()
     setup, measured = steps.make_setup(), PRINTED.table("table_4", "PP")
@@ -338,3 +341,8 @@ def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:
         TEXT.judge("leg_by_leg", ratio < 1.1, ratio=ratio, **methods),
         TEXT.judge("seven_poses", seven["left"] < 1e-6, seven=seven, ten=ten),
     )  # fmt: skip
+
+
+def list_replaced(results: Results) -> tuple[str, ...]:
+    """Return sentences on further sizes that another robot replaces."""
+    return ()

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from loopcal.papers import published
+from loopcal.papers.paper import StudyCase
 from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.steps import (
     BEFORE,
@@ -90,7 +91,9 @@ class Results:
         return {sweep.study.label: sweep for draws in self.draws for sweep in draws.sweeps}
 
 
-def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
+def compute(
+    seed: int, trials: int, progress: Callable[[str], None], case: StudyCase | None = None
+) -> Results:
     """Compute everything: one machine of each kind with the printed noise, then drawn machines."""
     cases = {}
     for name in ROBOTS:
@@ -620,3 +623,8 @@ def format_all(**errors: FloatArray) -> dict[str, str]:
 def format_pair(values: FloatArray) -> str:
     """Return ratios in position and angle as text; DIVERGED for one that is not finite."""
     return " and ".join(f"{v:.2f}" if np.isfinite(v) else DIVERGED for v in values[:2])
+
+
+def list_replaced(results: Results) -> tuple[str, ...]:
+    """Return sentences on further sizes that another robot replaces."""
+    return ()

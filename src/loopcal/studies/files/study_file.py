@@ -87,7 +87,11 @@ def load_study(path: str | Path, quick: bool = False) -> Study:
     ------
     FileError : what does not fit, at its line.
     """
-    file = read_yaml(path, "study file")
+    return parse_study(read_yaml(path, "study file"), quick)
+
+
+def parse_study(file: YamlFile, quick: bool = False) -> Study:
+    """Return the study of the content of a study file; parameters and errors as `load_study`."""
     check_format(file, 1)
     refuse_unknown_keys(file, list(file.content), ["format", *SETTINGS, *FACTORS, QUICK])
     full = {key: value for key, value in file.content.items() if key not in ("format", QUICK)}
