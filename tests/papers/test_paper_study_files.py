@@ -117,7 +117,12 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
 @pytest.mark.parametrize(
     ("paper", "robot", "replaced", "cell"),
     [
-        ("cmm-constraint-2011", "hexapod-octahedral", (), {"errors": "set 1", "method": "MAP"}),
+        (
+            "cmm-constraint-2011",
+            "hexapod-octahedral",
+            (),
+            {"errors": "1 tolerances", "method": "MAP"},
+        ),
         (
             "hexapod-42",
             "hexapod-nategh-agheli",
