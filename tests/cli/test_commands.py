@@ -82,6 +82,36 @@ def test_json_option_prints_one_document_and_nothing_else(loopcal, words) -> Non
     assert isinstance(printed.json, dict)
 
 
+@pytest.mark.parametrize(
+    ("words", "quantity", "sigma"),
+    [
+        ("simulate hexapod-42 --draw 2 --sigma-position 1um -o data.csv", "angle", "50 urad"),
+        ("identifiability 3-prs --draw 9 --sigma-angle 1urad", "length", "10 um"),
+        ("plan hexapod-42 -o plan --poses 7 --candidates 20 --sigma-position 1um", "angle",
+         "50 urad"),
+        ("new gough -o mine.yaml --measurements data.csv --sigma-angle 1urad", "length", "10 um"),
+    ],
+)  # fmt: skip
+def test_noise_that_is_assumed_beside_a_stated_one_is_on_screen_and_in_json(
+    loopcal, words, quantity, sigma
+) -> None:
+    printed = loopcal(f"{words} --json")
+    text = f"The standard deviation of each measured {quantity} is not stated: {sigma} is assumed."
+    assert printed.err.count(text) == 1
+    (finding,) = printed.json["input_findings"]
+    assert (finding["code"], finding["text"]) == ("data.sigma-assumed", text)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    ["", "--kind position --sigma-position 1um", "--sigma-position 1um --sigma-angle 1urad"],
+)
+def test_noise_that_is_stated_in_full_or_by_default_needs_no_note(loopcal, noise) -> None:
+    printed = loopcal(f"simulate hexapod-42 --draw 2 {noise} -o data.csv --json")
+    assert printed.err == ""
+    assert "input_findings" not in printed.json
+
+
 def test_unmet_quality_gate_gives_exit_code_2_and_keeps_the_run(loopcal, tmp_path) -> None:
     words = f"{CALIBRATE} --hold-out 0.25 --force --limit-position"
     loopcal(f"{words} 0.02mm --limit-angle 0.01deg")

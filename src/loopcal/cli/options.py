@@ -658,7 +658,25 @@ def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None
     instrument = simulated_measurements.build_instrument(
         simulated_measurements.InstrumentDescription(**described)
     )
+    _print_assumed_sigma(instrument)
     return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)
+
+
+def _print_assumed_sigma(instrument: lc.Instrument) -> None:
+    """Print a note where the user states the noise of lengths or of angles, and the instrument
+    measures both.
+    """
+    from loopcal.findings.wording import Quantity
+    from loopcal.measure.instrument import SIGMA
+
+    options = {"sigma_position": (Dimension.LENGTH, "length", "um"),
+               "sigma_angle": (Dimension.ANGLE, "angle", "urad")}  # fmt: skip
+    assumed = [name for name in options if not is_given(name)]
+    measured = {c.dimension for sensor in instrument.sensors for c in sensor.kind.noise_columns}
+    if len(assumed) == 1 and measured.issuperset((Dimension.LENGTH, Dimension.ANGLE)):
+        dimension, name, unit = options[assumed[0]]
+        sigma = Quantity(SIGMA[dimension] / find_unit(unit).factor_to_si, unit)
+        terminal.print_finding("data.sigma-assumed", quantity=name, sigma=sigma)
 
 
 def parse_reading_sigma(text: str | None, robot: lc.Mechanism) -> FloatArray | None:

@@ -65,7 +65,7 @@ def print_output(output: Output, as_json: bool) -> int:
     if as_json and output.document is not None:
         from loopcal.io.core.text_file import to_json
 
-        print_text(to_json(output.document))
+        print_text(to_json(add_findings(output.document)))
     elif isinstance(page, str):
         print_text(page)
     elif page:
@@ -150,10 +150,27 @@ def print_note(text: object) -> None:
 
 
 def print_finding(code: str, **facts: Any) -> None:
-    """Print the finding of a code as a note on standard error."""
+    """Print the finding of a code as a note on standard error, once; a document of --json contains
+    it as well.
+    """
     from loopcal.findings import report_finding
 
-    print_note(report_finding(code, **facts))
+    finding, printed = report_finding(code, **facts), list_printed()
+    if finding not in printed:
+        printed.append(finding)
+        print_note(finding)
+
+
+def list_printed() -> list[Finding]:
+    """Return the findings that the running command has printed as notes, to read or to extend."""
+    context = click.get_current_context(silent=True)
+    return [] if context is None else context.meta.setdefault("loopcal.printed", [])
+
+
+def add_findings(document: Any) -> Any:
+    """Return the document of the running command with the findings that were printed as notes."""
+    printed = list_printed()
+    return {**document, "input_findings": printed} if printed else document
 
 
 class TerminalProgress:

@@ -167,9 +167,10 @@ def simulate(
     Examples:
       loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
       loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
-      loopcal simulate truth.yaml --poses poses.csv --sigma-position 1um -o measurements.csv
+      loopcal simulate truth.yaml --poses poses.csv --kind position -o measurements.csv
       loopcal simulate linear-delta --kind position --sigma-reading 5um -o measurements.csv
-      loopcal simulate hexapod-42 --sigma-position 0.6um --distribution uniform -o measurements.csv
+      loopcal simulate hexapod-42 --sigma-position 0.6um --sigma-angle 0.6urad \\
+          --distribution uniform -o measurements.csv
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
     """
     from loopcal.apply.simulated_measurements import simulate_measurements

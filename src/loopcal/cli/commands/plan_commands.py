@@ -166,7 +166,7 @@ def plan(
         with terminal.TerminalProgress() as progress:
             result = lc.plan(machine, measuring, options=plan_options, progress=progress)
     made_by = collect_provenance(opt.list_words(), inputs, {"plan": seed})
-    document = {"format": FORMAT, **result.to_dict(), "made_by": made_by}
+    document = terminal.add_findings({"format": FORMAT, **result.to_dict(), "made_by": made_by})
     written = _write_plan(output, result, document, force)
     data = (*measured, output / "measurements.csv")
     page = [
