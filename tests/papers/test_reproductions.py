@@ -69,7 +69,8 @@ def test_statements_of_the_paper_and_own_checks_have_two_lists() -> None:
         (np.zeros(6, dtype=bool), False, "Does not agree",
          "True in 0 of 6 draws (95 % interval of the share: 0 to 46 %). x is 0.5."),
         ([None, None], None, "Undecided",
-         "True in 0 of 2 draws (95 % interval of the share: 0 to 100 %). x is 0.5."),
+         ("True in 0 of 2 draws (2 decide nothing; 95 % interval of the share: 0 to 100 %). "
+          "x is 0.5.")),
     ],
 )  # fmt: skip
 def test_claim_is_judged_by_one_decision_or_by_that_of_each_draw(

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """LS, RE and TSVD on two parallel manipulators: steps, claims of the paper, many machines.
 
-The small version below draws 4 machines; the tests marked `evidence` check the bounds at full size.
+The small version below draws 6 machines; the tests marked `evidence` check the bounds at full size.
 Page: docs/papers/tsvd-2016.md.
 """
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ import pytest
 from loopcal.measure.instrument import Uniform
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.papers.paper import PAPERS
-from loopcal.papers.published import Printed
+from loopcal.papers.published import PaperFile, Printed, decide
+from loopcal.papers.tsvd_2016 import results as results_module
 from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.results import (
     DIVERGED,
@@ -30,14 +32,12 @@ from loopcal.papers.tsvd_2016.results import (
 from loopcal.studies.simulation.published_steps import (
     EPSILON,
     LIMIT,
-    RawSteps,
     penalize_ridge,
     penalize_truncated,
 )
-from tests.papers.random_results import randomize
 
 ROOT = Path(__file__).parents[2]
-DRAWS = 4
+DRAWS = 6
 RAW = np.array([1e3, 1e3, 1e3, 1.0, 1.0, 1.0])  # from m and rad to mm and rad
 FIRST = np.zeros(1, dtype=np.int64)
 EXACT = np.zeros(6)
@@ -282,10 +282,11 @@ def test_map_has_smaller_errors_than_raw_methods_on_drawn_machines(results) -> N
 
 
 VERDICTS = {
-    "tsvd_best": False, "ls_fails": True, "no_solution": False, "faster": True, "deviate": True,
-    "k_near_j": False, "lambda_range": False, "five_usable": True, "mixed_units": True,
-    "noise": True,
+    "ls_fails": (True,), "no_solution": (True,), "faster": (True, None), "deviate": (True,),
+    "k_near_j": (None,), "lambda_range": (None,), "mixed_units": (True,), "noise": (True,),
+    "tsvd_best": (False, None),
 }  # fmt: skip
+"""Answers that six draws may give; None where they are too few, or of other machines."""
 
 
 @pytest.mark.slow
@@ -294,7 +295,7 @@ def test_statements_and_own_checks_have_the_expected_verdicts(results) -> None:
     assert [v.name for v in verdicts if not v.draws] == ["noise"]  # of Appendix 1 alone
     answers = {v.name: v.agrees for v in verdicts if v.name != "u_shape"}
     assert len(verdicts) == len(answers) + 4  # curves with 6- and 5-DOF measurement
-    assert {name: answers[name] for name in VERDICTS} == VERDICTS
+    assert all(answers[name] in allowed for name, allowed in VERDICTS.items())
     own = {"noise", "five_usable", "mixed_units", "map_better", "map_tolerances", "map_near_best"}
     assert {v.name for v in verdicts if v.is_own_check} == own
     assert all("MAP" not in v.claim for v in verdicts if not v.is_own_check)
@@ -304,45 +305,147 @@ def test_statements_and_own_checks_have_the_expected_verdicts(results) -> None:
 def test_verdicts_on_curves_equal_comparisons_written_out_machine_by_machine(results) -> None:
     verdicts = judge_claims(results)
     situations = results.sweeps.values()
-    best = np.ones(DRAWS, dtype=bool)
+    best, lost = np.ones(DRAWS, dtype=bool), np.zeros(DRAWS, dtype=bool)
     for situation, u_shape in zip(situations, verdicts, strict=False):
-        held = []
+        held: list[bool | None] = []
         for i in range(DRAWS):
             ridge, truncated = (situation.curves[a][i, :, :2] for a in (steps.RE, steps.TSVD))
             tsvd, re = (x[np.argmin(x[:, 0] * x[:, 1])] for x in (truncated[1:], ridge[1:]))
-            best[i] &= bool((tsvd <= re).all() and (tsvd <= truncated[0]).all())
+            others = (re, truncated[0])
+            best[i] &= all((tsvd <= other).all() for other in others)
+            lost[i] |= any((other < tsvd).all() for other in others)
             usable = [curve[np.isfinite(curve)] for curve in (*ridge.T, *truncated.T)]
-            held.append(all(min(c[0], c[-1]) > 1.05 * c[1:-1].min() for c in usable))
+            rises = [min(c[0], c[-1]) / c[1:-1].min() for c in usable]
+            held.append(True if min(rises) > 1.05 else False if min(rises) <= 1.0 else None)
         assert (u_shape.name, list(u_shape.draws)) == ("u_shape", held)
-    assert next(v for v in verdicts if v.name == "tsvd_best").draws == tuple(best)
+    decided = tuple(map(decide, best, lost))
+    assert next(v for v in verdicts if v.name == "tsvd_best").draws == decided
 
 
-def draw_random(draws: steps.Draws, rng: np.random.Generator, spread: float) -> steps.Draws:
-    """Return random errors and iterations at the same settings; with a large spread, errors that
-    rise with the settings.
-    """
-    made = randomize(draws, rng, spread, (steps.Study, RawSteps))
-    pairs = zip(made.sweeps, draws.sweeps, strict=True)
-    sweeps = [replace(drawn, settings=given.settings) for drawn, given in pairs]
-    if spread > 1.0:
-        rising = [{a: np.sort(c, axis=1) for a, c in sweep.curves.items()} for sweep in sweeps]
-        sweeps = [replace(s, curves=curves) for s, curves in zip(sweeps, rising, strict=True)]
-    return replace(made, sweeps=tuple(sweeps))
+def flatten_sweep(sweep: steps.Sweep, t: int) -> steps.Sweep:
+    """Return the settings of a sweep with t machines on which all errors are 1."""
+    lost = np.full((t, len(sweep.study.robot.parameters)), np.nan)
+
+    def flat(*shape: int) -> np.ndarray:
+        return np.ones((t, *shape, len(steps.MEASURES)))
+
+    chosen = {
+        a: steps.Chosen(np.ones(t), lost, np.full(t, 9), np.ones(t, bool), flat(), np.ones((t, 2)))
+        for a in sweep.chosen
+    }
+    curves = {a: flat(len(settings)) for a, settings in sweep.settings.items()}
+    short = flat(len(sweep.settings[steps.RE]) - 1)
+    return replace(sweep, chosen=chosen, curves=curves, short=short, exact=flat())
+
+
+def flatten(results: Results, t: int) -> Results:
+    """Return results of t machines on which all errors are 1, in arrays that may be changed."""
+    draws = [
+        replace(
+            draw, sweeps=tuple(flatten_sweep(sweep, t) for sweep in draw.sweeps),
+            errors={m: np.ones((t, len(steps.MEASURES))) for m in draw.errors},
+        )
+        for draw in results.draws
+    ]  # fmt: skip
+    return replace(results, draws=tuple(draws))
+
+
+def make_true(claim: str, draws: tuple[steps.Draws, ...], is_true: np.ndarray) -> None:
+    """Change flat results so that a claim is true in these draws (t,) and false in the others."""
+    low, high = np.where(is_true, 0.5, 2.0), np.where(is_true, 2.0, 0.5)
+    for number, draw in enumerate(draws):
+        errors, (six, five) = draw.errors, draw.sweeps
+        for sweep in draw.sweeps:
+            chosen, curve = sweep.chosen, sweep.curves[steps.TSVD]
+            match claim:
+                case "u_shape":
+                    for curves in sweep.curves.values():
+                        curves[np.ix_(is_true, [0, -1])] = 2.0
+                case "ls_not_best":
+                    chosen[steps.LS].errors[:] = high[:, None]
+                case "tsvd_best":
+                    chosen[steps.TSVD].errors[:] = low[:, None]
+                case "deviate":
+                    for algorithm in (steps.RANKED, steps.RE, steps.TSVD):
+                        chosen[algorithm].errors[:, :2] = 0.1
+                        chosen[algorithm].errors[:, 4] = np.where(is_true, 0.3, 0.0)
+                case "faster":
+                    chosen[steps.TSVD].iterations[:] = np.where(is_true, 5, 20)
+                case "lambda_range":
+                    best = np.where(is_true, 1e-4 if number else 1e-1, 10.0)
+                    chosen[steps.RE].settings[:] = best
+                    places = np.argmin(abs(sweep.settings[steps.RE][1:] - best[:, None]), axis=1)
+                    sweep.short[np.arange(len(best)), places] = 0.5
+                case "k_near_j":
+                    curve[np.arange(len(low)), np.where(is_true, 1, -1)] = 0.5
+                case _:
+                    pass
+        match claim:
+            case "ls_stable":
+                six.chosen[steps.LS].is_converged[:] = is_true
+            case "ls_fails":
+                five.chosen[steps.LS].errors[is_true] = np.inf
+                errors[steps.BEFORE][:] = 2.0
+            case "no_solution":
+                six.exact[:], five.exact[:, 3] = 0.0, np.where(is_true, 1.0, 0.0)
+            case "six_better":
+                for algorithm in (steps.RE, steps.TSVD):
+                    five.chosen[algorithm].errors[:, 3] = high
+            case "no_rule":
+                errors[steps.CROSS][:] = high[:, None]
+            case "five_usable":
+                errors[steps.RAW_FIVE][:] = low[:, None]
+            case "mixed_units":
+                errors[steps.WHITENED][:] = low[:, None]
+            case "map_better" | "map_near_best":
+                errors[steps.PRIOR][:] = low[:, None]
+            case "map_tolerances":
+                errors[steps.NARROW][:] = errors[steps.WIDE][:] = low[:, None]
+            case _:
+                pass
+
+
+CLAIMS = [name for name in results_module.TEXT._find("claims") if name != "noise"]
 
 
 @pytest.mark.slow
-def test_every_verdict_says_does_not_agree_on_random_results(results) -> None:
-    waiting = {f"{i} {verdict.name}" for i, verdict in enumerate(judge_claims(results))}
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        draws = tuple(draw_random(drawn, rng, (1.0, 0.3, 3.0)[seed % 3]) for drawn in results.draws)
-        noise = {row: tuple(map(str, rng.normal(0, 0.01, 6))) for row in results.noise.rows}
-        verdicts = judge_claims(replace(results, draws=draws, noise=Printed(noise)))
-        assert all("nan" not in verdict.why for verdict in verdicts)
-        waiting -= {f"{i} {v.name}" for i, v in enumerate(verdicts) if v.agrees is False}
-        if not waiting:
-            break
-    assert waiting == set()
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_every_claim_agrees_disagrees_or_stays_undecided(results, claim) -> None:
+    """True in all draws, in none, and in every second one; and in none of the paper's machines."""
+    t, answers = 12, []
+    for is_true in (np.ones(t, bool), np.zeros(t, bool), np.arange(t) % 2 == 0):
+        made = flatten(results, t)
+        make_true(claim, made.draws, is_true)
+        chosen = [v for v in judge_claims(made) if v.name == claim]
+        for verdict in chosen:
+            assert verdict.draws == tuple(is_true)
+            assert "nan" not in verdict.why
+        answers.append({(v.agrees, v.is_elsewhere) for v in chosen})
+    is_elsewhere = claim in ("k_near_j", "lambda_range")
+    no = (None, True) if is_elsewhere else (False, False)
+    assert answers == [{(True, False)}, {no}, {(None, False)}]
+
+
+@pytest.mark.slow
+def test_noise_is_judged_by_its_root_mean_square(results) -> None:
+    """Uniform noise, two and a half standard deviations less, and half of it."""
+    drawn = np.linspace(-1.0, 1.0, 217)[:216].reshape(36, 6) * steps.list_limits() * RAW
+    for factor, answer in ((1.0, True), (1.0 - 2.5 / np.sqrt(5.0 * 216), None), (0.5, False)):
+        rows = {str(i): tuple(map(str, row)) for i, row in enumerate(factor * drawn)}
+        (verdict,) = (
+            v for v in judge_claims(replace(results, noise=Printed(rows))) if v.name == "noise"
+        )
+        assert verdict.agrees is answer
+
+
+def test_printed_noise_decides_limits_and_number_of_poses(tmp_path, monkeypatch) -> None:
+    folder = Path(steps.__file__).parent
+    text = (folder / "published.yaml").read_text("utf-8").replace(" 0.009651", " 0.029651")
+    text = re.sub(r'^  "3[4-6]": "[-0-9. ]*"\n', "", text, flags=re.MULTILINE)
+    (tmp_path / "published.yaml").write_text(text.replace('"0.009651', '"0.029651'), "utf-8")
+    monkeypatch.setattr(steps, "PRINTED", PaperFile(str(tmp_path / "steps.py"), "published.yaml"))
+    np.testing.assert_allclose(steps.list_limits()[:3], 0.03e-3)
+    assert len(steps.list_measured_poses(steps.load_machine("3-PRS"))) == 33
 
 
 @pytest.mark.slow

@@ -264,8 +264,9 @@ class Verdict:
             sentences.insert(0, "The claim is about machines of other dimensions.")
         if self.draws:
             share, count = estimate_share(self.draws), sum(map(bool, self.draws))
+            idle = f"{n} decide nothing; " if (n := self.draws.count(None)) else ""
             sentences.insert(
-                0, f"True in {count} of {len(self.draws)} draws (95 % interval of the share: "
+                0, f"True in {count} of {len(self.draws)} draws ({idle}95 % interval of the share: "
                 f"{100 * share.low:.0f} to {100 * share.high:.0f} %)."
             )  # fmt: skip
         return " ".join(sentences)

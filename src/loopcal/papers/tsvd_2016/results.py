@@ -4,14 +4,15 @@ figures and verdicts.
 
 The paper simulates one machine of each structure. Here each drawn pair of machines is one draw of
 that simulation, and a claim is judged in every draw; it holds in a draw if it holds in all
-situations it speaks of. Claims about medians are judged in groups of machines.
+situations it speaks of, and a draw in which neither of two methods is better decides nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -388,57 +389,70 @@ def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     draws, sweeps, judge = results.draws, results.sweeps, _judge_places
     six, five = ({d.sweeps[i].study.label: d for d in draws} for i in (0, 1))
     whole = {draw.name: draw for draw in draws}
-    before = {sweep.study.label: (draw, sweep) for draw in draws for sweep in draw.sweeps}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (
-            *map(_judge_curve, sweeps.values()),
-            judge("ls_stable", six, _find_diverged, limit=LINEARIZATIONS),
-            judge("ls_not_best", six, _compare_unseen),
-            judge("tsvd_best", sweeps, _compare_best, trials=len(draws[0])),
-            judge("ls_fails", five, _compare_five),
-            judge("no_solution", five, _compare_exact),
-            judge("six_better", whole, _compare_parameters),
-            judge("deviate", before, _compare_deviations),
-            judge("faster", sweeps, _compare_speed),
-            _judge_lambda(results),
-            _judge_groups("no_rule", draws, {(CROSS, RAW_RE): 1.1}, sign=-1.0),
-            judge("k_near_j", sweeps, _find_best_k),
-            _judge_noise(results.noise),
-            *_judge_own_checks(draws),
-        )
+    both = {sweep.study.label: (draw, sweep) for draw in draws for sweep in draw.sweeps}
+    return (
+        *map(_judge_curve, sweeps.values()),
+        judge("ls_stable", six, _find_diverged, limit=LINEARIZATIONS),
+        judge("ls_not_best", six, _compare_ls),
+        judge("tsvd_best", sweeps, _compare_best, trials=len(draws[0])),
+        judge("ls_fails", five, _compare_five),
+        judge("no_solution", five, _compare_exact),
+        judge("six_better", whole, _compare_parameters),
+        judge("deviate", both, _compare_deviations),
+        judge("faster", sweeps, _compare_speed),
+        _judge_lambda(results),
+        judge("no_rule", whole, _compare_rule, is_any=True),
+        judge("k_near_j", sweeps, _find_best_k, near=SIZES.find("near")),
+        _judge_noise(results.noise),
+        *_judge_own_checks(whole),
+    )
 
 
-Held = tuple[BoolArray, dict[str, Any]]
-"""Whether a claim holds in each draw (t,) at a place, and the numbers that the evidence shows."""
+class Held(NamedTuple):
+    """A claim at a place: in which draws (t,) it is true and false there (neither: the draw decides
+    nothing), and the numbers that the evidence shows.
+    """
+
+    holds: BoolArray
+    fails: BoolArray
+    row: dict[str, Any]
 
 
 def _judge_places(
-    claim: str, places: Mapping[str, Place], compare: Callable[[Place], Held], **data: Any
-) -> published.Verdict:
-    """Judge a claim that holds in a draw if it holds there in all places."""
-    held, rows, shares = [], [], []
-    for name, place in places.items():
-        holds, row = compare(place)
-        held.append(holds)
-        rows.append({"name": name, **row})
-        shares.append({"name": name, "count": int(holds.sum()), "of": len(holds)})
-    return TEXT.judge(claim, np.all(held, axis=0), rows=rows, shares=shares, **data)
+    claim: str, places: Mapping[str, Place], compare: Callable[[Place], Held], *,
+    is_any: bool = False, **data: Any,
+) -> published.Verdict:  # fmt: skip
+    """Judge a claim that is true in a draw if it is true there in all places, or in any, and false
+    if it is false in any place, or in all.
+    """
+    held = {name: compare(place) for name, place in places.items()}
+    holds, fails = (np.array([h[i] for h in held.values()]) for i in (0, 1))
+    true, false = (np.any, np.all) if is_any else (np.all, np.any)
+    decided = [*map(published.decide, true(holds, axis=0), false(fails, axis=0))]
+    rows = [{"name": name, **h.row} for name, h in held.items()]
+    shares = [{"name": name, "count": int(h.holds.sum()), "against": int(h.fails.sum()),
+               "of": len(h.holds)} for name, h in held.items()]  # fmt: skip
+    return TEXT.judge(claim, decided, rows=rows, shares=shares, **data)
 
 
 def _judge_curve(sweep: Sweep) -> published.Verdict:
-    """Judge the curves over lambda and k of one figure: position and angle, each machine."""
-    gain, curves, held = SIZES.find("gain"), [], np.ones(len(sweep), dtype=bool)
+    """Judge the curves over lambda and k of one figure: position and angle, each machine. An end
+    that is the least but for the gain decides nothing.
+    """
+    gain, curves = SIZES.find("gain"), []
+    holds, fails = np.ones(len(sweep), dtype=bool), np.zeros(len(sweep), dtype=bool)
     for algorithm in (RE, TSVD):
         for i, error in enumerate(("position", "angle")):
-            is_inside = sweep.compute_rises(algorithm, i) > gain
-            held &= is_inside
+            rises = sweep.compute_rises(algorithm, i)
+            holds, fails = holds & (rises > gain), fails | (rises <= 1.0)
             curves.append(
-                {"letter": SETTING[algorithm], "error": error, "count": int(is_inside.sum()),
+                {"letter": SETTING[algorithm], "error": error, "count": int((rises > gain).sum()),
                  "of": len(sweep), **_describe_curve(sweep, algorithm, i)}
             )  # fmt: skip
     short = [sum(steps.compute_rise(c) > gain for c in sweep.short[:, :, i]) for i in (0, 1)]
     return TEXT.judge(
-        "u_shape", held, name=sweep.study.label, curves=curves, iterations=SIZES.find("short"),
+        "u_shape", [*map(published.decide, holds, fails)], name=sweep.study.label, curves=curves,
+        iterations=SIZES.find("short"),
         number=FIGURES[sweep.study.name, sweep.study.freedoms], short=short,
     )  # fmt: skip
 
@@ -458,26 +472,36 @@ def _describe_curve(sweep: Sweep, algorithm: str, i: int) -> dict[str, str]:
 def _find_diverged(draw: Draws) -> Held:
     """Return where LS diverges, and its iterations, with 6-DOF measurement."""
     ls = draw.sweeps[0].chosen[LS]
-    is_lost, is_slow = np.isinf(ls.errors[:, 0]), ls.iterations >= LINEARIZATIONS
-    return ~is_lost & ~is_slow, {"diverged": int(is_lost.sum()), "slow": int(is_slow.sum())}
+    is_lost = np.isinf(ls.errors[:, 0])
+    row = {"diverged": int(is_lost.sum()), "slow": int((~is_lost & ~ls.is_converged).sum())}
+    return Held(ls.is_converged & ~is_lost, ~ls.is_converged | is_lost, row)
 
 
-def _compare_unseen(draw: Draws) -> Held:
-    """Compare RE and TSVD with LS at settings that were best on other machines."""
-    ratios = {name: draw.sweeps[0].compare_unseen(a) for name, a in NAMES.items() if a != LS}
-    row = {name: format_pair(np.median(ratio, axis=0)) for name, ratio in ratios.items()}
-    return np.all([(ratio < 1.0).all(axis=1) for ratio in ratios.values()], axis=0), row
+def _are_better(first: FloatArray, second: FloatArray, factor: float = 1.0) -> BoolArray:
+    """Return where errors (t, ..) in position and in angle are below others times a factor."""
+    return np.all(first[:, :2] < factor * second[:, :2], axis=1)
+
+
+def _compare_ls(draw: Draws) -> Held:
+    """Compare LS with RE and TSVD at settings that were best on other machines. At its own best
+    each is as good as LS at least, because a small lambda is LS.
+    """
+    unseen = {name: draw.sweeps[0].compare_unseen(a) for name, a in NAMES.items() if a != LS}
+    row = {name: format_pair(np.median(ratio, axis=0)) for name, ratio in unseen.items()}
+    ratios = np.array([*unseen.values()])
+    is_worse = (ratios < 1.0).all(axis=2).any(axis=0)
+    return Held(is_worse, (ratios > 1.0).all(axis=(0, 2)), row)
 
 
 def _compare_best(sweep: Sweep) -> Held:
     """Compare TSVD with LS and RE, each of the three at the bottom of its curve."""
-    tsvd, ridge = sweep.chosen[TSVD], sweep.chosen[RE]
-    holds = [
-        ((tsvd.errors[:, :2] / sweep.chosen[a].errors[:, :2]).max(axis=1) <= 1.0) for a in (RE, LS)
-    ]
-    medians = {name: np.median(sweep.chosen[a].errors, axis=0) for name, a in NAMES.items()}
-    commanded = int(((tsvd.commanded / ridge.commanded).max(axis=1) <= 1.0).sum())
-    return np.all(holds, axis=0), {"commanded": commanded, **format_all(**medians)}
+    errors = {name: sweep.chosen[a].errors for name, a in NAMES.items()}
+    tsvd, others = errors["tsvd"], (errors["ls"], errors["ridge"])
+    medians = {name: np.median(of, axis=0) for name, of in errors.items()}
+    commanded = (sweep.chosen[a].commanded for a in (TSVD, RE))
+    row = {"commanded": int(np.less_equal(*commanded).all(axis=1).sum()), **format_all(**medians)}
+    holds = np.all([(tsvd[:, :2] <= other[:, :2]).all(axis=1) for other in others], axis=0)
+    return Held(holds, np.any([_are_better(other, tsvd) for other in others], axis=0), row)
 
 
 def _compare_five(draw: Draws) -> Held:
@@ -487,7 +511,8 @@ def _compare_five(draw: Draws) -> Held:
     is_lost = np.isinf(chosen[LS].errors[:, 0])
     row = {"diverged": int(is_lost.sum()), "of": len(is_lost), "ridge": float(np.median(ridge)),
            "tsvd": float(np.median(tsvd))}  # fmt: skip
-    return is_lost & (ridge < 1.0) & (tsvd < 1.0), row
+    holds = is_lost & (ridge < 1.0) & (tsvd < 1.0)
+    return Held(holds, ~holds, row)
 
 
 def _compare_with_before(draw: Draws, errors: FloatArray) -> FloatArray:
@@ -496,40 +521,61 @@ def _compare_with_before(draw: Draws, errors: FloatArray) -> FloatArray:
 
 
 def _compare_exact(draw: Draws) -> Held:
-    """Return the error of the poses that exact 5-DOF measurements leave."""
-    exact = draw.sweeps[1].exact
-    left = "{:.0e} mm / {:.0e} deg".format(*exact.max(axis=0)[:2])
-    row = {"left": left, "parameters": float(np.median(exact[:, 3]))}
-    return _compare_with_before(draw, exact) > 1e-3, row
+    """Return whether exact 5-DOF measurements lead to the true parameters, where exact 6-DOF ones
+    do.
+    """
+    limit = SIZES.find("reached") * draw.errors[BEFORE][:, 3]
+    six, five = (sweep.exact[:, 3] for sweep in draw.sweeps)
+    left = "{:.0e} mm / {:.0e} deg".format(*draw.sweeps[1].exact.max(axis=0)[:2])
+    row = {"left": left, "six": float(np.median(six)), "five": float(np.median(five))}
+    is_decided = (six <= limit) & np.isfinite(five)
+    return Held(is_decided & (five > limit), is_decided & (five <= limit), row)
 
 
 def _compare_parameters(draw: Draws) -> Held:
     """Compare the parameter errors of the paper's RE and TSVD with 5- and 6-DOF measurement."""
-    holds, row = [], {}
+    better, worse, row = [], [], {}
     for name, algorithm in (("ridge", RE), ("tsvd", TSVD)):
         six, five = (sweep.chosen[algorithm].errors[:, 3] for sweep in draw.sweeps)
-        holds.append(five / six > 1.0)
+        better.append(six < five)
+        worse.append(six > five)
         row |= {f"{name}_six": float(np.median(six)), f"{name}_five": float(np.median(five))}
     row |= {"six": draw.compute_median(PRIOR)[3], "five": draw.compute_median(PRIOR_FIVE)[3]}
-    return np.all(holds, axis=0), row
+    return Held(np.all(better, axis=0), np.all(worse, axis=0), row)
 
 
 def _compare_deviations(place: tuple[Draws, Sweep]) -> Held:
-    """Return both halves: parameters farther from the truth than nominal, and better poses."""
+    """Return whether acceptable solutions, those with small errors of poses, have parameters
+    farther from the truth than nominal ones.
+    """
     draw, sweep = place
     used = [sweep.chosen[a].errors for a in (RANKED, RE, TSVD)]
     worse = np.array([errors[:, 4] for errors in used])
     left = np.array([_compare_with_before(draw, errors) for errors in used])
+    is_acceptable = left < SIZES.find("acceptable")
     row = dict(zip(NAMES, np.median(worse, axis=1), strict=True))
-    holds = (worse.min(axis=0) > 0.0) & (left.max(axis=0) < 0.5)
-    return holds, {**row, "left": np.median(left)}
+    fails = (is_acceptable & (worse == 0.0)).any(axis=0)
+    return Held(is_acceptable.any(axis=0) & ~fails, fails, {**row, "left": np.median(left)})
 
 
 def _compare_speed(sweep: Sweep) -> Held:
-    used = zip(NAMES, (RANKED, RE, TSVD), strict=True)
-    counts = {name: sweep.chosen[a].iterations for name, a in used}
-    holds = (counts["tsvd"] < counts["ls"]) & (counts["tsvd"] < counts["ridge"])
-    return holds, {name: f"{np.median(count):,.0f}" for name, count in counts.items()}
+    """Compare iterations; a fit that does not converge needs infinitely many."""
+    used = zip(NAMES, (sweep.chosen[a] for a in (RANKED, RE, TSVD)), strict=True)
+    counts = {name: np.where(c.is_converged, c.iterations, np.inf) for name, c in used}
+    least, tsvd = np.minimum(counts["ls"], counts["ridge"]), counts["tsvd"]
+    row = {name: show_count(np.median(count)) for name, count in counts.items()}
+    return Held(tsvd < least, (tsvd >= least) & np.isfinite(least), row)
+
+
+def show_count(count: float) -> str:
+    """Return a number of iterations as text."""
+    return f"{count:,.0f}" if np.isfinite(count) else "not converged"
+
+
+def _compare_rule(draw: Draws) -> Held:
+    """Compare lambda by cross-validation with the best one of RE; a rule that works refutes."""
+    works = _are_better(draw.errors[CROSS], draw.errors[RAW_RE], SIZES.find("rule"))
+    return Held(~works, works, {"ratio": format_pair(draw.compute_ratio(CROSS, RAW_RE))})
 
 
 def _find_best_k(sweep: Sweep) -> Held:
@@ -539,77 +585,93 @@ def _find_best_k(sweep: Sweep) -> Held:
     distance = (ks[0] - best) / ks[0]
     row = {"low": int(best.min()), "high": int(best.max()), "middle": float(np.median(best)),
            "of": int(ks[0])}  # fmt: skip
-    return (distance <= 0.1) & (distance > 0.0), row
+    is_near = (distance <= SIZES.find("near")) & (distance > 0.0)
+    return Held(is_near, ~is_near, row)
 
 
 def _judge_lambda(results: Results) -> published.Verdict:
-    """Judge the range of the best lambda, looked for beyond that range, and its differences."""
-    best = {label: sweep.chosen[RE].settings for label, sweep in results.sweeps.items()}
-    first, *others = (draws.sweeps[0].chosen[RE].settings for draws in results.draws)
-    apart = np.max([np.maximum(first / other, other / first) for other in others], axis=0)
-    values, lambdas = np.array(list(best.values())), steps.list_lambdas()
-    holds = (values.min(axis=0) > 0.9e-5) & (values.max(axis=0) < 1.1) & (apart > 9.9)
-    rows = [{"name": name, "low": s.min(), "middle": np.median(s), "high": s.max()}
-            for name, s in best.items()]  # fmt: skip
-    by_steps = [{"end": f"after {n}" if isinstance(n, int) else n, "value": value}
-                for n, value, _ in results.ridge_steps]  # fmt: skip
-    ends = {"low": lambdas.min(), "high": lambdas.max()}
-    return TEXT.judge("lambda_range", holds, rows=rows, by_steps=by_steps, **ends)
+    """Judge the range of the best lambda, looked for beyond that range, and its differences: after
+    the whole iteration and after the short one, which must not contradict each other.
+    """
+    smallest, largest = (steps.PRINTED.number("lambda", end) for end in ("smallest", "largest"))
+    converged = {label: sweep.chosen[RE].settings for label, sweep in results.sweeps.items()}
+    early = {
+        label: sweep.settings[RE][1:][[steps.find_bottom(curve) for curve in sweep.short]]
+        for label, sweep in results.sweeps.items()
+    }
+    held = []
+    for best in (converged, early):
+        values = np.array(list(best.values()))
+        six = np.array([best[draw.sweeps[0].study.label] for draw in results.draws])
+        apart = six.max(axis=0) / six.min(axis=0) > 9.9  # of powers of ten
+        held.append((values.min(axis=0) > 0.9 * smallest) & (values.max(axis=0) < 1.1 * largest)
+                    & apart)  # fmt: skip
+    decided = map(published.decide, np.all(held, axis=0), ~np.any(held, axis=0))
+    rows = [
+        {"name": label, **{f"{when}_{name}": float(function(best[label]))
+                           for when, best in (("late", converged), ("early", early))
+                           for name, function in (("low", np.min), ("middle", np.median),
+                                                  ("high", np.max))}}
+        for label in converged
+    ]  # fmt: skip
+    lambdas = steps.list_lambdas()
+    ends = {"low": lambdas.min(), "high": lambdas.max(), "iterations": SIZES.find("short")}
+    return TEXT.judge("lambda_range", [*decided], rows=rows, **ends,
+                      smallest=smallest, largest=largest)  # fmt: skip
 
 
 def _judge_noise(noise: published.Printed) -> published.Verdict:
-    shares = noise.values * np.array([steps.MM] * 3 + [1.0] * 3) / steps.list_limits()
+    """Judge whether the printed noise is uniform within its limits: by its root mean square, which
+    has a standard deviation of sqrt(1 / (15 n)) of the limit.
+    """
+    limits = steps.list_limits() / ([steps.MM] * 3 + [1.0] * 3)  # [mm, rad]
+    shares = noise.values / limits
     largest, rms = np.abs(noise.values).max(axis=0), float(np.sqrt(np.mean(shares**2)))
-    # three standard deviations of the rms of that many uniform numbers
-    allowed = 3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))
-    is_uniform = abs(rms - 1.0 / np.sqrt(3.0)) < allowed
+    apart = abs(rms - 1.0 / np.sqrt(3.0)) * np.sqrt(15.0 * shares.size)
     return TEXT.judge(
-        "noise", np.abs(shares).max() <= 1.0 and is_uniform, count=shares.size, rms=rms,
+        "noise", published.decide(apart < 2.0, apart > 3.0), count=shares.size, rms=rms,
         length=largest[:3].max(), angle=largest[3:].max(), degrees=np.rad2deg(largest[3:].max()),
+        limit=limits[0], turn=np.rad2deg(limits[3]),
     )  # fmt: skip
 
 
-def _judge_own_checks(draws: Sequence[Draws]) -> tuple[published.Verdict, ...]:
+def _judge_own_checks(draws: Mapping[str, Draws]) -> tuple[published.Verdict, ...]:
     """Judge rank detection and units, and MAP: against the raw methods, with wrong tolerances, and
-    near the best choice.
+    near the best choice; each on every machine.
     """
     raw = (RAW_LS, RAW_RE, RAW_TSVD)
     wrong = [(p, m) for p in (NARROW, WIDE) for m in raw]
     near = {(PRIOR, CROSS): 1.05, (PRIOR, HINDSIGHT): 1.15}
-    judge = _judge_groups
+
+    def judge(
+        claim: str, limits: Mapping[tuple[str, str], float], first: int = 0, **data: Any
+    ) -> published.Verdict:
+        compare = partial(_compare_methods, limits=limits, first=first)
+        return _judge_places(claim, draws, compare, trials=len(next(iter(draws.values()))), **data)
+
     return (
-        judge("five_usable", draws, {(RAW_FIVE, RAW_LS): 1.1}),
-        judge("mixed_units", draws, {(WHITENED, RAW_LS): 0.9}, first=1),
-        judge("map_better", draws, dict.fromkeys([(PRIOR, m) for m in raw], 1.0)),
-        judge("map_tolerances", draws, dict.fromkeys(wrong, 1.0), factor=SIZES.find("factor")),
-        judge("map_near_best", draws, near, only="3-PRS"),
+        judge("five_usable", {(RAW_FIVE, RAW_LS): 1.1}),
+        judge("mixed_units", {(WHITENED, RAW_LS): 0.9}, first=1),
+        judge("map_better", dict.fromkeys([(PRIOR, m) for m in raw], 1.0)),
+        judge("map_tolerances", dict.fromkeys(wrong, 1.0), factor=SIZES.find("factor")),
+        judge("map_near_best", near),
     )
 
 
-def _judge_groups(
-    claim: str, draws: Sequence[Draws], limits: Mapping[tuple[str, str], float], *,
-    sign: float = 1.0, first: int = 0, only: str = "", **data: Any,
-) -> published.Verdict:  # fmt: skip
-    """Judge ratios of medians in each group of machines, see `Draws.list_groups`.
-
-    limits : of each pair of methods, which the largest ratio of all structures (or `only` one), in
-    position and angle (with first = 1 in the angle alone), stays below, or with sign = -1 exceeds.
+def _compare_methods(draw: Draws, limits: Mapping[tuple[str, str], float], first: int = 0) -> Held:
+    """Return where the errors of a method stay below those of another times a limit, in position
+    and in angle; first = 1: in the angle alone.
     """
-    held = []
-    for members in zip(*(draw.list_groups() for draw in draws), strict=True):
-        chosen = [d for d in members if only in ("", d.name)]
-        largest = {p: np.max([d.compute_ratio(*p)[first:2] for d in chosen]) for p in limits}
-        held.append(all(sign * largest[p] < sign * limit for p, limit in limits.items()))
+    part, errors = slice(first, 2), draw.errors
+    holds = np.all([(errors[a][:, part] < limit * errors[b][:, part]).all(axis=1)
+                    for (a, b), limit in limits.items()], axis=0)  # fmt: skip
     methods = {"prior": PRIOR, "narrow": NARROW, "wide": WIDE, "ls": RAW_LS, "six": RAW_LS,
                "ridge": RAW_RE, "tsvd": RAW_TSVD, "five": RAW_FIVE}  # fmt: skip
-    rows = [
-        {"name": d.name, **format_all(**{key: d.compute_median(m) for key, m in methods.items()}),
-         "gcv": format_pair(d.compute_ratio(PRIOR, CROSS)),
-         "hindsight": format_pair(d.compute_ratio(PRIOR, HINDSIGHT)),
-         "ratio": format_pair(d.compute_ratio(*next(iter(limits)))[first:2])}
-        for d in draws
-    ]  # fmt: skip
-    return TEXT.judge(claim, held, groups=len(held), trials=len(draws[0]), rows=rows, **data)
+    row = format_all(**{key: draw.compute_median(m) for key, m in methods.items()})
+    row |= {"gcv": format_pair(draw.compute_ratio(PRIOR, CROSS)),
+            "hindsight": format_pair(draw.compute_ratio(PRIOR, HINDSIGHT)),
+            "ratio": format_pair(draw.compute_ratio(*next(iter(limits)))[part])}  # fmt: skip
+    return Held(holds, ~holds, row)
 
 
 def format_all(**errors: FloatArray) -> dict[str, str]:

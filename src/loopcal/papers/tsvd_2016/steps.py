@@ -88,9 +88,16 @@ METHODS = (
 
 
 def list_limits() -> FloatArray:
-    """Return the limits (6,) of the noise [m, rad]."""
-    limits = SIZES.find("limits")
-    return np.array([limits["length"] * MM] * 3 + [np.deg2rad(limits["angle"])] * 3)
+    """Return the limits (6,) of the noise [m, rad]: the largest printed numbers of Appendix 1,
+    rounded up to one digit of a millimeter and of a degree.
+    """
+    largest = np.abs(PRINTED.table("appendix_1").values).max(axis=0)
+    sizes = largest[:3].max(), float(np.rad2deg(largest[3:].max()))
+    digits = [10.0 ** np.floor(np.log10(size)) for size in sizes]
+    length, angle = (
+        np.ceil(size / digit) * digit for size, digit in zip(sizes, digits, strict=True)
+    )
+    return np.array([length * MM] * 3 + [np.deg2rad(angle)] * 3)
 
 
 def list_lambdas(key: str = "exponents") -> FloatArray:
@@ -235,12 +242,14 @@ def read_noise() -> FloatArray:
 
 
 def list_measured_poses(robot: Mechanism) -> FloatArray:
-    """Return controlled coordinates (36, c) [m, rad]: 12 azimuths at each tilt.
+    """Return controlled coordinates (36, c) [m, rad], one for each row of Appendix 1: 12 azimuths
+    at each tilt.
 
     Free z takes the three heights in turn.
     """
-    n, heights = SIZES.find("azimuths"), np.array(SIZES.find("heights"))
-    grid = np.meshgrid(np.arange(n) * 360.0 / n, SIZES.find("tilts"))
+    tilts, heights = SIZES.find("tilts"), np.array(SIZES.find("heights"))
+    n = len(read_noise()) // len(tilts)
+    grid = np.meshgrid(np.arange(n) * 360.0 / n, tilts)
     phi, theta = (g.ravel() for g in grid)
     i = np.arange(len(phi))
     return _list_coordinates(robot, phi, theta, heights[(i // n + i) % len(heights)])
@@ -570,17 +579,6 @@ class Draws:
     def __len__(self) -> int:
         return len(self.sweeps[0])
 
-    def list_groups(self) -> tuple[Draws, ...]:
-        """Return groups of machines of about equal size, at most one for each machine.
-
-        They hold the errors of the methods; the sweeps stay those of all machines.
-        """
-        places = np.array_split(np.arange(len(self)), min(SIZES.find("groups"), len(self)))
-        return tuple(
-            replace(self, errors={m: errors[place] for m, errors in self.errors.items()})
-            for place in places
-        )
-
     def compute_median(self, method: str) -> FloatArray:
         """Return medians (5,) over the machines."""
         return np.median(self.errors[method], axis=0)
@@ -591,7 +589,8 @@ class Draws:
 
     def compute_ratio(self, method: str, other: str) -> FloatArray:
         """Return the ratio (5,) of medians, method over other."""
-        return self.compute_median(method) / self.compute_median(other)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of diverged fits
+            return self.compute_median(method) / self.compute_median(other)
 
     def compute_ratio_interval(self, method: str, other: str) -> FloatArray:
         """Return the bootstrap interval (2, 2) of the ratio of medians in position and angle, the
