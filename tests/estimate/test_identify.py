@@ -14,8 +14,12 @@ from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
 from loopcal.io.core.text_file import to_json
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
 from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.gauss_newton import DescentStatus
 from tests import zoo
 from tests.estimate.problems import (
@@ -246,6 +250,34 @@ def test_too_few_equations_are_refused_without_a_prior_or_the_option(data):
     assert len(forced.unidentifiable) == 12
     assert forced.residual_test.finding.code == "noise.no-degrees-of-freedom"
     assert np.isfinite(identify(hexapod(), few, MAP()).standard_deviations).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "poses", "rank"),
+    [("hexapod-42", "xy", 20, 38), ("rotary-delta", "z", 17, 16), ("3-prs", "xy", 15, 29)],
+)
+def test_least_squares_takes_what_rank_permits_and_counts_what_is_left(name, columns, poses, rank):
+    robot = load_robot(name)
+    sensor = Sensor(Component(tuple(columns)), Gaussian(np.full(len(columns), 10e-6)))
+    coordinates = sample_workspace(robot, poses, 1).coordinates
+    data = simulate(robot, coordinates, Instrument((sensor,)), seed=1)
+    equations = poses * len(columns)
+    assert rank < equations < len(robot.parameters)
+    fit = identify(robot, data, LeastSquares())
+    assert (fit.converged, fit.rank) == (True, rank)
+    assert fit.residual_test.degrees == equations - rank
+    assert np.isinf(fit.standard_deviations).any()
+    few = data.take(np.arange(rank // len(columns)))
+    with expect_refusal("fit.too-few-equations", equations=len(few.labels) * len(columns)):
+        identify(robot, few, LeastSquares())
+
+
+def test_equations_that_only_the_nominal_symmetry_leaves_over_are_refused():
+    robot = load_robot("linear-delta-6")
+    coordinates = sample_workspace(robot, 20, 1).coordinates
+    height = Instrument((Sensor(Component(("z",)), Gaussian(np.full(1, 10e-6))),))
+    with expect_refusal("fit.too-few-equations", equations=20, unknowns=40):
+        identify(robot, simulate(robot, coordinates, height, seed=1), LeastSquares())
 
 
 def test_intervals_of_few_degrees_of_freedom_are_those_of_student():

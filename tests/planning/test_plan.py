@@ -241,6 +241,19 @@ def test_impossible_numbers_of_poses_are_refused_with_the_reason(
         plan_poses(set_options(tracker_problem, **options))
 
 
+def test_a_plan_needs_equations_for_what_can_be_determined_and_one_to_spare():
+    robot = load_robot("rotary-delta")
+    height = build_instrument("component", 10 * UM, components=("z",))
+    made = prepare_problem(robot, height, PlanOptions(n_candidates=80, n_poses=17, hold_out=0))
+    rank = int(made.observable.rank[0])
+    assert rank < len(made.free)
+    assert made.min_groups == rank + 1 == 17
+    data = lc.simulate(robot, plan_poses(made).poses.coordinates, height, seed=1)
+    assert lc.identify(robot, data, lc.LeastSquares()).rank == rank
+    with expect_refusal("plan.too-few-equations", equations=16, unknowns=17, needed=17):
+        plan_poses(set_options(made, n_poses=16))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

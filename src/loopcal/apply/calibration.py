@@ -27,9 +27,12 @@ from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import check_types, exclude_poses, identify
-from loopcal.estimate.information import count_equations
+from loopcal.estimate.information import count_equations, has_equations_to_spare
+from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.prior import refuse_reused_rows
+from loopcal.estimate.problem import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import list_instrument_frames
 from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
@@ -162,7 +165,7 @@ def _fit(
             raise DataError(report_finding("workflow.no-parameter-chosen", not_compared=left_out))
     chosen = robot if choice is None else choice.robot
     free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
-    if fit_options.method is None and available < free:
+    if fit_options.method is None and available < free and not _can_spare(chosen, data):
         from loopcal.diagnose.identifiable_parameters import describe_missing_equations
 
         missing = describe_missing_equations(chosen, data) or ""
@@ -172,6 +175,13 @@ def _fit(
     count.begin(f"fitting {free} parameters")
     fit = identify(chosen, data, options=fit_options, progress=count.progress)
     return fit, choice, None
+
+
+def _can_spare(robot: Mechanism, data: Measurements) -> bool:
+    """Return whether data determine with fewer equations what they can determine at all."""
+    problem = problem_of(select_free_parameters(robot), data)
+    z = problem.free.deviation(robot.values[None])
+    return has_equations_to_spare(problem, z, LeastSquares())
 
 
 def _report(

@@ -29,6 +29,7 @@ from loopcal.estimate.fit_descent import (
     report_closure_start,
 )
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.information import has_equations_to_spare
 from loopcal.estimate.linearization import (
     Linearization,
     PoseEstimates,
@@ -162,17 +163,22 @@ def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
         raise EstimationError(report_finding("fit.no-measured-value"))
 
 
-def check_count(problem: Problem, data: Measurements, method: Method, allow_fewer: bool) -> None:
-    """Refuse fewer equations than parameters where the method has no prior to fill the gap."""
+def check_count(problem: Problem, data: Measurements, options: FitOptions, z: FloatArray) -> None:
+    """Refuse equations of which each is needed and that leave parameters without a prior open: more
+    of them would determine more. With equations to spare the rank decides what is determined.
+    """
+    method = get_method(options)
     nuisance = 0 if problem.nuisance is None else problem.nuisance.unpenalized_count
     required = method.required_equations(problem.parameters)
     m, p = int(problem.equations[0]), required + nuisance
-    if m >= p or allow_fewer:
+    if m >= p or options.allow_fewer_equations or options.prior is not None:
         return
     if m == 0:
         raise EstimationError(
             report_finding("fit.no-equation-left", poses=data.n_poses, unknowns=p)
         )
+    if has_equations_to_spare(problem, z, method, options.rank_tolerance):
+        return
     raise EstimationError(
         report_finding(
             "fit.too-few-equations",
@@ -341,12 +347,14 @@ def identify(
     options = choose_noise(options, data, int(problem.equations[0]) - unknowns)
     method = adapt_method(options.method or default, free.assumed, options.noise, free.correlation)
     options = replace(options, method=method)
-    check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
+    check_count(problem, data, options, z)
     fit, weights, weighted, options = fit_with_tolerances(problem, data, z, options, free, progress)
     if fit.status[0] == DescentStatus.BAD_START.value:
         check_start(problem, data, z, fit.cost)
+    else:  # the rank of a symmetric machine may be larger there than at its nominal values
+        check_count(problem, data, options, fit.deviation)
     unclosed = find_unclosed_poses(robot.with_values(values), data)
     if fit.status[0] != DescentStatus.CONVERGED.value and unclosed.are_most:
         raise EstimationError(unclosed.report("fit.poses-open"))

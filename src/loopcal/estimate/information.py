@@ -17,7 +17,8 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.linearization import LinearizedPoses, linearize_poses
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.penalties import Method, decompose_for
+from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
 from loopcal.measure.measurements import Measurements
@@ -25,7 +26,7 @@ from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.readings import resolve_reading_sigma
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.decomposition import empty_factor
+from loopcal.numerics.decomposition import RANK_TOLERANCE, empty_factor
 from loopcal.numerics.elimination import eliminate_from_factor
 from loopcal.typing import BoolArray, FloatArray
 
@@ -125,6 +126,24 @@ def count_equations(robot: Mechanism, data: Measurements) -> int:
     if resolve_reading_sigma(robot, data.reading_sigma, data.n_poses) is None:
         return data.n_rows
     return int(problem_of(select_free_parameters(robot), data).equations[0])
+
+
+def has_equations_to_spare(
+    problem: Problem, z: FloatArray, method: Method, tolerance: float = RANK_TOLERANCE
+) -> bool:
+    """Return whether the equations (t = 1) that setup parameters leave determine, at deviations z
+    (1, p), all parameters without a penalty, or are more than the directions that they determine.
+
+    Otherwise their number limits the rank. Poses out of reach count as spared: a fit names them.
+    """
+    rows = problem.linearize(z, problem.start(z))
+    if not np.isfinite(rows.cost[0]):
+        return True
+    d = decompose_for(method, rows.factor, rows.equations, z, tolerance)
+    required = method.required_equations(problem.parameters)
+    determined = d.used if d.unpenalized is None else d.used & d.unpenalized
+    rank = min(int(determined.sum()), required)
+    return int(rows.equations[0]) > rank or rank == required > 0
 
 
 def instrument_factor(poses: ObservedPoses, measured: Measurements) -> FloatArray:

@@ -202,13 +202,17 @@ class PlanningProblem:
 
     @cached_property
     def n_unknowns(self) -> int:
-        """Number of equations needed: parameters, or observable ones with nuisance parameters."""
+        """Number of equations needed: one for each direction that candidates and earlier
+        measurements determine and for each setup parameter without a prior, and one to spare where
+        these are not all parameters, which shows that more poses would not determine more.
+        """
         known = self.groups.nuisance_prior
         length = np.linalg.norm(known, axis=0)
         s = np.linalg.svd(known / np.where(length > 0.0, length, 1.0), compute_uv=False)
         stated = int(are_nonzero(s).sum()) if s.size else 0
-        nuisance = self.space.nuisance.shape[1] - stated
-        return max(len(self.free), int(self.observable.rank[0]) + max(nuisance, 0))
+        nuisance = max(self.space.nuisance.shape[1] - stated, 0)
+        rank = int(self.observable.rank[0])
+        return rank + nuisance + int(rank < len(self.free))
 
     @property
     def min_groups(self) -> int:
@@ -269,7 +273,6 @@ class PlanningProblem:
                     equations=n * self.groups.rows.shape[1],
                     earlier=self.n_earlier_equations,
                     unknowns=self.n_unknowns,
-                    parameters=len(self.free),
                     needed=self.min_groups * k,
                 )
             )

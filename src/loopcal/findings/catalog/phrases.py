@@ -205,11 +205,6 @@ def reduction(data: Data) -> str:
     return fill_template(" ({target} error {reduction:percent} below random)", **data)
 
 
-def instrument_unknowns(data: Data) -> str:
-    """Return whose the unknowns are that are no parameters of the robot."""
-    return ", the others of the instrument" if data["unknowns"] > data["parameters"] else ""
-
-
 def joints_to_free(data: Data) -> str:
     """Return the lines to write behind joints, and the alternatives."""
     alternatives = []
