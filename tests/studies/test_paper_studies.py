@@ -117,7 +117,9 @@ def test_raw_least_squares_without_rank_detection_diverges_and_truncated_svd_doe
 def test_per_leg_trials_are_those_of_identify_per_leg():
     methods = {
         "steps": MethodLevel("per-leg", steps=2),
-        "epsilon": MethodLevel("per-leg", epsilon=1e-3),
+        "epsilon": MethodLevel("per-leg", epsilon=1e-3, stop="step"),
+        "poses": MethodLevel("per-leg", epsilon=1.0),
+        "never": MethodLevel("per-leg", epsilon=1e-9, steps=5),
     }
     study = make_study(
         "hexapod-42",
@@ -127,13 +129,17 @@ def test_per_leg_trials_are_those_of_identify_per_leg():
         replicates=2,
         block=2,
     )
-    two, rule = calibrate_cells(study)
+    two, rule, poses, never = calibrate_cells(study)
     prepared, truth, data = replay_trial(study, 0, 1)
     fit = identify_per_leg(prepared.robot, data, 2)
     assert_allclose(two.values[1], fit.robot.values, rtol=0, atol=1e-15)
     assert_array_equal(two.truth[1], truth.values)
     assert rule.is_converged.all()
     assert (rule.iterations > 1).all()
+    assert_array_equal(poses.iterations, 1)
+    assert poses.is_converged.all()
+    assert_array_equal(never.iterations, 5)
+    assert {OUTCOMES[code] for code in never.outcome} == {"study.out-of-iterations"}
     delta = {"delta": read_robot("linear-delta")}
     (refused,) = calibrate_cells(replace(study, robots=delta, methods={"m": methods["steps"]}))
     assert {OUTCOMES[code] for code in refused.outcome} == {"study.refused"}
@@ -222,6 +228,8 @@ methods:
         ("method: least-squares", "method: ridge, rows: raw", 9, "needs lam"),
         ("method: least-squares", "method: map, epsilon: 1", 9, "rows: raw"),
         ("method: least-squares", "method: per-leg, epsilon: 0", 9, "must be above 0"),
+        ("method: least-squares", "method: per-leg, stop: step", 9, "per-leg with epsilon"),
+        ("method: least-squares", "rows: raw, epsilon: 1, stop: dQint", 9, "per-leg with epsilon"),
         ("method: least-squares", "method: per-leg, steps: 0", 9, "must be from 1 to"),
         ("method: least-squares", "method: per-leg, loss: huber", 9, "has no loss"),
         ("method: least-squares", "method: per-leg, rows: raw", 9, "remove 'rows'"),

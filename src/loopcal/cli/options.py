@@ -624,6 +624,13 @@ DRAW: Any = option(
     type=Count("DRAWN_POSES", 1),
 )
 
+EPSILON: Any = option(
+    "End the steps when the largest error of a pose after a step, max dQint = position error [mm] "
+    "+ angle [rad], is at most this number.",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="NUMBER",
+)
+
 DISTRIBUTION: Any = option(
     "Distribution of the noise of measured values. Uniform noise lies within sqrt(3) = 1.732 "
     "standard deviations; a limit of 1 um is --sigma-position 0.57735um.",

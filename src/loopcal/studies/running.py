@@ -44,9 +44,8 @@ from loopcal.studies.simulation.block import (
     make_poses_task,
     replay_trial,
 )
-from loopcal.studies.simulation.fits import OUTCOMES, choose_rule
+from loopcal.studies.simulation.fits import OUTCOMES, fit_per_leg
 from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
-from loopcal.studies.simulation.published_steps import identify_per_leg
 from loopcal.studies.specification.levels import FACTORS, PER_LEG
 from loopcal.studies.specification.study import Cell, Study, compute_key, describe_cell
 from loopcal.typing import Progress, report_no_progress
@@ -438,8 +437,7 @@ def calibrate_trial(
     prepared, truth, data = replay_trial(study, cell, trial)
     robot, method = prepared.robot, prepared.content.method
     if method.method == PER_LEG:  # the reason for which such a fit is refused
-        rule = choose_rule(method)
-        identify_per_leg(robot, data, rule.limit, rule.epsilon)
+        fit_per_leg(robot, data, method)
     levels, limits = study.cells[cell].levels, study.scores
     options = CalibrationOptions(
         fit=prepared.fit_options,

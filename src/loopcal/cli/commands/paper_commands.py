@@ -93,6 +93,7 @@ def per_leg(
         of="loopcal.studies.simulation.published_steps:identify_per_leg",
         type=opt.Count("STEPS", 1),
     ),
+    epsilon: float = opt.EPSILON,
     output: Path | None = opt.path("Robot file to write, with the identified values.", "-o"),
     force: bool = opt.force("the output file"),
     allowed: dict[str, bool] = opt.ALLOWED,
@@ -105,20 +106,25 @@ def per_leg(
     Examples:
       loopcal per-leg hexapod-42 measurements.csv
       loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
+      loopcal per-leg hexapod-42 measurements.csv --steps 20 --epsilon 1e-3
     """
     from loopcal.studies.simulation.published_steps import identify_per_leg
 
     machine = opt.open_robot(robot, (output,), data, force)
     measurements = opt.read_fitted_measurements(data, machine, allowed)
-    estimate = identify_per_leg(machine, measurements, steps)
+    estimate = identify_per_leg(machine, measurements, steps, epsilon or 0.0)
     if output is not None:
         lc.save_robot(estimate.robot, output)
     poses = len(measurements.readings)
+    if not estimate.is_converged:
+        reached, wanted = estimate.integrated_errors[-1], epsilon
+        terminal.print_finding("fit.epsilon-not-met", steps=steps, reached=reached, wanted=wanted)
     return Output(estimate.to_dict(), lambda: _view_legs(estimate, poses, output))
 
 
 def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> list[Block]:
-    """Return the parameters, the condition numbers of the legs and the last step."""
+    """Return the steps, the condition numbers of the legs and the parameters."""
+    from loopcal.findings.wording import name_count
     from loopcal.results.tables import Column, Table, word_column
 
     columns = (word_column("parameter"), *map(Column, ("unit", "nominal", "estimate", "change")))
@@ -128,11 +134,12 @@ def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> lis
         for row in estimate.to_dict()["parameters"]
     ]  # fmt: skip
     conditions = ", ".join(f"{condition:.0f}" for condition in estimate.conditions)
-    steps = len(estimate.estimate_history) - 1
-    name = estimate.robot.name
+    errors = ", ".join(f"{error:.2g}" for error in estimate.integrated_errors)
+    name, count = estimate.robot.name, name_count(estimate.steps, "step")
     note = "No uncertainties: this method ignores the noise of the instrument."
     page: list[Block] = [
-        f"{name} identified leg by leg from {poses} full poses: {steps} steps",
+        f"{name} identified leg by leg from {poses} full poses: {count}",
+        f"Largest error of a pose, max dQint, before and after each step: {errors} mm + rad",
         f"Condition numbers of the legs: {conditions}",
         Table("Parameters", columns, tuple(rows)),
         f"{note} For calibrations use loopcal calibrate.",

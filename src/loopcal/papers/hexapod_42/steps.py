@@ -30,11 +30,15 @@ from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.published import PaperFile, Printed, Row
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
-from loopcal.studies.simulation.published_steps import LegForm, identify_per_leg
+from loopcal.studies.simulation.published_steps import (
+    MM,
+    LegForm,
+    identify_per_leg,
+    integrate_errors,
+)
 from loopcal.studies.specification.levels import PosesLevel
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-MM = 1e-3
 TO_SI, TO_PRINTED = np.array([MM] * 3 + [1.0] * 3), np.array([1.0 / MM] * 3 + [1.0] * 3)
 """From the units of Tables 4 and 6 to [m, rad], and from [m, rad] to them."""
 PARAMETERS = ("base.x", "base.y", "base.z", "length", "platform.x", "platform.y", "platform.z")
@@ -197,16 +201,6 @@ def iterate(
         errors.append(subtract_poses(measured, reached))
     stacked = np.stack(errors)
     return Iterations(np.stack(values), stacked, integrate_errors(stacked), nominal.conditions)
-
-
-def integrate_errors(errors: FloatArray) -> FloatArray:
-    """Return the largest integrated error dQint (k,) [mm + rad] of errors (k, n, 6) [m, rad].
-
-    Equations (15) to (17): dQint = |(dx, dy, dz)| [mm] + |(dalpha, dbeta, dgamma)| [rad]. The index
-    adds millimeters and radians as they are, so it exists in this paper only.
-    """
-    lengths, angles = (np.linalg.norm(part, axis=2) for part in (errors[..., :3], errors[..., 3:]))
-    return (lengths / MM + angles).max(axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ from loopcal.estimate.identification import IdentifiedTrials, identify, identify
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials
 from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.states import Status
@@ -32,8 +33,10 @@ from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.studies.simulation.machines import PreparedCell, make_fit_options
 from loopcal.studies.simulation.published_steps import (
     EPSILON,
+    LEG_STEPS,
     LIMIT,
     PaperRows,
+    PerLegEstimate,
     StepRule,
     identify_from_rows,
     identify_per_leg,
@@ -135,16 +138,17 @@ def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> Fitted
     )
 
 
-MOST_LEG_STEPS = 100
-"""Steps of a fit leg by leg at most, where epsilon ends them."""
-
-
 def choose_rule(method: MethodLevel) -> StepRule:
-    """Return when the steps of raw fits, or of fits leg by leg, end."""
+    """Return when the steps of raw fits end."""
     if method.steps is not None:
         return StepRule(method.epsilon or 0.0, method.steps)
-    epsilon = EPSILON if method.epsilon is None else method.epsilon
-    return StepRule(epsilon, MOST_LEG_STEPS if method.method == PER_LEG else LIMIT)
+    return StepRule(EPSILON if method.epsilon is None else method.epsilon, LIMIT)
+
+
+def fit_per_leg(robot: Mechanism, data: Measurements, method: MethodLevel) -> PerLegEstimate:
+    """Fit leg by leg. EstimationError as of `identify_per_leg`."""
+    steps, epsilon = method.steps or LEG_STEPS, method.epsilon or 0.0
+    return identify_per_leg(robot, data, steps, epsilon, method.stop or "dQint")
 
 
 def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
@@ -160,12 +164,11 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
     elif method.method == PER_LEG:
         values = np.full((t, len(robot.parameters)), np.nan)
         outcome, iterations = np.full(t, REFUSED), np.zeros(t, dtype=np.int64)
-        rule = choose_rule(method)
         for i in range(t):
             with suppress(EstimationError, DataError):
-                fit = identify_per_leg(robot, trials.trial(i), rule.limit, rule.epsilon)
+                fit = fit_per_leg(robot, trials.trial(i), method)
                 values[i], outcome[i] = fit.robot.values, 0 if fit.is_converged else EXHAUSTED
-                iterations[i] = len(fit.estimate_history) - 1
+                iterations[i] = fit.steps
     else:
         raw = make_raw_problem(robot, trials)
         p = raw.problem.parameters

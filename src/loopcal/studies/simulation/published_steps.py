@@ -47,6 +47,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import Method
 from loopcal.estimate.problem import Problem, problem_of_trials
+from loopcal.findings import report_finding
 from loopcal.measure.instrument import Gaussian, Instrument, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -84,6 +85,16 @@ truncated SVD, whose steps with the same H are zero after the first, take one st
 
 LOST = 1e4
 """A step of more than this [mm, rad] has diverged: ten meters."""
+
+
+LEG_STEPS = 3
+"""Steps of a fit leg by leg, unless another number is stated."""
+
+Stop = Literal["step", "dQint"]
+"""What the epsilon of a fit leg by leg limits: the largest component of a step [mm, rad], or the
+largest integrated error of a pose after a step [mm + rad], see `integrate_errors`. The latter is
+the rule of the study hexapod-42.
+"""
 
 
 @dataclass(frozen=True)
@@ -275,7 +286,7 @@ class LegForm:
     ----------
     G : (n, 6, p) change of each leg's length with the parameters.
     S : (n, 6, 6) twist by leg lengths. D : (n, 6, p) twist by parameters.
-    members : for each leg, the positions of its parameters.
+    members : for each leg, the positions of its free parameters.
     """
 
     G: FloatArray
@@ -290,7 +301,7 @@ class LegForm:
         S, D = slopes.readings[0], slopes.parameters[0]
         G = np.asarray(np.linalg.solve(S, D), dtype=np.float64)
         size = np.abs(G).max(axis=0)
-        touched = size > SHARED * size.max(axis=0, keepdims=True)
+        touched = machine.parameters.free & (size > SHARED * size.max(axis=0, keepdims=True))
         members = tuple(np.flatnonzero(row) for row in touched)
         return cls(G, S, D, members)
 
@@ -324,6 +335,17 @@ class LegForm:
         return np.array([np.linalg.cond(matrix) for matrix in columns])
 
 
+def integrate_errors(errors: FloatArray) -> FloatArray:
+    """Return the largest integrated error, max dQint (..,) [mm + rad], of pose errors (.., n, 6)
+    [m, rad], positions first.
+
+    Equations (15) to (17) of the study hexapod-42: dQint = |(dx, dy, dz)| [mm] + |(dalpha, dbeta,
+    dgamma)| [rad]. It adds millimeters and radians as they are, so it depends on these units.
+    """
+    lengths, angles = (np.linalg.norm(part, axis=-1) for part in (errors[..., :3], errors[..., 3:]))
+    return np.asarray((lengths / MM + angles).max(axis=-1))
+
+
 @dataclass(frozen=True, eq=False)
 class PerLegEstimate:
     """Result of the identification leg by leg.
@@ -332,16 +354,25 @@ class PerLegEstimate:
     ----------
     robot : at the estimated values. estimate_history : (steps + 1, p) parameters after each step
         [SI]. conditions : (6,) condition number of each leg's matrix in the last step.
-    is_converged : whether the last step was at most epsilon; always with a fixed number of steps.
+    integrated_errors : (steps + 1,) max dQint [mm + rad] at these parameters, see
+        `integrate_errors`; the angle of a pose is that between its measured and computed rotation.
+        Infinite where a pose is out of reach.
+    is_converged : whether the rule ended the steps; always with a fixed number of steps.
     """
 
     robot: Mechanism
     estimate_history: FloatArray
     conditions: FloatArray
+    integrated_errors: FloatArray
     is_converged: bool = True
 
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return len(self.estimate_history) - 1
+
     def to_dict(self) -> dict[str, Any]:
-        """Return the parameters in the units of the robot file, and the condition numbers."""
+        """Return the parameters in the units of the robot file, condition numbers, and steps."""
         factor, symbols = select_free_parameters(self.robot).display()
         table = zip(self.robot.parameters.entries, self.robot.values, factor, symbols, strict=True)
         rows = [
@@ -353,56 +384,72 @@ class PerLegEstimate:
             }
             for p, value, unit_in_si, unit in table
         ]
-        conditions = self.conditions.tolist()
-        return {"robot": self.robot.name, "parameters": rows, "conditions": conditions}
+        return {
+            "robot": self.robot.name,
+            "parameters": rows,
+            "conditions": self.conditions.tolist(),
+            "steps": self.steps,
+            "integrated_errors": self.integrated_errors.tolist(),
+            "is_converged": self.is_converged,
+        }
 
 
 def identify_per_leg(
-    robot: Mechanism, data: Measurements, steps: int = 3, epsilon: float = 0.0
+    robot: Mechanism,
+    data: Measurements,
+    steps: int = LEG_STEPS,
+    epsilon: float = 0.0,
+    stop: Stop = "dQint",
 ) -> PerLegEstimate:
     """Identify a hexapod leg by leg by full Gauss-Newton steps.
 
     Parameters
     ----------
-    robot : start values; all parameters free. data : full poses of one kind. steps : at most.
-    epsilon : largest component of a step [mm, rad] at which they end; 0 takes all steps.
+    robot : start values. data : full poses of one kind. steps : at most.
+    epsilon : limit at which the steps end; 0 takes all steps. stop : what epsilon limits, see
+        `Stop`.
 
     Raises
     ------
     EstimationError
         The robot has not six actuators, the data are not full poses in known frames or too few, a
-        parameter moves no leg or several, or a pose is out of reach.
+        parameter moves no leg or several, a pose is out of reach, or epsilon is below zero.
     """
+    if not epsilon >= 0.0:
+        raise EstimationError(f"epsilon is {epsilon}; give a number above 0, or 0 for all steps")
     if len(robot.actuators) != 6:
-        raise EstimationError(
-            f"{robot.name} has {len(robot.actuators)} actuators; identification leg by leg needs "
-            "six legs with one actuator each; use identify"
-        )
+        facts = {"robot": robot.name, "actuators": len(robot.actuators)}
+        raise EstimationError(report_finding("fit.no-six-legs", **facts))
     observations = _select_full_poses(data)
     q = data.readings[observations.rows]
     values, history, conditions = robot.values.copy(), [robot.values.copy()], np.zeros(0)
-    units, is_converged = list_raw_units(robot.parameters.dimensions), epsilon == 0.0
-    for _ in range(steps):
+    units, integrated, is_met = list_raw_units(robot.parameters.dimensions), [], False
+    while True:
         machine = robot.with_values(values)
         solution = forward(machine, q)
-        if not solution.converged.all():
+        reached = solution.converged.all()
+        evaluated = observations.kind.evaluate(solution.T[None], observations.measured[None])
+        errors = np.roll(evaluated.residual[0], 3, axis=1)  # a kind has its angles first
+        integrated.append(float(integrate_errors(errors)) if reached else np.inf)
+        if stop == "dQint" and len(history) > 1:
+            is_met = epsilon > 0.0 and integrated[-1] <= epsilon
+        if is_met or len(history) > steps:
+            break
+        if not reached:
             raise EstimationError(
                 f"{robot.name} cannot reach {int((~solution.converged).sum())} of these poses; "
                 "check the readings"
             )
         legs = LegForm.at(machine, solution)
         _check_members(robot, legs, len(q))
-        evaluated = observations.kind.evaluate(solution.T[None], observations.measured[None])
         twists = -np.linalg.solve(evaluated.jacobian[0], evaluated.residual[0, :, :, None])[:, :, 0]
         change = legs.fit(twists)
-        values = values + change
+        values, conditions = values + change, legs.conditions
         history.append(values.copy())
-        conditions = legs.conditions
-        if epsilon and np.abs(change / units).max() <= epsilon:
-            is_converged = True
-            break
-    machine = robot.with_values(values)
-    return PerLegEstimate(machine, np.stack(history), conditions, is_converged)
+        is_met = stop == "step" and np.abs(change / units).max() <= epsilon
+    return PerLegEstimate(
+        machine, np.stack(history), conditions, np.array(integrated), is_met or epsilon == 0.0
+    )
 
 
 def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
@@ -410,12 +457,11 @@ def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
     count = np.zeros(len(robot.parameters), dtype=int)
     for members in legs.members:
         count[members] += 1
-    if (count != 1).any():
-        name = robot.parameters.names[int(np.argmax(count != 1))]
-        raise EstimationError(
-            f"{name} moves {int(count[count != 1][0])} legs, not exactly one, so the legs cannot "
-            "be identified one by one; use identify"
-        )
+    is_shared = robot.parameters.free & (count != 1)
+    if is_shared.any():
+        place = int(np.argmax(is_shared))
+        facts = {"parameter": robot.parameters.names[place], "legs": int(count[place])}
+        raise EstimationError(report_finding("fit.legs-coupled", robot=robot.name, **facts))
     most = max(len(members) for members in legs.members)
     if poses < most:
         raise EstimationError(

@@ -200,8 +200,11 @@ class MethodLevel(Limited):
         detection, and ridge and truncated-svd need `lam` and `keep`. "products" takes products of
         points on planes and lines with their covariance, and "products-printed" with the weight
         one, as another study does. For comparisons.
-    epsilon : largest component of a step [mm, rad] at which raw and per-leg fits end; 1e-6 by
-        default. steps : of these fits, at most; without epsilon, exactly.
+    epsilon : limit at which raw and per-leg fits end: of the largest component of a step [mm, rad]
+        for raw fits (1e-6 by default), of what `stop` names for per-leg. steps : of these fits, at
+        most; without epsilon, exactly (3 by default for per-leg).
+    stop : what epsilon limits of per-leg: "dQint", the default, is the largest error of a pose
+        after a step, position [mm] plus angle [rad]; "step" the largest component of a step.
     """
 
     PLAIN: ClassVar[str] = "method"
@@ -219,6 +222,7 @@ class MethodLevel(Limited):
     rows: Literal["weighted", "raw", "products", "products-printed"] = "weighted"
     epsilon: float | None = None
     steps: int | None = None
+    stop: Literal["step", "dQint"] | None = None
 
     @property
     def is_published(self) -> bool:
@@ -260,6 +264,10 @@ class MethodLevel(Limited):
                     raise ValueError(
                         f"{key} belongs to 'rows: raw' and to the method per-leg; remove it"
                     )
+        if self.stop and (self.method != PER_LEG or self.epsilon is None):
+            raise ValueError(
+                "stop belongs to the method per-leg with epsilon; add these, or remove it"
+            )
         if not self.is_published:
             return
         what = "the method per-leg" if self.method == PER_LEG else f"'rows: {self.rows}'"
