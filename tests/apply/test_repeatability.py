@@ -198,6 +198,22 @@ def test_data_without_repeats_or_poses_are_refused() -> None:
         lc.assess_repeatability(robot, data)
 
 
+def test_jitter_of_recorded_readings_is_part_of_the_repeatability() -> None:
+    """The command is one: each visit is compared with the mean of the recorded readings."""
+    robot = lc.load_robot("hexapod-42")
+    data = visit_poses(robot, hexapod_poses(4), 8, UM, SHIFT)
+    jitter = np.random.default_rng(1).normal(0.0, UM / 5, data.readings.shape)
+    jitter -= np.repeat(jitter.reshape(4, 8, -1).mean(axis=1), 8, axis=0)
+    recorded = lc.assess_repeatability(robot, replace(data, readings=data.readings + jitter))
+    for pose, equal in zip(
+        recorded.poses["position"],
+        lc.assess_repeatability(robot, data).poses["position"],
+        strict=True,
+    ):
+        estimates = zip(get_estimates(pose), get_estimates(equal), strict=True)
+        assert all(a.value == pytest.approx(b.value, abs=1e-3 * UM) for a, b in estimates)
+
+
 def test_command_prints_the_page(tmp_path, capsys) -> None:
     robot = lc.load_robot("hexapod-42")
     lc.save_measurements(

@@ -156,9 +156,9 @@ def test_repeats_of_a_pose_stay_on_one_side_of_a_split():
     twice = replace(data, readings=np.repeat(data.readings[:6], 2, axis=0), block=np.arange(12))
     for seed in range(8):
         split = split_data(twice, hold_out=0.4, seed=seed)
-        assert split.list_repeats() == ()
+        assert split.repeats == ()
     named = split_data(twice, held_out=("1", "3", "4"))
-    assert named.list_repeats() == ("1",)
+    assert named.repeats == ("1",)
 
 
 def test_assumed_noise_survives_a_file_and_decides_nothing(tmp_path):

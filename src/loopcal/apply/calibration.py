@@ -216,7 +216,7 @@ def _report(
         comparison = compare_with_values(fit, options.compare_with)
     examined = () if examination is None else examination.findings
     doubts = () if conventions.finding is None else (conventions.finding,)
-    repeats = tuple(f"pose {label}" for label in split.list_repeats())
+    repeats = tuple(f"pose {label}" for label in split.repeats)
     findings = [
         # fit and validation answer doubts about conventions
         *(replace(finding, severity=Severity.INFO) for finding in doubts),

@@ -122,9 +122,6 @@ class CalibrationOptions:
         return {**plain, "fit": self.fit.to_dict()}
 
 
-UNKNOWN = np.array(np.inf)  # sigma of readings that may be missing
-
-
 @dataclass(frozen=True, eq=False)
 class DataSplit:
     """The two sets of a calibration."""
@@ -133,22 +130,12 @@ class DataSplit:
     held_out: Measurements | None  # measurements for validation; None where there are none
     share: float  # the share that was asked for; 0 where poses were named, or none were held out
     seed: int  # of the random choice
+    repeats: tuple[str, ...] = ()  # labels of held-out poses that repeat a fitted one
 
     def list_observations(self) -> tuple[Observations, ...]:
         """Return the observations of both sets, those of targets on the base once."""
         held_out = () if self.held_out is None else self.held_out.observations
         return (*self.fitted.all_observations, *held_out)
-
-    def list_repeats(self) -> tuple[str, ...]:
-        """Return the labels of held-out poses that repeat a fitted one."""
-        if self.held_out is None:
-            return ()
-        n = self.fitted.n_poses
-        readings = np.concatenate([self.fitted.readings, self.held_out.readings])
-        repeats = Measurements(self.fitted.robot_name, readings, (), reading_sigma=UNKNOWN).repeats
-        is_repeat = np.isin(repeats[n:], repeats[:n])
-        pairs = zip(self.held_out.labels, is_repeat, strict=True)
-        return tuple(label for label, repeated in pairs if repeated)
 
     def to_dict(self) -> dict[str, object] | None:
         """Return share, seed and labels of the held-out poses for JSON; None without any."""
@@ -180,11 +167,12 @@ def split_data(
                     f"{suggest_names(label, data.labels)}"
                 )
         names = set(held_out)
-        is_held_out = [label in names for label in data.labels]
-        if all(is_held_out):
+        is_held_out = np.array([label in names for label in data.labels])
+        if is_held_out.all():
             raise DataError("all poses of the data are held out; leave some to fit")
-        is_fitted = [not chosen for chosen in is_held_out]
-        return DataSplit(data.take(is_fitted), data.take(is_held_out), 0.0, seed)
+        is_repeat = is_held_out & np.isin(data.repeats, data.repeats[~is_held_out])
+        repeats = tuple(data.labels[i] for i in np.flatnonzero(is_repeat))
+        return DataSplit(data.take(~is_held_out), data.take(is_held_out), 0.0, seed, repeats)
     if not hold_out:
         return DataSplit(data, None, 0.0, seed)
     return DataSplit(*data.split(hold_out=hold_out, seed=seed), hold_out, seed)

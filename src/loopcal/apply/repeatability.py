@@ -35,6 +35,7 @@ from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.kinds.kind import ErrorGroup, list_error_groups
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
+from loopcal.measure.repeats import find_reading_tolerance, find_repeats
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.results.description import Field, fields
@@ -184,8 +185,10 @@ def assess_repeatability(
 ) -> Repeatability:
     """Compute pose accuracy and repeatability by ISO 9283 from repeated visits.
 
-    Visits of a pose have the same readings, as they have where a file states commanded coordinates.
-    Each instrument is assessed on its own, such as gauges of one axis each.
+    Visits of a pose have the same readings to a thousandth of their range, as they have where a
+    file states commanded coordinates. The commanded pose is that of their mean, so jitter of the
+    recorded readings is part of the repeatability. Each instrument is assessed on its own, such as
+    gauges of one axis each.
 
     Parameters
     ----------
@@ -206,7 +209,12 @@ def assess_repeatability(
     )
     if not kept:
         raise DataError(report_finding("repeatability.nothing-measured"))
-    data = replace(data, observations=kept)
+    # commanded poses are far apart, whatever the noise of the instrument is
+    member = find_repeats(data.readings, find_reading_tolerance(data.readings, ()))
+    sums = np.zeros((int(member.max()) + 1, data.readings.shape[1]))
+    np.add.at(sums, member, data.readings)
+    mean = sums / np.bincount(member)[:, None]
+    data = replace(data, observations=kept, readings=mean[member])
     compared = compare_predictions(robot, robot, data, nuisance_values, nuisance_values)
     rows = compared.data.observations
     residuals = compared.after.residuals(rows)

@@ -116,9 +116,10 @@ class CrossValidation(TableResult):
 
 def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
     """Draw the poses held out in each of `count` folds of nearly equal size: whole blocks, because
-    otherwise no fold would have a row that compares poses, such as a distance.
+    otherwise no fold would have a row that compares poses, such as a distance, and all repeats of a
+    pose together.
     """
-    names, member = np.unique(linked_blocks(data), return_inverse=True)
+    names, member = np.unique(linked_blocks(data, data.undivided), return_inverse=True)
     if count < 2 or len(names) < count:
         raise DataError(
             f"{count} folds of {len(names)} blocks of poses: give at least 2 folds and no more "
@@ -223,7 +224,7 @@ def score_leave_one_out(
     used = (total > 0.0) & np.isfinite(total)
     weight = np.divide(1.0, total, out=np.zeros_like(total), where=used)
     y = weight * (s * d.projections[0])
-    blocks, member = np.unique(linked_blocks(data), return_inverse=True)
+    blocks, member = np.unique(linked_blocks(data, data.undivided), return_inverse=True)
     square, equations = np.zeros((len(blocks), len(penalty))), np.zeros(len(blocks))
     count, rows = (
         problem.poses.count_rows(member, len(blocks)),

@@ -138,9 +138,11 @@ class Residuals(NamedTuple):
     whitened: FloatArray
 
 
-def linked_blocks(data: Measurements) -> IntArray:
-    """Return the block (n,) of each pose, where rows that compare poses join their blocks."""
-    numbers, member = np.unique(data.block, return_inverse=True)
+def linked_blocks(data: Measurements, block: IntArray | None = None) -> IntArray:
+    """Return the block (n,) of each pose, where rows that compare poses join their blocks; `block`
+    are those of the data by default.
+    """
+    numbers, member = np.unique(data.block if block is None else block, return_inverse=True)
     pairs = [o.rows for o in data.observations if o.kind.poses_per_row > 1 and len(o)]
     if not pairs:
         return member

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -23,6 +24,7 @@ from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.readings import check_reading_sigma, weight_reading_sigma
+from loopcal.measure.repeats import find_reading_tolerance, find_repeats
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import Field, label_axes
@@ -77,7 +79,6 @@ def anchor_rows(rows: Observations, observations: Sequence[Observations]) -> Int
 
 
 OF_POSES = ("readings", "reading_sigma", "block", "is_held_out")  # attributes (n, ..), or None
-SAME_READING = 1e-9  # readings [m] or [rad] that differ by less belong to repeats of one pose
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -215,11 +216,22 @@ class Measurements(TableResult):
         """Number of scalar residuals of targets on the base that count."""
         return sum(rows.n_residuals for rows in self.base_observations)
 
-    @property
+    @cached_property
     def repeats(self) -> IntArray:
-        """(n,) number of the pose that each pose repeats: equal ones have the same readings."""
-        rounded = np.round(self.readings / SAME_READING)
-        return np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1)
+        """(n,) number of the pose that each pose repeats, see `loopcal.measure.repeats`."""
+        readings, sigma = self.readings, self.reading_sigma
+        return find_repeats(readings, find_reading_tolerance(readings, self.observations, sigma))
+
+    @property
+    def undivided(self) -> IntArray:
+        """(n,) number of the poses that stay together where some are held out: blocks, and all that
+        repeat a pose of the block, because a repeat of a fitted pose says nothing of other poses.
+        """
+        names, block = np.unique(self.block, return_inverse=True)
+        order = np.argsort(self.repeats, kind="stable")
+        repeated = np.flatnonzero(np.diff(self.repeats[order]) == 0)
+        links = np.column_stack([block[order[repeated]], block[order[repeated + 1]]])
+        return find_connected_groups(links, len(names))[block]
 
     @property
     def noise_source(self) -> str:
@@ -297,8 +309,8 @@ class Measurements(TableResult):
     def split(self, *, hold_out: float, seed: int) -> tuple[Self, Self]:
         """Split the poses at random into a set to fit and a held-out set.
 
-        Blocks are not split, and repeats of a pose (`repeats`) stay together: a repeat of a fitted
-        pose says nothing of other poses. The poses of each set keep their order.
+        Blocks and repeats of a pose are not split (`undivided`). The poses of each set keep their
+        order.
 
         Parameters
         ----------
@@ -313,12 +325,7 @@ class Measurements(TableResult):
                 f"cannot hold out a share of {hold_out}; give the share of the poses that is not "
                 "fitted, above 0 and below 1, such as 0.25"
             )
-        block = np.unique(self.block, return_inverse=True)[1]
-        order = np.argsort(self.repeats, kind="stable")
-        repeated = np.flatnonzero(np.diff(self.repeats[order]) == 0)
-        links = np.column_stack([block[order[repeated]], block[order[repeated + 1]]])
-        joined = find_connected_groups(links, int(block.max()) + 1)[block]
-        names, member, sizes = np.unique(joined, return_inverse=True, return_counts=True)
+        names, member, sizes = np.unique(self.undivided, return_inverse=True, return_counts=True)
         if len(names) < 2:
             raise DataError(
                 "cannot split measurements of a single block; measure more poses, or state smaller "

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find poses that repeat another one: their readings differ by less than shows in the measurements.
+
+A controller records the readings of each visit of a pose with jitter of its own, so repeats seldom
+have equal readings. The tolerance of a reading is the share of its range that the noise has of the
+range of the measured values: a change by it moves no measured value much beyond its noise. Poses
+are repeats if all their readings lie within this tolerance and no other pose is near. A slow scan,
+whose poses form a chain longer than the tolerance, has no repeats but at equal readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loopcal.measure.observations import Observations
+from loopcal.typing import FloatArray, IntArray
+
+# Standard deviations of the noise by which repeats may differ. The readings of a few visits span
+# two to four standard deviations of their jitter, so jitter below the noise is accepted. Errors
+# of the model change over a much larger share of the range.
+SIGMAS = 3.0
+# Largest tolerance, as a share of the range of a reading, however coarse the instrument is: the
+# errors of a geometry are equal at poses that are this near.
+LARGEST_SHARE = 1e-3
+# Least range of a reading, as a share of the largest one: measurements of one pose have no range.
+LEAST_RANGE = 1e-2
+RANGE = (10.0, 90.0)  # percentiles, so that a wrong row does not change the tolerance
+MISSING = 1e300  # stands for readings that are NaN: equal to each other
+STEP, STEPS = 4.0, 8  # factor and number of the finer gaps at which long chains are divided
+
+
+def find_reading_tolerance(
+    readings: FloatArray,
+    observations: Sequence[Observations],
+    reading_sigma: FloatArray | None = None,
+) -> FloatArray:
+    """Return by how much each reading (a,) [SI] of repeats may differ.
+
+    readings : (n, a) [SI]. observations : with the noise of their rows. reading_sigma : (n, a)
+        [SI] or None, of uncertain readings, which differ by it although the pose is the same.
+    """
+    share = LARGEST_SHARE
+    for o in observations:
+        places = {column.name: j for j, column in enumerate(o.kind.columns)}
+        for i, column in enumerate(o.kind.noise_columns):
+            seen = o.present[:, i] & (o.weight > 0.0)
+            if seen.any() and column.name in places:
+                span = np.ptp(np.percentile(o.measured[seen, places[column.name]], RANGE))
+                sd = float(np.median(np.sqrt(o.covariance[seen, i, i])))
+                share = min(share, SIGMAS * sd / span) if span > 0.0 else share
+    is_known = np.isfinite(readings)
+    first = np.take_along_axis(readings, is_known.argmax(axis=0)[None], axis=0)
+    known = np.where(is_known, readings, np.nan_to_num(first))
+    least = LEAST_RANGE * np.abs(known).max(initial=0.0)
+    tolerance = share * np.maximum(np.ptp(np.percentile(known, RANGE, axis=0), axis=0), least)
+    if reading_sigma is not None:
+        jitter = np.median(np.where(np.isfinite(reading_sigma), reading_sigma, 0.0), axis=0)
+        tolerance = np.maximum(tolerance, 2.0 * SIGMAS * jitter)
+    return np.asarray(tolerance)
+
+
+def find_repeats(readings: FloatArray, tolerance: FloatArray) -> IntArray:
+    """Return the number (n,) of the pose that each pose repeats, whatever their order.
+
+    Poses without a gap above the tolerance (a,) between their readings (n, a) are repeats where all
+    lie within the tolerance. Longer chains are divided at smaller gaps, in the end between all
+    readings that differ.
+    """
+    values = np.nan_to_num(readings, nan=MISSING)
+    label, is_open = np.zeros(len(values), dtype=np.intp), np.ones(len(values), dtype=bool)
+    for gap in (*(tolerance / STEP**k for k in range(STEPS)), np.zeros_like(tolerance)):
+        label[is_open] = label.max() + 1 + _divide(values[is_open], gap, label[is_open])
+        label = np.unique(label, return_inverse=True)[1].reshape(-1)
+        low, high = np.full((2, int(label.max()) + 1, values.shape[1]), [[[np.inf]], [[-np.inf]]])
+        np.minimum.at(low, label, values)
+        np.maximum.at(high, label, values)
+        is_open = np.any(high - low > tolerance, axis=1, keepdims=True)[label, 0]
+        if not is_open.any():
+            break
+    return label
+
+
+def _divide(values: FloatArray, gap: FloatArray, label: IntArray) -> IntArray:
+    """Return the numbers (n,) of groups that no column of values (n, a) can divide at a gap above
+    that of the column (a,), within those of a label (n,).
+    """
+    count = 0
+    while (groups := int(label.max()) + 1) > count:
+        count = groups
+        for column, largest in zip(values.T, gap, strict=True):
+            order = np.lexsort((column, label))
+            is_new = (np.diff(label[order]) != 0) | (np.diff(column[order]) > largest)
+            label = np.empty_like(label)
+            label[order] = np.concatenate([[0], np.cumsum(is_new)])
+    return label
