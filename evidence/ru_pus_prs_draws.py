@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from evidence.three_prs_draws import to_document
-from loopcal.papers.tsvd_2016.steps import draw_machines
+from loopcal.papers.tsvd_2016.steps import load_design, simulate_machines
 
 DRAWS, SEED = 50, 0
 
@@ -23,4 +23,4 @@ def check(tables: dict[str, Any]) -> None:
 
 def collect() -> dict[str, Any]:
     """Collect medians with bootstrap intervals, ratios, and curves over lambda and k."""
-    return to_document(draw_machines("RU-PUS-PRS", SEED, DRAWS), SEED)
+    return to_document(simulate_machines(load_design("RU-PUS-PRS"), SEED, DRAWS), SEED)

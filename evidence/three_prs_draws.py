@@ -9,7 +9,7 @@ from typing import Any
 
 from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.results import make_median_curves, make_medians, make_ratios
-from loopcal.papers.tsvd_2016.steps import RE, SIZES, TSVD, Draws, draw_machines
+from loopcal.papers.tsvd_2016.steps import RE, SIZES, TSVD, Draws, load_design, simulate_machines
 
 DRAWS, SEED = 100, 0
 
@@ -55,4 +55,4 @@ def check(tables: dict[str, Any]) -> None:
 
 def collect() -> dict[str, Any]:
     """Collect medians with bootstrap intervals, ratios, and curves over lambda and k."""
-    return to_document(draw_machines("3-PRS", SEED, DRAWS), SEED)
+    return to_document(simulate_machines(load_design("3-PRS"), SEED, DRAWS), SEED)

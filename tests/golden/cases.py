@@ -438,7 +438,7 @@ def run_tsvd_2016(name: str, five: bool) -> Report:
     """Run truncated SVD and the library's methods on one machine with the printed noise."""
     from loopcal.papers.tsvd_2016 import steps
 
-    measured = steps.measure_case(name, 0)
+    measured = steps.measure_case(steps.load_design(name), 0)
     measured = measured.five if five else measured
     library = steps.run_library(measured)
     return {

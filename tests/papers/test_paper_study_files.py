@@ -82,7 +82,7 @@ def test_the_noise_study_has_the_errors_and_poses_of_the_tables():
 
 @pytest.mark.parametrize("name", tsvd.ROBOTS)
 def test_the_sweeps_have_the_settings_and_poses_of_the_reproduction(name):
-    study, robot = PAPERS["tsvd-2016"].load_study(tsvd.ROBOTS[name]), tsvd.load_machine(name)
+    study, robot = PAPERS["tsvd-2016"].load_study(tsvd.ROBOTS[name]), tsvd.load_design(name).robot
     p = len(robot.parameters)
     (poses,) = study.poses.values()
     assert_allclose(poses.coordinates, tsvd.list_measured_poses(robot), rtol=0, atol=1e-8)
@@ -106,7 +106,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
         for method, penalty in settings.items():
             numbers = find_cells(study, instrument=instrument, method=method)
             (cell,) = calibrate_cells(study, numbers)
-            measured = tsvd.measure_machines("3-PRS", cell.truth)
+            measured = tsvd.measure_machines(tsvd.load_design("3-PRS"), cell.truth)
             trials = replace(measured.trials, measured=cell.measured)
             run = tsvd.iterate(replace(measured, trials=trials), penalty, np.arange(2))
             step = np.abs(run.values - measured.robot.values).max()

@@ -41,11 +41,12 @@ DRAWS = 6
 RAW = np.array([1e3, 1e3, 1e3, 1.0, 1.0, 1.0])  # from m and rad to mm and rad
 FIRST = np.zeros(1, dtype=np.int64)
 EXACT = np.zeros(6)
+DESIGN = steps.load_design("3-PRS")
 
 
 @pytest.fixture(scope="module")
 def tripod() -> steps.Study:
-    return steps.measure_case("3-PRS", 0)
+    return steps.measure_case(steps.load_design("3-PRS"), 0)
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +66,14 @@ def test_appendix_1_is_read_as_printed() -> None:
 
 
 def test_poses_parameter_errors_and_output_range_agree_with_the_paper() -> None:
-    robot = steps.load_machine("3-PRS")
+    robot = steps.load_design("3-PRS").robot
     z, phi, theta = steps.list_measured_poses(robot).T
     assert len(z) == 36
     assert set(np.round(z, 9)) == {0.65, 0.7, 0.75}
     assert {int(x) for x in np.round(np.rad2deg(theta))} == {10, 20, 30}
     assert len(set(np.round(np.rad2deg(phi)))) == 12
     for name in steps.ROBOTS:
-        assert len(steps.list_output_range(steps.load_machine(name))) == 96
+        assert len(steps.list_output_range(steps.load_design(name).robot)) == 96
     errors = np.abs(steps.draw_true_values(robot, 5, 0) - robot.parameters.nominal)
     lengths = steps.list_scales(robot) != 1.0
     for chosen, (low, high) in ((lengths, (0.05e-3, 0.1e-3)), (~lengths, (2.5e-4, 5e-4))):
@@ -86,7 +87,7 @@ def test_poses_parameter_errors_and_output_range_agree_with_the_paper() -> None:
 @pytest.mark.parametrize("name", steps.ROBOTS)
 def test_first_step_agrees_with_the_printed_formulas(name) -> None:
     """H (216, p) in mm and rad by central differences of the forward kinematics."""
-    measured = steps.measure_case(name, 0)
+    measured = steps.measure_case(steps.load_design(name), 0)
     robot, kind, readings = measured.robot, measured.kind, measured.trials.readings[None]
     nominal, scale, p, lam, k = (
         robot.values[None],
@@ -118,10 +119,10 @@ def test_first_step_agrees_with_the_printed_formulas(name) -> None:
 
 
 def test_repeated_ridge_steps_reduce_the_effect_of_lambda() -> None:
-    robot, lam = steps.load_machine("3-PRS"), 0.01
+    robot, lam = steps.load_design("3-PRS").robot, 0.01
     # errors so small that the problem is linear
     small = robot.values + 1e-2 * (steps.draw_true_values(robot, 1, 0) - robot.values)
-    measured = steps.measure_machines("3-PRS", small).with_noise(EXACT)
+    measured = steps.measure_machines(DESIGN, small).with_noise(EXACT)
     d = steps.linearize(measured)
     for m in (1, 3, 10):
         values = steps.iterate(measured, penalize_ridge(np.array([lam]), 33), limit=m).values
@@ -132,8 +133,8 @@ def test_repeated_ridge_steps_reduce_the_effect_of_lambda() -> None:
 
 
 def test_exact_measurements_give_the_true_parameters() -> None:
-    truth = steps.draw_true_values(steps.load_machine("3-PRS"), 2, 0)
-    exact = steps.measure_machines("3-PRS", truth).with_noise(EXACT)
+    truth = steps.draw_true_values(steps.load_design("3-PRS").robot, 2, 0)
+    exact = steps.measure_machines(DESIGN, truth).with_noise(EXACT)
     run = steps.iterate(exact, np.zeros((1, 33)), np.arange(2))
     assert run.is_converged.all()
     # [m, rad], rounding times 1 / 4e-4
@@ -218,7 +219,7 @@ def test_interior_minimum_is_lower_than_both_ends() -> None:
 
 @pytest.mark.slow
 def test_same_seed_gives_the_same_numbers(results) -> None:
-    draws, again = results.draws[1], steps.draw_machines("3-PRS", 0, 2)
+    draws, again = results.draws[1], steps.simulate_machines(DESIGN, 0, 2)
     for method in steps.METHODS:  # a machine is the same however many there are
         first = draws.errors[method][:2]
         np.testing.assert_allclose(again.errors[method], first, rtol=1e-6)
@@ -360,7 +361,7 @@ def make_true(claim: str, draws: tuple[steps.Draws, ...], is_true: np.ndarray) -
             match claim:
                 case "u_shape":
                     for curves in sweep.curves.values():
-                        curves[np.ix_(is_true, [0, -1])] = 2.0
+                        curves[is_true, 0] = curves[is_true, -1] = 2.0
                 case "ls_not_best":
                     chosen[steps.LS].errors[:] = high[:, None]
                 case "tsvd_best":
@@ -445,7 +446,7 @@ def test_printed_noise_decides_limits_and_number_of_poses(tmp_path, monkeypatch)
     (tmp_path / "published.yaml").write_text(text.replace('"0.009651', '"0.029651'), "utf-8")
     monkeypatch.setattr(steps, "PRINTED", PaperFile(str(tmp_path / "steps.py"), "published.yaml"))
     np.testing.assert_allclose(steps.list_limits()[:3], 0.03e-3)
-    assert len(steps.list_measured_poses(steps.load_machine("3-PRS"))) == 33
+    assert len(steps.list_measured_poses(steps.load_design("3-PRS").robot)) == 33
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.papers import published
 from loopcal.papers.paper import StudyCase
 from loopcal.papers.tsvd_2016 import steps
@@ -33,7 +34,6 @@ from loopcal.papers.tsvd_2016.steps import (
     RAW_RE,
     RAW_TSVD,
     RE,
-    ROBOTS,
     SIZES,
     TSVD,
     WHITENED,
@@ -80,11 +80,18 @@ Place = TypeVar("Place")
 class Results:
     """All computed numbers, before they are judged."""
 
-    cases: Mapping[tuple[str, int], Case]  # both manipulators, each with 6- and 5-DOF measurement
-    draws: tuple[Draws, ...]  # of both manipulators
+    # all manipulators, each with 6- and 5-DOF measurement, or with the coordinates that it has
+    cases: Mapping[tuple[str, int], Case]
+    draws: tuple[Draws, ...]  # of all manipulators
     # best lambda and errors of RE after some iterations, 3-PRS with 6-DOF measurement
     ridge_steps: list[tuple[int | str, float, FloatArray]]
     noise: published.Printed  # Appendix 1 as printed
+    is_adapted: bool = False  # to another robot
+
+    @property
+    def whole(self) -> dict[str, Case]:
+        """By manipulator, the case with all measured coordinates."""
+        return {d.name: self.cases[d.name, d.sweeps[0].study.freedoms] for d in self.draws}
 
     @property
     def sweeps(self) -> dict[str, Sweep]:
@@ -96,15 +103,16 @@ def compute(
     seed: int, trials: int, progress: Callable[[str], None], case: StudyCase | None = None
 ) -> Results:
     """Compute everything: one machine of each kind with the printed noise, then drawn machines."""
-    cases = {}
-    for name in ROBOTS:
-        whole = steps.measure_case(name, seed)
-        for measured in (whole, whole.five):
-            cases[name, measured.freedoms] = steps.solve_case(measured, progress)
+    cases, designs = {}, steps.list_designs(case)
+    for design in designs:
+        for measured in steps.measure_case(design, seed).both:
+            cases[design.name, measured.freedoms] = steps.solve_case(measured, progress)
     progress("ridge steps")
-    ridge_steps = steps.follow_ridge(cases["3-PRS", 6].study)
-    draws = tuple(steps.draw_machines(name, seed, trials, progress) for name in ROBOTS)
-    return Results(cases, draws, ridge_steps, steps.PRINTED.table("appendix_1"))
+    followed = next(case.study for (name, _), case in cases.items() if name == designs[-1].name)
+    draws = tuple(steps.simulate_machines(d, seed, trials, progress) for d in designs)
+    noise = steps.PRINTED.table("appendix_1")
+    is_adapted = case is not None and case.robot is not None
+    return Results(cases, draws, steps.follow_ridge(followed), noise, is_adapted)
 
 
 def show_number(value: float) -> published.Cell:
@@ -119,8 +127,16 @@ def show_all(values: Iterable[float]) -> list[published.Cell]:
     return [show_number(value) for value in values]
 
 
+def show_errors(design: steps.Design, values: Iterable[float]) -> list[published.Cell]:
+    """Return errors in the order of MEASURES as cells; None for a part that the platform lacks."""
+    return [show_number(value) if i > 2 or min(i, 1) in design.parts else None
+            for i, value in enumerate(values)]  # fmt: skip
+
+
 def compare_tables(results: Results) -> Iterator[published.Comparison]:
-    """Yield the numbers that the text states, beside the computed ranks."""
+    """Yield the numbers that the text states, beside the computed ranks; none of another robot."""
+    if results.is_adapted:
+        return
     tripod = results.cases["3-PRS", 6]
     chain = sum("1" in name for name in tripod.study.robot.parameters.names)
     numbers = (results.cases["RU-PUS-PRS", 6].rank, tripod.rank, chain,
@@ -132,7 +148,7 @@ def compare_tables(results: Results) -> Iterator[published.Comparison]:
 def make_tables(results: Results) -> Iterator[published.Table]:
     """Yield all tables: the analogues of Tables 1 to 8, and the figures as numbers."""
     cases, draws, noise = results.cases.values(), results.draws, results.noise.values
-    yield TEXT.table("given", [row for name in ROBOTS for row in _list_machine(name)])
+    yield TEXT.table("given", [row for draw in draws for row in _list_machine(draw.design)])
 
     limits = steps.list_limits() * np.array([1e3] * 3 + [1.0] * 3)
     largest, rms = np.abs(noise).max(axis=0), np.sqrt(np.mean(noise**2, axis=0))
@@ -147,27 +163,34 @@ def make_tables(results: Results) -> Iterator[published.Table]:
         ranks.append((case.study.label, rank, *values, case.normal_equations, null))
     yield TEXT.table("ranks", ranks)
 
-    yield from (_list_outputs(name, results) for name in ROBOTS)
+    yield from (_list_outputs(name, results) for name in results.whole)
     yield from map(make_medians, draws)
     yield from map(make_ratios, draws)
 
     iterations = []
     for case in cases:
-        ls = LS if case.study.freedoms == 6 else RANKED
+        ls = LS if case in results.whole.values() else RANKED
         counts = [describe_end(case, method)[0] for method in (ls, RE, TSVD, WHITENED, PRIOR)]
         iterations.append((case.study.label, *counts))
     yield TEXT.table("convergence", iterations)
 
-    ridge = [(n, lam, *show_all(errors[:2])) for n, lam, errors in results.ridge_steps]
-    yield TEXT.table("ridge_steps", ridge)
+    last = draws[-1].design  # 3-PRS, where there are two
+    ridge = [(n, lam, *show_errors(last, errors[:2])) for n, lam, errors in results.ridge_steps]
+    yield TEXT.table("ridge_steps", ridge, name=results.whole[last.name].study.label)
 
-    for name in ROBOTS:
-        study, number = results.cases[name, 6].study, TABLES[name][0]
-        found = [results.cases[name, f].answers[m].values[0] for m, f in IDENTIFIED]
-        values = to_paper_units(study, np.array([study.trials.truth[0], *found])).T
-        labels = list_labels(study)
-        rows = [(*label, *show_all(row)) for label, row in zip(labels, values, strict=True)]
-        yield TEXT.table("identified", rows, f"table_{number}", name=name, number=number)
+    for name, whole in results.whole.items():
+        study, five = whole.study, results.cases.get((name, 5))
+        columns = [show_all(to_paper_units(study, study.trials.truth[0]))]
+        for method, freedoms in IDENTIFIED:
+            case = whole if freedoms == 6 else five
+            columns.append(
+                [None] * len(columns[0]) if case is None
+                else show_all(to_paper_units(study, case.answers[method].values[0]))
+            )  # fmt: skip
+        rows = [(*label, *row) for label, *row in zip(list_labels(study), *columns, strict=True)]
+        number = TABLES.get(name, ("", ""))[0]
+        file = f"table_{number}" if number else f"identified_{study.design.file}"
+        yield TEXT.table("identified", rows, file, name=name, number=number)
 
     yield from map(_list_curves, cases)
     yield from map(make_median_curves, results.sweeps.values())
@@ -183,33 +206,43 @@ def make_tables(results: Results) -> Iterator[published.Table]:
         yield TEXT.table("history", history, name, more, case=study.label)
 
 
-def _list_machine(name: str) -> list[tuple[str, str, str]]:
-    robot = steps.load_machine(name)
+def _list_machine(design: steps.Design) -> list[tuple[str, str, str]]:
+    name, robot = design.name, design.robot
     sizes = vars(robot.record.record)  # of the file: dimensions in SI
     rows = [(name, size.replace("_", " "), f"{1e3 * sizes[size]:g} mm")
-            for size in DIMENSIONS if size in sizes]  # fmt: skip
-    tilts = ", ".join(f"{tilt:g}" for tilt in SIZES.find("evaluated_tilts"))
-    heights = ", ".join(f"{1e3 * z:g}" for z in SIZES.find("heights"))
-    z = f" at z {heights} mm" if "z" in robot.controlled else ""
-    count = SIZES.find("evaluated")
-    return [*rows, (name, "output range", f"{count} poses, tilts of {tilts} deg{z}")]
+            for size in DIMENSIONS if isinstance(sizes.get(size), float)]  # fmt: skip
+    rows += [(name, "error parameters", f"{len(design.free)}")]
+    for what, poses in (("measured", design.poses), ("output range", design.output_range)):
+        ranges = [describe_range(n, c) for n, c in zip(robot.controlled, poses.T, strict=True)]
+        rows += [(name, what, f"{len(poses)} poses: {', '.join(ranges)}")]
+    return [*rows, (name, "coordinates", " ".join(design.columns))]
+
+
+def describe_range(name: str, values: FloatArray) -> str:
+    """Return the range of a controlled coordinate [m, rad], such as `z 650 to 750 mm`."""
+    factor, unit = (1e3, "mm") if name in POSITION else (np.rad2deg(1.0), "deg")
+    ends = dict.fromkeys(f"{factor * end:.4g}" for end in (values.min(), values.max()))
+    return f"{name} {' to '.join(ends)} {unit}"
 
 
 def _list_outputs(name: str, results: Results) -> published.Table:
-    study = results.cases[name, 6].study
+    study = results.whole[name].study
+    design = study.design
     rows: list[tuple[Any, ...]] = []
     for method, values in ((BEFORE, study.robot.parameters.nominal[None]),
                            (steps.TRUE, study.trials.truth)):  # fmt: skip
         commanded = study.compute_commanded_errors(values)[0]
-        errors = study.compute_output_errors(values)[0, :4]
-        rows.append(("", method, None, *errors, *commanded, None, None))
-    for case in (results.cases[name, freedoms] for freedoms in (6, 5)):
+        errors = show_errors(design, study.compute_output_errors(values)[0, :4])
+        rows.append(("", method, None, *errors, *show_errors(design, commanded), None, None))
+    for case in (case for (other, _), case in results.cases.items() if other == name):
         for method, answer in case.answers.items():
-            numbers = show_all((*answer.errors[0, :4], *answer.commanded[0]))
+            numbers = (*show_errors(design, answer.errors[0, :4]),
+                       *show_errors(design, answer.commanded[0]))  # fmt: skip
             label = (f"{case.study.freedoms}-DOF", method, case.describe_setting(method))
             rows.append((*label, *numbers, answer.iterations[0], describe_end(case, method)[1]))
-    number = TABLES[name][1]
-    return TEXT.table("outputs", rows, f"table_{number}", name=name, number=number)
+    number = TABLES.get(name, ("", ""))[1]
+    file = f"table_{number}" if number else f"outputs_{design.file}"
+    return TEXT.table("outputs", rows, file, name=name, number=number)
 
 
 def _list_curves(case: Case) -> published.Table:
@@ -219,7 +252,7 @@ def _list_curves(case: Case) -> published.Table:
             spacing = None
             if algorithm == RE:
                 spacing = "equal intervals" if case.is_equal[i] else "equal ratios"
-            errors = show_all(sweep.curves[algorithm][0, first + i, :3])
+            errors = show_errors(case.study.design, sweep.curves[algorithm][0, first + i, :3])
             count = sweep.counts[algorithm][0, first + i]
             rows.append((algorithm, setting, spacing, *errors, count))
     low, high = case.bracket
@@ -229,40 +262,42 @@ def _list_curves(case: Case) -> published.Table:
 
 def make_medians(draws: Draws) -> published.Table:
     """Return medians with their intervals."""
-    rows = []
-    for method in steps.METHODS:
+    rows, design = [], draws.design
+    for method in draws.errors:
         middle, ends = draws.compute_median(method), draws.compute_interval(method)
         cells: list[published.Cell] = []
-        for i in (0, 1, 2):
+        for i, shown in enumerate(show_errors(design, middle[:3])):
             low, high = (f"{e[i]:.2g}" if np.isfinite(e[i]) else DIVERGED for e in ends)
-            cells += [show_number(middle[i]), f"{low} to {high}"]
+            cells += [shown, None if shown is None else f"{low} to {high}"]
         after: list[published.Cell] = [None, None]
         if method in draws.commanded:
-            after = show_all(np.median(draws.commanded[method], axis=0))
+            after = show_errors(design, np.median(draws.commanded[method], axis=0))
         lost = np.isinf(draws.errors[method][:, 0]).sum()
         rows.append((method, *cells, *after, show_number(middle[3]), lost))
-    name = f"draws_{ROBOTS[draws.name].replace('-', '_')}"
+    name = f"draws_{design.file}"
     return TEXT.table("draws", rows, name, name=draws.name, trials=len(draws))
 
 
 def make_ratios(draws: Draws) -> published.Table:
     """Return ratios of medians: MAP, the default kind of fit, over each of the others."""
-    rows = []
+    rows, parts = [], draws.design.parts
     for other in COMPARED:
-        columns = (draws.compute_ratio(PRIOR, other), *draws.compute_ratio_interval(PRIOR, other))
-        rows.append((f"MAP over {other}", *show_all(np.array([c[:2] for c in columns]).T.ravel())))
-    name = f"ratios_{ROBOTS[draws.name].replace('-', '_')}"
+        ratio = draws.compute_ratio(PRIOR, other)[None, parts]
+        columns = np.concatenate([ratio, draws.compute_ratio_interval(PRIOR, other)])
+        cells = [show_all(columns[:, parts.index(i)]) if i in parts else [None] * 3 for i in (0, 1)]
+        rows.append((f"MAP over {other}", *cells[0], *cells[1]))
+    name = f"ratios_{draws.design.file}"
     return TEXT.table("ratios", rows, name, name=draws.name, trials=len(draws))
 
 
 def make_median_curves(sweep: Sweep) -> published.Table:
     """Return median errors at every lambda and k."""
-    rows, short = [], np.median(sweep.short, axis=0)[:, :2]
+    rows, short, design = [], np.median(sweep.short, axis=0)[:, :2], sweep.study.design
     for algorithm, settings in sweep.settings.items():
         for i, errors in enumerate(sweep.compute_median(algorithm)[:, :3]):
             is_early = algorithm == RE and i > 0
-            early = show_all(short[i - 1]) if is_early else [None, None]
-            rows.append((algorithm, settings[i], *show_all(errors), *early))
+            early = show_errors(design, short[i - 1]) if is_early else [None, None]
+            rows.append((algorithm, settings[i], *show_errors(design, errors), *early))
     name, data = f"curves_{sweep.study.file}_machines", {"name": sweep.study.label}
     return TEXT.table("median_curves", rows, name, **data, trials=len(sweep))
 
@@ -287,63 +322,70 @@ def collect_history(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
 
 
 def to_paper_units(study: steps.Study, values: FloatArray) -> FloatArray:
-    """Return deviations from nominal [mm, rad] of values (.., p)."""
-    return (values - study.robot.parameters.nominal) / steps.list_scales(study.robot)
+    """Return deviations from nominal [mm, rad] of the free ones of values (.., p)."""
+    deviations = (values - study.robot.parameters.nominal) / steps.list_scales(study.robot)
+    return deviations[..., study.design.free.places]
 
 
 def list_labels(study: steps.Study) -> list[tuple[str, str]]:
     """Return the name of each parameter, and the unit of the paper's raw numbers."""
-    table = study.robot.parameters
-    units = ["mm" if d is Dimension.LENGTH else "rad" for d in table.dimensions]
-    return list(zip(table.names, units, strict=True))
+    free, known = study.design.free, {Dimension.LENGTH: "mm", Dimension.ANGLE: "rad"}
+    units = [known.get(dimension, "1") for dimension in free.dimensions]
+    return list(zip(free.names, units, strict=True))
 
 
 def make_figures(results: Results) -> Iterator[published.Figure]:
     """Yield all figures: the analogues of figures 6 to 11, and medians over many machines."""
     for draws in results.draws:
-        for sweep, method in zip(draws.sweeps, (PRIOR, PRIOR_FIVE), strict=True):
+        for sweep, method in zip(draws.sweeps, (PRIOR, PRIOR_FIVE), strict=False):
             prior, data = draws.compute_median(method), {"name": sweep.study.label}
             for a, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 has no place on its axis
-                drawn = a, sweep.settings[a][first:], sweep.compute_median(a)[first:], prior
+                errors = sweep.compute_median(a)[first:]
+                drawn = draws.design, a, sweep.settings[a][first:], errors, prior
                 file = f"medians_{sweep.study.file}_{a.lower()}"
                 yield _draw_curve("medians", file, *drawn, **data, trials=len(draws))
     for case in results.cases.values():
-        number = FIGURES[case.study.name, case.study.freedoms]
+        number = FIGURES.get((case.study.name, case.study.freedoms))
         for a, first, part in ((RE, 1, "a"), (TSVD, 0, "b")):
             errors = case.sweep.curves[a][0, first:]
-            drawn = a, case.sweep.settings[a][first:], errors, case.answers[PRIOR].errors[0]
-            data = {"number": f"{number}({part})", "case": case.study.label,
+            prior = case.answers[PRIOR].errors[0]
+            drawn = case.study.design, a, case.sweep.settings[a][first:], errors, prior
+            file = f"figure_{number}{part}" if number else f"curve_{case.study.file}_{a.lower()}"
+            data = {"number": number and f"{number}({part})", "case": case.study.label,
                     "best": case.describe_setting(a),
                     "diverged": int(np.isinf(errors[:, 0]).sum())}  # fmt: skip
-            yield _draw_curve("curve", f"figure_{number}{part}", *drawn, **data)
-    for freedoms, algorithms in ((6, (LS, RE, TSVD)), (5, (RE, TSVD))):
-        case = results.cases["RU-PUS-PRS", freedoms]
-        yield from (_draw_history(case, a, unit) for a in algorithms for unit in ("mm", "rad"))
+            yield _draw_curve("curve", file, *drawn, **data)
+    for (name, freedoms), case in results.cases.items():
+        if name == "3-PRS" and not results.is_adapted:  # similar, says the paper
+            continue
+        algorithms = (RE, TSVD) if freedoms == 5 else (LS, RE, TSVD)
+        yield from (_draw_history(case, a, unit) for a in algorithms
+                   for unit in dict.fromkeys(u for _, u in list_labels(case.study)))  # fmt: skip
     yield _draw_steps(results)
 
 
 def _draw_curve(
-    text: str, file: str, algorithm: str, settings: FloatArray, errors: FloatArray,
-    prior: FloatArray, **data: Any,
+    text: str, file: str, design: steps.Design, algorithm: str, settings: FloatArray,
+    errors: FloatArray, prior: FloatArray, **data: Any,
 ) -> published.Figure:  # fmt: skip
     """Return position and angle errors (s, ..) over the settings (s,), and those of MAP.
 
     Settings that diverged have no error; they are a series of their own at the upper end.
     """
-    usable = np.isfinite(errors[:, :2]).all(axis=1)
-    lines = [published.Series.of(label, settings[usable], errors[usable, i])
-             for i, label in enumerate(LABELS)]  # fmt: skip
+    parts = design.parts
+    usable = np.isfinite(errors[:, parts]).all(axis=1)
+    lines = [published.Series.of(LABELS[i], settings[usable], errors[usable, i]) for i in parts]
     if not usable.all():
-        top = float(errors[usable, :2].max(initial=0.0)) or 1.0
+        top = float(errors[usable][:, parts].max(initial=0.0)) or 1.0
         lines.append(published.Series.of(DIVERGED, settings[~usable], [top] * int((~usable).sum())))
-    levels = {f"MAP, {label}": float(prior[i]) for i, label in enumerate(LABELS)}
+    levels = {f"MAP, {LABELS[i]}": float(prior[i]) for i in parts}
     data |= {"algorithm": algorithm, "setting": SETTING[algorithm]}
     return TEXT.figure(text, lines, levels, file, LOG[algorithm], **data)
 
 
 def _draw_history(case: Case, algorithm: str, unit: str) -> published.Figure:
     """Return the parameters of one unit by iteration; those that RE changes most are named."""
-    labels, names = list_labels(case.study), case.study.robot.parameters.names
+    labels, names = list_labels(case.study), case.study.design.free.names
     chosen = [i for i, (_, u) in enumerate(labels) if u == unit]
     reference = collect_history(case, RE)[1][-1]
     named = sorted(chosen, key=lambda i: -abs(reference[i]))[:NAMED]
@@ -356,11 +398,14 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> published.Figure:
         )
         for i in (*named, *(i for i in chosen if i not in named))
     ]
-    what, is_diverged = "lengths" if unit == "mm" else "angles", case.is_diverged(algorithm)
-    number = HISTORIES[case.study.freedoms]
+    what = {"mm": "lengths", "rad": "angles"}.get(unit, "ratios")
+    is_diverged, number = case.is_diverged(algorithm), None
+    if case.study.name in TABLES:
+        number = HISTORIES[case.study.freedoms]
+    file = f"figure_{number}" if number else f"history_{case.study.file}"
     method = algorithm if algorithm == LS else f"{algorithm} ({case.describe_setting(algorithm)})"
     return TEXT.figure(
-        "history", lines, None, f"figure_{number}_{algorithm.lower()}_{what}", log, number=number,
+        "history", lines, None, f"{file}_{algorithm.lower()}_{what}", log, number=number,
         method=f"{method}, {DIVERGED}" if is_diverged else method, what=what, unit=unit,
         case=case.study.label, chosen=len(chosen), count=len(names), named=len(named),
         file=case.study.file, diverged=is_diverged,
@@ -370,8 +415,7 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> published.Figure:
 def _draw_steps(results: Results) -> published.Figure:
     """Return the largest component of each step."""
     lines, longest = [], 0
-    for name in ROBOTS:
-        case = results.cases[name, 6]
+    for name, case in results.whole.items():
         for algorithm in (LS, RE, TSVD):
             runs, i = case.sweep.runs, case.sweep.places[algorithm][0]
             done, sizes = runs.done[:, i], runs.steps[:, i]
@@ -385,25 +429,31 @@ def _draw_steps(results: Results) -> published.Figure:
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
-    """Return a verdict for each claim."""
+    """Return a verdict for each claim; of another robot without those on printed numbers and on
+    different manipulators, and without those on coordinates that it does not have.
+    """
     draws, sweeps, judge = results.draws, results.sweeps, _judge_places
-    six, five = ({d.sweeps[i].study.label: d for d in draws} for i in (0, 1))
+    six = {d.sweeps[0].study.label: d for d in draws}
+    five = {d.sweeps[1].study.label: d for d in draws if len(d.sweeps) > 1}
     whole = {draw.name: draw for draw in draws}
     both = {sweep.study.label: (draw, sweep) for draw in draws for sweep in draw.sweeps}
+    of_five = (
+        judge("ls_fails", five, _compare_five),
+        judge("no_solution", five, _compare_exact),
+        judge("six_better", {draw.name: draw for draw in five.values()}, _compare_parameters),
+    ) if five else ()  # fmt: skip
     return (
         *map(_judge_curve, sweeps.values()),
         judge("ls_stable", six, _find_diverged, limit=LINEARIZATIONS),
         judge("ls_not_best", six, _compare_ls),
         judge("tsvd_best", sweeps, _compare_best, trials=len(draws[0])),
-        judge("ls_fails", five, _compare_five),
-        judge("no_solution", five, _compare_exact),
-        judge("six_better", whole, _compare_parameters),
+        *of_five,
         judge("deviate", both, _compare_deviations),
         judge("faster", sweeps, _compare_speed),
-        _judge_lambda(results),
+        *(() if results.is_adapted else (_judge_lambda(results),)),
         judge("no_rule", whole, _compare_rule, is_any=True),
         judge("k_near_j", sweeps, _find_best_k, near=SIZES.find("near")),
-        _judge_noise(results.noise),
+        *(() if results.is_adapted else (_judge_noise(results.noise),)),
         *_judge_own_checks(whole),
     )
 
@@ -442,18 +492,23 @@ def _judge_curve(sweep: Sweep) -> published.Verdict:
     gain, curves = SIZES.find("gain"), []
     holds, fails = np.ones(len(sweep), dtype=bool), np.zeros(len(sweep), dtype=bool)
     for algorithm in (RE, TSVD):
-        for i, error in enumerate(("position", "angle")):
+        for i in sweep.study.design.parts:
+            error = ("position", "angle")[i]
             rises = sweep.compute_rises(algorithm, i)
             holds, fails = holds & (rises > gain), fails | (rises <= 1.0)
             curves.append(
                 {"letter": SETTING[algorithm], "error": error, "count": int((rises > gain).sum()),
                  "of": len(sweep), **_describe_curve(sweep, algorithm, i)}
             )  # fmt: skip
-    short = [sum(steps.compute_rise(c) > gain for c in sweep.short[:, :, i]) for i in (0, 1)]
+    short = [
+        {"error": ("position", "angle")[i],
+         "count": sum(steps.compute_rise(c) > gain for c in sweep.short[:, :, i])}
+        for i in sweep.study.design.parts
+    ]  # fmt: skip
     return TEXT.judge(
         "u_shape", [*map(published.decide, holds, fails)], name=sweep.study.label, curves=curves,
         iterations=SIZES.find("short"),
-        number=FIGURES[sweep.study.name, sweep.study.freedoms], short=short,
+        number=FIGURES.get((sweep.study.name, sweep.study.freedoms)), short=short,
     )  # fmt: skip
 
 
@@ -478,8 +533,8 @@ def _find_diverged(draw: Draws) -> Held:
 
 
 def _are_better(first: FloatArray, second: FloatArray, factor: float = 1.0) -> BoolArray:
-    """Return where errors (t, ..) in position and in angle are below others times a factor."""
-    return np.all(first[:, :2] < factor * second[:, :2], axis=1)
+    """Return where all errors (t, parts), position and angle, are below others times a factor."""
+    return np.all(first < factor * second, axis=1)
 
 
 def _compare_ls(draw: Draws) -> Held:
@@ -495,12 +550,14 @@ def _compare_ls(draw: Draws) -> Held:
 
 def _compare_best(sweep: Sweep) -> Held:
     """Compare TSVD with LS and RE, each of the three at the bottom of its curve."""
-    errors = {name: sweep.chosen[a].errors for name, a in NAMES.items()}
+    parts = sweep.study.design.parts
+    errors = {name: sweep.chosen[a].errors[:, parts] for name, a in NAMES.items()}
     tsvd, others = errors["tsvd"], (errors["ls"], errors["ridge"])
-    medians = {name: np.median(of, axis=0) for name, of in errors.items()}
-    commanded = (sweep.chosen[a].commanded for a in (TSVD, RE))
-    row = {"commanded": int(np.less_equal(*commanded).all(axis=1).sum()), **format_all(**medians)}
-    holds = np.all([(tsvd[:, :2] <= other[:, :2]).all(axis=1) for other in others], axis=0)
+    medians = {name: np.median(sweep.chosen[a].errors, axis=0) for name, a in NAMES.items()}
+    commanded = (sweep.chosen[a].commanded[:, parts] for a in (TSVD, RE))
+    row = {"commanded": int(np.less_equal(*commanded).all(axis=1).sum()),
+           **format_all(parts, **medians)}  # fmt: skip
+    holds = np.all([(tsvd <= other).all(axis=1) for other in others], axis=0)
     return Held(holds, np.any([_are_better(other, tsvd) for other in others], axis=0), row)
 
 
@@ -517,7 +574,8 @@ def _compare_five(draw: Draws) -> Held:
 
 def _compare_with_before(draw: Draws, errors: FloatArray) -> FloatArray:
     """Return the larger of the errors (t, 5) in position and angle, relative to those before."""
-    return (errors[:, :2] / draw.errors[BEFORE][:, :2]).max(axis=1)
+    parts = draw.design.parts
+    return (errors[:, parts] / draw.errors[BEFORE][:, parts]).max(axis=1)
 
 
 def _compare_exact(draw: Draws) -> Held:
@@ -574,14 +632,17 @@ def show_count(count: float) -> str:
 
 def _compare_rule(draw: Draws) -> Held:
     """Compare lambda by cross-validation with the best one of RE; a rule that works refutes."""
-    works = _are_better(draw.errors[CROSS], draw.errors[RAW_RE], SIZES.find("rule"))
-    return Held(~works, works, {"ratio": format_pair(draw.compute_ratio(CROSS, RAW_RE))})
+    parts = draw.design.parts
+    found, best = (draw.errors[method][:, parts] for method in (CROSS, RAW_RE))
+    works, ratio = _are_better(found, best, SIZES.find("rule")), draw.compute_ratio(CROSS, RAW_RE)
+    return Held(~works, works, {"ratio": format_pair(ratio[[*parts]])})
 
 
 def _find_best_k(sweep: Sweep) -> Held:
     """Return the best k, all parameters included, by its distance from their number."""
     ks = sweep.settings[TSVD].astype(int)
-    best = np.array([ks[steps.find_bottom(curve)] for curve in sweep.curves[TSVD]])
+    curves = sweep.curves[TSVD][:, :, sweep.study.design.parts]
+    best = np.array([ks[steps.find_bottom(curve)] for curve in curves])
     distance = (ks[0] - best) / ks[0]
     row = {"low": int(best.min()), "high": int(best.max()), "middle": float(np.median(best)),
            "of": int(ks[0])}  # fmt: skip
@@ -596,7 +657,7 @@ def _judge_lambda(results: Results) -> published.Verdict:
     smallest, largest = (steps.PRINTED.number("lambda", end) for end in ("smallest", "largest"))
     converged = {label: sweep.chosen[RE].settings for label, sweep in results.sweeps.items()}
     early = {
-        label: sweep.settings[RE][1:][[steps.find_bottom(curve) for curve in sweep.short]]
+        label: sweep.settings[RE][1:][[steps.find_bottom(curve[:, :2]) for curve in sweep.short]]
         for label, sweep in results.sweeps.items()
     }
     held = []
@@ -643,6 +704,9 @@ def _judge_own_checks(draws: Mapping[str, Draws]) -> tuple[published.Verdict, ..
     wrong = [(p, m) for p in (NARROW, WIDE) for m in raw]
     near = {(PRIOR, CROSS): 1.05, (PRIOR, HINDSIGHT): 1.15}
 
+    has_five = all(len(draw.sweeps) > 1 for draw in draws.values())
+    has_angle = all(1 in draw.design.parts for draw in draws.values())
+
     def judge(
         claim: str, limits: Mapping[tuple[str, str], float], first: int = 0, **data: Any
     ) -> published.Verdict:
@@ -650,8 +714,8 @@ def _judge_own_checks(draws: Mapping[str, Draws]) -> tuple[published.Verdict, ..
         return _judge_places(claim, draws, compare, trials=len(next(iter(draws.values()))), **data)
 
     return (
-        judge("five_usable", {(RAW_FIVE, RAW_LS): 1.1}),
-        judge("mixed_units", {(WHITENED, RAW_LS): 0.9}, first=1),
+        *((judge("five_usable", {(RAW_FIVE, RAW_LS): 1.1}),) if has_five else ()),
+        *((judge("mixed_units", {(WHITENED, RAW_LS): 0.9}, first=1),) if has_angle else ()),
         judge("map_better", dict.fromkeys([(PRIOR, m) for m in raw], 1.0)),
         judge("map_tolerances", dict.fromkeys(wrong, 1.0), factor=SIZES.find("factor")),
         judge("map_near_best", near),
@@ -662,31 +726,48 @@ def _compare_methods(draw: Draws, limits: Mapping[tuple[str, str], float], first
     """Return where the errors of a method stay below those of another times a limit, in position
     and in angle; first = 1: in the angle alone.
     """
-    part, errors = slice(first, 2), draw.errors
-    holds = np.all([(errors[a][:, part] < limit * errors[b][:, part]).all(axis=1)
-                    for (a, b), limit in limits.items()], axis=0)  # fmt: skip
+    parts = [i for i in draw.design.parts if i >= first]
+    errors = {m: of[:, parts] for m, of in draw.errors.items()}
+    holds = np.all([_are_better(errors[a], errors[b], x) for (a, b), x in limits.items()], axis=0)
     methods = {"prior": PRIOR, "narrow": NARROW, "wide": WIDE, "ls": RAW_LS, "six": RAW_LS,
                "ridge": RAW_RE, "tsvd": RAW_TSVD, "five": RAW_FIVE}  # fmt: skip
-    row = format_all(**{key: draw.compute_median(m) for key, m in methods.items()})
-    row |= {"gcv": format_pair(draw.compute_ratio(PRIOR, CROSS)),
-            "hindsight": format_pair(draw.compute_ratio(PRIOR, HINDSIGHT)),
-            "ratio": format_pair(draw.compute_ratio(*next(iter(limits)))[part])}  # fmt: skip
+    medians = {key: draw.compute_median(m) for key, m in methods.items() if m in errors}
+    ratios = {"gcv": (PRIOR, CROSS), "hindsight": (PRIOR, HINDSIGHT), "ratio": next(iter(limits))}
+    row = format_all(draw.design.parts, **medians)
+    row |= {key: format_pair(draw.compute_ratio(*pair)[parts]) for key, pair in ratios.items()}
     return Held(holds, ~holds, row)
 
 
-def format_all(**errors: FloatArray) -> dict[str, str]:
-    """Return errors in position and angle as text."""
+def format_all(parts: tuple[int, ...], **errors: FloatArray) -> dict[str, str]:
+    """Return errors in position and angle, as far as the platform has them, as text."""
     return {
-        name: f"{e[0]:.2g} mm / {e[1]:.2g} deg" if np.isfinite(e[:2]).all() else DIVERGED
+        name: " / ".join(f"{e[i]:.2g} {('mm', 'deg')[i]}" for i in parts)
+        if np.isfinite(e[[*parts]]).all() else DIVERGED
         for name, e in errors.items()
-    }
+    }  # fmt: skip
 
 
 def format_pair(values: FloatArray) -> str:
     """Return ratios in position and angle as text; DIVERGED for one that is not finite."""
-    return " and ".join(f"{v:.2f}" if np.isfinite(v) else DIVERGED for v in values[:2])
+    return " and ".join(f"{v:.2f}" if np.isfinite(v) else DIVERGED for v in values)
 
 
 def list_replaced(results: Results) -> tuple[str, ...]:
     """Return sentences on further sizes that another robot replaces."""
-    return ()
+    if not results.is_adapted:
+        return ()
+    design, of_paper = results.draws[0].design, steps.load_design("3-PRS")
+    sentences = published.PaperFile(__file__, "text.yaml").find("replaced")
+    ranges = {
+        key: [
+            describe_range(n, c) for n, c in zip(d.robot.controlled, d.output_range.T, strict=True)
+        ]
+        for key, d in (("range", design), ("of_paper", of_paper))
+    }
+    data = {"robot": design.name, "parameters": len(design.free), "poses": len(design.output_range),
+            "paper_poses": len(of_paper.output_range), "first": len(design.free) - 1,
+            "last": int(results.draws[0].sweeps[0].settings[TSVD][-1]), **ranges}  # fmt: skip
+    is_fixed = "psi" not in design.columns
+    kept = ["range", "settings", *(["fixed"] if is_fixed else [])]
+    kept += ["no_tilt"] if not is_fixed and 1 not in design.parts else []
+    return tuple(published.fill_template(sentences[name], **data) for name in kept)

@@ -14,6 +14,7 @@ torsion, as in the paper.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,15 +24,24 @@ import numpy as np
 import loopcal as lc
 from loopcal import geometry
 from loopcal.diagnose.identifiable_parameters import Identifiability
+from loopcal.errors import DataError
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.penalties import Method
 from loopcal.measure.instrument import make_random_stream
-from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.poses import SMALL_TILT, Component
 from loopcal.measure.simulation import Trials, simulate_trials
 from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.numerics.decomposition import Decomposition, are_nonzero
+from loopcal.papers.paper import StudyCase
 from loopcal.papers.published import PaperFile
+from loopcal.studies.simulation.machines import (
+    change_tolerances,
+    compute_poses,
+    describe_poses,
+    draw_machines,
+)
 from loopcal.studies.simulation.published_steps import (
     AHEAD,
     LIMIT,
@@ -44,6 +54,8 @@ from loopcal.studies.simulation.published_steps import (
     penalize_truncated,
     take_steps,
 )
+from loopcal.studies.specification.levels import ErrorsLevel
+from loopcal.studies.specification.study import describe_cell
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -106,13 +118,101 @@ def list_lambdas(key: str = "exponents") -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
+class Design:
+    """A manipulator as designed, and what is measured.
+
+    name : in tables. poses : (n, c) measured controlled coordinates [m, rad].
+    output_range : (m, c) those at which errors are computed. errors : of true machines; None for
+    those of sizes.yaml.
+    """
+
+    name: str
+    robot: Mechanism
+    poses: FloatArray
+    output_range: FloatArray
+    errors: ErrorsLevel | None = None
+
+    @property
+    def file(self) -> str:
+        """Its name in names of files."""
+        return re.sub(r"\W+", "_", self.name.lower())
+
+    @cached_property
+    def free(self) -> FreeParameters:
+        """The parameters that are identified."""
+        return select_free_parameters(self.robot)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Coordinates that are measured: all, or x, y and z of a platform that cannot rotate."""
+        return COLUMNS if set(self.robot.program.freedoms) & {0, 1, 2} else COLUMNS[:3]
+
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """Which of position and angle, the first MEASURES, the platform has."""
+        freedoms = set(self.robot.program.freedoms)
+        return tuple(i for i, of in enumerate(({3, 4, 5}, {0, 1})) if freedoms & of)
+
+    def draw_true_values(self, trials: int, seed: int) -> FloatArray:
+        """Return values (t, p) of true machines [SI]; machine i is the same for any number."""
+        if self.errors is None:
+            return draw_true_values(self.robot, trials, seed)
+        return draw_machines(change_tolerances(self.robot, self.errors), self.errors, trials, seed)
+
+
+def load_design(name: str) -> Design:
+    """Return a manipulator of the paper: the shipped robot file of step 1, with our poses."""
+    robot = lc.load_robot(ROBOTS[name])
+    return Design(name, robot, list_measured_poses(robot), list_output_range(robot))
+
+
+def adapt_design(case: StudyCase) -> Design:
+    """Return another robot with the poses and errors of its study file; DataError where it has no
+    errors to identify.
+    """
+    study, robot = case.load_study(), case.robot
+    assert robot is not None
+    content = describe_cell(study, study.cells[0])
+    poses, (errors,) = compute_poses(describe_poses(content)), study.errors.values()
+    measured, held_out = np.array(poses.measured), np.array(poses.held_out)
+    design = Design(robot.name, robot, measured, held_out, errors)
+    if len(design.free) < 2 or not design.parts:
+        raise DataError(
+            f"{robot.name} has {len(design.free)} free parameters; the study needs 2 or more, and "
+            "a platform that moves or tilts"
+        )
+    if np.isnan(robot.parameters.tolerance).all():
+        raise DataError(
+            f"{robot.name} states no tolerances, so its machines have no errors to identify; add "
+            "`tolerances:` to its file"
+        )
+    return design
+
+
+def list_designs(case: StudyCase | None) -> tuple[Design, ...]:
+    """Return the manipulators of the paper, or the robot that replaces them."""
+    if case is None or case.robot is None:
+        return tuple(map(load_design, ROBOTS))
+    return (adapt_design(case),)
+
+
+@dataclass(frozen=True, eq=False)
 class Study:
     """t machines of one structure, measured."""
 
-    name: str  # of the structure in the paper
-    robot: Mechanism  # as designed
+    design: Design
     trials: Trials  # true machines and their measurements
-    freedoms: int = len(COLUMNS)  # measured coordinates of a pose, 6 or 5
+    freedoms: int = len(COLUMNS)  # measured coordinates of a pose
+
+    @property
+    def name(self) -> str:
+        """Name of the structure."""
+        return self.design.name
+
+    @property
+    def robot(self) -> Mechanism:
+        """As designed."""
+        return self.design.robot
 
     @property
     def label(self) -> str:
@@ -122,7 +222,12 @@ class Study:
     @property
     def file(self) -> str:
         """The same in names of files."""
-        return f"{ROBOTS[self.name].replace('-', '_')}_{self.freedoms}"
+        return f"{self.design.file}_{self.freedoms}"
+
+    @property
+    def both(self) -> tuple[Study, ...]:
+        """The same machines with all coordinates and, where psi is one of them, without it."""
+        return (self, self.five) if "psi" in self.design.columns else (self,)
 
     @property
     def kind(self) -> Component:
@@ -142,8 +247,8 @@ class Study:
         return replace(self, trials=trials, freedoms=5)
 
     def with_noise(self, noise: FloatArray) -> Study:
-        """Return the same poses measured with a noise (36, c) [m, rad]."""
-        T = self.trials.T
+        """Return the same poses measured with a noise (36, c or more) [m, rad]."""
+        T, noise = self.trials.T, noise[..., : self.freedoms]
         measured = self.kind.measure(T, np.broadcast_to(noise, (*T.shape[:2], self.freedoms)))
         return replace(self, trials=replace(self.trials, measured=(measured,)))
 
@@ -154,8 +259,8 @@ class Study:
 
     @cached_property
     def grid(self) -> Solution:
-        """The output range: 96 poses, commanded with the machine as designed."""
-        return inverse(self.robot, list_output_range(self.robot))
+        """The output range: its poses, commanded with the machine as designed."""
+        return inverse(self.robot, self.design.output_range)
 
     @cached_property
     def true_outputs(self) -> FloatArray:
@@ -177,9 +282,10 @@ class Study:
         is_finite = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
         T = self._compute_outputs(np.where(is_finite, values, self.robot.values))
-        truth, nominal = self.trials.truth[machine], self.robot.parameters.nominal
-        parameters = ((values - truth) / self.robot.parameters.tolerance) ** 2
-        worse = np.abs(values - truth) > np.abs(nominal - truth)
+        free = self.design.free
+        truth = self.trials.truth[machine]
+        off, before = ((x - truth)[:, free.places] for x in (values, self.robot.parameters.nominal))
+        parameters, worse = (off / free.tolerance) ** 2, np.abs(off) > np.abs(before)
         sizes = np.sqrt(parameters.mean(axis=1)), worse.mean(axis=1)
         errors = np.column_stack([_compare_poses(T, self.true_outputs[machine]), *sizes])
         return np.where(is_finite, errors, np.nan)
@@ -196,7 +302,7 @@ class Study:
         is_finite = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
         known = np.where(is_finite, values, self.robot.values)
-        target = list_output_range(self.robot)[None]
+        target = self.design.output_range[None]
         state = inverse_trials(self.robot, known, target, self.grid.state)
         q = compute_readings(self.robot, known, state)
         T = forward_trials(self.robot, self.trials.truth[machine], q, self.grid.state).T
@@ -204,34 +310,29 @@ class Study:
 
 
 def _compare_poses(T: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return rms differences (a, 3) of poses (a, n, 4, 4): the first three MEASURES."""
+    """Return rms differences (a, 3) of poses (a, n, 4, 4): the first three MEASURES. Where the
+    tilt is so small that phi means nothing, the normal counts in place of phi and theta.
+    """
     position = np.sum((T[..., :3, 3] - reference[..., :3, 3]) ** 2, axis=-1) / MM**2
     first, second = (geometry.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, reference))
     turned = np.rad2deg(geometry.wrap_angle(first - second))[..., :2]
-    angles = np.sum(turned**2, axis=-1)
     normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - reference[..., :3, 2]) ** 2, axis=-1)
+    angles = np.where(second[..., 1] < SMALL_TILT, normal, np.sum(turned**2, axis=-1))
     return np.sqrt(np.stack([np.mean(x, axis=1) for x in (position, angles, normal)], axis=1))
 
 
-def load_machine(name: str) -> Mechanism:
-    """Return the machine as designed, from the shipped robot file: step 1."""
-    return lc.load_robot(ROBOTS[name])
+def measure_machines(design: Design, truth: FloatArray, seed: int = 0) -> Study:
+    """Measure the poses of true machines (t, p) [SI] with drawn noise: steps 3 and 4."""
+    n = len(design.columns)
+    kind = Component(design.columns, "tilt-torsion" if n > 3 else None)
+    instrument = lc.Instrument((lc.Sensor(kind, lc.Uniform(list_limits()[:n])),))
+    trials = simulate_trials(design.robot, truth, design.poses, instrument, seed)
+    return Study(design, trials, n)
 
 
-def measure_machines(name: str, truth: FloatArray, seed: int = 0) -> Study:
-    """Measure 36 poses of true machines (t, p) [SI] in six coordinates with drawn noise: steps 3
-    and 4.
-    """
-    robot, kind = load_machine(name), Component(COLUMNS, "tilt-torsion")
-    instrument = lc.Instrument((lc.Sensor(kind, lc.Uniform(list_limits())),))
-    poses = list_measured_poses(robot)
-    return Study(name, robot, simulate_trials(robot, truth, poses, instrument, seed))
-
-
-def measure_case(name: str, seed: int) -> Study:
+def measure_case(design: Design, seed: int) -> Study:
     """Measure one machine with drawn errors and the noise of Appendix 1."""
-    truth = draw_true_values(load_machine(name), 1, seed)
-    return measure_machines(name, truth).with_noise(read_noise())
+    return measure_machines(design, design.draw_true_values(1, seed)).with_noise(read_noise())
 
 
 def read_noise() -> FloatArray:
@@ -305,14 +406,19 @@ def linearize(study: Study) -> Decomposition:
     return first.linearize(study.robot.parameters.nominal[None])[0]
 
 
+def find_rank(decomposition: Decomposition) -> int:
+    """Return the rank of the first machine's H."""
+    return int(are_nonzero(decomposition.singular_values[0]).sum())
+
+
 def list_scales(robot: Mechanism) -> FloatArray:
     """Return the paper's units (p,) in SI: millimeters and radians."""
     return list_raw_units(robot.parameters.dimensions)
 
 
 def find_bottom(errors: FloatArray) -> int:
-    """Return the place of the smallest product of position and angle error in (s, 2 or more)."""
-    product = errors[:, 0] * errors[:, 1]
+    """Return the place of the smallest product of errors (s, ..), those of `Design.parts`."""
+    product = errors.prod(axis=1)
     return int(np.argmin(np.where(np.isnan(product), np.inf, product)))
 
 
@@ -384,15 +490,16 @@ class Sweep:
         return np.array([compute_rise(curve) for curve in self.curves[algorithm][:, :, measure]])
 
     def compare_unseen(self, algorithm: str) -> FloatArray:
-        """Return errors (t, 2) relative to LS with a setting that was best on other machines.
+        """Return errors (t, parts) relative to LS with a setting that was best on other machines.
 
         Each half of the machines takes the setting at the bottom of the median curve of the other
-        half. Position and angle; infinite if the algorithm diverged, 0 if only LS did.
+        half. Infinite if the algorithm diverged, 0 if only LS did.
         """
-        curves, ratios = self.curves[algorithm][:, 1:, :2], np.empty((len(self), 2))
+        parts = self.study.design.parts
+        curves, ratios = self.curves[algorithm][:, 1:, parts], np.empty((len(self), len(parts)))
         for half in (0, 1):
             best = find_bottom(np.median(curves[1 - half :: 2], axis=0))
-            errors, reference = curves[half::2, best], self.chosen[LS].errors[half::2, :2]
+            errors, reference = curves[half::2, best], self.chosen[LS].errors[half::2, parts]
             with np.errstate(invalid="ignore"):
                 ratios[half::2] = np.where(np.isfinite(errors), errors / reference, np.inf)
         return ratios
@@ -402,10 +509,11 @@ def run_settings(
     study: Study, lambdas: FloatArray, progress: Callable[[str], None] = lambda _: None
 ) -> Sweep:
     """Run the paper's methods on all machines, RE with these lambdas and TSVD with k from the
-    number of parameters to a third of it.
+    number of parameters to a third of it, or to the rank.
     """
-    p, t, null = len(study.robot.parameters), len(study.trials), 6 - study.freedoms
-    ks = np.arange(p, p // 3, -1)
+    p, t, judged = len(study.design.free), len(study.trials), study.design.parts
+    null = p - find_rank(linearize(study))
+    ks = np.arange(p, min(p // 3, p - null - 1), -1)
     k, together = len(ks), SIZES.find("together")
     penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(lambdas, p)])
     settings = np.concatenate([ks.astype(np.float64), lambdas])
@@ -430,8 +538,8 @@ def run_settings(
     places = {
         LS: np.zeros(t, np.int64),
         RANKED: np.full(t, null),
-        RE: k + np.array([find_bottom(curve) for curve in errors[:, k:]]),
-        TSVD: 1 + np.array([find_bottom(curve) for curve in errors[:, 1:k]]),
+        RE: k + np.array([find_bottom(curve) for curve in errors[:, k:, judged]]),
+        TSVD: 1 + np.array([find_bottom(curve) for curve in errors[:, 1:k, judged]]),
     }
     chosen = {
         algorithm: Chosen.judge(
@@ -493,8 +601,8 @@ class Case:
 def solve_case(study: Study, progress: Callable[[str], None]) -> Case:
     """Run all methods on one machine's measurements."""
     progress(f"{study.label} measurement")
-    p, s = len(study.robot.parameters), linearize(study).singular_values[0]
-    rank, tried = int(are_nonzero(s).sum()), np.array(SIZES.find("tried"))
+    p, known = len(study.design.free), linearize(study)
+    s, rank, tried = known.singular_values[0], find_rank(known), np.array(SIZES.find("tried"))
     lambdas, is_equal = space_lambdas(s[rank - 1])
     sweep = run_settings(study, lambdas)
     safe = tried[~iterate(study, penalize_ridge(tried, p), limit=3).is_diverged]
@@ -548,16 +656,17 @@ def follow_ridge(study: Study) -> list[tuple[int | str, float, FloatArray]]:
     of the iteration.
     """
     counts = SIZES.find("ridge_steps")
-    smallest = float(linearize(study).singular_values[0, -1])
+    known, parts = linearize(study), study.design.parts
+    smallest = float(known.singular_values[0, find_rank(known) - 1])
     lambdas = np.geomspace(smallest, 1.0, SIZES.find("equal_ratios"))
-    penalty = penalize_ridge(lambdas, len(study.robot.parameters))
+    penalty = penalize_ridge(lambdas, len(study.design.free))
     history = iterate(study, penalty, limit=max(counts), ahead=0.0).history
     ends: dict[int | str, FloatArray] = {n: history[min(n, len(history) - 1)] for n in counts}
     ends["at convergence"] = iterate(study, penalty).values
     rows = []
     for count, values in ends.items():
         errors = study.compute_output_errors(values, np.zeros(len(values), dtype=np.int64))
-        best = find_bottom(errors)
+        best = find_bottom(errors[:, parts])
         rows.append((count, float(lambdas[best]), errors[best]))
     return rows
 
@@ -570,7 +679,6 @@ class Draws:
     choose theirs from the data; MAP is given the true spread of the errors as its tolerances.
     """
 
-    name: str
     sweeps: tuple[Sweep, ...]  # the paper's methods with 6- and 5-DOF measurement
     errors: Mapping[str, FloatArray]  # method -> (t, 5), see MEASURES, infinite if diverged
     # method -> (t, 2), see `Chosen`; without HINDSIGHT, which takes another lambda for each measure
@@ -578,6 +686,16 @@ class Draws:
 
     def __len__(self) -> int:
         return len(self.sweeps[0])
+
+    @property
+    def design(self) -> Design:
+        """The structure."""
+        return self.sweeps[0].study.design
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.design.name
 
     def compute_median(self, method: str) -> FloatArray:
         """Return medians (5,) over the machines."""
@@ -593,10 +711,11 @@ class Draws:
             return self.compute_median(method) / self.compute_median(other)
 
     def compute_ratio_interval(self, method: str, other: str) -> FloatArray:
-        """Return the bootstrap interval (2, 2) of the ratio of medians in position and angle, the
-        machines drawn in pairs, 95 %.
+        """Return the bootstrap interval (2, parts) of the ratio of medians, the machines drawn in
+        pairs, 95 %.
         """
-        first, second = (_resample_medians(self.errors[m][:, :2]) for m in (method, other))
+        parts = self.design.parts
+        first, second = (_resample_medians(self.errors[m][:, parts]) for m in (method, other))
         return _find_interval(first / second)
 
 
@@ -611,20 +730,20 @@ def _find_interval(medians: FloatArray) -> FloatArray:
     return np.quantile(medians, [0.025, 0.975], axis=0, method="nearest")  # some may be infinite
 
 
-def draw_machines(
-    name: str, seed: int, trials: int, progress: Callable[[str], None] = lambda _: None
+def simulate_machines(
+    design: Design, seed: int, trials: int, progress: Callable[[str], None] = lambda _: None
 ) -> Draws:
     """Draw machines, measure and identify them by all methods."""
-    truth = draw_true_values(load_machine(name), trials, seed)
-    whole = measure_machines(name, truth, seed)
+    truth = design.draw_true_values(trials, seed)
+    whole = measure_machines(design, truth, seed)
     lambdas = list_lambdas()
-    sweeps = tuple(run_settings(study, lambdas, progress) for study in (whole, whole.five))
-    progress(f"{name}, methods of loopcal")
+    sweeps = tuple(run_settings(study, lambdas, progress) for study in whole.both)
+    progress(f"{design.name}, methods of loopcal")
     factor = SIZES.find("factor")
     scaled = {NARROW: lc.Ridge(factor**2), WIDE: lc.Ridge(factor**-2)}
     without = {WHITENED_FIVE: lc.LeastSquares(), PRIOR_FIVE: lc.MAP()}
     values = {BEFORE: np.repeat(whole.robot.parameters.nominal[None], trials, axis=0), TRUE: truth}
-    for study, methods in ((whole, {**LIBRARY, **scaled}), (whole.five, without)):
+    for study, methods in zip(whole.both, ({**LIBRARY, **scaled}, without), strict=False):
         for method, how in methods.items():
             values[method] = lc.identify_trials(study.robot, study.trials, how).values
     errors = {m: whole.compute_output_errors(v) for m, v in values.items()}
@@ -637,9 +756,11 @@ def draw_machines(
         tried.append(whole.compute_output_errors(fit.values))
     errors[HINDSIGHT] = np.min(tried, axis=0)
     for method, (place, algorithm) in RAW.items():
+        if place == len(sweeps):  # without psi, which is not measured
+            continue
         chosen = sweeps[place].chosen[algorithm]
         errors[method], commanded[method] = chosen.errors, chosen.commanded
     errors, commanded = (
         {m: mark_diverged(of[m]) for m in METHODS if m in of} for of in (errors, commanded)
     )
-    return Draws(name, sweeps, errors, commanded)
+    return Draws(sweeps, errors, commanded)
