@@ -30,10 +30,14 @@ from loopcal.papers.tsvd_2016.results import (
     make_medians,
 )
 from loopcal.studies.simulation.published_steps import (
+    AHEAD,
     EPSILON,
     LIMIT,
+    SINGLE,
+    StepRule,
     penalize_ridge,
     penalize_truncated,
+    take_steps,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -163,18 +167,44 @@ def test_measurements_without_psi_keep_the_other_five_coordinates(tripod) -> Non
     np.testing.assert_allclose(sigma, Uniform(steps.list_limits()[:5]).sigma)
 
 
-def test_ridge_steps_with_one_matrix_end_where_single_steps_do(tripod) -> None:
-    """60 steps of steps.RE taken together give the errors of 60 single ones within a percent."""
+def test_first_20_ridge_steps_are_computed_one_by_one(tripod) -> None:
     penalty = penalize_ridge(np.array([1e-3, 0.1, 10.0]), 33)
-    single = steps.iterate(tripod, penalty, limit=60, ahead=0.0)
-    together = steps.iterate(tripod, penalty, limit=60)
-    assert (single.count == together.count).all()
-    assert len(together.history) < 20
-    first, second = (
-        tripod.compute_output_errors(run.values, np.zeros(3, np.int64))[:, :2]
-        for run in (single, together)
-    )
-    np.testing.assert_allclose(second, first, rtol=0.01)
+    single, run = (steps.iterate(tripod, penalty, limit=60, ahead=a) for a in (0.0, AHEAD))
+    np.testing.assert_array_equal(run.done[: SINGLE + 1], single.done[: SINGLE + 1])
+    np.testing.assert_array_equal(run.history[: SINGLE + 1], single.history[: SINGLE + 1])
+    assert len(run.history) < len(single.history)
+
+
+def test_ridge_leaps_end_where_single_steps_do(tripod) -> None:
+    penalty, machine = penalize_ridge(np.array([1e-2, 1.0, 100.0]), 33), np.zeros(3, np.int64)
+    single, run = (steps.iterate(tripod, penalty, limit=300, ahead=a) for a in (0.0, AHEAD))
+    assert (single.count == run.count).all()
+    assert len(run.history) < 100
+    first, second = (tripod.compute_output_errors(x.values, machine) for x in (single, run))
+    np.testing.assert_allclose(second, first, rtol=1e-4)
+
+
+def test_ridge_leaps_agree_with_100000_single_steps(tripod) -> None:
+    """Errors computed once by a loop of single steps (15 minutes); lambda = 100 ends before."""
+    penalty = penalize_ridge(np.array([0.01, 0.1, 1.0, 100.0]), 33)
+    run = steps.iterate(tripod, penalty, limit=100_000)
+    errors = tripod.compute_output_errors(run.values, np.zeros(4, np.int64))[:, :2]
+    expected = [
+        [6.8725196e-3, 3.7259392e-2],  # [mm], [deg]
+        [6.0248488e-3, 3.7245793e-2],
+        [5.4766020e-3, 3.8343422e-2],
+        [4.9843617e-3, 2.8652481e-2],
+    ]
+    np.testing.assert_allclose(errors, expected, rtol=1e-3)
+    assert run.is_converged.tolist() == [False, False, False, True]
+    assert run.count[3] == pytest.approx(87048, rel=1e-3)
+
+
+def test_stated_number_of_steps_is_taken_by_every_method(tripod) -> None:
+    """Least squares, too, which ends after 40 steps where none is stated."""
+    penalty = np.concatenate([np.zeros((1, 33)), penalize_ridge(np.array([1.0]), 33)])
+    run = take_steps(tripod.raw.take(np.zeros(2, np.int64)), penalty, StepRule(0.0, 45))
+    assert run.count.tolist() == [45, 45]
 
 
 def test_ridge_runs_until_its_steps_are_small(tripod) -> None:

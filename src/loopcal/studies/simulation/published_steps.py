@@ -71,16 +71,18 @@ LIMIT = 1_000_000
 """Steps at most; ridge steps shorten slowly, and 100,000 of them are common."""
 
 LINEARIZATIONS = 40
-"""Matrices H at most: enough for `LIMIT` ridge steps, see `AHEAD`, and for 40 steps of least
-squares.
-"""
+"""Steps of least squares and truncated SVD at most, unless their number is stated."""
 
-AHEAD = 0.5
-"""Steps taken with one H, as a share of the steps done before.
+SINGLE, AHEAD, BACK = 20, 0.5, 0.125
+"""Steps of ridge that are computed one by one. How many are then taken with one H, as a share of
+the steps done before, and at most, as a share of the steps left.
 
 Ridge converges in many steps that hardly change the machine, and so hardly change H. With the same
-H the sum of m steps has a closed form, the filter 1 - (lam / (s^2 + lam))^m. Least squares and
-truncated SVD, whose steps with the same H are zero after the first, take one step with each H.
+H the sum of m steps has a closed form, the filter 1 - (lam / (s^2 + lam))^m. It starts at the state
+before, so that the H of the middle carries both leaps. A leap leaves well-determined directions
+where the H before saw their end, so leaps get shorter before the limit. In the study `tsvd-2016`
+errors of poses differ by 1e-5 from those of 100,000 single steps on the 3-PRS. On the RU-PUS-PRS
+they differ from those of leaps of 2 % by 1e-3 (median over machines) and 2e-2 (largest).
 """
 
 LOST = 1e4
@@ -110,6 +112,19 @@ class StepRule:
     epsilon: float = EPSILON
     limit: int = LIMIT
     ahead: float = AHEAD
+
+    def plan_leap(self, count: IntArray) -> IntArray:
+        """Return how many steps to take with one H after `count` (a,) steps."""
+        wanted = np.where(count < SINGLE, 1.0, self.ahead * count)
+        return np.maximum(1.0, np.minimum(wanted, BACK * (self.limit - count))).astype(np.int64)
+
+    @property
+    def matrices(self) -> int:
+        """Number of matrices H with which the limit is reached, if no step before is small."""
+        count, number = np.zeros(1, dtype=np.int64), 0
+        while count[0] < self.limit:
+            count, number = count + self.plan_leap(count), number + 1
+        return number
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,20 +212,26 @@ def take_steps(raw: RawProblem, penalty: FloatArray, rule: StepRule | None = Non
     penalty = np.broadcast_to(penalty, (t, penalty.shape[1]))
     values = np.repeat(free.robot.values[None], t, axis=0)
     diverged, converged = np.zeros(t, dtype=bool), np.zeros(t, dtype=bool)
-    count = np.zeros(t, dtype=np.int64)
+    count, before, last = np.zeros(t, dtype=np.int64), values.copy(), np.zeros(t, dtype=np.int64)
+    is_ridge = ((penalty > 0.0) & np.isfinite(penalty)).any(axis=1)
+    most = np.where(is_ridge | (rule.epsilon == 0.0), rule.limit, min(rule.limit, LINEARIZATIONS))
     history, steps, done = [values.copy()], [], [count.copy()]
-    for _ in range(LINEARIZATIONS if rule.ahead else rule.limit):
-        active = np.flatnonzero(~diverged & ~converged & (count < rule.limit))
+    for _ in range(rule.matrices if rule.epsilon else rule.limit):
+        active = np.flatnonzero(~diverged & ~converged & (count < most))
         if not active.size:
             break
         decomposition, reached = raw.take(active).linearize(values[active])
-        wanted = np.minimum(np.maximum(1, rule.ahead * count[active]), rule.limit - count[active])
-        wanted = wanted.astype(np.int64)
+        wanted = rule.plan_leap(count[active])
         taken = _count_steps(decomposition, penalty[active], wanted, rule.epsilon)
         size = _measure_step(decomposition, penalty[active], np.zeros(len(active), np.int64))
-        change = decomposition.deviation(_sum_steps(decomposition, penalty[active], taken))
+        is_leap = taken > 1
+        start = (before[active] - values[active])[:, free.places] / free.tolerance
+        start *= is_leap[:, None]
+        total = taken + np.where(is_leap, last[active], 0)
+        change = _sum_steps(decomposition, penalty[active], total, start)
         good = reached & (size < LOST) & (np.abs(change).max(axis=1) < LOST)
         moved = np.where(good[:, None], change, np.nan) * free.tolerance
+        before[active], last[active] = values[active], taken
         values[np.ix_(active, free.places)] += moved
         count[active] += np.where(good, taken, 1)
         is_small = size <= rule.epsilon if rule.epsilon else np.zeros(len(active), dtype=bool)
@@ -238,16 +259,19 @@ def penalize_truncated(k: IntArray, parameters: int) -> FloatArray:
     return np.where(np.arange(parameters) < np.asarray(k)[:, None], 0.0, np.inf)
 
 
-def _sum_steps(decomposition: Decomposition, penalty: FloatArray, count: IntArray) -> FloatArray:
-    """Return the coordinates (a, p) of the sum of `count` (a,) steps with the same H.
+def _sum_steps(
+    decomposition: Decomposition, penalty: FloatArray, count: IntArray, start: FloatArray
+) -> FloatArray:
+    """Return the deviation (a, p) after `count` (a,) steps with the same H from a deviation
+    `start` (a, p).
 
-    Step m + 1 has the filter f r^m with f = s^2 / (s^2 + penalty) and r = 1 - f, so that the sum
-    has the filter 1 - r^m.
+    Step m + 1 from y = V'start has the filter f r^m with f = s^2 / (s^2 + penalty) and r = 1 - f,
+    so that the sum has the filter 1 - r^m.
     """
-    left = 1.0 - decomposition.filter_factors(penalty)
-    kept = 1.0 - left ** count[:, None]
-    s = decomposition.singular_values
-    return np.divide(kept * decomposition.projections, s, out=np.zeros_like(s), where=s > 0.0)
+    s, y = decomposition.singular_values, decomposition.coordinates(start)
+    kept = 1.0 - (1.0 - decomposition.filter_factors(penalty)) ** count[:, None]
+    end = np.divide(decomposition.projections, s, out=y.copy(), where=s > 0.0)
+    return decomposition.deviation(y + kept * (end - y))
 
 
 def _measure_step(
