@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopcal.errors import LoopcalError
+from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.measure.instrument import Uniform
 from loopcal.mechanism.kinematics import forward_trials
-from loopcal.papers.paper import PAPERS
+from loopcal.papers.paper import PAPERS, make_paper_study
 from loopcal.papers.published import PaperFile, Printed, decide
 from loopcal.papers.tsvd_2016 import results as results_module
 from loopcal.papers.tsvd_2016 import steps
@@ -29,6 +31,8 @@ from loopcal.papers.tsvd_2016.results import (
     make_median_curves,
     make_medians,
 )
+from loopcal.studies.files.study_file import load_study
+from loopcal.studies.simulation.block import calibrate_cells, find_cells, set_size
 from loopcal.studies.simulation.published_steps import (
     AHEAD,
     EPSILON,
@@ -71,7 +75,7 @@ def test_appendix_1_is_read_as_printed() -> None:
 
 def test_poses_parameter_errors_and_output_range_agree_with_the_paper() -> None:
     robot = steps.load_design("3-PRS").robot
-    z, phi, theta = steps.list_measured_poses(robot).T
+    z, phi, theta = DESIGN.poses.T
     assert len(z) == 36
     assert set(np.round(z, 9)) == {0.65, 0.7, 0.75}
     assert {int(x) for x in np.round(np.rad2deg(theta))} == {10, 20, 30}
@@ -476,7 +480,7 @@ def test_printed_noise_decides_limits_and_number_of_poses(tmp_path, monkeypatch)
     (tmp_path / "published.yaml").write_text(text.replace('"0.009651', '"0.029651'), "utf-8")
     monkeypatch.setattr(steps, "PRINTED", PaperFile(str(tmp_path / "steps.py"), "published.yaml"))
     np.testing.assert_allclose(steps.list_limits()[:3], 0.03e-3)
-    assert len(steps.list_measured_poses(steps.load_design("3-PRS").robot)) == 33
+    assert len(steps.load_design("3-PRS").poses) == 33
 
 
 @pytest.mark.slow
@@ -515,6 +519,88 @@ def test_tables_state_accuracy_after_commanding(results) -> None:
         assert rows[steps.HINDSIGHT][place] is None
         assert "true spread" in table.note
     assert make_median_curves(results.draws[0].sweeps[1]).rows[0][2] == DIVERGED
+
+
+@pytest.fixture(scope="module")
+def tripod_file(tmp_path_factory) -> Path:
+    """Return the file of a 3-PRS of other dimensions."""
+    changed = {"name: 3-prs": "name: my tripod", "base_radius: 350": "base_radius: 260",
+               "platform_radius: 200": "platform_radius: 120", "rod: 500": "rod: 400",
+               "{z: 700}": "{z: 520}", "[650, 750]": "[480, 560]", "[0, 35]": "[0, 28]",
+               "sd: 0.076": "sd: 0.05"}  # fmt: skip
+    text = find_robot_file("3-prs").read_text("utf-8")
+    for old, new in changed.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path_factory.mktemp("robot") / "tripod.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+OF_FIVE = {"ls_fails", "no_solution", "six_better", "five_usable"}
+OF_PAPER = {"lambda_range", "noise"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("robot", "measures", "left_out"),
+    [
+        ("five-bar", ("position [mm]",), OF_PAPER | OF_FIVE | {"mixed_units"}),
+        ("agile-eye", ("phi and theta [deg]",), OF_PAPER),
+        ("linear-delta", ("position [mm]",), OF_PAPER | OF_FIVE | {"mixed_units"}),
+    ],
+)
+def test_another_robot_has_the_tables_figures_and_claims_of_its_freedoms(
+    robot, measures, left_out
+) -> None:
+    made = PAPERS["tsvd-2016"].run(0, 2, robot=robot)
+    content, text = made.content, " ".join(made.replaced)
+    assert not content.comparisons
+    names = {v.name for v in content.verdicts}
+    assert {*CLAIMS, "noise"} - names == left_out
+    tables = {table.name.rsplit("_", 1)[0]: table for table in content.tables}
+    outputs = next(table for name, table in tables.items() if name.startswith("outputs"))
+    before: dict[str, Any] = dict(zip(outputs.columns, outputs.rows[0], strict=True))
+    assert {name for name in steps.MEASURES[:2] if before[name] is not None} == set(measures)
+    assert all(isinstance(before[name], float) and before[name] > 0.0 for name in measures)
+    kinds = {figure.name.split("_")[0] for figure in content.figures}
+    assert kinds == {"medians", "curve", "history", "convergence"}
+    assert {s.label for f in content.figures if f.name.startswith("curve_") for s in f.series} <= {
+        *measures, DIVERGED,
+    }  # fmt: skip
+    assert "36 poses of" in text
+    assert "free parameters" in text
+    assert ("left out" in text) == (len(measures) == 1 and robot != "agile-eye")
+
+
+def test_the_study_of_another_robot_is_the_one_that_is_written(tripod_file, tmp_path) -> None:
+    design = steps.adapt_design(PAPERS["tsvd-2016"].make_case(tripod_file))
+    theta = np.rad2deg(design.poses[:, design.robot.controlled.index("theta")])
+    np.testing.assert_allclose(np.unique(np.round(theta, 9)), [8.0, 16.0, 24.0])
+    path = tmp_path / "study.yaml"
+    make_paper_study(PAPERS["tsvd-2016"], path, str(tripod_file)).write()
+    study = load_study(path)
+    (cell,) = calibrate_cells(
+        set_size(study, 0, 2), find_cells(study, instrument="6-DOF", method="LS")
+    )
+    measured = steps.measure_machines(design, cell.truth)
+    np.testing.assert_allclose(measured.trials.readings, cell.readings, rtol=0, atol=1e-12)
+    drawn = np.abs(design.draw_true_values(5, 0) - design.robot.parameters.nominal)
+    limit = np.sqrt(12.0 / 7.0) * design.robot.parameters.tolerance  # half to whole of it
+    assert ((drawn >= 0.5 * limit - 1e-12) & (drawn <= limit + 1e-12)).all()
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("tolerances:", "", "states no tolerances"),
+    ("z: [480, 560]", "z: [4800, 5600]", "almost nothing of its workspace"),
+])  # fmt: skip
+def test_a_robot_without_errors_or_workspace_is_refused(
+    tripod_file, tmp_path, old, new, message
+) -> None:
+    text, path = tripod_file.read_text("utf-8"), tmp_path / "robot.yaml"
+    path.write_text(text.replace(old, new) if new else text.split(old)[0], "utf-8")
+    with pytest.raises(LoopcalError, match=message):
+        PAPERS["tsvd-2016"].run(0, 2, robot=path)
 
 
 def load_evidence(name: str) -> dict:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loopcal import geometry
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
@@ -175,6 +176,44 @@ def sample_workspace(
     return WorkspaceSample(
         coordinates, inverse(robot, coordinates), kept / tried, dict((+rejected).most_common())
     )
+
+
+RING_SHARES = (2 / 7, 4 / 7, 6 / 7)
+"""Tilts of rings of poses, as shares of the largest one; the tilts between them stay for checks."""
+
+
+def list_tilt_rings(robot: Mechanism, n: int) -> FloatArray:
+    """Return coordinates (n, c) [m, rad] on three rings of equal tilt at even azimuths. If z is
+    controlled, it takes the ends and the middle of its range in turn, begun anew on each ring.
+
+    Raises
+    ------
+    MechanismError : n is no multiple of 3, the robot controls other coordinates than phi, theta and
+        z, states no range for one, or does not reach all of these positions.
+    """
+    rings, azimuths = len(RING_SHARES), n // len(RING_SHARES)
+    if n < 1 or n % rings or not {"phi", "theta"} <= {*robot.controlled} <= {"phi", "theta", "z"}:
+        raise MechanismError(
+            f"{n} poses of {robot.name} are not {rings} rings of equal tilt: take a multiple of "
+            f"{rings} and a robot that controls phi and theta, or with z, alone"
+        )
+    ranges = workspace_ranges(robot)
+    ring, i = np.repeat(np.arange(rings), azimuths), np.tile(np.arange(azimuths), rings)
+    given = {
+        "phi": geometry.wrap_angle(i * 2.0 * np.pi / azimuths),
+        "theta": np.take(RING_SHARES, ring) * ranges["theta"][1],
+    }
+    if "z" in ranges:
+        given["z"] = np.linspace(*ranges["z"], 3)[(ring + i) % 3]
+    coordinates = np.column_stack([given[name] for name in robot.controlled])
+    rejected: Counter[str] = Counter()
+    if not _find_reachable(robot, coordinates, rejected).all():
+        reason, count = rejected.most_common(1)[0]
+        raise MechanismError(
+            f"{robot.name} does not reach {count} of {n} poses on rings of equal tilt ({reason}); "
+            "reduce `workspace:`, or draw poses at random"
+        )
+    return coordinates
 
 
 def resolve_poses(robot: Mechanism, poses: ArrayLike | int, seed: int) -> FloatArray:

@@ -19,10 +19,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from loopcal.errors import DataError, suggest_names
+from loopcal.errors import DataError, MechanismError, suggest_names
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.findings.wording import list_names, round_to_digits
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
+from loopcal.mechanism.workspace import list_tilt_rings
 
 if TYPE_CHECKING:
     from loopcal.mechanism.model import Mechanism
@@ -47,7 +48,6 @@ class Paper:
     title: str
     source: str
     studies: Mapping[str, str]
-    has_epsilon: bool = False  # whether its steps end where max dQint is at most epsilon
 
     @property
     def package(self) -> str:
@@ -60,39 +60,30 @@ class Paper:
         trials: int = TRIALS,
         progress: Callable[[str], None] | None = None,
         robot: str | Path | None = None,
-        epsilon: float | None = None,
     ) -> Reproduction:
         """Repeat the study.
 
         trials : drawings behind each statistical number. progress : receives a few words on each
         step. robot : another robot, or its file, that takes the place of those of the paper.
-        epsilon : in place of the limit at which the steps of a paper with such a rule end.
 
         Raises
         ------
-        DataError : a seed below zero, fewer than 2 trials, a robot that does not fit the study, or
-            an epsilon for a study without this rule.
+        DataError : a seed below zero, fewer than 2 trials, or a robot that does not fit the study.
         FileError : the robot cannot be read.
         """
         if seed < 0 or trials < 2:
             raise DataError(
                 f"seed {seed} with {trials} trials: give a seed of 0 or more, and 2 trials or more"
             )
-        compute = import_module(f"{self.package}.results").compute
-        case = self.make_case(robot, epsilon)
+        compute, case = import_module(f"{self.package}.results").compute, self.make_case(robot)
         results = compute(seed, trials, progress or (lambda _: None), case)
         return self.present(results, seed, trials, case)
 
-    def make_case(self, robot: str | Path | None = None, epsilon: float | None = None) -> StudyCase:
+    def make_case(self, robot: str | Path | None = None) -> StudyCase:
         """Return the study of a robot, or its file; by default that of the robots of the paper."""
-        if epsilon is not None and not (self.has_epsilon and epsilon > 0.0):
-            able = ", ".join(paper.name for paper in PAPERS.values() if paper.has_epsilon)
-            raise DataError(
-                f"epsilon is {epsilon:g} for {self.name}; give a number above 0, for {able} only"
-            )
         if robot is None or str(robot) in self.studies:
-            return StudyCase(self, epsilon=epsilon)
-        return StudyCase(self, str(robot), load_robot(robot), epsilon)
+            return StudyCase(self)
+        return StudyCase(self, str(robot), load_robot(robot))
 
     def present(
         self, results: Any, seed: int, trials: int, case: StudyCase | None = None
@@ -113,9 +104,7 @@ class Paper:
             self.title,
             self.source,
             PaperText(str(module.__file__)).about(),
-            {"seed": seed, "trials": trials}
-            | ({"robot": case.source} if case.robot else {})
-            | ({"epsilon": case.epsilon} if case.epsilon else {}),
+            {"seed": seed, "trials": trials} | ({"robot": case.source} if case.robot else {}),
             Content(*(tuple(part(results)) for part in parts)),
             (*case.list_replaced(), *module.list_replaced(results)),
         )
@@ -137,13 +126,12 @@ class StudyCase:
     """The study of a paper with its own robots, or with another one.
 
     source : name or file of the other robot, "" for those of the paper. robot : it, None for those
-    of the paper. epsilon : in place of the limit of the paper's rule.
+    of the paper.
     """
 
     paper: Paper
     source: str = ""
     robot: Mechanism | None = None
-    epsilon: float | None = None
 
     def load_study(self, name: str = "") -> Study:
         """Return the study of the robot; name : which robot of the paper, by default the first."""
@@ -206,7 +194,6 @@ PAPERS: Mapping[str, Paper] = {
             "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no "
             "DOI known to us",
             {"hexapod-42": "study.yaml"},
-            has_epsilon=True,
         ),
         Paper(
             "tsvd-2016",
@@ -266,8 +253,9 @@ class PaperStudyFile:
 def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> PaperStudyFile:
     """Return the study file of a paper, for its robot or for another one.
 
-    Another robot gets as many poses of its own workspace in place of a file of poses, and errors by
-    its tolerances in place of the errors of one machine.
+    Another robot gets as many poses of its own workspace in place of a file of poses, and of rings
+    that it does not reach, errors by its tolerances in place of the errors of one machine, as many
+    directions of truncated SVD as it has parameters, and no angles that it does not have.
     """
     from loopcal.io.core.yaml_file import quote_scalar
     from loopcal.studies.files.study_file import quote_robot
@@ -289,12 +277,44 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
         changes["poses"] = f"poses: [{count}]  # drawn from the workspace"
     if re.search(r"^ +deviations:", text, re.MULTILINE):
         changes["errors"] = ANY_ERRORS
+    loaded = load_robot(wanted)
+    if (rings := re.search(r"count: (\d+), choice: tilts", text)) is not None:
+        try:
+            list_tilt_rings(loaded.nominal, int(rings[1]))
+        except MechanismError:
+            changes["poses"] = f"poses: [{rings[1]}]  # drawn from the workspace"
+    if "unused: [psi]" in text and not set(loaded.program.freedoms) & {0, 1, 2}:
+        changes["instruments"] = _keep_position(text)
     for key, content in changes.items():
         text = _replace_key(text, key, content)
+    text = _list_directions(text, len(select_free_parameters(loaded)))
+    title = quote_scalar(f"{paper.name} with {loaded.name}")
+    text = re.sub(r"^title: .*$", lambda _: f"title: {title}", text, flags=re.MULTILINE)
     # a factor of tolerances is no size of the paper
     text = re.sub(r"^  [^:\n]+: (\{tolerance_factor: ([\d.]+)\})$", r"  \2 tolerances: \1", text,
                   flags=re.MULTILINE)  # fmt: skip
     return PaperStudyFile({path: text}, wanted, tuple(changes)[1:])
+
+
+def _keep_position(text: str) -> str:
+    """Return the instruments of a study file without angles, for a platform that cannot rotate."""
+    found = re.search(r"(distribution: \w+, sigma_position: [^,}\n]+)", text)
+    assert found is not None
+    return f"instruments:\n  3-DOF: {{kinds: [component], components: [x, y, z], {found[1]}}}"
+
+
+def _list_directions(text: str, parameters: int) -> str:
+    """Return the text of a study file in which truncated SVD keeps each number of directions from
+    one fewer than the parameters to a third of them, if it lists such numbers.
+    """
+    listed = re.compile(r"(?:^  [^:\n]*\d+: \{[^\n]*keep: \d+\}\n)+", re.MULTILINE)
+
+    def list_all(found: re.Match[str]) -> str:
+        line = found[0].splitlines(keepends=True)[0]
+        numbers = range(parameters - 1, parameters // 3, -1)
+        return "".join(re.sub(r"\d+(?=: \{|\})", str(number), line) for number in numbers)
+
+    return listed.sub(list_all, text)
 
 
 def _replace_key(text: str, key: str, content: str) -> str:

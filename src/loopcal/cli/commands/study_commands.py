@@ -162,7 +162,9 @@ def new(
         made.write()
         page = [f"Written: {', '.join(map(str, made.outputs))}"]
         if made.replaced:
-            keys = " and ".join(made.replaced)
+            from loopcal.findings.wording import list_names
+
+            keys = list_names(made.replaced)
             page.append(f"The {keys} of the paper belong to its robot and were replaced, too.")
         page.append(following)
         written = [str(path) for path in made.outputs]

@@ -213,16 +213,18 @@ def _list_machine(design: steps.Design) -> list[tuple[str, str, str]]:
             for size in DIMENSIONS if isinstance(sizes.get(size), float)]  # fmt: skip
     rows += [(name, "error parameters", f"{len(design.free)}")]
     for what, poses in (("measured", design.poses), ("output range", design.output_range)):
-        ranges = [describe_range(n, c) for n, c in zip(robot.controlled, poses.T, strict=True)]
-        rows += [(name, what, f"{len(poses)} poses: {', '.join(ranges)}")]
+        rows += [(name, what, f"{len(poses)} poses: {', '.join(list_ranges(design, poses))}")]
     return [*rows, (name, "coordinates", " ".join(design.columns))]
 
 
-def describe_range(name: str, values: FloatArray) -> str:
-    """Return the range of a controlled coordinate [m, rad], such as `z 650 to 750 mm`."""
-    factor, unit = (1e3, "mm") if name in POSITION else (np.rad2deg(1.0), "deg")
-    ends = dict.fromkeys(f"{factor * end:.4g}" for end in (values.min(), values.max()))
-    return f"{name} {' to '.join(ends)} {unit}"
+def list_ranges(design: steps.Design, poses: FloatArray) -> list[str]:
+    """Return the range of each controlled coordinate of poses (n, c), such as `z 650 to 750 mm`."""
+    ranges = []
+    for name, values in zip(design.robot.controlled, poses.T, strict=True):
+        factor, unit = (1e3, "mm") if name in POSITION else (np.rad2deg(1.0), "deg")
+        ends = dict.fromkeys(f"{factor * end:.4g}" for end in (values.min(), values.max()))
+        ranges.append(f"{name} {' to '.join(ends)} {unit}")
+    return ranges
 
 
 def _list_outputs(name: str, results: Results) -> published.Table:
@@ -544,8 +546,8 @@ def _compare_ls(draw: Draws) -> Held:
     unseen = {name: draw.sweeps[0].compare_unseen(a) for name, a in NAMES.items() if a != LS}
     row = {name: format_pair(np.median(ratio, axis=0)) for name, ratio in unseen.items()}
     ratios = np.array([*unseen.values()])
-    is_worse = (ratios < 1.0).all(axis=2).any(axis=0)
-    return Held(is_worse, (ratios > 1.0).all(axis=(0, 2)), row)
+    is_worse, is_best = np.any(np.all(ratios < 1.0, axis=2), axis=0), np.all(ratios > 1.0, (0, 2))
+    return Held(is_worse, is_best, row)
 
 
 def _compare_best(sweep: Sweep) -> Held:
@@ -759,15 +761,16 @@ def list_replaced(results: Results) -> tuple[str, ...]:
     design, of_paper = results.draws[0].design, steps.load_design("3-PRS")
     sentences = published.PaperFile(__file__, "text.yaml").find("replaced")
     ranges = {
-        key: [
-            describe_range(n, c) for n, c in zip(d.robot.controlled, d.output_range.T, strict=True)
-        ]
-        for key, d in (("range", design), ("of_paper", of_paper))
+        "measured": list_ranges(design, design.poses),
+        "range": list_ranges(design, design.output_range),
+        "of_paper": list_ranges(of_paper, of_paper.output_range),
+        "of_paper_measured": list_ranges(of_paper, of_paper.poses),
     }
-    data = {"robot": design.name, "parameters": len(design.free), "poses": len(design.output_range),
+    data = {"robot": design.name, "parameters": len(design.free), "poses": len(design.poses),
+            "checked": len(design.output_range),
             "paper_poses": len(of_paper.output_range), "first": len(design.free) - 1,
             "last": int(results.draws[0].sweeps[0].settings[TSVD][-1]), **ranges}  # fmt: skip
     is_fixed = "psi" not in design.columns
-    kept = ["range", "settings", *(["fixed"] if is_fixed else [])]
+    kept = ["poses", "range", "settings", *(["fixed"] if is_fixed else [])]
     kept += ["no_tilt"] if not is_fixed and 1 not in design.parts else []
     return tuple(published.fill_template(sentences[name], **data) for name in kept)

@@ -33,6 +33,7 @@ from loopcal.measure.simulation import Trials, simulate_trials
 from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
+from loopcal.mechanism.workspace import list_tilt_rings
 from loopcal.numerics.decomposition import Decomposition, are_nonzero
 from loopcal.papers.paper import StudyCase
 from loopcal.papers.published import PaperFile
@@ -163,7 +164,8 @@ class Design:
 def load_design(name: str) -> Design:
     """Return a manipulator of the paper: the shipped robot file of step 1, with our poses."""
     robot = lc.load_robot(ROBOTS[name])
-    return Design(name, robot, list_measured_poses(robot), list_output_range(robot))
+    poses = list_tilt_rings(robot, len(read_noise()))
+    return Design(name, robot, poses, list_output_range(robot))
 
 
 def adapt_design(case: StudyCase) -> Design:
@@ -342,32 +344,13 @@ def read_noise() -> FloatArray:
     return values
 
 
-def list_measured_poses(robot: Mechanism) -> FloatArray:
-    """Return controlled coordinates (36, c) [m, rad], one for each row of Appendix 1: 12 azimuths
-    at each tilt.
-
-    Free z takes the three heights in turn.
-    """
-    tilts, heights = SIZES.find("tilts"), np.array(SIZES.find("heights"))
-    n = len(read_noise()) // len(tilts)
-    grid = np.meshgrid(np.arange(n) * 360.0 / n, tilts)
-    phi, theta = (g.ravel() for g in grid)
-    i = np.arange(len(phi))
-    return _list_coordinates(robot, phi, theta, heights[(i // n + i) % len(heights)])
-
-
 def list_output_range(robot: Mechanism) -> FloatArray:
     """Return controlled coordinates (96, c) [m, rad]: tilts of 5 to 35 degrees, more azimuths."""
     heights = SIZES.find("heights") if "z" in robot.controlled else (0.0,)
     tilts = SIZES.find("evaluated_tilts")
     count = SIZES.find("evaluated") // (len(tilts) * len(heights))
     grid = np.meshgrid(np.arange(count) * 360.0 / count, tilts, heights)
-    return _list_coordinates(robot, *(g.ravel() for g in grid))
-
-
-def _list_coordinates(
-    robot: Mechanism, phi: FloatArray, theta: FloatArray, z: FloatArray
-) -> FloatArray:
+    phi, theta, z = (g.ravel() for g in grid)
     given = {"phi": geometry.wrap_angle(np.deg2rad(phi)), "theta": np.deg2rad(theta), "z": z}
     return np.column_stack([given[name] for name in robot.controlled])
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from importlib.resources import files
@@ -296,8 +295,10 @@ def write_template(path: Path, robot: str) -> None:
 
 def quote_robot(path: Path, robot: str) -> str:
     """Return how a study file names a robot: a shipped one by its name, another one by its file,
-    relative to the study file.
+    relative to the study file where it is in the same folder or below.
     """
     if robot in list_shipped_robots():
         return robot
-    return quote_scalar(Path(os.path.relpath(find_robot_file(robot), path.parent)).as_posix())
+    file, folder = find_robot_file(robot).resolve(), path.parent.resolve()
+    named = file.relative_to(folder) if file.is_relative_to(folder) else file
+    return quote_scalar(named.as_posix())

@@ -34,7 +34,7 @@ from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.mechanism.states import Status
-from loopcal.mechanism.workspace import sample_workspace
+from loopcal.mechanism.workspace import list_tilt_rings, sample_workspace
 from loopcal.parameters import ParameterTable
 from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.plane_line_planning import (
@@ -282,6 +282,8 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
         measured = np.array(level.coordinates)
     elif level.is_on_surfaces:
         measured = plan_plane_line_points(robot.nominal, level, stream)
+    elif level.choice == "tilts":
+        measured = list_tilt_rings(robot.nominal, level.count)
     elif not is_planned(level):
         measured = sample_workspace(robot.nominal, level.count, stream).coordinates
     else:

@@ -101,8 +101,9 @@ class PosesLevel(Limited):
     Parameters
     ----------
     count : number of poses. choice : "random" draws them evenly from the workspace, "planned" plans
-        them for the robot and the instrument, "plane-line" puts them on planes and perpendicular
-        lines for an instrument of the kinds plane and line. seed : of the draw or the plan; by
+        them for the robot and the instrument, "tilts" puts them on three rings of equal tilt,
+        "plane-line" on planes and perpendicular lines for an instrument of the kinds plane and
+        line. seed : of the draw or the plan; by
         default that of the study. Every trial of a cell measures the same poses.
     groups : planes with a line each, for "plane-line"; count is the number of all their points.
     axis : along which their lines run. sweeps : of the coordinate exchange that improves the
@@ -118,7 +119,7 @@ class PosesLevel(Limited):
         "sweeps": whole_numbers(0, 100),
     }
     count: int = 40
-    choice: Literal["random", "planned", "plane-line"] = "random"
+    choice: Literal["random", "planned", "tilts", "plane-line"] = "random"
     groups: int = 10
     axis: Literal["x", "y", "z"] = "z"
     sweeps: int = 3
