@@ -28,7 +28,7 @@ RESULT = {
 }
 """The least that result.json of a run states."""
 
-SIZES = {"p": 1, "a": 1, "u": 0, "s": 1, "c": 1}
+SIZES = {"p": 1, "a": 1, "u": 0, "e": 0, "s": 1, "c": 1}
 TYPES = {"finite": "f8", "number": "f8", "logical": "?", "text": "U1", "whole": "i8"}
 ARRAYS = {
     name: np.ones([SIZES[size] for size in form.split()[1:]]).astype(TYPES[form.split()[0]])

@@ -54,6 +54,7 @@ OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-rea
 NOTHING_TO_COMPARE = (
     "residuals.readings-missing",
     "residuals.no-rows-to-predict",
+    "validation.setup-undetermined",
     "residuals.before-out-of-reach",
 )
 # Steps that the progress callback counts: conventions, model, fit, what the residuals add to the

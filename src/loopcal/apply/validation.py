@@ -62,6 +62,9 @@ FEW_ROWS = 5
 GREW = 1.1  # factor by which an error must grow to be called larger
 NOISE_LEVEL = 1e-3  # probability that noise alone exceeds what is called the noise
 DOMINATES = 2.0  # factor by which blunders that dominate an rms error raise it
+# Standard deviations of the noise within which the setup must be known where a row is predicted:
+# otherwise it measures its frame or target, and not the machine.
+SETUP_KNOWN = 10.0
 REFUSED_SHARE = 0.5  # share of reused rows from which data are refused for validation
 ERRORS = ("before", "after")  # errors whose differences are stored
 # First word of the names of the stored arrays, `held_out_<before or after>_<quantity>`.
@@ -363,6 +366,14 @@ def validate(
         for values in (nuisance_values_before, nuisance_values)
     )
     compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
+    is_open = _find_unpredicted(compared, uncertainty)
+    unpredicted = _report_unpredicted(compared, is_open)
+    if unpredicted:
+        pairs = zip(compared.data.observations, is_open, strict=True)
+        data = replace(compared.data, observations=tuple(o.take(~of_kind) for o, of_kind in pairs))
+        if not data.n_rows and robot.program.sigma is None:
+            raise DataError(unpredicted[0])
+        compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
     limits = {"position": limit_position, "orientation": limit_angle}
     result = _summarize(robot, compared, limits)
     blunders = _find_blunders(robot, compared, uncertainty)
@@ -381,6 +392,7 @@ def validate(
             *_check_limits(result, limits),
             *report_conformity(conformity, limits, result.after, result.units),
             *_report_blunders(blunders, result, rest),
+            *unpredicted,
             *report_base_targets(data),
             *_report_moved_setup(robot, compared, kept),
             *_report_left_out(data, compared),
@@ -561,6 +573,46 @@ def _report_left_out(data: Measurements, compared: PredictionComparison) -> list
         for code, poses, more in cases
         if poses.any()
     ]
+
+
+# Rows that the fitted ones do not predict, because they leave a frame or target open.
+
+
+def _find_unpredicted(
+    compared: PredictionComparison, uncertainty: FitUncertainty | None
+) -> list[BoolArray]:
+    """Return the rows (r,) of every kind whose setup the fit does not know: at a known machine it
+    moves their prediction by more than `SETUP_KNOWN` standard deviations of the noise.
+    """
+    after, places = compared.after, {}
+    if uncertainty is not None:
+        places = {name: i for i, name in enumerate(uncertainty.names) if name in after.kept}
+    root = np.zeros((len(after.setup), 0 if uncertainty is None else uncertainty.root.shape[1]))
+    for i, name in enumerate(after.setup.table.names):
+        if uncertainty is not None and name in places:
+            root[i] = uncertainty.root[places[name]] / uncertainty.noise_scale
+    sizes = after.setup_deviations(compared.data.observations, root)
+    return [of_kind > SETUP_KNOWN for of_kind in sizes]
+
+
+def _report_unpredicted(
+    compared: PredictionComparison, is_open: Sequence[BoolArray]
+) -> list[Finding]:
+    """Report the poses and the setup of rows that are not predicted."""
+    poses: dict[str, None] = {}
+    is_used = np.zeros((2, len(compared.after.setup)), dtype=bool)  # by others, and by these rows
+    setup = compared.after.setup
+    for o, used, opened in zip(compared.data.observations, setup.indices, is_open, strict=False):
+        poses |= dict.fromkeys(compared.data.labels[i] for i in o.rows[opened].ravel())
+        for own, which in zip(is_used, (~opened, opened), strict=True):
+            own[used[which].ravel()] = True
+    if not poses:
+        return []
+    alone = is_used[1] & ~is_used[0]
+    chosen = np.flatnonzero(alone if alone.any() else is_used[1])
+    owners = dict.fromkeys(owner_of(setup.table.names[i]) for i in chosen)
+    code = "validation.setup-undetermined"
+    return [report_finding(code, poses=tuple(poses), names=tuple(owners))]
 
 
 # Held-out poses that neither the calibration nor the others explain.

@@ -172,7 +172,7 @@ class Predictor(NamedTuple):
         errors of a model discrepancy by y.
         """
         fit, U = self.uncertainty, len(names)
-        p, w = (0, 0) if fit is None else (len(fit.posterior.unit), len(fit.names))
+        p, w = (0, 0) if fit is None else (len(fit.posterior.unit), fit.root.shape[1])
         own = None if fit is None else fit.posterior.discrepancy
         m = 0 if own is None else own.errors.count
         by_y = np.zeros((U + p + m, p + w + len(self.unknown) + m))

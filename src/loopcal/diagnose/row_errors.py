@@ -419,6 +419,23 @@ class PosePredictions:
             differences.append(evaluation.residual[0])
         return differences
 
+    def setup_deviations(
+        self, observations: Sequence[Observations], root: FloatArray
+    ) -> list[FloatArray]:
+        """Return how far the setup parameters with a square root (U, w) [SI] of their covariance
+        move the predictions (r,) of every kind, in standard deviations of its noise.
+        """
+        sizes = []
+        for i, o in enumerate(observations):
+            by_setup = o.evaluate(self.T, *self._inputs_of(i, o)).nuisance
+            used, factor = self.setup.indices[i], self.setup.factor(i)
+            if by_setup is None or not used.shape[1]:
+                sizes.append(np.zeros(len(o)))
+                continue
+            moved = o.whitener @ by_setup[0] * (1.0 if factor is None else factor[:, None])
+            sizes.append(np.linalg.norm(np.matmul(moved, root[used]), axis=(1, 2)))
+        return sizes
+
     def _inputs_of(self, i: int, o: Observations) -> tuple[FloatArray | None, FloatArray | None]:
         """Return setup parameters (1, r, u) and joint values (1, r, j) that a kind needs."""
         setup = self.setup.select(i, self.values) if o.kind.nuisance_parameters else None

@@ -182,7 +182,7 @@ class FitUncertainty(NamedTuple):
     Attributes
     ----------
     posterior : of the machine. names : (U,) nuisance parameters.
-    slope : (U, p) S [SI / SI]. root : (U, U) T [SI].
+    slope : (U, p) S [SI / SI]. root : (U, w) T [SI], see `NuisanceEstimate`.
     noise_scale : factor on the stated sigmas of the rows.
     """
 

@@ -725,6 +725,9 @@ SMALLEST_EFFECT = 1e-7
 """Share of all that the machine does to a nuisance parameter below which a direction does not move
 it: rounding."""
 
+UNDETERMINED = 1e3
+"""Standard deviation [m] or [rad] that stands for that of a direction that no row determines."""
+
 
 @dataclass(frozen=True, eq=False)
 class NuisanceEstimate(TableResult):
@@ -739,7 +742,8 @@ class NuisanceEstimate(TableResult):
     sd : standard deviations; infinite where the data do not determine the parameter, 0 where it is
         fixed, NaN without an interval.
     slope : (U, p) change of the best values by the machine's deviations in tolerances.
-    root : (U, U) square root of their covariance at a known machine; NaN without intervals.
+    root : (U, U + d) square root of their covariance at a known machine, NaN without intervals;
+        its last columns are the d directions that no row determines, with `UNDETERMINED`.
     is_unobservable : (U,) parameters with a part in a direction that no row determines, whatever
         the machine.
     display : factor to SI and symbol of the unit in which each is shown.
@@ -816,7 +820,7 @@ class NuisanceEstimate(TableResult):
         nothing in them was estimated. The noise among the parts of the machine's posterior is also
         that of the setup parameters at a known machine; `tolerance` (p,) [SI].
         """
-        own = np.nan_to_num((self.root**2).sum(axis=1))
+        own = np.nan_to_num((self.root[:, : len(self)] ** 2).sum(axis=1))
         squares = []
         for part in parts:
             by_machine = ((self.slope @ (part.root / tolerance[:, None])) ** 2).sum(axis=1)
@@ -911,7 +915,7 @@ def estimate_nuisance(
         linearization.nuisance.best[0],
         np.sqrt(square),
         slope,
-        done.joint_root()[0] * np.sqrt(noise),
+        np.hstack([done.joint_root()[0] * np.sqrt(noise), UNDETERMINED * done.null_directions()]),
         is_unobservable,
         shown,
         _only_displaces(robot, table, is_unobservable, int(is_free.sum() - done.rank[0])),

@@ -20,6 +20,7 @@ from loopcal.measure.array_checks import (
     refuse_first,
     set_fields,
 )
+from loopcal.measure.hold_out import choose_fitted
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -309,8 +310,9 @@ class Measurements(TableResult):
     def split(self, *, hold_out: float, seed: int) -> tuple[Self, Self]:
         """Split the poses at random into a set to fit and a held-out set.
 
-        Blocks and repeats of a pose are not split (`undivided`). The poses of each set keep their
-        order.
+        Blocks and repeats of a pose are not split (`undivided`), and the poses to fit determine
+        every frame, target and surface as far as possible, see `loopcal.measure.hold_out`. The
+        poses of each set keep their order.
 
         Parameters
         ----------
@@ -325,15 +327,7 @@ class Measurements(TableResult):
                 f"cannot hold out a share of {hold_out}; give the share of the poses that is not "
                 "fitted, above 0 and below 1, such as 0.25"
             )
-        names, member, sizes = np.unique(self.undivided, return_inverse=True, return_counts=True)
-        if len(names) < 2:
-            raise DataError(
-                "cannot split measurements of a single block; measure more poses, or state smaller "
-                "blocks"
-            )
-        order = np.random.default_rng(np.random.SeedSequence(seed)).permutation(len(names))
-        error = np.abs(np.cumsum(sizes[order])[:-1] - (1.0 - hold_out) * self.n_poses)
-        fitted = np.isin(member, order[: int(np.argmin(error)) + 1])
+        fitted = choose_fitted(self, hold_out, seed)
         return self.take(fitted), self.take(~fitted)
 
     def with_weights(self, weight: ArrayLike) -> Self:

@@ -317,7 +317,7 @@ class TreeElimination(TrialBatch):
     shift : (a, U) step from the present values to the best ones at the present machine.
     rank : (a,) number of observable directions.
     is_unobservable : (a, U) unknowns with a part in an unobservable direction.
-    nodes : the solution of every structure.
+    nodes : the solution of every structure. length : (a, U) of the columns over all rows.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("tree",)
@@ -328,6 +328,7 @@ class TreeElimination(TrialBatch):
     rank: IntArray
     is_unobservable: BoolArray
     nodes: tuple[NodeSolution, ...]
+    length: FloatArray
 
     @cached_property
     def roots(self) -> tuple[FloatArray, ...]:
@@ -370,6 +371,24 @@ class TreeElimination(TrialBatch):
             joint[:, rows, columns] = root[:, :, :u]
         return joint
 
+    def null_directions(self) -> FloatArray:
+        """Return the directions (U, d) that no row of the first trial determines, at a known
+        machine; the largest entry of each is 1.
+        """
+        null, first = np.zeros((self.shift.shape[1], len(self.tree.node))), 0
+        for structure, node in zip(self.tree.structures, self.nodes, strict=True):
+            own, u = structure.unknowns, structure.unknowns.shape[1]
+            if structure.width > u:  # unknowns follow their ancestors
+                by_ancestors = node.solution[0, ..., : structure.width - u]
+                null[own] = -np.matmul(by_ancestors, null[structure.path[:, u:]])
+            places, rows = np.nonzero(node.unobservable[0].any(axis=2))
+            columns = first + np.arange(len(places))
+            null[own[places], columns[:, None]] = node.unobservable[0][places, rows]
+            null[own[places], columns[:, None]] /= self.length[0][own[places]]
+            first += len(places)
+        null = null[:, :first]
+        return np.asarray(null / np.abs(null).max(axis=0, initial=0.0))
+
     def variances(self) -> FloatArray:
         """Return the variance (a, U) of each unknown at a known machine, for unit noise.
 
@@ -408,7 +427,7 @@ def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
     values = _back_substitute(factors, nodes)
     is_unobservable, values = _remove_unobservable(tree, nodes, length, values)
     elimination = TreeElimination(
-        tree, values[..., :-1], values[..., -1], rank, is_unobservable, nodes
+        tree, values[..., :-1], values[..., -1], rank, is_unobservable, nodes, length
     )
     return elimination, rest
 

@@ -48,6 +48,7 @@ class Paper:
     title: str
     source: str
     studies: Mapping[str, str]
+    has_epsilon: bool = False  # whether its steps end where max dQint is at most epsilon
 
     @property
     def package(self) -> str:
@@ -60,30 +61,39 @@ class Paper:
         trials: int = TRIALS,
         progress: Callable[[str], None] | None = None,
         robot: str | Path | None = None,
+        epsilon: float | None = None,
     ) -> Reproduction:
         """Repeat the study.
 
         trials : drawings behind each statistical number. progress : receives a few words on each
         step. robot : another robot, or its file, that takes the place of those of the paper.
+        epsilon : in place of the limit at which the steps of a paper with such a rule end.
 
         Raises
         ------
-        DataError : a seed below zero, fewer than 2 trials, or a robot that does not fit the study.
+        DataError : a seed below zero, fewer than 2 trials, a robot that does not fit the study, or
+            an epsilon for a study without this rule.
         FileError : the robot cannot be read.
         """
         if seed < 0 or trials < 2:
             raise DataError(
                 f"seed {seed} with {trials} trials: give a seed of 0 or more, and 2 trials or more"
             )
-        compute, case = import_module(f"{self.package}.results").compute, self.make_case(robot)
+        compute = import_module(f"{self.package}.results").compute
+        case = self.make_case(robot, epsilon)
         results = compute(seed, trials, progress or (lambda _: None), case)
         return self.present(results, seed, trials, case)
 
-    def make_case(self, robot: str | Path | None = None) -> StudyCase:
+    def make_case(self, robot: str | Path | None = None, epsilon: float | None = None) -> StudyCase:
         """Return the study of a robot, or its file; by default that of the robots of the paper."""
+        if epsilon is not None and not (self.has_epsilon and epsilon > 0.0):
+            able = ", ".join(paper.name for paper in PAPERS.values() if paper.has_epsilon)
+            raise DataError(
+                f"epsilon is {epsilon:g} for {self.name}; give a number above 0, for {able} only"
+            )
         if robot is None or str(robot) in self.studies:
-            return StudyCase(self)
-        return StudyCase(self, str(robot), load_robot(robot))
+            return StudyCase(self, epsilon=epsilon)
+        return StudyCase(self, str(robot), load_robot(robot), epsilon)
 
     def present(
         self, results: Any, seed: int, trials: int, case: StudyCase | None = None
@@ -104,7 +114,9 @@ class Paper:
             self.title,
             self.source,
             PaperText(str(module.__file__)).about(),
-            {"seed": seed, "trials": trials} | ({"robot": case.source} if case.robot else {}),
+            {"seed": seed, "trials": trials}
+            | ({"robot": case.source} if case.robot else {})
+            | ({"epsilon": case.epsilon} if case.epsilon else {}),
             Content(*(tuple(part(results)) for part in parts)),
             (*case.list_replaced(), *module.list_replaced(results)),
         )
@@ -126,12 +138,13 @@ class StudyCase:
     """The study of a paper with its own robots, or with another one.
 
     source : name or file of the other robot, "" for those of the paper. robot : it, None for those
-    of the paper.
+    of the paper. epsilon : in place of the limit of the paper's rule.
     """
 
     paper: Paper
     source: str = ""
     robot: Mechanism | None = None
+    epsilon: float | None = None
 
     def load_study(self, name: str = "") -> Study:
         """Return the study of the robot; name : which robot of the paper, by default the first."""
@@ -194,6 +207,7 @@ PAPERS: Mapping[str, Paper] = {
             "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no "
             "DOI known to us",
             {"hexapod-42": "study.yaml"},
+            has_epsilon=True,
         ),
         Paper(
             "tsvd-2016",

@@ -37,6 +37,7 @@ def reproduce(
     robot: str | None = opt.option(
         "Robot, or its file, in place of those of the paper.", metavar="ROBOT"
     ),
+    epsilon: float | None = opt.EPSILON,
     force: bool = opt.flag("Replace an earlier result in FOLDER."),
 ) -> Output:
     """Repeat the study PAPER; without PAPER, list the studies.
@@ -50,12 +51,13 @@ def reproduce(
       loopcal reproduce hexapod-42
       loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
       loopcal reproduce tsvd-2016 --robot mine.yaml -o study
+      loopcal reproduce hexapod-42 --epsilon 1e-3
     """
     from loopcal.papers.paper import PAPERS, find_paper
 
     if paper is None:
         opt.refuse_given(
-            ("output", "seed", "trials", "robot", "force"),
+            ("output", "seed", "trials", "robot", "epsilon", "force"),
             "without the name of a study, which is repeated",
         )
         rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
@@ -75,7 +77,7 @@ def reproduce(
         if sys.stderr.isatty():
             terminal.print_message(text)
 
-    result = chosen.run(seed, trials, print_step, robot)
+    result = chosen.run(seed, trials, print_step, robot, epsilon)
     made_by = collect_provenance(opt.list_words(), {}, {"seed": seed})
     last = "Add -o FOLDER for all tables and figures."
     if output is not None:
@@ -93,7 +95,7 @@ def per_leg(
         of="loopcal.studies.simulation.published_steps:identify_per_leg",
         type=opt.Count("STEPS", 1),
     ),
-    epsilon: float = opt.EPSILON,
+    epsilon: float | None = opt.EPSILON,
     output: Path | None = opt.path("Robot file to write, with the identified values.", "-o"),
     force: bool = opt.force("the output file"),
     allowed: dict[str, bool] = opt.ALLOWED,

@@ -293,7 +293,7 @@ FORMS: Mapping[str, str] = {
     "local_start": "finite u",
     "local_sd": "number u",
     "local_slope": "finite u p",
-    "local_root": "finite u u",
+    "local_root": "finite u e",
     "posterior_unit": "finite p",
     "posterior_directions": "finite p p",
     "posterior_variance": "number p",

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal import geometry
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.findings.wording import fill_template
 from loopcal.mechanism.solutions import inverse
 from loopcal.papers import published
 from loopcal.papers.hexapod_42 import steps
@@ -20,101 +22,133 @@ from loopcal.papers.hexapod_42.steps import (
     SIZES,
     STATED,
     TO_PRINTED,
+    Draws,
     Setup,
     compute_rms,
     find_places,
 )
 from loopcal.papers.paper import StudyCase
+from loopcal.papers.published import decide
+from loopcal.studies.simulation.published_steps import list_raw_units
 from loopcal.typing import BoolArray, FloatArray
 
 TEXT = published.PaperText(__file__)
+
+METHODS = {
+    "before": "not calibrated",
+    "alone": "leg by leg, unweighted (the paper)",
+    "together": "all legs, weighted by the noise",
+    "prior": "the same with tolerances as prior (MAP)",
+}
+RUNS = ("without noise", "without noise, one matrix throughout")
+"""Titles of the runs without noise, of which the second keeps the matrix of step 5."""
+
+# Limits of decisions; a number between the two of a pair decides nothing.
+UNITS = (1.0, 2.0)  # of the last digit: a second one can come from the rounding of other tables
+ROUNDING = 2.0  # rms differences over the rounding; numbers within one unit cannot exceed 3.5
+OF_NOISE = (1.3, 2.0)  # factor between the rms of 27 numbers and that of their noise: 3 sd are 1.3
+P_VALUES = (0.05, 0.001)
+EXPLAINED = (25.0, 50.0)  # % of the residuals of a leg; 0 for least squares, 84 expected for noise
+STANDARD_ERRORS = (4.0, 7.0)  # largest of six means of ten poses: 2 % and 0.04 % exceed these
+OF_RULE = ("converges", "threshold_noise", "noise_size")
+"""Claims on what the rule of the paper leaves."""
+AS_GOOD = 1.1  # ratio of errors
+EXACT = 1e-6  # [mm] parameter error that steps without noise leave
+
+
+@dataclass(frozen=True, eq=False)
+class PrintedTables:
+    """What the printed tables say by themselves."""
+
+    comparisons: Mapping[str, published.Comparison]  # of Tables 2 to 6, by name
+    orders: list[published.Row]  # the best first
+    outliers: steps.Outliers
+    rounding: list[published.Row]
+    sizes: FloatArray  # (4,) of Tables 5 and 6, see `Level`
+    explained: FloatArray  # (6,) share of the residuals of Table 6 that parameters explain
+    noise: FloatArray  # (n, 6) [m, rad] that Tables 5 and 6 imply
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
     """All computed numbers, before they are judged."""
 
-    setup: Setup  # the machine of Tables 2 and 3
+    setup: Setup  # the machine of Tables 2 and 3, or another one
     # "exact": without noise; "frozen": the same with one matrix; "presumed", "stated": with noise
     runs: Mapping[str, steps.Iterations]
-    levels: Mapping[str, steps.Level]  # by instrument of study.yaml
-    methods: list[published.Row]
+    levels: Mapping[str, steps.Level]  # by noise of sizes.yaml
+    methods: Mapping[str, Draws]  # by key of METHODS
     poses: list[published.Row]
-    orders: list[published.Row]  # the best first
-    outliers: steps.Outliers
-    rounding: list[published.Row]
-    comparisons: Mapping[str, published.Comparison]  # of Tables 2 to 6, by name
-    sizes: FloatArray  # (4,) of Tables 5 and 6, see `Level`
-    explained: FloatArray  # (6,) share of the residuals of Table 6 that parameters explain
-    noise: FloatArray  # (n, 6) [m, rad] that Tables 5 and 6 imply
+    tables: PrintedTables | None  # None for another robot
 
 
 def compute(
     seed: int, trials: int, progress: Callable[[str], None], case: StudyCase | None = None
 ) -> Results:
-    """Compute everything."""
-    threshold, used = find_rule()
-    setup, measured = steps.make_setup(), PRINTED.table("table_4", "PP")
-    count, noises = SIZES.find("iterations"), steps.list_noises()
+    """Compute everything; case : another robot or rule.
+
+    Raises EstimationError: the legs of the robot cannot be identified one by one.
+    """
+    setup = steps.make_setup(case, seed)
     progress("the ten steps")
     runs = {
-        "exact": steps.iterate(setup, setup.actual, count),
-        "frozen": steps.iterate(setup, setup.actual, count, is_renewed=False),
+        "exact": steps.iterate(setup, setup.actual),
+        "frozen": steps.iterate(setup, setup.actual, is_renewed=False),
     }
-    for name, instrument in (("presumed", PRESUMED), ("stated", STATED)):
-        drawn = steps.draw_measured_poses(setup, noises[instrument], seed)
-        runs[name] = steps.iterate(setup, drawn, count)
-    progress("Euler orders and outliers of Table 4")
-    good = np.array([label != ODD_POSE for label in measured.labels])
-    orders = steps.rank_euler_orders(setup, setup.poses[good], (measured.values / TO_PRINTED)[good])
-    outliers = steps.search_outliers(setup, measured)
-    rounding = steps.calibrate_from_print(setup, measured)
+    for name in (PRESUMED, STATED):
+        drawn = steps.draw_measured_poses(setup, steps.list_noises()[name], seed)
+        runs[name] = steps.iterate(setup, drawn)
+    tables = None
+    if setup.is_printed:
+        progress("Euler orders and outliers of Table 4")
+        tables = read_tables(setup, runs)
     progress("levels of noise")
-    levels = steps.sweep_noise(setup, used, threshold, seed, trials)
+    levels = steps.sweep_noise(setup, seed, trials)
     progress("methods and numbers of poses")
-    printed = PRINTED.table("table_6", "after").values
-    residual = printed * steps.TO_SI
+    methods = steps.compare_methods(setup, seed, trials)
+    return Results(setup, runs, levels, methods, steps.compare_poses(setup, seed, trials), tables)
+
+
+def read_tables(setup: Setup, runs: Mapping[str, steps.Iterations]) -> PrintedTables:
+    """Examine the printed tables, and put the computed ones beside them."""
+    measured, printed = PRINTED.table("table_4", "PP"), PRINTED.table("table_6", "after").values
+    good = np.array([label != ODD_POSE for label in measured.labels])
+    places, sd = measured.values / TO_PRINTED, steps.find_rounding(measured)
+    residual = printed / TO_PRINTED
     parameters = PRINTED.table("table_5", "after").values * 1e-3
     rms = [compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:], parameters)]
-    twists = steps.to_twists(printed / TO_PRINTED, setup.actual)
-    return Results(
-        setup=setup,
-        runs=runs,
-        levels=levels,
-        methods=steps.compare_methods(setup, seed, trials),
-        poses=steps.compare_poses(setup, threshold, seed, trials),
-        orders=orders,
-        outliers=outliers,
-        rounding=rounding,
-        comparisons={c.name: c for c in _compare(setup, runs["exact"], runs["presumed"])},
-        sizes=np.array([*rms, steps.integrate_errors(residual[None])[0]]),
-        explained=steps.linearize_truth(setup).explain(twists),
+    odd = steps.make_setup(leg_lengths=False).actual[~good]
+    return PrintedTables(
+        comparisons={c.name: c for c in _compare(setup, runs["exact"], runs[PRESUMED], odd)},
+        orders=steps.rank_euler_orders(setup, setup.poses[good], places[good], sd[good]),
+        outliers=steps.search_outliers(setup, measured),
+        rounding=steps.calibrate_from_print(setup, measured),
+        sizes=np.array([*rms, steps.integrate_errors(residual)]),
+        explained=steps.linearize_truth(setup).explain(setup.to_twists(residual, setup.actual)),
         noise=steps.recover_noise(setup),
     )
 
 
-def find_rule() -> tuple[float, int]:
-    """Return max dQint [mm + rad] at which the paper's iteration ends, and its iterations."""
-    return PRINTED.number("threshold", "value"), int(PRINTED.find("iterations", "value"))
+def count_printed() -> int:
+    """Return the iterations after which the paper's rule ends them."""
+    return int(PRINTED.find("iterations", "value"))
 
 
 def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
     """Return Tables 2 to 6, printed beside computed."""
-    return tuple(results.comparisons.values())
+    return () if results.tables is None else tuple(results.tables.comparisons.values())
 
 
 def _compare(
-    setup: Setup, exact: steps.Iterations, noisy: steps.Iterations
+    setup: Setup, exact: steps.Iterations, noisy: steps.Iterations, odd: FloatArray
 ) -> tuple[published.Comparison, ...]:
-    used = find_rule()[1]
+    used = count_printed()
     robot, measured = setup.robot, PRINTED.table("table_4", "PP")
     errors = setup.truth.values - noisy.values
     places = find_places(robot)
     before, after = errors[0][places] / MM, errors[used][places] / (1e-3 * MM)
     first = (setup.actual - setup.poses) * TO_PRINTED
     identified = (exact.values[used + 1] - robot.values)[places] / MM
-    odd = measured.labels.index(ODD_POSE)
-    odd_row = steps.make_setup(leg_lengths=False).actual[odd : odd + 1] * TO_PRINTED
     printed_row = published.Printed({ODD_POSE: measured.rows[ODD_POSE]})
     noise, six = _describe_noise(PRESUMED), PRINTED.table("table_6", "before")
     compare, printed = TEXT.compare, PRINTED.table
@@ -122,7 +156,7 @@ def _compare(
         compare("table_2", printed("table_2"), make_symmetric(setup)),
         compare("table_3", printed("table_3"), identified, iterations=used + 1),
         _compare_table_4(setup),
-        compare("table_4_a2", printed_row, odd_row),
+        compare("table_4_a2", printed_row, odd * TO_PRINTED),
         compare("table_5_before", printed("table_5", "before"), before),
         compare("table_5_after", printed("table_5", "after"), after, noise=noise),
         compare("table_6_before", six, first, np.maximum(six.unit, measured.unit)),
@@ -160,44 +194,110 @@ def _compare_table_4(setup: Setup) -> published.Comparison:
     return TEXT.compare("table_4", published.Printed(texts), numbers, unit, row=ODD_POSE)
 
 
+def list_replaced(results: Results) -> tuple[str, ...]:
+    """Return sentences on the rule that another one replaces, and on what belongs to the robot of
+    the paper alone.
+    """
+    setup, printed = results.setup, PRINTED.number("threshold", "value")
+    data = {"epsilon": setup.epsilon, "printed": printed, "robot": setup.robot.name,
+            "count": len(setup.poses), "noise": PRINTED.number("noise", "value")}  # fmt: skip
+    is_replaced = {"epsilon": setup.epsilon != printed, "robot": not setup.is_printed}
+    texts = published.PaperFile(__file__, "text.yaml").find("replaced")
+    return tuple(fill_template(texts[key], **data) for key, yes in is_replaced.items() if yes)
+
+
 def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return the tables beyond those of the paper."""
-    threshold, used = find_rule()
-    runs, stated = results.runs.values(), results.levels[STATED]
-    trials, (low, high) = len(stated.needed), SIZES.find("ranges", "wide")
+    setup, tables, levels = results.setup, results.tables, results.levels
+    runs, trials, (_, high) = results.runs.values(), len(levels[STATED].needed), SIZES.find("wide")
+    rule = {
+        "threshold": setup.epsilon,
+        "limit": SIZES.find("iterations"),
+        "count": len(setup.poses),
+    }
     states = zip(*(run.integrated for run in runs), strict=True)
     figure_4 = [(str(k), *sizes) for k, sizes in enumerate(states)]
-    figure_4.append(("iterations needed", *(run.count_needed(threshold) for run in runs)))
-    formula = steps.write_rotation(PRINTED.find("rotation", "order"))
-    orders = [(o["formula"], i, o["position"], o["rotation"], o["formula"] == formula)
-              for i, o in enumerate(results.orders, 1)]  # fmt: skip
+    figure_4.append(("iterations needed", *(run.count_needed(setup.epsilon) for run in runs)))
     conditions = [(f"leg {i}", x) for i, x in enumerate(results.runs["exact"].conditions, 1)]
-    labels, first, last = results.outliers
-    noise: list[tuple[object, ...]] = [
-        ("published, Tables 5 and 6", None, None, *results.sizes, None, None)
-    ]
-    for level in results.levels.values():
+    noise = []
+    for level in levels.values():
         met = f"{np.isfinite(level.needed).sum()} of {len(level.needed)}"
-        inside = bool(level.contains(results.sizes).all())
-        noise.append(("computed, median", *level.limits, *level.median, met, inside))
+        p_value = () if tables is None else (level.test(tables.sizes),)
+        noise.append(("computed, median", *level.limits, *level.median, met, *p_value))
+    if tables is not None:
+        noise.insert(0, ("published, Tables 5 and 6", None, None, *tables.sizes, None, None))
+    of_published = () if tables is None else (("p-value of the published sizes", ".2g"),)
+    places = [
+        (f"position error rms, poses {name} [mm]", ".2g") for name in steps.list_places(setup)
+    ]
+    methods = [(METHODS[key], *draws.rms.values()) for key, draws in results.methods.items()]
+    before = results.methods["before"].rms["parameters"]
     return (
-        TEXT.table("figure_4", figure_4, threshold=threshold, iterations=used,
-                   presumed=_describe_noise(PRESUMED), stated=_describe_noise(STATED)),
-        TEXT.table("conditions", conditions),
-        TEXT.table("euler_orders", orders),
-        TEXT.table("outliers", [(*fit.values(), fit["label"] in labels) for fit in first],
-                   largest=max(fit["drop"] for fit in last)),
-        TEXT.table("rounding", results.rounding, rotation=steps.write_rotation(steps.ORDER)),
-        TEXT.table("noise", noise, iterations=used),
-        TEXT.table("methods", results.methods, limits=stated.limits, trials=trials,
-                   unmeasured=SIZES.find("unmeasured")),
-        TEXT.table("poses", results.poses, trials=trials, low=low, high=high,
-                   before=results.methods[0]["parameters"]),
+        TEXT.table("figure_4", figure_4, "", (), presumed=_describe_noise(PRESUMED),
+                   stated=_describe_noise(STATED), **rule),
+        TEXT.table("conditions", conditions, count=len(setup.poses)),
+        *(() if tables is None else _make_printed_tables(tables)),
+        *(() if tables is not None else _make_own_tables(results)),
+        TEXT.table("noise", noise, "", of_published, **rule),
+        TEXT.table("methods", methods, "", places, limits=levels[STATED].limits, trials=trials,
+                   unmeasured=SIZES.find("unmeasured"), count=len(setup.poses)),
+        TEXT.table("poses", results.poses, trials=trials, high=high, before=before,
+                   is_printed=setup.is_printed),
     )  # fmt: skip
 
 
-def _describe_noise(instrument: str) -> str:
-    length, angle = steps.list_noises()[instrument]
+def _make_printed_tables(tables: PrintedTables) -> tuple[published.Table, ...]:
+    """Return what the tables of the paper say by themselves."""
+    formula = steps.write_rotation(PRINTED.find("rotation", "order"))
+    orders = [
+        (o["formula"], i, o["position"], o["rotation"], o["rounding"], o["formula"] == formula)
+        for i, o in enumerate(tables.orders, 1)
+    ]
+    labels, first, last = tables.outliers
+    return (
+        TEXT.table("euler_orders", orders),
+        TEXT.table("outliers", [(*fit.values(), fit["label"] in labels) for fit in first],
+                   largest=max(fit["drop"] for fit in last)),
+        TEXT.table("rounding", tables.rounding, rotation=steps.write_rotation(steps.ORDER)),
+    )  # fmt: skip
+
+
+def _make_own_tables(results: Results) -> tuple[published.Table, ...]:
+    """Return the parameters and poses of another robot, as Tables 2 to 6 have those of the paper's:
+    errors that are left by the rule.
+    """
+    setup, runs = results.setup, results.runs
+    factor, symbols = select_free_parameters(setup.robot).display()
+    ends = {name: run.find_end(setup.epsilon) for name, run in runs.items()}
+    columns = [setup.robot.values, setup.truth.values - setup.robot.values]
+    columns += [
+        setup.truth.values - run.values[ends[name]]
+        for name, run in runs.items()
+        if name != "frozen"
+    ]
+    table = setup.robot.parameters
+    parameters = [
+        (name, unit, *(column[i] / factor[i] for column in columns))
+        for i, (name, unit, is_free) in enumerate(
+            zip(table.names, symbols, table.free, strict=True)
+        )
+        if is_free
+    ]
+    blocks = {"PT": setup.poses, "PP": setup.actual, "before": setup.actual - setup.poses,
+              "after": runs[STATED].pose_errors[ends[STATED]]}  # fmt: skip
+    poses = [
+        (f"A{i + 1} {name}", *(block[i] * TO_PRINTED))
+        for i in range(len(setup.poses)) for name, block in blocks.items()
+    ]  # fmt: skip
+    noises = {"presumed": _describe_noise(PRESUMED), "stated": _describe_noise(STATED)}
+    return (
+        TEXT.table("parameters", parameters, threshold=setup.epsilon, **noises),
+        TEXT.table("pose_errors", poses, **noises),
+    )
+
+
+def _describe_noise(name: str) -> str:
+    length, angle = steps.list_noises()[name]
     return f"noise within +-{length:g} mm, +-{angle:g} rad"
 
 
@@ -208,15 +308,15 @@ def make_figures(results: Results) -> tuple[published.Figure, ...]:
 
 def _draw_figure_4(results: Results) -> published.Figure:
     """Return max dQint by iteration."""
-    threshold, used = find_rule()
-    labels = ("without noise", "without noise, one matrix throughout", _describe_noise(PRESUMED),
-              _describe_noise(STATED))  # fmt: skip
+    threshold, count = results.setup.epsilon, len(results.setup.poses)
+    labels = (*RUNS, _describe_noise(PRESUMED), _describe_noise(STATED))
     lines = [
         published.Series.of(label, range(len(run.integrated)), run.integrated)
         for label, run in zip(labels, results.runs.values(), strict=True)
     ]
-    levels = {f"published rule {threshold:g}": threshold}
-    return TEXT.figure("figure_4", lines, levels, threshold=threshold, iterations=used)
+    levels = {f"rule {threshold:g}": threshold}
+    return TEXT.figure("figure_4", lines, levels, threshold=threshold, count=count,
+                       iterations=count_printed(), tables=results.tables)  # fmt: skip
 
 
 def _draw_noise(results: Results) -> published.Figure:
@@ -226,123 +326,173 @@ def _draw_noise(results: Results) -> published.Figure:
         for level in sorted(results.levels.values(), key=lambda level: level.limits)
         if np.isclose(level.limits[1], 1e-3 * level.limits[0], atol=0.0)
     ]
-    x, sizes = [level.limits[0] for level in levels], results.sizes
+    x = [level.limits[0] for level in levels]
     places = {"parameter error rms [mm]": (2, 5), "pose residual rms [mm]": (0, 6)}
     lines = [
         published.Series.of(label, x, [level.median[i] for level in levels])
         for label, (i, _) in places.items()
     ]
-    marks = {f"published, Table {number}": float(sizes[i]) for i, number in places.values()}
-    marks["before calibration"] = results.methods[0]["parameters"]
-    noise, trials = PRINTED.number("noise", "value"), len(levels[0].needed)
-    return TEXT.figure("noise", lines, marks, trials=trials, iterations=find_rule()[1], noise=noise)
+    marks = {}
+    if results.tables is not None:
+        sizes = results.tables.sizes
+        marks = {f"published, Table {number}": float(sizes[i]) for i, number in places.values()}
+    marks["before calibration"] = results.methods["before"].rms["parameters"]
+    stated, trials = results.levels[STATED].limits[0], len(levels[0].needed)
+    return TEXT.figure("noise", lines, marks, trials=trials, noise=stated, tables=results.tables,
+                       presumed=results.levels[PRESUMED].limits[0])  # fmt: skip
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
-    """Return a verdict for each claim."""
-    used = find_rule()[1]
-    second, third = (results.comparisons[name] for name in ("table_2", "table_3"))
-    return (
-        TEXT.judge(
-            "symmetric", second.within.all(), table=second, differing=_count(~second.within)
-        ),
-        TEXT.judge("converges", third.within.all(), table=third, iterations=used + 1),
-        *_judge_table_4(results),
-        *_judge_noise(results),
+    """Return a verdict for each claim; those on the printed tables belong to their machine, and
+    `OF_RULE` to the paper's rule.
+    """
+    tables = results.tables
+    verdicts = (
+        *(() if tables is None else _judge_tables(tables)),
+        *_judge_steps(results),
+        *(() if tables is None else _judge_noise(results, tables)),
         *_judge_methods(results),
     )
+    is_rule = results.setup.epsilon == PRINTED.number("threshold", "value")
+    return tuple(verdict for verdict in verdicts if is_rule or verdict.name not in OF_RULE)
 
 
 def _count(values: BoolArray) -> int:
     return int(values.sum())
 
 
-def _judge_table_4(results: Results) -> tuple[published.Verdict, ...]:
-    judge, (best, second, *_) = TEXT.judge, results.orders
+def _decide(value: float, limits: tuple[float, float]) -> bool | None:
+    """Return whether a value is up to the first limit; False beyond the second."""
+    return decide(value <= limits[0], value > limits[1])
+
+
+def _count_units(comparison: published.Comparison, rows: BoolArray | slice = slice(None)) -> float:
+    """Return the largest difference in units of the last digit."""
+    difference = abs(comparison.difference) / comparison.step
+    return float(difference[rows].max()) / (1.0 + published.ROUNDING)
+
+
+def _judge_tables(tables: PrintedTables) -> tuple[published.Verdict, ...]:
+    """Judge Tables 2 and 4."""
+    judge, (best, second, *_) = TEXT.judge, tables.orders
     printed = steps.write_rotation(PRINTED.find("rotation", "order"))
-    stated = next(order for order in results.orders if order["formula"] == printed)
-    fourth = results.comparisons["table_4"]
+    stated = next(order for order in tables.orders if order["formula"] == printed)
+    fits = [o["formula"] for o in tables.orders if o["rounding"] <= ROUNDING]
+    symmetric, fourth, odd = (tables.comparisons[n] for n in ("table_2", "table_4", "table_4_a2"))
     labels = fourth.published.labels
     is_actual = np.array([not label.endswith("PT") for label in labels])
     is_odd = np.array([label.startswith(f"{ODD_POSE} ") for label in labels])
     good, bad = fourth.within[is_actual & ~is_odd], fourth.within[is_actual & is_odd]
-    without = next(fit for fit in results.outliers.first if fit["label"] == ODD_POSE)
-    odd, noise = results.comparisons["table_4_a2"].within, PRINTED.number("noise", "value")
-    rms = noise / np.sqrt(3.0)
+    without = next(fit for fit in tables.outliers.first if fit["label"] == ODD_POSE)
+    units, named = _count_units(fourth, is_actual & is_odd), tables.outliers.labels
+    rms = PRINTED.number("noise", "value") / np.sqrt(3.0)
+    rounded = compute_rms(steps.find_rounding(PRINTED.table("table_4", "PP"))[:, :3] / MM)
+    factor = best["position"] / np.hypot(rms, rounded)
     short = ("before", "as printed", "row corrected", "without row", "in full", "weighted", "prior")
-    errors = {name: row["error"] for name, row in zip(short, results.rounding, strict=True)}
+    errors = {name: row["error"] for name, row in zip(short, tables.rounding, strict=True)}
+    tried = [errors[name] for name in short[1:4]]
     return (
-        judge("rotation", best["formula"] == printed, printed=printed, count=len(results.orders),
-              best=best, second=second, stated=stated),
-        judge("table_4", good.all(), row=ODD_POSE, agreeing=_count(good), count=good.size),
-        judge("odd_row", bad.all(), row=ODD_POSE, differing=_count(~bad), count=bad.size,
-              without=without, agreeing_odd=_count(odd), size=odd.size,
-              named=results.outliers.labels or ("no pose",)),
-        judge("table_4_noise", best["position"] > rms / 3.0, best=best, stated=rms),
-        judge("rounding", max(errors[n] for n in short[1:4]) < errors["before"], row=ODD_POSE,
-              errors=errors),
+        judge("symmetric", _decide(_count_units(symmetric), UNITS), table=symmetric,
+              differing=_count(~symmetric.within)),
+        judge("rotation", decide(fits == [printed], bool(fits) and printed not in fits),
+              printed=printed, count=len(tables.orders), best=best, second=second, stated=stated),
+        judge("table_4", _decide(_count_units(fourth, is_actual & ~is_odd), UNITS), row=ODD_POSE,
+              agreeing=_count(good), count=good.size),
+        judge("odd_row", decide(units <= UNITS[0], units > UNITS[1] and ODD_POSE in named),
+              row=ODD_POSE, differing=_count(~bad), count=bad.size, without=without,
+              agreeing_odd=_count(odd.within), size=odd.within.size, named=named or ("no pose",)),
+        judge("table_4_noise", _decide(max(factor, 1.0 / factor), OF_NOISE), best=best, stated=rms,
+              noise=PRINTED.number("noise", "value")),
+        judge("rounding", decide(max(tried) < errors["before"], min(tried) >= errors["before"]),
+              row=ODD_POSE, errors=errors),
     )  # fmt: skip
 
 
-def _judge_noise(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge the stopping rule, and the origin of Tables 5 and 6."""
-    threshold, used = find_rule()
+def _judge_steps(results: Results) -> tuple[published.Verdict, ...]:
+    """Judge convergence and the stopping rule."""
+    setup, used, judge = results.setup, count_printed(), TEXT.judge
+    printed, elsewhere = PRINTED.number("threshold", "value"), not setup.is_printed
     exact, frozen = results.runs["exact"], results.runs["frozen"]
-    levels, sizes, limit = results.levels, results.sizes, PRINTED.number("noise", "value")
-    stated, judge = levels[STATED], TEXT.judge
-    met = np.isfinite(stated.needed)
-    holding = [
-        "+-{:g} mm with +-{:g} rad".format(*level.limits)
-        for level in levels.values() if level.contains(sizes).all()
-    ]  # fmt: skip
-    explained, before = 100.0 * results.explained, results.comparisons["table_6_before"]
+    counts = [run.count_needed(printed) for run in (exact, frozen)]
+    units = list_raw_units(setup.robot.parameters.dimensions)
+    largest = np.abs((setup.truth.values - exact.values) / units).max(axis=1)
+    five = (abs(PRINTED.table("table_5", name).values).max() for name in ("before", "after"))
+    share = 1e-3 / next(five) * next(five)
+    stated, noise = results.levels[STATED], PRINTED.number("noise", "value")
+    alone = results.methods["alone"]
+    return (
+        judge("exact", decide(largest[used] <= share * largest[0], largest[used] >= largest[0]),
+              iterations=used, largest=largest[used], more=largest[used + 1], share=100.0 * share),
+        judge("converges", [_decide(r, (share, 1.0)) for r in alone.largest], elsewhere=elsewhere,
+              parameters=_count(setup.robot.parameters.free), iterations=used, noise=noise,
+              ratio=np.median(alone.largest), share=100.0 * share),
+        judge("threshold", decide(counts == [used, used], used not in counts), elsewhere=elsewhere,
+              threshold=printed, iterations=used, exact=exact.integrated, frozen=frozen.integrated),
+        judge("threshold_noise", stated.needed <= used, elsewhere=elsewhere, noise=noise,
+              median=stated.median[3], angle=stated.limits[1]),
+    )  # fmt: skip
+
+
+def _judge_noise(results: Results, tables: PrintedTables) -> tuple[published.Verdict, ...]:
+    """Judge the origin of Tables 5 and 6."""
+    levels, sizes, judge = results.levels, tables.sizes, TEXT.judge
+    stated, p_values = levels[STATED], {k: level.test(sizes) for k, level in levels.items()}
+    holding = [k for k, p in p_values.items() if p >= P_VALUES[0]]
+    agrees = decide(holding == [STATED], p_values[STATED] < P_VALUES[1])
+    explained, before = 100.0 * tables.explained, tables.comparisons["table_6_before"]
     is_good = np.array([label != ODD_POSE for label in before.published.labels])
     as_rad, as_mrad = (
         _count(before.agrees_with(factor * before.computed)[is_good, 3:]) for factor in (1.0, 1e3)
     )
-    noise, presumed = results.noise * TO_PRINTED, levels[PRESUMED].limits[0]
+    noise, presumed = tables.noise * TO_PRINTED, levels[PRESUMED].limits[0]
     mean, scatter = noise.mean(axis=0), noise.std(axis=0, ddof=1)
     offset = (np.abs(mean) * np.sqrt(len(noise)) / scatter).max()
     lengths, angles = (", ".join(f"{x:.1e}" for x in part) for part in (mean[:3], mean[3:]))
+    names = ["+-{:g} mm with +-{:g} rad".format(*levels[k].limits) for k in holding]
     return (
-        judge("threshold", all(r.count_needed(threshold) == used for r in (exact, frozen)),
-              threshold=threshold, iterations=used, exact=exact.integrated,
-              frozen=frozen.integrated),
-        judge("threshold_noise", met.all(), noise=limit, met=_count(met), count=len(met),
-              median=stated.median[3], angle=stated.limits[1]),
-        judge("noise_size", stated.contains(sizes).all(), printed=sizes, noise=limit,
-              holding=holding, stated=stated.median),
-        judge("residuals", explained.max() < 25.0, least=explained.min(), most=explained.max(),
-              random=100.0 * np.sqrt(0.7)),
-        judge("milliradians", published.decide(as_mrad > as_rad, as_rad > as_mrad), as_rad=as_rad,
+        judge("noise_size", agrees, printed=sizes, noise=PRINTED.number("noise", "value"),
+              holding=names, stated=stated.median),
+        judge("residuals", _decide(explained.max(), EXPLAINED), least=explained.min(),
+              most=explained.max(), random=100.0 * np.sqrt(0.7)),
+        judge("milliradians", decide(as_mrad > as_rad, as_rad > as_mrad), as_rad=as_rad,
               as_mrad=as_mrad, count=3 * _count(is_good), row=ODD_POSE),
-        judge("mean_noise", offset < 4.0, offset=offset, lengths=lengths, angles=angles,
-              scatter_mm=scatter[:3].max(), scatter_rad=scatter[3:].max(), limit=presumed,
-              limit_sd=presumed / np.sqrt(3.0)),
+        judge("mean_noise", _decide(offset, STANDARD_ERRORS), offset=offset, lengths=lengths,
+              angles=angles, scatter_mm=scatter[:3].max(), scatter_rad=scatter[3:].max(),
+              limit=presumed, limit_sd=presumed / np.sqrt(3.0)),
     )  # fmt: skip
 
 
 def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:
-    names = ("before", "alone", "together", "prior")
-    methods = dict(zip(names, results.methods, strict=True))
-    before, alone, together, _ = results.methods
-    seven = results.poses[0]
-    ten = next(row for row in results.poses if row["poses"] == steps.PAPERS_TEN)
-    smaller, ratio = {}, alone["parameters"] / together["parameters"]
-    for name in ("stated", "presumed"):
-        errors = np.abs(results.setup.truth.values - results.runs[name].values)
-        smaller[f"smaller_{name}"] = _count(errors[find_rule()[1]] < errors[0])
-    improved = {place: alone[place] < before[place] for place in before if place != "method"}
-    parameters = improved.pop("parameters")
+    """Judge what calibration improves, for each draw of noise."""
+    setup, elsewhere = results.setup, not results.setup.is_printed
+    alone, together, before = (results.methods[key] for key in ("alone", "together", "before"))
+    rms = {key: draws.rms for key, draws in results.methods.items()}
+    shares = zip(alone.smaller, alone.halved, strict=True)
+    at_measured = compute_rms(results.runs["exact"].pose_errors[0][:, :3] / MM)
+    residuals = results.levels[STATED].sizes[:, 0]
+    improved = np.array([alone.places[name] < before.places[name] for name in before.places])
+    places = [
+        {"place": name, **{key: draws.rms[name] for key, draws in results.methods.items()}}
+        for name in before.places
+    ]
+    ratio = rms["alone"]["parameters"] / rms["together"]["parameters"]
+    least = results.poses[0]
+    own = next(row for row in results.poses if row["poses"] == steps.MEASURED)
+    left = least["left"]
+    enough = decide(
+        left is not None and left < EXACT, left is None or left >= rms["before"]["parameters"]
+    )
     return (
-        TEXT.judge("parameters_improve", parameters, presumed=results.levels[PRESUMED].limits,
-                   ratio=alone["parameters"] / before["parameters"], **smaller, **methods),
-        TEXT.judge("positions_improve", all(improved.values()), **methods),
-        TEXT.judge("leg_by_leg", ratio < 1.1, ratio=ratio, **methods),
-        TEXT.judge("seven_poses", seven["left"] < 1e-6, seven=seven, ten=ten),
+        TEXT.judge("parameters_improve", [decide(h > 0.5, s <= 0.5) for s, h in shares],
+                   elsewhere=elsewhere, noise=results.levels[STATED].limits[0],
+                   smaller=100.0 * np.median(alone.smaller), halved=100.0 * np.median(alone.halved),
+                   ratio=rms["alone"]["parameters"] / rms["before"]["parameters"], rms=rms),
+        TEXT.judge("poses_improve", [_decide(r / at_measured, (0.5, 1.0)) for r in residuals],
+                   elsewhere=elsewhere, before=at_measured, after=np.median(residuals)),
+        TEXT.judge("positions_improve", [decide(x.all(), not x.any()) for x in improved.T],
+                   elsewhere=elsewhere, places=places),
+        TEXT.judge("leg_by_leg", alone.parameters <= AS_GOOD * together.parameters, ratio=ratio,
+                   rms=rms),
+        TEXT.judge("fewest_poses", enough, elsewhere=elsewhere, least=least, own=own,
+                   parameters=_count(setup.robot.parameters.free)),
     )  # fmt: skip
-
-
-def list_replaced(results: Results) -> tuple[str, ...]:
-    """Return sentences on further sizes that another robot replaces."""
-    return ()

@@ -9,7 +9,8 @@ Derivation: docs/theory/hexapod.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
@@ -19,15 +20,19 @@ import numpy as np
 
 import loopcal as lc
 from loopcal import geometry
+from loopcal.errors import DataError, EstimationError
+from loopcal.findings import report_finding
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward, inverse
-from loopcal.numerics.statistics import compute_chi_square_quantile
-from loopcal.papers.paper import PAPERS
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.statistics import compute_chi_square_quantile, compute_f_tail
+from loopcal.papers.paper import PAPERS, StudyCase
 from loopcal.papers.published import PaperFile, Printed, Row
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
 from loopcal.studies.simulation.published_steps import (
@@ -35,9 +40,12 @@ from loopcal.studies.simulation.published_steps import (
     LegForm,
     identify_per_leg,
     integrate_errors,
+    list_raw_units,
 )
-from loopcal.studies.specification.levels import PosesLevel
+from loopcal.studies.specification import levels
+from loopcal.studies.specification.study import Study
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import SI_SYMBOLS, Dimension
 
 TO_SI, TO_PRINTED = np.array([MM] * 3 + [1.0] * 3), np.array([1.0 / MM] * 3 + [1.0] * 3)
 """From the units of Tables 4 and 6 to [m, rad], and from [m, rad] to them."""
@@ -52,58 +60,188 @@ ORDER = "xyz"
 ANGLES = geometry.parse_orientation(f"euler-{ORDER}")
 GREEK = ("alpha", "beta", "gamma")
 
-STATED, PRESUMED = "0.001 mm and 1e-06 rad", "1e-06 mm and 1e-09 rad"
-"""Instruments of study.yaml: the stated noise, and that with which Tables 5 and 6 agree, as the
+STATED, PRESUMED = "stated", "presumed"
+"""Noises of sizes.yaml: that of the paper, and that with which its Tables 5 and 6 agree, as the
 sweep shows. The paper states none for angles: the same number in the unit that its Table 6 prints,
 0.001 mrad.
 """
-PER_LEG = ("per leg, 1 step", "per leg, 2 steps", "per leg, 3 steps")
-TOGETHER, PRIOR = "least squares", "MAP"
+PER_LEG, TOGETHER, PRIOR = "per leg", "least squares", "MAP"
 """Methods of study.yaml."""
-PAPERS_TEN = "the paper's ten"
+MEASURED = "the measured ones"
+NEAR, WIDE, WORKSPACE = "as in the paper", "wide", "in the workspace"
+"""Where poses lie."""
 DRAWN_POSES = 3  # purpose of a random stream
+MOST_DRAWN = 4
+"""Poses that are drawn for each that the machine with errors must reach."""
+MOST_FIRST = 3
+"""Numbers of poses that are tried, from the fewest."""
 
 PRINTED, SIZES = PaperFile(__file__, "published.yaml"), PaperFile(__file__, "sizes.yaml")
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Step 1."""
+    """Step 1.
 
+    study : the simulation with these poses and errors, and the noises of `list_noises`.
+    coordinates : (n, c) of the poses, by which the robot is controlled [m, rad]. epsilon : max
+    dQint [mm + rad] at which the steps end. is_printed : whether robot, errors and poses are those
+    of the paper's tables.
+    """
+
+    study: Study
     robot: Mechanism  # the machine as designed
     truth: Mechanism  # with its errors
-    poses: FloatArray  # (n, 6) nominal [m, rad]
+    coordinates: FloatArray
+    epsilon: float
+    is_printed: bool
 
     @cached_property
     def commanded(self) -> Solution:
         """Nominal poses with the leg readings of the nominal machine."""
-        R = ANGLES.to_matrix(self.poses[:, 3:])
-        return inverse(self.robot, geometry.make_pose(R, self.poses[:, :3]))
+        return inverse(self.robot, self.coordinates)
+
+    @cached_property
+    def poses(self) -> FloatArray:
+        """(n, 6) nominal poses of the tool [m, rad]."""
+        return to_coordinates(self.commanded.T @ self.robot.tool)
 
     @cached_property
     def actual(self) -> FloatArray:
         """(n, 6) true poses at the readings of the nominal machine: step 2."""
         return self.compute_reached(self.truth)
 
+    @cached_property
+    def is_length(self) -> BoolArray:
+        """(p,) which parameters are free lengths: rms errors are over these."""
+        table = self.robot.parameters
+        return table.free & np.array([d is Dimension.LENGTH for d in table.dimensions])
+
+    @property
+    def fewest(self) -> int:
+        """Poses with as many equations, six each, as there are parameters."""
+        if self.is_printed:
+            return int(PRINTED.find("poses", "least"))
+        return count_fewest(self.robot)
+
     def compute_reached(self, machine: Mechanism) -> FloatArray:
         """Return the poses (n, 6) [m, rad] of a machine at the readings of the nominal one."""
-        return to_coordinates(forward(machine, self.commanded.q, self.commanded).T)
+        solution = forward(machine, self.commanded.q, self.commanded)
+        return to_coordinates(solution.T @ self.robot.tool)
+
+    def to_twists(self, errors: FloatArray, poses: FloatArray) -> FloatArray:
+        """Return twists (n, 6) of the platform, rotation first, of coordinate errors (n, 6) [m,
+        rad] near poses (n, 6) of the tool.
+        """
+        omega = (ANGLES.rates(poses[:, 3:]) @ errors[:, 3:, None])[..., 0]
+        arm = ANGLES.to_matrix(poses[:, 3:]) @ geometry.invert_pose(self.robot.tool)[:3, 3]
+        return np.concatenate([omega, errors[:, :3] + np.cross(omega, arm)], axis=1)
+
+    def compute_error(self, values: FloatArray) -> FloatArray:
+        """Return the rms errors (..) [mm] of the lengths among parameters (.., p) [SI]."""
+        change = (values - self.truth.values)[..., self.is_length] / MM
+        return np.asarray(np.sqrt(np.mean(change**2, axis=-1)))
+
+    def calibrate(
+        self, seed: int, trials: int, noise: str, method: str, poses: FloatArray | None = None
+    ) -> CalibratedCell:
+        """Return the calibrations with so many draws of noise; poses : (n, c), in place of its."""
+        study = set_size(self.study, seed, trials)
+        if poses is not None:
+            study = replace(study, poses={MEASURED: make_poses_level(poses)})
+        (cell,) = calibrate_cells(study, find_cells(study, instrument=noise, method=method))
+        return cell
 
 
-def make_setup(leg_lengths: bool = True) -> Setup:
-    """Return the hexapod of Tables 2 and 3 at the nominal poses of Table 4.
+def make_setup(case: StudyCase | None = None, seed: int = 0, leg_lengths: bool = True) -> Setup:
+    """Return the hexapod of Tables 2 and 3 at the nominal poses of Table 4, or another robot with
+    drawn errors at drawn poses.
 
     The printed radians are whole degrees to their last digit. Without `leg_lengths` the errors of
     the leg lengths are zero.
+
+    Raises DataError: another robot states no tolerances, or reaches too few poses.
     """
-    robot = lc.load_robot("hexapod-42")
-    errors = PRINTED.table("table_3").values * MM
-    errors[:, PARAMETERS.index("length")] *= leg_lengths
-    poses = PRINTED.table("table_4", "PT").values / TO_PRINTED
-    poses[:, 3:] = np.deg2rad(np.round(np.rad2deg(poses[:, 3:])))
-    truth = robot.parameters.nominal.copy()
-    truth[find_places(robot)] += errors
-    return Setup(robot, robot.with_values(truth), poses)
+    case = case or StudyCase(PAPERS["hexapod-42"])
+    robot, study = case.robot, case.load_study()
+    epsilon = case.epsilon or PRINTED.number("threshold", "value")
+    if robot is None:
+        robot = lc.load_robot("hexapod-42")
+        errors = PRINTED.table("table_3").values * MM
+        errors[:, PARAMETERS.index("length")] *= leg_lengths
+        coordinates = PRINTED.table("table_4", "PT").values / TO_PRINTED
+        coordinates[:, 3:] = np.deg2rad(np.round(np.rad2deg(coordinates[:, 3:])))
+        truth = robot.parameters.nominal.copy()
+        truth[find_places(robot)] += errors
+    else:
+        robot, truth = robot.nominal, sample_truth(robot, 1, seed)[0]
+        if np.array_equal(truth, robot.values):
+            raise DataError(report_finding("data.no-errors-drawn", robot=robot.name))
+        (level,) = study.poses.values()
+        count = max(level.count, count_fewest(robot) + 3)  # three to spare, as in the paper
+        coordinates = draw_reached(robot, robot.with_values(truth), count, seed)
+    table = robot.parameters
+    deviations = {
+        name: f"{error!r} {SI_SYMBOLS[dimension]}"
+        for name, dimension, error in zip(
+            table.names, table.dimensions, (truth - table.nominal).tolist(), strict=True
+        )
+        if error
+    }
+    rule = levels.MethodLevel(levels.PER_LEG, epsilon=epsilon, steps=SIZES.find("iterations"))
+    study = replace(
+        study,
+        instruments={name: make_instrument(*limits) for name, limits in list_noises().items()},
+        poses={MEASURED: make_poses_level(coordinates)},
+        errors={"one machine": levels.ErrorsLevel(deviations=deviations)},
+        methods={**study.methods, PER_LEG: rule},
+    )
+    truth = robot.with_values(truth)
+    return Setup(study, robot, truth, coordinates, epsilon, case.robot is None)
+
+
+def make_poses_level(coordinates: FloatArray) -> levels.PosesLevel:
+    """Return the level of a study with these poses (n, c) [m, rad]."""
+    return levels.PosesLevel(len(coordinates), coordinates=tuple(map(tuple, coordinates.tolist())))
+
+
+def make_instrument(length: float, angle: float) -> levels.InstrumentLevel:
+    """Return an instrument with uniform noise within limits [mm] of lengths and [rad] of angles."""
+    position, orientation = (float(x / np.sqrt(3.0)) for x in (length * MM, angle))
+    kind = (("pose",), (), f"euler-{ORDER}")
+    return levels.InstrumentLevel(*kind, position, orientation, distribution="uniform")
+
+
+def list_noises() -> dict[str, tuple[float, float]]:
+    """Return the limits [mm, rad] of the noises of sizes.yaml, which are multiples of the printed
+    one.
+    """
+    printed = PRINTED.number("noise", "value")
+    return {
+        name: (float(f"{share * printed:.6g}"), float(f"{share * printed * angle:.6g}"))
+        for name, (share, angle) in SIZES.find("noises").items()
+    }
+
+
+def count_fewest(robot: Mechanism) -> int:
+    """Return the number of poses with as many equations as the robot has free parameters."""
+    return -(-int(robot.parameters.free.sum()) // 6)
+
+
+def draw_reached(
+    robot: Mechanism, truth: Mechanism, n: int, seed: int | np.random.Generator
+) -> FloatArray:
+    """Return poses (n, c) [m, rad] drawn from the workspace of a robot that the machine with errors
+    reaches, too. DataError: it reaches too few.
+    """
+    drawn = sample_workspace(robot, MOST_DRAWN * n, seed)
+    reached = forward(truth, drawn.solution.q, drawn.solution).converged
+    if reached.sum() < n:
+        raise DataError(
+            f"{robot.name} with errors by its tolerances reaches {int(reached.sum())} of "
+            f"{len(reached)} poses of its workspace; state a smaller workspace or tolerances"
+        )
+    return drawn.coordinates[reached][:n]
 
 
 def find_places(robot: Mechanism) -> IntArray:
@@ -123,12 +261,6 @@ def subtract_poses(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.concatenate([change[:, :3], geometry.wrap_angle(change[:, 3:])], axis=1)
 
 
-def to_twists(errors: FloatArray, poses: FloatArray) -> FloatArray:
-    """Return twists (n, 6), rotation first, of coordinate errors (n, 6) [m, rad] near poses."""
-    omega = ANGLES.rates(poses[:, 3:]) @ errors[:, 3:, None]
-    return np.concatenate([omega[..., 0], errors[:, :3]], axis=1)
-
-
 def to_measurements(
     setup: Setup, measured: FloatArray, sigma: FloatArray | float = 1.0
 ) -> Measurements:
@@ -139,16 +271,6 @@ def to_measurements(
     rows = Observations.from_sigma(kind, np.arange(len(measured)), np.roll(measured, 3, axis=1), sd)
     labels = tuple(f"A{i + 1}" for i in range(len(measured)))
     return Measurements(setup.robot.name, setup.commanded.q, (rows,), labels=labels)
-
-
-def list_noises() -> dict[str, tuple[float, float]]:
-    """Return the limits [mm, rad] of the uniform noise of each instrument of study.yaml."""
-    levels, root = PAPERS["hexapod-42"].load_study().instruments, np.sqrt(3.0)
-    sigmas = {name: (of.sigma_position / MM, of.sigma_angle) for name, of in levels.items()}
-    return {  # sigmas have nine digits
-        name: (float(f"{root * length:.6g}"), float(f"{root * angle:.6g}"))
-        for name, (length, angle) in sigmas.items()
-    }
 
 
 def compute_rms(values: FloatArray) -> float:
@@ -170,6 +292,10 @@ class Iterations:
         met = np.flatnonzero(self.integrated[1:] <= threshold)
         return int(met[0]) + 1 if len(met) else None
 
+    def find_end(self, threshold: float) -> int:
+        """Return the state at which the rule ends the steps: the last one where it never does."""
+        return self.count_needed(threshold) or len(self.integrated) - 1
+
 
 def draw_measured_poses(
     setup: Setup, limits: tuple[float, float], seed: int = 0, trial: int = 0
@@ -183,20 +309,22 @@ def draw_measured_poses(
 
 
 def iterate(
-    setup: Setup, measured: FloatArray, limit: int = 4, is_renewed: bool = True
+    setup: Setup, measured: FloatArray, limit: int | None = None, is_renewed: bool = True
 ) -> Iterations:
-    """Run steps 4 to 10 on measured poses (n, 6) [m, rad], `limit` times, beyond the paper's rule.
+    """Run steps 4 to 10 on measured poses (n, 6) [m, rad], `limit` times (default: as sizes.yaml
+    states), beyond the rule.
 
     is_renewed : whether the matrix is computed anew at every corrected machine. The paper does not
     say. False keeps the matrix of the nominal machine throughout.
     """
     robot, data = setup.robot, to_measurements(setup, measured)
-    nominal = LegForm.at(robot, setup.commanded)
+    limit = int(limit or SIZES.find("iterations"))
     values = list(identify_per_leg(robot, data, limit if is_renewed else 1).estimate_history)
+    nominal = LegForm.at(robot, setup.commanded)
     errors = [subtract_poses(measured, setup.poses)]
     for k in range(1, limit + 1):
         if k == len(values):
-            values.append(values[-1] + nominal.fit(to_twists(errors[-1], measured)))
+            values.append(values[-1] + nominal.fit(setup.to_twists(errors[-1], measured)))
         reached = setup.compute_reached(robot.with_values(values[k]))
         errors.append(subtract_poses(measured, reached))
     stacked = np.stack(errors)
@@ -208,7 +336,8 @@ class Level:
     """Results with one level of noise."""
 
     limits: tuple[float, float]  # [mm, rad]
-    # (t, 4): rms of pose residuals [mm], [rad] and of parameter errors [mm], max dQint [mm + rad]
+    # (t, 4): rms of pose residuals [mm], [rad] and of parameter errors [mm], max dQint [mm + rad];
+    # infinite for lost draws
     sizes: FloatArray
     needed: FloatArray  # (t,) iterations, infinite for never
 
@@ -217,101 +346,136 @@ class Level:
         """(4,) medians of the sizes."""
         return np.median(self.sizes, axis=0)
 
-    def contains(self, sizes: FloatArray) -> BoolArray:
-        """Return which sizes (4,) lie between the smallest and the largest drawn ones."""
-        return (sizes >= self.sizes.min(axis=0)) & (sizes <= self.sizes.max(axis=0))
+    def test(self, sizes: FloatArray) -> float:
+        """Return the p-value of sizes (4,) as one more draw: Student's t of their logarithms, the
+        smallest of the four probabilities times four.
+        """
+        logs = np.log(self.sizes[np.isfinite(self.sizes).all(axis=1)])
+        if len(logs) < 2:
+            return np.nan
+        spread = logs.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(logs))
+        t = (np.log(sizes) - logs.mean(axis=0)) / spread
+        return float(min(4.0 * compute_f_tail(1, len(logs) - 1, t**2).min(), 1.0))
 
 
-def calibrate_methods(
-    seed: int, trials: int, instrument: str, methods: Sequence[str], **poses: PosesLevel
-) -> Iterator[CalibratedCell]:
-    """Yield cells of study.yaml with so many draws, method by method; poses : in place of its."""
-    study = set_size(PAPERS["hexapod-42"].load_study(), seed, trials)
-    study = replace(study, poses=poses or study.poses)
-    for method in methods:
-        yield from calibrate_cells(study, find_cells(study, instrument=instrument, method=method))
+def sweep_noise(setup: Setup, seed: int, trials: int) -> dict[str, Level]:
+    """Repeat the ten steps at every level of noise, until the rule ends them."""
+    results, commanded = {}, setup.commanded
+    for name, limits in list_noises().items():
+        cell = setup.calibrate(seed, trials, name, PER_LEG)
+        is_known = np.isfinite(cell.values).all(axis=1, keepdims=True)
+        values = np.where(is_known, cell.values, setup.robot.values)
+        T = forward_trials(setup.robot, values, commanded.q[None], commanded.state).T
+        measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
+        residual = np.stack(
+            [
+                subtract_poses(poses, to_coordinates(reached @ setup.robot.tool))
+                for poses, reached in zip(measured, T, strict=True)
+            ]
+        )
+        by_dimension = residual[..., :3] / MM, residual[..., 3:]
+        rms = [np.sqrt(np.mean(x**2, axis=(1, 2))) for x in by_dimension]
+        sizes = np.column_stack([*rms, setup.compute_error(values), integrate_errors(residual)])
+        needed = np.where(cell.is_converged, cell.iterations, np.inf)
+        results[name] = Level(limits, np.where(is_known, sizes, np.inf), needed)
+    return results
 
 
-def sweep_noise(
-    setup: Setup, iterations: int, threshold: float, seed: int, trials: int
-) -> dict[str, Level]:
-    """Repeat the ten steps at every level of noise; sizes are those after `iterations`."""
-    levels, commanded = {}, setup.commanded
-    for instrument, limits in list_noises().items():
-        integrated, sizes = [], np.zeros((trials, 4))
-        for i, cell in enumerate(calibrate_methods(seed, trials, instrument, PER_LEG)):
-            T = forward_trials(setup.robot, cell.values, commanded.q[None], commanded.state).T
-            measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
-            residual = np.stack(
-                [
-                    subtract_poses(poses, to_coordinates(reached))
-                    for poses, reached in zip(measured, T, strict=True)
-                ]
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Results of one method with t draws of noise; NaN for lost ones.
+
+    Attributes
+    ----------
+    parameters : (t,) rms errors of the lengths [mm]. places : (t,) rms errors of positions [mm] at
+        equal readings, by where the poses lie. smaller, halved : (t,) share of the parameters
+        whose error is smaller than before, and at most half as large. largest : (t,) largest error
+        [mm, rad] over that before.
+    """
+
+    parameters: FloatArray
+    places: Mapping[str, FloatArray]
+    smaller: FloatArray
+    halved: FloatArray
+    largest: FloatArray
+
+    @property
+    def rms(self) -> Row:
+        """The sizes over all draws."""
+        sizes = {"parameters": self.parameters, **self.places}
+        return {name: compute_rms(size) for name, size in sizes.items()}
+
+
+def compare_methods(setup: Setup, seed: int, trials: int) -> dict[str, Draws]:
+    """Compare the paper's method, all legs weighted together, and MAP on the same stated noise, and
+    the machine as designed.
+    """
+    methods = {"alone": PER_LEG, "together": TOGETHER, "prior": PRIOR}
+    values = {"before": setup.robot.values[None]}
+    values |= {k: setup.calibrate(seed, trials, STATED, name).values for k, name in methods.items()}
+    truth, results, count = setup.truth.values, {}, SIZES.find("unmeasured")
+    units = list_raw_units(setup.robot.parameters.dimensions)
+    errors = np.abs(setup.robot.values - truth) / units
+    drawn = {name: inverse(setup.robot, draw_poses(setup, name, count, seed))
+             for name in list_places(setup)}  # fmt: skip
+    for key, v in values.items():
+        places = {}
+        for name, poses in drawn.items():
+            found, true = (
+                forward_trials(setup.robot, machine, poses.q[None], poses.state).T
+                @ setup.robot.tool
+                for machine in (v, truth[None])
             )
-            integrated.append(integrate_errors(residual))
-            if i + 1 == iterations:
-                by_dimension = residual[..., :3] / MM, residual[..., 3:]
-                error = (setup.truth.values - cell.values)[:, None] / MM
-                rms = [np.sqrt(np.mean(x**2, axis=(1, 2))) for x in (*by_dimension, error)]
-                sizes = np.column_stack([*rms, integrated[-1]])
-        met = np.array(integrated) <= threshold
-        needed = np.where(met.any(axis=0), 1.0 + met.argmax(axis=0), np.inf)
-        levels[instrument] = Level(limits, sizes, needed)
-    return levels
+            squares = np.sum(((found - true)[..., :3, 3] / MM) ** 2, axis=-1)
+            places[name] = np.sqrt(np.mean(squares, axis=1))
+        left = (np.abs(v - truth) / units)[:, errors > 0.0]
+        ratio = left / errors[errors > 0.0]
+        shares = ((ratio < 1.0).mean(axis=1), (ratio <= 0.5).mean(axis=1))
+        largest = left.max(axis=1) / errors.max()
+        results[key] = Draws(setup.compute_error(v), places, *shares, largest)
+    return results
 
 
-def compare_methods(setup: Setup, seed: int, trials: int) -> list[Row]:
-    """Compare the paper's method, all legs weighted together, and MAP on the same stated noise."""
-    cells = calibrate_methods(seed, trials, STATED, (PER_LEG[-1], TOGETHER, PRIOR))
-    names = ("leg by leg, unweighted (the paper)", "all legs, weighted by the noise",
-             "the same with tolerances as prior (MAP)")  # fmt: skip
-    values = {"not calibrated": setup.robot.values[None]}
-    values |= {name: cell.values for name, cell in zip(names, cells, strict=True)}
-    unmeasured = {
-        name: replace(setup, poses=draw_poses(name, SIZES.find("unmeasured"), seed))
-        for name in SIZES.find("ranges")
-    }
+def compare_poses(setup: Setup, seed: int, trials: int) -> list[Row]:
+    """Calibrate from other numbers and ranges of poses; None where that is impossible."""
+    own, columns = setup.coordinates, ("iterations", "left", "condition", PER_LEG, TOGETHER)
+    sets = [("the first ones", own[:n]) for n in range(setup.fewest, len(own))][:MOST_FIRST]
+    sets.append((MEASURED, own))
+    for place in list_places(setup):
+        counts = [share * len(own) for share in SIZES.find("drawn")]
+        sets += [(f"drawn, {place}", draw_poses(setup, place, n, seed)) for n in counts]
     rows = []
-    for name, v in values.items():
-        row: Row = {"method": name, "parameters": compute_rms((v - setup.truth.values) / MM)}
-        for place, other in unmeasured.items():  # at equal readings
-            poses = other.commanded
-            predicted, true = (
-                forward_trials(setup.robot, machine, poses.q[None], poses.state).T[..., :3, 3]
-                for machine in (v, setup.truth.values[None])
-            )
-            squares = np.sum(((predicted - true) / MM) ** 2, axis=-1)
-            row[place] = float(np.sqrt(np.mean(squares)))
-        rows.append(row)
-    return rows
-
-
-def compare_poses(setup: Setup, threshold: float, seed: int, trials: int) -> list[Row]:
-    """Calibrate from other numbers and ranges of poses."""
-    sets = [("first of the paper", setup.poses[:n]) for n in SIZES.find("first")]
-    sets.append((PAPERS_TEN, setup.poses))
-    for name, counts in SIZES.find("drawn").items():
-        sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
-    rows, methods = [], (PER_LEG[-1], TOGETHER)
     for name, poses in sets:
-        other = replace(setup, poses=poses)
-        exact = iterate(other, other.actual)
-        level = PosesLevel(len(poses), coordinates=tuple(map(tuple, poses.tolist())))
-        left = compute_rms((setup.truth.values - exact.values[-1]) / MM)
-        row: Row = {
-            "poses": name, "number": len(poses), "iterations": exact.count_needed(threshold),
-            "left": left, "condition": float(exact.conditions.max()),
-        }  # fmt: skip
-        for cell in calibrate_methods(seed, trials, STATED, methods, poses=level):
-            row[cell.levels["method"]] = compute_rms((cell.values - setup.truth.values) / MM)
+        other = replace(setup, coordinates=poses)
+        row: Row = {"poses": name, "number": len(poses), **dict.fromkeys(columns)}
+        with suppress(EstimationError):
+            exact = iterate(other, other.actual)
+            left = float(other.compute_error(exact.values[-1]))
+            row |= {"iterations": exact.count_needed(setup.epsilon), "left": left,
+                    "condition": float(exact.conditions.max())}  # fmt: skip
+            for method in (PER_LEG, TOGETHER):
+                cell = setup.calibrate(seed, trials, STATED, method, poses)
+                row[method] = compute_rms(other.compute_error(cell.values))
         rows.append(row)
     return rows
 
 
-def draw_poses(name: str, n: int, seed: int) -> FloatArray:
-    """Return poses (n, 6) [m, rad] drawn uniformly in one of the ranges."""
-    low, high = np.array(SIZES.find("ranges", name)) * np.array([MM] * 3 + [np.pi / 180.0] * 3)
-    return make_random_stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
+def list_places(setup: Setup) -> tuple[str, ...]:
+    """Return where poses are drawn."""
+    return (NEAR, WIDE) if setup.is_printed else (WORKSPACE,)
+
+
+def draw_poses(setup: Setup, place: str, n: int, seed: int) -> FloatArray:
+    """Return poses (n, c) [m, rad] drawn uniformly in the range of the paper's poses, in the wide
+    one, or in the workspace of another robot.
+    """
+    stream = make_random_stream(seed, n, DRAWN_POSES)
+    if place == WORKSPACE:
+        return draw_reached(setup.robot, setup.truth, n, stream)
+    low, high = setup.coordinates.min(axis=0), setup.coordinates.max(axis=0)
+    if place == WIDE:
+        low, high = np.array(SIZES.find("wide")) * np.array([MM] * 3 + [np.pi / 180.0] * 3)
+    return stream.uniform(low, high, (n, 6))
 
 
 def recover_noise(setup: Setup) -> FloatArray:
@@ -346,11 +510,14 @@ def write_rotation(order: str, angles: tuple[int, ...] = (0, 1, 2)) -> str:
     return " ".join(reversed(turns) if order.islower() else turns)
 
 
-def rank_euler_orders(setup: Setup, nominal: FloatArray, measured: FloatArray) -> list[Row]:
+def rank_euler_orders(
+    setup: Setup, nominal: FloatArray, measured: FloatArray, sd: FloatArray
+) -> list[Row]:
     """Return the rms differences [mm, rad] of all products, the best first: 12 sequences of axes,
     angles in any order.
 
-    setup : machines of Tables 2 and 3. nominal, measured : (n, 6) poses of Table 4 [m, rad].
+    setup : machines of Tables 2 and 3. nominal, measured : (n, 6) poses of Table 4 [m, rad]. sd :
+    (n, 6) of their rounding; "rounding" is the rms of position differences over it.
     """
     orders = []
     for order in (name for name in geometry.EULER_ORDERS if name.islower()):
@@ -367,7 +534,8 @@ def rank_euler_orders(setup: Setup, nominal: FloatArray, measured: FloatArray) -
             orders.append(
                 {"formula": write_rotation(order, angles),
                  "position": compute_rms(change[:, 3:] / MM),
-                 "rotation": compute_rms(change[:, :3])}
+                 "rotation": compute_rms(change[:, :3]),
+                 "rounding": compute_rms(change[:, 3:] / sd[:, :3])}
             )  # fmt: skip
     return sorted(orders, key=lambda order: order["position"])
 
@@ -425,7 +593,7 @@ def calibrate_from_print(setup: Setup, printed: Printed) -> list[Row]:
     repaired = measured.copy()
     repaired[odd] = np.round(actual[odd] / unit) * unit
     keep = np.arange(len(measured)) != odd
-    nine = replace(setup, poses=setup.poses[keep])
+    nine = replace(setup, coordinates=setup.coordinates[keep])
     made: list[tuple[str, int | None, FloatArray]] = [("not calibrated", None, setup.robot.values)]
     for name, other, poses in (
         ("Table 4 as printed", setup, measured),
@@ -440,7 +608,9 @@ def calibrate_from_print(setup: Setup, printed: Printed) -> list[Row]:
         ("tolerances as prior (MAP)", lc.MAP()),
     ):
         title = f"without row A2, all legs weighted by the rounding, {name}"
-        made.append((title, len(nine.poses), lc.identify(setup.robot, data, method).robot.values))
+        made.append(
+            (title, len(nine.coordinates), lc.identify(setup.robot, data, method).robot.values)
+        )
     return [
         {"name": name, "number": n, "error": compute_rms(v - setup.truth.values) / MM}
         for name, n, v in made
