@@ -21,12 +21,14 @@ from loopcal.apply.verdict import (
 from loopcal.checks import check_choice
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
+from loopcal.diagnose.drive_errors import find_drive_errors
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.information import count_equations, has_equations_to_spare
@@ -132,7 +134,14 @@ def calibrate(
     held_out = 0 if split.held_out is None else split.held_out.n_poses
     fit, choice, change = _fit(robot, split.fitted, options, count, held_out)
     count.begin("testing the residuals for patterns and slow errors")
-    fit = adjust_uncertainty(fit, split.fitted)
+    linear = linearize_fit(fit, split.fitted) if fit.converged else None
+    drives = None if linear is None else find_drive_errors(linear)
+    fit = adjust_uncertainty(fit, split.fitted, linear)
+    if drives is not None and drives.explain_better(fit):
+        split, again = split.with_reading_sigma(drives.sigma), replace(options, choose_model=False)
+        refit, _, change = _fit(fit.initial, split.fitted, again, count, held_out)
+        if refit.converged:
+            fit = adjust_uncertainty(drives.add_to(refit), split.fitted)
     return _report(fit, choice, change, split, conventions, options, count)
 
 

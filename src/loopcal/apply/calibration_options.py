@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from loopcal.measure.array_checks import check_seed, check_type
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
+from loopcal.typing import FloatArray
 
 
 def describe_wrong_share(share: float) -> str:
@@ -131,6 +132,15 @@ class DataSplit:
     share: float  # the share that was asked for; 0 where poses were named, or none were held out
     seed: int  # of the random choice
     repeats: tuple[str, ...] = ()  # labels of held-out poses that repeat a fitted one
+
+    def with_reading_sigma(self, sigma: FloatArray) -> DataSplit:
+        """Return the sets with standard deviations (a,) [SI] of all readings."""
+        fitted, held_out = (
+            data and replace(data, reading_sigma=np.broadcast_to(sigma, data.readings.shape))
+            for data in (self.fitted, self.held_out)
+        )
+        assert fitted is not None
+        return replace(self, fitted=fitted, held_out=held_out)
 
     def list_observations(self) -> tuple[Observations, ...]:
         """Return the observations of both sets, those of targets on the base once."""

@@ -359,7 +359,7 @@ def linearize_tool_errors(
     return ToolErrors(
         by_errors[..., :p],
         H @ frame.own_errors(solution.T),
-        H @ (S.readings[0] * robot.stated_sigma),
+        H @ (S.readings[0] * posterior.repeatability),
         by_discrepancy,
         np.linalg.norm(D[..., :p] * twist_weights(robot.size)[:, None], axis=(1, 2)),
         frame.describe(axes=""),

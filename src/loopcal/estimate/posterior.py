@@ -31,7 +31,7 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 PREFIX, DISCREPANCY_PREFIX = "posterior_", "discrepancy_"
 """Beginnings of the names of the arrays of a run folder."""
 
-SHOWN_NOISE = "posterior_shown_noise"
+SHOWN_NOISE, SHOWN_READINGS = "posterior_shown_noise", "posterior_reading_sigma"
 INFORMATION = ("information_rows", "information_deviations", "information_noise")
 """Names of arrays of a run folder."""
 
@@ -294,6 +294,8 @@ class Posterior:
     shown_noise : the noise that the residuals alone show; None where it is not known.
     information : what the data say without tolerances, to compare calibrations; None where it is
         not known.
+    reading_sigma : (a,) standard deviations [SI] of the errors of readings at a pose that
+        residuals show; None for those that the robot states.
     """
 
     robot: Mechanism
@@ -308,6 +310,7 @@ class Posterior:
     discrepancy: ModelDiscrepancy | None = None
     shown_noise: ShownNoise | None = None
     information: DataInformation | None = None
+    reading_sigma: FloatArray | None = None
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *(Field(name, is_stored=True) for name in ("unit", "directions", "variance")),
@@ -330,6 +333,11 @@ class Posterior:
     def estimate(self) -> FloatArray:
         """(p,) estimates [SI]."""
         return self.robot.values[self.places]
+
+    @property
+    def repeatability(self) -> FloatArray:
+        """(a,) standard deviations [SI] of the errors of readings at a pose."""
+        return self.robot.stated_sigma if self.reading_sigma is None else self.reading_sigma
 
     @property
     def without_discrepancy(self) -> Posterior:
@@ -377,6 +385,8 @@ class Posterior:
             stored |= store_arrays(own.errors, DISCREPANCY_PREFIX)
         if (shown := self.shown_noise) is not None:
             stored[SHOWN_NOISE] = np.array([shown.variance, shown.degrees, shown.used])
+        if self.reading_sigma is not None:
+            stored[SHOWN_READINGS] = self.reading_sigma
         if (data := self.information) is not None:
             noise = np.array([data.variance, data.degrees])
             arrays = (data.rows, data.deviations, noise)
@@ -486,6 +496,7 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         discrepancy,
         ShownNoise(*arrays[SHOWN_NOISE].tolist()) if SHOWN_NOISE in arrays else None,
         information,
+        arrays.get(SHOWN_READINGS),
     )
 
 

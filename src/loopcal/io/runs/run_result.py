@@ -320,6 +320,7 @@ FORMS: Mapping[str, str] = {
     "discrepancy_whitening": "finite k k",
     "discrepancy_amplitude": "number 6",
     "posterior_shown_noise": "number 3",
+    "posterior_reading_sigma": "finite actuators",
     "information_rows": "finite d p",
     "information_deviations": "finite d",
     "information_noise": "number 2",
@@ -338,7 +339,7 @@ FITTED = "number rows values"
 FIRST = ("nominal", "estimate", "sd")
 """Arrays of every run; runs of format 1 may lack the others."""
 
-GROUPS = ("frames_", "discrepancy_", "information_", "heights_", "posterior_shown_")
+GROUPS = ("frames_", "discrepancy_", "information_", "heights_", "posterior_shown_", "posterior_reading_")
 """Beginnings of names of which a run has all arrays or none."""
 
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors that the drives have at every pose by itself: repeatability, backlash, errors of gears.
+
+With whitened rows e of a fit, of which nothing estimated explains r = M e (nu degrees of freedom),
+an error of variance tau^2 of every reading at every pose adds tau^2 Z Z' to their covariance, Z the
+whitened derivatives by the readings, which are zero but for those of the pose of a row. The size of
+
+    q = r'Z Z'r / (r'r + nu0),    nu0 degrees of freedom of the stated sigmas
+
+is compared with its mean and variance without such errors, which follow from the traces of
+K = M Z Z'M and K^2. tau maximizes the restricted likelihood of the rows. Backlash is an error
+of the sign of travel from the pose before: a linear effect, see `residual_patterns`.
+Sources: Patterson and Thompson, Recovery of inter-block information when block sizes are unequal,
+Biometrika 58 (1971); docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopcal.diagnose.residual_patterns import (
+    FEWEST_LEFT,
+    ResidualRows,
+    collect_residual_rows,
+    order_by_time,
+    scale_to_range,
+    span_columns,
+    test_effect,
+)
+from loopcal.estimate.fit_linearization import FitLinearization
+from loopcal.estimate.linearization import evaluate_rows
+from loopcal.estimate.posterior import DISCREPANCY
+from loopcal.estimate.residual_test import choose_severity, count_sigma_degrees
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward
+from loopcal.numerics.statistics import compute_chi_square_tail, compute_single_level
+from loopcal.typing import FloatArray, IntArray
+
+LEVEL = 0.01
+"""Probability that independent errors of the instrument show errors of the drives."""
+
+DOUBTED = 0.1
+"""The same where residuals contradict the stated noise: then either that is wrong, or the drives
+have errors, and their pattern decides.
+"""
+
+SLOW = (DISCREPANCY, "residuals.depend-on-reading")
+"""Codes of findings on errors that depend on the pose in another way."""
+
+SIZES = np.geomspace(0.03, 300.0, 81)
+"""Sizes of the errors that are compared, in units in which they double the variance of the rows."""
+
+
+@dataclass(frozen=True, eq=False)
+class DriveErrors:
+    """Errors of the readings that every pose has by itself.
+
+    sigma : (a,) their standard deviations [SI]. p_value : of independent errors of the instrument
+    alone. findings : which errors, and how they show.
+    """
+
+    sigma: FloatArray
+    p_value: float
+    findings: tuple[Finding, ...]
+
+    def explain_better(self, fit: Identification) -> bool:
+        """Return whether they are less likely to be chance than what a fit, with its uncertainty
+        adjusted, found of errors that depend on the pose.
+        """
+        found = (f.data["p_value"] for f in fit.findings if "p_value" in f.data and f.code in SLOW)
+        return self.p_value < min(found, default=1.0)
+
+    def add_to(self, fit: Identification) -> Identification:
+        """Return a fit with readings of these standard deviations, which says so."""
+        posterior = replace(fit.posterior, reading_sigma=self.sigma)
+        return replace(fit, posterior=posterior, findings=(*fit.findings, *self.findings))
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingColumns:
+    """Whitened derivatives of R rows by the a readings of their poses [1 / SI].
+
+    values : (R, links, a). poses : (R, links) poses of the rows. count : n of all poses.
+    """
+
+    values: FloatArray
+    poses: IntArray
+    count: int
+
+    def project(self, columns: FloatArray) -> FloatArray:
+        """Return Z' columns (n, a, c) of columns (R, c)."""
+        total = np.zeros((self.count, self.values.shape[-1], columns.shape[1]))
+        for link in range(self.poses.shape[1]):
+            products = self.values[:, link, :, None] * columns[:, None, :]
+            np.add.at(total, self.poses[:, link], products)
+        return total
+
+    def square_poses(self) -> FloatArray:
+        """Return the blocks (n, a, a) of Z'Z of each pose; those of two linked poses count as 0."""
+        total = np.zeros((self.count, *self.values.shape[-1:] * 2))
+        for link in range(self.poses.shape[1]):
+            v = self.values[:, link]
+            np.add.at(total, self.poses[:, link], v[:, :, None] * v[:, None, :])
+        return total
+
+    def expand(self, errors: FloatArray) -> FloatArray:
+        """Return Z errors (R, c) of errors (n, a, c) of the readings."""
+        return np.einsum("rla,rlac->rc", self.values, errors[self.poses])
+
+
+def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
+    """Return the errors of the drives that the residuals of a fit with exact readings show; None
+    where they show none, or cannot.
+    """
+    fit, poses = linear.fit, linear.solution.linearized
+    is_tested = fit.converged and fit.residual_test.intervals and fit.options.loss is None
+    if not is_tested or poses is None or fit.options.prior is not None:
+        return None
+    rows = collect_residual_rows(linear)
+    if rows is None or rows.degrees < FEWEST_LEFT:
+        return None
+    columns = differentiate_by_readings(linear, rows)
+    if columns is None:
+        return None
+    unit = list_units(linear)
+    level = DOUBTED if fit.residual_test.failed else compute_single_level(LEVEL, 2)
+    rows, backlash, findings = _find_backlash(linear, rows, columns, unit, level)
+    p_values = [float(f.data["p_value"]) for f in findings]
+    known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
+    scaled = ReadingColumns(columns.values * unit, columns.poses, columns.count)
+    p_value, sigma = test_independent_errors(rows, scaled, known), np.zeros_like(unit)
+    if p_value < level:
+        sigma = estimate_size(rows, scaled, known) * unit
+        largest = int(np.argmax(sigma))
+        size = fit.robot.to_quantity(float(sigma[largest]), fit.robot.actuators[largest].dimension)
+        severity = choose_severity(p_value)
+        found = report_finding(
+            "residuals.drive-errors", size=size, p_value=p_value, severity=severity
+        )
+        findings.append(found)
+        p_values.append(p_value)
+    if not findings:
+        return None
+    return DriveErrors(np.hypot(sigma, backlash), min(p_values), tuple(findings))
+
+
+def list_units(linear: FitLinearization) -> FloatArray:
+    """Return the units (a,) [SI] in which errors of different drives count alike: lengths, and
+    angles that turn the size of the robot by them.
+    """
+    robot = linear.fit.robot
+    is_angle = np.array(
+        [robot.actuators[i].dimension.value == "angle" for i in range(len(robot.actuators))]
+    )
+    return np.where(is_angle, 1.0 / robot.size, 1.0)
+
+
+def differentiate_by_readings(
+    linear: FitLinearization, rows: ResidualRows
+) -> ReadingColumns | None:
+    """Return the derivatives of the rows by the readings of their poses; None where rows sense
+    joints, which follow the readings in another way.
+    """
+    poses, robot, problem = linear.solution.linearized, linear.fit.robot, linear.problem
+    assert poses is not None
+    kinds = [r for r in problem.rows if len(r.poses)]
+    if any(r.kind.sensed_joints for r in kinds):
+        return None
+    solution = forward(robot, linear.data.readings)
+    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).readings[0]
+    links = max(r.kind.poses_per_row for r in kinds)
+    values = np.zeros((len(rows.residual), links, S.shape[-1]))
+    places = np.zeros((len(rows.residual), links), dtype=np.int64)
+    for number, r in enumerate(kinds):
+        evaluated, white = evaluate_rows(r, poses, np.zeros(1, np.int64), linear.solution.nuisance)
+        own = np.flatnonzero(rows.kind == number)
+        for link in range(r.kind.poses_per_row):
+            by_twist = (
+                evaluated.jacobian if r.kind.poses_per_row == 1 else evaluated.jacobian[:, :, link]
+            )
+            of_link = r.poses_by_link[:, link]
+            Z = r.whiten_columns(white, by_twist)[0] @ S[of_link]
+            values[own, link] = Z[rows.row[own], rows.column[own]]
+            places[own, link] = of_link[rows.row[own]]
+    return ReadingColumns(values, places, len(S))
+
+
+def _find_backlash(
+    linear: FitLinearization, rows: ResidualRows, columns: ReadingColumns, unit: FloatArray,
+    level: float,
+) -> tuple[ResidualRows, FloatArray, list[Finding]]:  # fmt: skip
+    """Return rows as if the fit had also estimated the backlash that they show, half of it (a,)
+    [SI] for each actuator, and the finding. The order of the rows is that of travel.
+    """
+    readings, robot = linear.data.readings, linear.fit.robot
+    nothing = np.zeros(len(unit))
+    times = [o.context.get("time") for o in linear.data.observations if len(o)]
+    time = (
+        times[0] if len(times) == 1 and len(linear.data.observations[0]) == len(readings) else None
+    )
+    order = order_by_time(time, len(readings))
+    direction = np.zeros_like(readings)
+    direction[order[1:]] = np.sign(np.diff(readings[order], axis=0))
+    x = np.apply_along_axis(scale_to_range, 0, readings)
+
+    def shift(errors: FloatArray) -> FloatArray:
+        return np.einsum("rla,rla->ra", columns.values, errors[columns.poses]) * unit
+
+    effect = shift(direction)
+    # the direction of travel goes with the reading: a pose at an end was reached towards it
+    known = rows.with_effects(np.concatenate([shift(x**k) for k in (1, 2, 3)], axis=1))
+    basis = span_columns(known.project(effect))
+    q = basis.shape[1]
+    if q < len(unit) or known.degrees < (1.0 + FEWEST_LEFT) * q:
+        return rows, nothing, []
+    p_value = test_effect(known, basis)
+    if not p_value < level:
+        return rows, nothing, []
+    half, *_ = np.linalg.lstsq(known.project(effect), known.residual, rcond=None)
+    largest = int(np.argmax(np.abs(half)))
+    actuator = robot.actuators[largest]
+    size = robot.to_quantity(2.0 * float(abs(half[largest]) * unit[largest]), actuator.dimension)
+    finding = report_finding(
+        "residuals.backlash", name=actuator.name, size=size, p_value=p_value,
+        severity=choose_severity(p_value),
+    )  # fmt: skip
+    return rows.with_effects(effect), np.abs(half) * unit, [finding]
+
+
+def test_independent_errors(rows: ResidualRows, columns: ReadingColumns, known: float) -> float:
+    """Return the probability of a larger q for independent errors of the instrument alone.
+
+    known : nu0, degrees of freedom of the stated sigmas; infinite where these are exact.
+    """
+    U, nu = rows.basis, rows.degrees
+    own = columns.project(U)  # Z'U
+    square = columns.project(rows.residual[:, None])
+    total, gram = float((columns.values**2).sum()), columns.square_poses()
+    inner = np.einsum("nac,nad->cd", own, own)
+    spread = columns.expand(own)
+    first = total - float(np.trace(inner))
+    second = float((gram**2).sum()) - 2.0 * float((spread**2).sum()) + float((inner**2).sum())
+    if not first > 1e-9 * total:
+        return 1.0
+    if np.isinf(known):
+        ratio, mean, variance = float((square**2).sum()), first, 2.0 * second
+    else:
+        n = nu + known
+        ratio = float((square**2).sum()) / (rows.square + known) * n
+        mean, variance = first, 2.0 * (n * second - first**2) / (n + 2.0)
+    if not variance > 0.0:
+        return 1.0
+    degrees = 2.0 * mean**2 / variance
+    return float(compute_chi_square_tail(degrees, degrees * ratio / mean))
+
+
+def estimate_size(rows: ResidualRows, columns: ReadingColumns, known: float) -> float:
+    """Return the standard deviation tau [SI, scaled] of the errors of the readings at which the
+    restricted likelihood of the rows is largest, their noise at its best size.
+    """
+    both = np.column_stack([rows.basis, rows.residual])
+    B, (c, Q) = columns.project(both), np.linalg.eigh(columns.square_poses())
+    B, c = Q.swapaxes(1, 2) @ B, np.maximum(c, 0.0)
+    whole, q = both.T @ both, rows.basis.shape[1]
+    unit = float(np.sqrt(len(both) / (columns.values**2).sum()))
+    best, size = -np.inf, 0.0
+    for tau in SIZES * unit:
+        weight = tau**2 / (1.0 + tau**2 * c)
+        # columns are orthonormal and residuals orthogonal to them, so products lose no digits
+        left = whole - np.einsum("nac,na,nad->cd", B, weight, B)
+        triangle = np.linalg.cholesky(left).T
+        square = float(triangle[-1, -1] ** 2)
+        log_det = float(np.log1p(tau**2 * c).sum()) + 2.0 * float(
+            np.log(np.diag(triangle)[:q]).sum()
+        )
+        n, scale = rows.degrees + known, 1.0
+        if np.isfinite(known):
+            scale = (square + known) / n
+            square = n * np.log(scale)
+        likelihood = -0.5 * (log_det + square)
+        if likelihood > best:
+            best, size = likelihood, tau * np.sqrt(scale)
+    return float(size)
