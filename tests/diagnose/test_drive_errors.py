@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the drives at single poses, on a hexapod whose readings are computed without loopcal."""
+"""Errors of the drives at single poses; readings of a hexapod are computed without loopcal."""
 
 from dataclasses import replace
 

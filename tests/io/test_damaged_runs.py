@@ -206,13 +206,14 @@ def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
         ("1", "2"), np.ones((2, 2)), np.ones(2), np.ones(2), np.ones(2, dtype=bool), find_unit("mm")
     )
     arrays |= store_arrays(heights, PREFIX)
+    arrays["posterior_reading_sigma"] = np.ones(arrays["frames_readings"].shape[1])
     assert set(FORMS) <= set(arrays)
     assert {name for name in FORMS if name.startswith("discrepancy_")} == set(own)
     assert find_problem(arrays) is None
     for name in (*FORMS, "fitted_0_position"):
         if name in FORMS:
             without = {key: array for key, array in arrays.items() if key != name}
-            is_alone = name == "posterior_shown_noise"
+            is_alone = name in ("posterior_shown_noise", "posterior_reading_sigma")
             assert (find_problem(without) is None) == is_alone, name
         for form, wrong in list_wrong_arrays(arrays[name]):
             problem = find_problem(arrays | {name: wrong})

@@ -339,7 +339,14 @@ FITTED = "number rows values"
 FIRST = ("nominal", "estimate", "sd")
 """Arrays of every run; runs of format 1 may lack the others."""
 
-GROUPS = ("frames_", "discrepancy_", "information_", "heights_", "posterior_shown_", "posterior_reading_")
+GROUPS = (
+    "frames_",
+    "discrepancy_",
+    "information_",
+    "heights_",
+    "posterior_shown_",
+    "posterior_reading_",
+)
 """Beginnings of names of which a run has all arrays or none."""
 
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
