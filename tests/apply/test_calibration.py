@@ -172,7 +172,7 @@ def test_gauge_freedom_of_frames_is_one_finding_of_severity_info(robot):
     report = calibrate(robot, data, CalibrationOptions(hold_out=0.25))
     (freedom,) = [f for f in report.findings if f.code == "workflow.frame-freedoms"]
     assert freedom.severity is Severity.INFO
-    assert freedom.data == {"count": 6, "frames": ("base",)}
+    assert freedom.data == {"count": 6, "frames": ("base",), "still": 0}
     assert not any(f.code == "workflow.undetermined-combinations" for f in report.findings)
     assert report.verdict is Verdict.CALIBRATED
 
@@ -233,7 +233,13 @@ def test_wrong_or_contradictory_arguments_are_refused(expected):
 
 SMALL = Quantity(0.003, "mm")
 JUDGED = ("estimate", "expanded", "low", "high", "limit", "guard_band", "acceptance_limit")
-UNDETERMINED = report_finding("workflow.undetermined-combinations", count=1, names=("leg1.length",))
+UNDETERMINED = report_finding(
+    "workflow.undetermined-combinations",
+    count=1,
+    names=("leg1.length",),
+    sizes=(Quantity(0.1, "mm"),),
+    where="the workspace",
+)
 NOISE = report_finding(
     "noise.residuals-too-large", Severity.FAILURE, ratio=3.9, degrees=81.0, p_value=1e-9
 )
@@ -253,7 +259,7 @@ GROWN = report_finding("gates.errors-grew", quantity="position", times=1.4)
 
 def test_most_severe_finding_decides_the_verdict():
     undecided = report_finding("workflow.no-held-out-poses")
-    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",))
+    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",), still=0)
     findings = (info, UNDETERMINED, undecided, MISSING)
     verdicts = [decide_verdict(findings[:count]).name for count in (4, 3, 2, 1)]
     assert verdicts == ["NOT_CALIBRATED", "UNDECIDED", "RESERVATIONS", "CALIBRATED"]

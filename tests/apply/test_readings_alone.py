@@ -124,7 +124,9 @@ def test_gauge_is_found_by_computation(robot):
     """Three motions of the plane; spools of unknown radius add the size of the machine."""
     _, readings = measure(*draw_machine(1), 40, 2)
     fit = identify(robot, make_data(robot, readings), LeastSquares())
-    motions = find_gauge_freedoms(fit.posterior)
+    motions = find_gauge_freedoms(
+        fit.posterior.robot, fit.posterior.places, fit.posterior.unit, fit.posterior.undetermined
+    )
     assert (motions.count, motions.has_scale) == (3, False)
     cable = lc.load_robot("cable-4")
     poses = lc.sample_workspace(cable, 30, 1).coordinates

@@ -217,7 +217,8 @@ def _report(
         from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
 
         analysis = identifiability(fit.robot, fitted, fit.options.rank_tolerance)
-        suggestions = suggest_measurements(analysis)
+        listed = suggest_measurements(analysis)
+        suggestions = tuple(s for s in listed if not s.combination.is_harmless)
     start = check_start_values(fit)
     comparison = None
     if options.compare_with is not None:

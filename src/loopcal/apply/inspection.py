@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
-from loopcal.apply.verdict import is_readings_alone, report_undetermined
+from loopcal.apply.verdict import is_readings_alone
+from loopcal.diagnose.gauge_freedoms import report_undetermined
 from loopcal.diagnose.identifiable_parameters import (
     Identifiability,
     IdentifiableSubset,
@@ -58,28 +59,24 @@ class IdentifiabilityReport:
         )
 
     def _report_undetermined(self) -> list[Finding]:
-        """Return how many undetermined combinations move frames, and how many change poses."""
-        analysis = self.analysis
+        """Return how many undetermined combinations are harmless, and how many change poses."""
+        analysis, alone = self.analysis, self.is_readings_alone
         if not analysis.unidentifiable:
             return []
-        count = analysis.n_parameters - analysis.rank
         findings, changing = report_undetermined(
-            analysis.posterior,
-            analysis.unidentifiable,
-            count,
-            self.is_readings_alone,
-            ("identifiability.frames-only", "identifiability.changes-poses"),
+            analysis.free_parameters, analysis.unidentifiable, is_readings_alone=alone
         )
         return [*findings, *(c.finding for c in changing if len(changing) <= FEW)]
 
     def _report_measurement(self) -> list[Finding]:
-        """Return the further measurement that determines most combinations, the simplest of them;
-        or that none does.
+        """Return the further measurement that determines most combinations that move the platform
+        or a frame, the simplest of them; or that none does.
         """
-        solved = Counter(m.words for s in self.suggestions for m in s.measurements)
+        suggestions = [s for s in self.suggestions if not s.combination.is_harmless]
+        solved = Counter(m.words for s in suggestions for m in s.measurements)
         if not solved:
-            return [s.finding for s in self.suggestions]
-        (words, count), total = solved.most_common(1)[0], len(self.suggestions)
+            return [s.finding for s in suggestions]
+        (words, count), total = solved.most_common(1)[0], len(suggestions)
         stated: dict[str, Any] = {"words": words, "count": count}
         stated |= {"total": total, "left": total - count}
         return [report_finding("identifiability.measure-for-all", **stated)]

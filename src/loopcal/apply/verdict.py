@@ -7,14 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from enum import Enum
-from typing import Any
 
 from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation import FEW_ROWS, Validation
 from loopcal.diagnose.fit_examination import StartCheck, StartVerdict
-from loopcal.diagnose.gauge_freedoms import GaugeFreedoms, find_gauge_freedoms
-from loopcal.estimate.null_space import Combination
-from loopcal.estimate.posterior import Posterior
+from loopcal.diagnose.gauge_freedoms import report_undetermined
 from loopcal.estimate.residual_test import SIGNIFICANCE, ResidualTest, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
@@ -130,59 +127,18 @@ def report_scale(fit: Identification, data: Measurements) -> list[Finding]:
 
 
 def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
-    """Return whether open combinations only move frames, or change poses."""
+    """Return whether open combinations are harmless, or change poses."""
     if not fit.converged or not fit.unidentifiable:
         return []
     codes = ("workflow.frame-freedoms", "workflow.undetermined-combinations")
-    count, alone = len(fit.names) - fit.rank, is_readings_alone(data)
-    findings, _ = report_undetermined(fit.posterior, fit.unidentifiable, count, alone, codes)
-    return findings
-
-
-def report_undetermined(
-    posterior: Posterior,
-    unidentifiable: tuple[Combination, ...],
-    count: int,
-    is_readings_alone: bool,
-    codes: tuple[str, str],
-) -> tuple[list[Finding], tuple[Combination, ...]]:
-    """Return how many of `count` undetermined combinations only move frames, and how many change
-    poses; and the combinations that do where there are any.
-
-    A combination with a meaning, such as the place of a frame, changes no pose. Where all have one,
-    but they are more than the motions of frames, the parameters of all are named.
-
-    codes : of the two findings.
-    """
-    motions, findings = find_gauge_freedoms(posterior), []
-    changing = tuple(c for c in unidentifiable if not c.meaning)
-    if is_readings_alone:
-        findings.append(report_readings_gauge(motions, count))
-    if motions.count:
-        moved: dict[str, Any] = {"count": motions.count, "frames": tuple(motions.frames)}
-        findings.append(report_finding(codes[0], **moved))
-    if (left := count - motions.count) <= 0:
-        return findings, ()
-    names = dict.fromkeys(name for c in changing or unidentifiable for name in c.names)
-    changed: dict[str, Any] = {"count": left, "names": tuple(names)}
-    return [*findings, report_finding(codes[1], **changed)], changing
+    alone = is_readings_alone(data)
+    free = replace(fit.free_parameters, robot=fit.robot)
+    return report_undetermined(free, fit.unidentifiable, codes, alone)[0]
 
 
 def is_readings_alone(data: Measurements) -> bool:
     """Return whether measurements have no measured column."""
     return all(isinstance(rows.kind, Closure) for rows in data.observations)
-
-
-def report_readings_gauge(motions: GaugeFreedoms, count: int) -> Finding:
-    """Return what `count` open combinations are: the place of frames, the size, and others."""
-    others = count - motions.count - motions.has_scale
-    combinations = (
-        {"what": "frames", "frames": motions.frames, "count": motions.count},
-        {"what": "scale", "frames": (), "count": int(motions.has_scale)},
-        {"what": "others", "frames": (), "count": others},
-    )
-    kept = tuple(part for part in combinations if part["count"])
-    return report_finding("identifiability.readings-gauge", parts=kept)
 
 
 class Verdict(Enum):

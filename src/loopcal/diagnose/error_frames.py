@@ -262,7 +262,8 @@ def list_unfixed_motions(posterior: Posterior) -> FloatArray:
     known = np.zeros((MOTIONS, 0)) if posterior.frames is None else posterior.frames.unfixed
     if posterior.determined.all():
         return known
-    moved = find_gauge_freedoms(posterior).motions
+    of_null = (posterior.places, posterior.unit, posterior.undetermined)
+    moved = find_gauge_freedoms(posterior.robot, *of_null).motions
     u, s, _ = np.linalg.svd(np.concatenate([known, moved], axis=1), full_matrices=False)
     return u[:, s > FIT_TOLERANCE]
 

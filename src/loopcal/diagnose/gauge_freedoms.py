@@ -1,93 +1,227 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interpret directions that the data do not determine as motions of the base or platform frame.
+"""Classify directions that the data do not determine by what they do to poses: nothing, a motion of
+the base or platform frame, or a change of poses.
 
 A direction n moves the platform by the twist D(x) n at the pose x. It is a motion of the base frame
 where it equals (w, c + w x t) for one w and c at all poses, and one of the platform frame where it
 equals (R w, R c). Such a direction is a gauge freedom: it changes no dimension of the machine, only
-where its frames are placed. See docs/theory/gauge.md.
+where its frames are placed. The poses are some of the stated workspace, and some about home. All
+statements on undetermined combinations follow from this one place. See docs/theory/gauge.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from loopcal import geometry
+from loopcal.errors import MechanismError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import spread_states
 from loopcal.estimate.null_space import Combination
-from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.states import Status
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.mechanism.workspace import check_limits, draw_coordinates, workspace_ranges
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-# Poses at which motions are compared: 144 equations for the 12 numbers of two frames and the
-# directions in question.
+# Poses at which motions are compared, in the workspace and about home each: 144 equations for the
+# 12 numbers of two frames and the directions in question.
 PROBES = 24
-# Range of the readings of these poses to each side of home, in robot sizes and radians.
+# Range of the readings of the poses about home to each side, in robot sizes and radians.
 SPREAD_LENGTH, SPREAD_ANGLE = 0.05, 0.1
 # Shares of this range that are tried, until half of the poses are reached.
 SHARES = (1.0, 0.1, 0.01)
 # Share of the motion by all parameters below which a motion counts as none: the square root of
 # double rounding.
 NO_MOTION = 1e-8
-SAME_MOTION = 1e-6  # relative difference below which two motions count as equal
+# Share of the motions by its single parameters up to which the motion of a combination is none, or
+# is that of a frame. Null directions of the last linearization, at the values after the last step,
+# leave 1e-10 or less in complete models; of tolerances of 0.1 mm this share is 0.1 nm.
+SAME_MOTION = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class GaugeFreedoms:
-    """The d unobservable directions, and the frames that their combinations move."""
+    """Effect of the unobservable directions on poses."""
 
-    # (p, d) the directions without the combinations that move frames; columns are zero where
-    # nothing else remains
-    kept: FloatArray
-    frames: tuple[str, ...]  # names of the moved frames: (), ("base",), ("platform",) or both
-    count: int  # number of independent combinations that move frames
+    frames: tuple[str, ...] = ()  # names of the moved frames: (), ("base",), ("platform",) or both
+    count: int = 0  # number of independent combinations that move frames, and nothing else
     # (12, g) motions of the two frames by these combinations, in the units of
     # `loopcal.estimate.unfixed_motions.frame_twists`, each of length one
-    motions: FloatArray
+    motions: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
     has_scale: bool = False  # whether a further combination enlarges all poses by one factor
+    still: int = 0  # number of independent combinations that change no pose
+    changing: int = 0  # number of the others, which change poses relative to both frames
+    # rotation [rad] and displacement of the tool [m] by the latter after the best fit of both
+    # frames: root mean square over poses, where every parameter deviates by its tolerance
+    effect: tuple[float, float] = (0.0, 0.0)
+    where: str = "the workspace"  # or "poses about home", where the robot states no workspace
 
 
-def find_gauge_freedoms(posterior: Posterior) -> GaugeFreedoms:
-    """Separate motions of frames from the directions that the data of a fit do not determine."""
-    null = posterior.directions[:, ~posterior.determined]
-    if null.shape[1] == 0:
-        return GaugeFreedoms(null, (), 0, np.zeros((12, 0)))
-    robot = posterior.robot
+class SampledMotions(NamedTuple):
+    """Poses T (n, 4, 4), and their twists D (n, 6, p) by all parameters [per SI]."""
+
+    T: FloatArray
+    D: FloatArray
+    in_workspace: int  # number of the poses in the stated workspace, which are the last ones
+
+
+@lru_cache(maxsize=2)  # a report asks several times for one calibrated robot
+def sample_motions(robot: Mechanism) -> SampledMotions:
+    """Return motions of a robot about home, and in its workspace where the robot states one."""
     T, D = observe_motions(robot, probe_readings(robot))
+    try:
+        ranges = workspace_ranges(robot)
+    except MechanismError:
+        return SampledMotions(T, D, 0)
+    drawn = draw_coordinates(np.random.default_rng(0), robot.controlled, ranges, PROBES)
+    solution = inverse(robot, drawn)
+    allowed = check_limits(robot, robot.values[None], solution.q[None], solution.state)[0][0]
+    workspace = observe_motions(robot, solution.q[solution.converged & allowed])
+    return SampledMotions(
+        np.concatenate([T, workspace[0]]), np.concatenate([D, workspace[1]]), len(workspace[0])
+    )
+
+
+class WeighedMotions(NamedTuple):
+    """Motions at sampled poses, rotations times the robot's size, see `weigh_motions`."""
+
+    sample: SampledMotions
+    by_parameters: FloatArray  # (6 n, p) in tolerances
+    base: FloatArray  # (6 n, 6) by the base frame
+    platform: FloatArray  # (6 n, 6) by the platform frame
+    # (p,) length of the motion by each parameter, at least the median: the scale of combinations
+    scale: FloatArray
+
+
+def _weigh(robot: Mechanism, places: IntArray, unit: FloatArray) -> WeighedMotions:
+    """Return motions by the parameters at places (p,) of the table, in a unit (p,)."""
+    sample = sample_motions(robot)
+    twists = sample.D[:, :, places] * unit
+    motions, base, platform = weigh_motions(sample.T, robot.size, twists)
+    own = np.linalg.norm(motions, axis=0)
+    floor = np.median(own[own > NO_MOTION * own.max(initial=0.0)]) if own.any() else 1.0
+    return WeighedMotions(sample, motions, base, platform, np.maximum(own, floor))
+
+
+def find_gauge_freedoms(
+    robot: Mechanism, places: IntArray, unit: FloatArray, null: FloatArray
+) -> GaugeFreedoms:
+    """Classify independent directions (p, d) that data do not determine, of the parameters at
+    places (p,) of the table, in a unit (p,).
+
+    Without a pose that the robot reaches all of them count as changing poses, by an unknown effect.
+    """
+    if null.shape[1] == 0:
+        return GaugeFreedoms()
+    weighed = _weigh(robot, places, unit)
+    T = weighed.sample.T
     if not len(T):
-        return GaugeFreedoms(null, (), 0, np.zeros((12, 0)))
-    twists = D[:, :, posterior.places] * posterior.unit
-    motions, base, platform = weigh_motions(T, robot.size, twists)
-    total = float(np.linalg.norm(motions))
-    moved = motions @ null
-    _, s, vt = np.linalg.svd(_without_span([base, platform], moved), full_matrices=False)
-    # directions are those of the last linearization, motions those after the last step of the fit
-    gauge = vt[s <= SAME_MOTION * total].T
-    moving = moved @ gauge
-    _, s, combine = np.linalg.svd(moving, full_matrices=False)
-    moving = moving @ combine[s > NO_MOTION * total].T
+        return GaugeFreedoms(changing=null.shape[1], effect=(np.nan, np.nan))
+    base, platform = weighed.base, weighed.platform
+    # in this basis, a combination of length one is made of motions of length one by its parameters
+    basis = np.linalg.qr(weighed.scale[:, None] * null)[0]
+    moved = (weighed.by_parameters / weighed.scale) @ basis
+    rest = _without_span([base, platform], moved)
+    _, s, vt = np.linalg.svd(np.linalg.qr(rest, mode="r"))
+    changing = int((s > SAME_MOTION).sum())
+    _, s, combine = np.linalg.svd(moved @ vt[changing:].T, full_matrices=False)
+    moving = moved @ vt[changing:].T @ combine[s > SAME_MOTION].T
     count = moving.shape[1]
-    frames = find_moving_frames(moving, base, platform, SAME_MOTION * total) if count else ()
-    infinite = np.isinf(posterior.variance[~posterior.determined])
-    kept = null @ _gauge_projector(gauge, infinite)
-    both = np.concatenate([base, platform], axis=1)
-    motion = np.linalg.lstsq(both, moving, rcond=NO_MOTION)[0]
-    explained = motion / np.linalg.norm(motion, axis=0)
+    frames = find_moving_frames(moving, base, platform, SAME_MOTION) if count else ()
+    motion = np.linalg.lstsq(np.concatenate([base, platform], axis=1), moving, rcond=NO_MOTION)[0]
     growth = np.zeros((len(T), 6, 1))
     growth[:, 3:, 0] = T[:, :3, 3]
-    rest = _without_span([base, platform, growth.reshape(-1, 1)], moved)
-    with_scale = np.linalg.svd(rest, compute_uv=False) <= SAME_MOTION * total
-    return GaugeFreedoms(kept, frames, count, explained, bool(with_scale.sum() > gauge.shape[1]))
+    grown = _without_span([base, platform, growth.reshape(-1, 1)], moved)
+    with_scale = int((np.linalg.svd(grown, compute_uv=False) > SAME_MOTION).sum())
+    return GaugeFreedoms(
+        frames,
+        count,
+        motion / np.linalg.norm(motion, axis=0),
+        has_scale=with_scale < changing,
+        still=null.shape[1] - changing - count,
+        changing=changing,
+        effect=_measure_effect(robot, weighed, null) if changing else (0.0, 0.0),
+        where="the workspace" if weighed.sample.in_workspace else "poses about home",
+    )
+
+
+def _measure_effect(
+    robot: Mechanism, weighed: WeighedMotions, null: FloatArray
+) -> tuple[float, float]:
+    """Return `GaugeFreedoms.effect` of directions (p, d), over the workspace where one is known."""
+    moved = weighed.by_parameters @ np.linalg.qr(null)[0]
+    rest = _without_span([weighed.base, weighed.platform], moved)
+    chosen = slice(-weighed.sample.in_workspace or None, None)
+    T = weighed.sample.T[chosen]
+    twists = rest.reshape(-1, 6, null.shape[1])[chosen] / twist_weights(robot.size)[:, None]
+    at_tool = geometry.transport_matrix(T[:, :3, :3] @ robot.tool[:3, 3]) @ twists
+    rotation, displacement = np.sqrt((at_tool**2).sum(axis=2).reshape(-1, 2, 3).sum(2).mean(0))
+    kept = SAME_MOTION * np.hypot(rotation * robot.size, displacement)  # a smaller one is rounding
+    return (
+        float(rotation) if rotation * robot.size > kept else 0.0,
+        float(displacement) if displacement > kept else 0.0,
+    )
+
+
+def report_undetermined(
+    free: FreeParameters,
+    unidentifiable: tuple[Combination, ...],
+    codes: tuple[str, str] = ("identifiability.frames-only", "identifiability.changes-poses"),
+    is_readings_alone: bool = False,
+) -> tuple[list[Finding], tuple[Combination, ...]]:
+    """Return how many undetermined combinations are harmless, and how many change poses by how
+    much; and the combinations that do.
+
+    A combination with a meaning, such as the place of a frame, changes no pose. Where all have one,
+    but together change poses, the parameters of all are named.
+
+    codes : of the two findings.
+    """
+    null = np.stack([combination.direction for combination in unidentifiable], axis=1)
+    freedoms = find_gauge_freedoms(free.robot, free.places, free.tolerance, null)
+    findings = []
+    if is_readings_alone:
+        findings.append(report_readings_gauge(freedoms))
+    if freedoms.count or freedoms.still:
+        harmless: dict[str, Any] = {"count": freedoms.count, "frames": freedoms.frames}
+        findings.append(report_finding(codes[0], still=freedoms.still, **harmless))
+    if not freedoms.changing:
+        return findings, ()
+    changing = tuple(c for c in unidentifiable if not c.meaning)
+    names = dict.fromkeys(name for c in changing or unidentifiable for name in c.names)
+    to_quantity, (rotation, displacement) = free.robot.to_quantity, freedoms.effect
+    sizes = ((displacement, Dimension.LENGTH), (rotation, Dimension.ANGLE))
+    changed: dict[str, Any] = {
+        "count": freedoms.changing,
+        "names": tuple(names),
+        "sizes": tuple(to_quantity(*size) for size in sizes if size[0] > 0.0),
+        "where": freedoms.where,
+    }
+    return [*findings, report_finding(codes[1], **changed)], changing
+
+
+def report_readings_gauge(freedoms: GaugeFreedoms) -> Finding:
+    """Return what open combinations are: the place of frames, the size, and others."""
+    others = freedoms.changing - freedoms.has_scale
+    combinations = (
+        {"what": "frames", "frames": freedoms.frames, "count": freedoms.count},
+        {"what": "scale", "frames": (), "count": int(freedoms.has_scale)},
+        {"what": "others", "frames": (), "count": others},
+    )
+    kept = tuple(part for part in combinations if part["count"])
+    return report_finding("identifiability.readings-gauge", parts=kept)
 
 
 def twist_weights(size: float) -> FloatArray:
@@ -114,17 +248,15 @@ def interpret_combinations(
     if not combinations:
         return combinations
     robot = free.robot
-    T, D = observe_motions(robot, probe_readings(robot))
-    if not len(T):
+    weighed = _weigh(robot, free.places, free.tolerance)
+    if not len(weighed.sample.T):
         return combinations
-    motions, base, platform = weigh_motions(T, robot.size, D[:, :, free.places] * free.tolerance)
-    frames = {"platform": platform, "base": base}
-    limit = NO_MOTION * float(np.linalg.norm(motions))
+    frames = {"platform": weighed.platform, "base": weighed.base}
     interpreted = []
     for combination in combinations:
         n = combination.direction
-        moved = motions @ (n / np.linalg.norm(n))
-        motion = _describe_motion(moved, frames, limit, robot.size)
+        limit = SAME_MOTION * float(np.linalg.norm(weighed.scale * n))
+        motion = _describe_motion(weighed.by_parameters @ n, frames, limit, robot.size)
         interpreted.append(replace(combination, meaning="" if motion is None else motion))
     return tuple(interpreted)
 
@@ -137,22 +269,6 @@ def interpret_fit(fit: Identification) -> Identification:
     codes = {combination.finding.code for combination in fit.unidentifiable}
     findings = tuple(next(named) if f.code in codes else f for f in fit.findings)
     return replace(fit, unidentifiable=combinations, findings=findings)
-
-
-def _gauge_projector(gauge: FloatArray, infinite: BoolArray) -> FloatArray:
-    """Return the projector (d, d) along `gauge` (d, g); coordinates of infinite variance go first.
-
-    The choice of the frame that is fitted is a convention; this one leaves nothing infinite that a
-    motion of a frame can remove.
-    """
-    d = len(gauge)
-    u, s, vt = np.linalg.svd(gauge[infinite], full_matrices=True)
-    rank = int((s > NO_MOTION).sum())
-    first, second = gauge @ vt[:rank].T, gauge @ vt[rank:].T
-    projector = np.eye(d)
-    projector[:, infinite] -= (first / s[:rank]) @ u[:, :rank].T
-    basis = np.linalg.qr(second)[0]
-    return projector - basis @ (basis.T @ projector)
 
 
 def probe_readings(robot: Mechanism) -> FloatArray:
@@ -234,14 +350,13 @@ def _describe_motion(
     moved: FloatArray, frames: dict[str, FloatArray], limit: float, size: float
 ) -> Finding | None:
     """Return a finding on a motion (6 n,); None where it is not rigid."""
-    length = np.linalg.norm(moved)
-    if length <= limit:
+    if np.linalg.norm(moved) <= limit:
         return report_finding("identifiability.no-motion")
     for name, frame in frames.items():
-        if np.linalg.norm(_without_span([frame], moved)) <= SAME_MOTION * length:
+        if np.linalg.norm(_without_span([frame], moved)) <= limit:
             motion = np.linalg.lstsq(frame, moved, rcond=NO_MOTION)[0]
             return _describe_frame_motion(name, np.asarray(motion, dtype=np.float64), size)
-    if np.linalg.norm(_without_span(list(frames.values()), moved)) <= SAME_MOTION * length:
+    if np.linalg.norm(_without_span(list(frames.values()), moved)) <= limit:
         return report_finding("identifiability.both-frames-move")
     return None
 

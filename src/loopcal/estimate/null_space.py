@@ -64,6 +64,11 @@ class Combination(Result):
     )
 
     @property
+    def is_harmless(self) -> bool:
+        """Whether it is known that no pose depends on it."""
+        return getattr(self.meaning, "code", "") == "identifiability.no-motion"
+
+    @property
     def finding(self) -> Finding:
         """That the data do not determine this combination, or hardly."""
         weak = self.singular_value > 0.0

@@ -330,6 +330,11 @@ class Posterior:
         return tuple(self.robot.parameters.names[i] for i in self.places)
 
     @property
+    def undetermined(self) -> FloatArray:
+        """(p, d) directions that the rows do not determine."""
+        return self.directions[:, ~self.determined]
+
+    @property
     def estimate(self) -> FloatArray:
         """(p,) estimates [SI]."""
         return self.robot.values[self.places]

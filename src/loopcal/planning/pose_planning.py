@@ -15,7 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal.apply.validation import FEW_ROWS
+from loopcal.diagnose.gauge_freedoms import interpret_combinations, report_undetermined
 from loopcal.errors import EstimationError
+from loopcal.estimate.null_space import describe_null_space
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument
@@ -463,7 +465,7 @@ def _arrange_poses(
 
 def _collect_notes(problem: PlanningProblem) -> list[Finding]:
     """Return findings on what was assumed and excluded."""
-    p, rank, assumed = len(problem.free), int(problem.observable.rank[0]), problem.free.assumed
+    p, assumed = len(problem.free), problem.free.assumed
     notes = [problem.candidates.report()]
     if assumed.any():
         notes.append(
@@ -473,6 +475,8 @@ def _collect_notes(problem: PlanningProblem) -> list[Finding]:
     if frame.fitted or frame.undetermined:
         frames = frame.fitted or frame.undetermined
         notes.append(report_finding("plan.frames-undetermined", frames=frames))
-    if rank < p:
-        notes.append(report_finding("plan.unobservable", count=p - rank, parameters=p))
+    combinations = describe_null_space(problem.free, problem.observable.null_space())
+    if combinations:
+        interpreted = interpret_combinations(problem.free, combinations)
+        notes += report_undetermined(problem.free, interpreted)[0]
     return notes
