@@ -6,39 +6,45 @@ of coordinate exchange.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from loopcal.papers.cmm_constraint_2011 import steps
 from loopcal.papers.cmm_constraint_2011.steps import (
+    ABSOLUTE,
     ALIGNED,
+    AT_NOMINAL,
     BEFORE,
-    FRAMES,
+    CASE,
+    DETERMINED,
     LS,
     METHODS,
-    MM,
-    ONE,
     PRIOR,
     SIZES,
-    TEN,
     WEIGHTS,
     Cell,
     Study,
-    calibrate_fifty,
+    calibrate,
     calibrate_figure_5,
-    calibrate_grid,
-    compare_estimates,
-    compute_rank_correlation,
-    draw_true_machines,
+    change_sizes,
+    compare_interpretations,
     list_printed,
+    load_grid,
+    name_measure,
+    place_fifty,
     plan_points,
-    rank_candidates,
+    rank_correlations,
+    take_median,
 )
 from loopcal.planning.plane_line_planning import PlaneLineGroups
+from loopcal.studies.simulation.block import calibrate_cells, set_size
 from loopcal.typing import FloatArray
 
 SEED, DRAWS, STARTS, FEW_DRAWS, DRAWS_PER_INTERPRETATION = 0, 200, 5, 40, 60
-MACHINES = 50
-"""Identified with surfaces as unknowns."""
+MACHINES, NOISE = 50, 0.01
+"""Identified with surfaces as unknowns, and the noise of their held coordinates [mm]."""
 WEIGHT_NAMES = {
     "printed": "as printed: weight one",
     "distance": "divided by the distance d_1",
@@ -62,7 +68,7 @@ def time_linearization(planned: PlaneLineGroups, design: FloatArray) -> float:
 def optimize_from_start(seed: int) -> tuple[Study, list]:
     """Run coordinate exchange from one random start; return the study and its row."""
     began = time.process_time()
-    study = plan_points(seed=seed)
+    study = plan_points(load_grid(CASE, seed, DRAWS))
     spent = time.process_time() - began
     before, after = study.spreads
     cost = spent / time_linearization(study.planned, study.first) if seed == SEED else None
@@ -70,12 +76,18 @@ def optimize_from_start(seed: int) -> tuple[Study, list]:
 
 
 MEDIANS = {
-    "position, aligned [mm]": "position, aligned [mm]",
-    "position, absolute [mm]": "position [mm]",
-    "position, gauge at nominal [mm]": "position, gauge at nominal [mm]",
-    "parameters without gauge [mm]": "parameters without gauge [mm]",
+    "position, aligned [mm]": name_measure("position", ALIGNED),
+    "position, absolute [mm]": name_measure("position", ABSOLUTE),
+    "position, gauge at nominal [mm]": name_measure("position", AT_NOMINAL),
+    "parameters without gauge [mm]": DETERMINED,
 }
-"""Columns of Table 3: their names in MEASURES."""
+"""Columns of Table 3 and the names of their measures."""
+POSITION = name_measure("position", ALIGNED)
+
+
+def take_machines(study: Study, machines: int) -> Study:
+    """Return a study of so many machines."""
+    return replace(study, grid=set_size(study.grid, SEED, machines))
 
 
 def list_medians(c: Cell) -> list[float]:
@@ -87,63 +99,69 @@ def compare_weights(study: Study) -> list[list[Any]]:
     """Return errors by LS and MAP for each weighting of the rows, and the ratio of LS to that as
     printed.
     """
-    cells = {w: calibrate_figure_5(study, SEED, DRAWS, weights=w) for w in WEIGHTS}
-    position, parameters = "position, aligned [mm]", "parameters without gauge [mm]"
-    first = cells["printed"].compute_median(LS, position)
+    cells = {w: calibrate_figure_5(study, "" if w == "full" else f"products-{w}") for w in WEIGHTS}
+    first = cells["printed"].compute_median(LS, POSITION)
     return [
         [
             WEIGHT_NAMES[w],
-            *(c.compute_median(m, name) for name in (position, parameters) for m in (LS, PRIOR)),
-            c.compute_median(LS, position) / first,
+            *(c.compute_median(m, name) for name in (POSITION, DETERMINED) for m in (LS, PRIOR)),
+            c.compute_median(LS, POSITION) / first,
         ]
         for w, c in cells.items()
     ]
 
 
-def compare_interpretations(study: Study) -> list[list[Any]]:
-    """Return figure 5 as printed and under every interpretation."""
-    result = rank_candidates({TEN: study}, SEED, DRAWS_PER_INTERPRETATION)
-    names = ("reading", "truth", "frame", "parameters", "position", "orientation")
-    rows = [[row[name] for name in names] for row in result]
-    return [["as printed", None, None, *map(float, list_printed())], *rows]
+def list_interpretations(study: Study) -> list[list[Any]]:
+    """Return figure 5 as printed and under every interpretation, the nearest first."""
+    study, printed = take_machines(study, DRAWS_PER_INTERPRETATION), list_printed()
+    candidates = compare_interpretations(study, calibrate_figure_5(study))
+    rows = [
+        [of.reading, of.truth, of.frame, *(of.medians[name] for name in printed)]
+        for of in sorted(candidates, key=lambda of: of.distance)
+    ]
+    return [["as printed", None, None, *printed.values()], *rows]
 
 
 def identify_with_surfaces(study: Study) -> list[list[Any]]:
     """Return on how many machines fits with surfaces as unknowns converge, and how far their
-    estimates are from those of the paper's rows.
+    estimates are from those of the paper's rows: the largest difference along a direction [sd].
     """
-    forms = SIZES.find("forms")
-    noise = max(forms["noises"]) * MM
-    q = study.layout.solve_readings(
-        draw_true_machines(study.robot, forms["errors"] * MM, MACHINES, SEED), noise, SEED
-    )
-    rows = (compare_estimates(study.layout, q, noise, name) for name in METHODS)
-    return [
-        [
-            row["method"],
-            f"{row['converged']} of {row['machines']}",
-            *(row[name] for name in ("iterations", "median", "largest")),
-        ]
-        for row in rows
-    ]
+    rows, compared = study.optimized.rows.reshape(-1, len(study.planned.free)), []
+    for name in METHODS:
+        grid = change_sizes(set_size(study.grid, SEED, MACHINES), {"": 1.0}, {"": NOISE})
+        level = grid.methods[name]
+        methods = {"products": level, "surfaces": replace(level, rows="weighted")}
+        products, surfaces = calibrate_cells(replace(grid, methods=methods))
+        both = products.is_converged & surfaces.is_converged
+        free = study.planned.free
+        z = (surfaces.values - products.values)[both][:, free.places] / free.tolerance
+        unlike = np.linalg.norm(z @ rows.T, axis=1) / NOISE  # rows have a noise of 1 mm
+        compared.append(
+            [
+                name,
+                f"{both.sum()} of {len(both)}",
+                int(surfaces.iterations.max()),
+                float(np.median(unlike)),
+                float(unlike.max()),
+            ]
+        )
+    return compared
 
 
 def compare_fifty_points(study: Study) -> list[list[Any]]:
     """Return mean position errors before, by LS and by MAP in each frame, and the share of LS fits
     that converge within 5 iterations.
     """
-    position, planes = steps.STATISTICS[0], SIZES.find("fifty", "planes")
-    cells = {groups: calibrate_fifty(study, groups, SEED, FEW_DRAWS) for groups in planes}
-    return [
-        [
-            groups,
-            frame,
-            *(cell.compute_median(m, f"{position}, {frame}") for m in (BEFORE, LS, PRIOR)),
-            cell.within_five if frame == ALIGNED else None,
-        ]
-        for groups, cell in cells.items()
-        for frame in FRAMES
-    ]
+    rows, study = list[list[Any]](), take_machines(study, FEW_DRAWS)
+    most = int(steps.PRINTED.find("experiment", "iterations"))
+    for groups in SIZES.find("fifty", "planes"):
+        (cell,) = calibrate(study, place_fifty(study.grid, groups)).values()
+        for frame in steps.FRAMES:
+            mean = name_measure("position", frame, ", mean")
+            within = 100.0 * float(cell.is_within(most).mean()) if frame == ALIGNED else None
+            medians = (cell.compute_median(m, mean) for m in (BEFORE, LS, PRIOR))
+            rows.append([groups, frame, *medians, within])
+    return rows
 
 
 QUICK = {"DRAWS": 8, "STARTS": 1, "FEW_DRAWS": 3, "DRAWS_PER_INTERPRETATION": 4, "MACHINES": 4}
@@ -162,21 +180,24 @@ def collect() -> dict[str, Any]:
     """
     study, first = optimize_from_start(SEED)
     starts = [first, *(optimize_from_start(seed)[1] for seed in range(SEED + 1, SEED + STARTS))]
-    cells = calibrate_grid(study, SEED, DRAWS, lambda _: None)
+    cells = calibrate(study)
     rows = [
-        [given, noise, *list_medians(c), c.count_worse(PRIOR, "position, aligned [mm]"), c.failed]
-        for (given, noise), c in cells.items()
-    ]
-    plan = plan_points(1, 100, seed=SEED, sweeps=1)
-    one = calibrate_figure_5(plan, SEED, FEW_DRAWS)
+        [given, noise, *list_medians(c), int((c.compute_left(PRIOR, POSITION) > 1.0).sum()),
+         sum(int((~converged).sum()) for converged in c.converged.values())]
+        for (given, noise), c in sorted(cells.items(), key=lambda of: of[1].size)
+    ]  # fmt: skip
+    (level,) = study.grid.poses.values()
+    few = load_grid(CASE, SEED, FEW_DRAWS)
+    plan = plan_points(few, replace(level, groups=1, sweeps=1, coordinates=()))
+    one = calibrate_figure_5(plan)
     placed = [
-        [TEN, first[1], first[2], *_pair(cells["1", "0.01"]), DRAWS],
-        [ONE, *plan.spreads, *_pair(one), FEW_DRAWS],
+        [steps.name_planes(level.groups), *first[1:3], *_pair(cells["1", "0.01"]), DRAWS],
+        [steps.name_planes(1), *plan.spreads, *_pair(one), FEW_DRAWS],
     ]
     ranks = [
         [
             method,
-            compute_rank_correlation(cells.values(), method),
+            take_median(rank_correlations(cells.values(), method)),
             len(cells),
             len({c.ratio for c in cells.values()}),
         ]
@@ -245,7 +266,7 @@ def collect() -> dict[str, Any]:
                     "orientation [%]",
                 ],
                 ["", "", "", ".0f", ".0f", ".0f"],
-                compare_interpretations(study),
+                list_interpretations(study),
             ),
             "fifty": make_table(
                 [
@@ -284,4 +305,4 @@ def make_table(columns: list[str], formats: list[str], rows: list[list[Any]]) ->
 
 def _pair(c: Cell) -> list[float]:
     """Return the aligned position errors by LS and MAP."""
-    return [c.compute_median(m, "position, aligned [mm]") for m in (LS, PRIOR)]
+    return [c.compute_median(m, POSITION) for m in (LS, PRIOR)]

@@ -457,13 +457,15 @@ def run_cmm_constraint_2011() -> Report:
     """Plan points, draw machines, and calibrate them from planes and lines in the paper's form."""
     from loopcal.papers.cmm_constraint_2011 import steps
 
-    study = steps.plan_points(8, 8, seed=0, sweeps=1)
-    cell = steps.calibrate_cell(study, 1e-3, 1e-5, 0, 3, weights="full")
+    grid = steps.load_grid(steps.CASE, 0, 3)
+    (level,) = grid.poses.values()
+    study = steps.plan_points(grid, replace(level, count=64, groups=8, sweeps=1))
+    cell = steps.calibrate_figure_5(study)
     return {
         "design": study.optimized.design,
         "value": study.optimized.history[-1],
-        "failed": cell.failed,
-        "errors": {name: errors[:, :7] for name, errors in cell.errors.items()},
+        "converged": cell.converged,
+        "errors": cell.errors,
     }
 
 

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from loopcal.mechanism.platform_coordinates import POSITION as POSITION_AXES
 from loopcal.papers import published
 from loopcal.papers.cmm_constraint_2011 import steps
 from loopcal.papers.cmm_constraint_2011.steps import (
@@ -16,119 +17,159 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     ALIGNED,
     AT_NOMINAL,
     BEFORE,
+    DETERMINED,
     LS,
     METHODS,
-    MM,
-    NO_GAUGE,
-    POSITION_ALIGNED,
+    PARAMETERS,
     PRINTED,
     PRIOR,
     SIZES,
+    Candidate,
     Cell,
     Draw,
-    Stated,
+    Key,
+    Quotient,
+    name_measure,
 )
 from loopcal.papers.paper import StudyCase
+from loopcal.papers.published import Row, decide, decide_share
 from loopcal.typing import FloatArray
 
 TEXT = published.PaperText(__file__)
-WEIGHTS = ("as printed: weight one", "divided by |d_1|", "divided by the sd of each",
-           "full covariance")  # fmt: skip
-MOTIONS = (
-    "the end point moves along it",
-    "the end point rotates about it, the base's origin fixed",
-    "the end point stays; the platform rotates about it",
-)
+WEIGHTS = {"printed": "as printed: weight one", "distance": "divided by |d_1|",
+           "single": "divided by the sd of each", "full": "full covariance"}  # fmt: skip
+POSITION = name_measure("position", ALIGNED)
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
     """All computed numbers, before they are judged."""
 
+    case: StudyCase
     study: steps.Study  # the ten groups
     draws: tuple[Draw, ...]  # tables and figures show the first
-    arrangements: list[published.Row]  # TEN, ONE and ANY
-    candidates: list[published.Row]  # interpretations, the nearest first
-    forms: list[published.Row]  # surfaces as unknowns, the hardest first
-    covariance: float  # largest relative difference of a variance of both forms
-    ranks: list[published.Row]  # of random groups
+    arrangements: list[Row]  # of 100 points: the ten groups, one group, groups of any axis
+    one_plane: Cell  # figure 5 from points on one plane and line
+    candidates: list[Candidate]  # interpretations, the nearest first
+    ranks: list[Row]  # of random groups
     pair: tuple[int, int]  # points of a group and rank of the equations of all its pairs
-    gauge_effects: FloatArray  # (9,) of the directions of GAUGE_NAMES on the rows
-    table_4: Mapping[str, Stated]  # factors as printed
-    conclusion: Mapping[str, str]  # of root mean squares, as printed
+    frame_effect: float  # of a motion of the measuring machine on the equations
+    undetermined: list[tuple[str, float]]  # directions, and their effect on the rows
+    table_4: Mapping[str, Quotient]  # as printed
+    conclusion: Mapping[str, Quotient]  # of root mean squares, as printed
 
     @property
-    def cells(self) -> Mapping[tuple[str, str], Cell]:
+    def cells(self) -> Mapping[Key, Cell]:
         """Table 3 of the first draw."""
         return self.draws[0].cells
 
     @property
+    def figure_5(self) -> Cell:
+        """Its cell of the first draw."""
+        return self.draws[0].weights["full"]
+
+    @property
     def trials(self) -> int:
         """Machines of each cell."""
-        return len(self.draws[0].weights["full"].iterations)
+        return len(self.figure_5.iterations)
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether errors before calibration that are printed for figure 5 are outside of those of
+        all machines, so that the dimensions must be others.
+        """
+        errors, figure = self.figure_5.errors[BEFORE], PRINTED.find("figure_5")
+        printed = {name_measure(w, ABSOLUTE): float(figure[w]["before"]) for w in self.study.parts}
+        return any(not errors[w].min() <= x <= errors[w].max() for w, x in printed.items())
+
+    def reduce(self, measure: str) -> FloatArray:
+        """Return the reductions of an error [%] by least squares, figure 5, all machines."""
+        cells = [draw.weights["full"] for draw in self.draws]
+        return 100.0 * (1.0 - np.concatenate([c.compute_left(LS, measure) for c in cells]))
+
+    def pool(self, judge: Callable[[Draw], Sequence[bool | None]]) -> list[bool | None]:
+        """Return the decisions on the machines of all draws."""
+        return [decision for draw in self.draws for decision in judge(draw)]
 
 
 def compute(
-    seed: int, trials: int, progress: Callable[[str], None], case: StudyCase | None = None,
+    seed: int, trials: int, progress: Callable[[str], None], case: StudyCase = steps.CASE,
     draws: int = 0, sweeps: tuple[int | None, int] = (None, 1),
 ) -> Results:  # fmt: skip
     """Compute everything.
 
     draws : of points, machines and noise, by default those of sizes.yaml. sweeps : of the
     coordinate exchange, on the planes of study.yaml and for the other arrangements.
+
+    Raises EstimationError: a robot whose end point cannot be held on planes and lines.
     """
-    progress("coordinate exchange, ten planes")
-    study = steps.plan_points(seed=seed, sweeps=sweeps[0])
-    drawn = [steps.compute_draw(study, seed, trials, progress)]
-    progress("one plane and one line")
-    one = steps.plan_points(**SIZES.find("one_plane"), seed=seed, sweeps=sweeps[1])
-    progress("planes of any axis")
-    free = steps.plan_points(axes=("x", "y", "z"), seed=seed, sweeps=sweeps[1])
-    arrangements = [drawn[0].points]
-    for name, points in ((steps.ONE, one), (steps.ANY, free)):
-        cell = steps.calibrate_figure_5(points, seed, trials)
-        arrangements.append(steps.describe_points(name, points, cell))
-    progress("interpretations of figure 5")
-    candidates = steps.rank_candidates({steps.TEN: study, steps.ONE: one}, seed, trials)
-    progress("both forms")
-    forms = steps.compare_forms(study, seed, trials)
-    draws = draws or SIZES.find("draws")
-    for i in range(1, draws):
-        other = seed + SIZES.find("seed_step") * i
-        points = steps.plan_points(seed=other, sweeps=sweeps[0])
+    draws, drawn = draws or SIZES.find("draws"), list[Draw]()
+    grid = steps.load_grid(case, seed, trials)
+    (level,) = grid.poses.values()
+    level = level if sweeps[0] is None else replace(level, sweeps=sweeps[0])
+    other = replace(level, sweeps=sweeps[1])
+    progress("coordinate exchange")
+    study = steps.plan_points(grid, level)
+    for i in range(draws):
+        points = replace(grid, seed=seed + SIZES.find("seed_step") * i)
         label = f"draw {i + 1} of {draws}"
         drawn.append(
-            steps.compute_draw(points, other, trials, lambda s, n=label: progress(f"{n}: {s}"))
+            steps.compute_draw(
+                steps.plan_points(points, level) if i else study,
+                lambda step, label=label: progress(f"{label}: {step}"),
+            )
         )
+    progress("one plane and one line, and planes of any axis")
+    one = steps.plan_points(grid, replace(other, groups=1))
+    free = steps.plan_points(grid, other, ("x", "y", "z"))
+    first, on_one, on_free = drawn[0], *map(steps.calibrate_figure_5, (one, free))
+    arrangements = [first.points, steps.describe_points(one, on_one)]
+    arrangements.append(steps.describe_points(free, on_free, " of any axis"))
+    progress("interpretations of figure 5")
+    candidates = steps.compare_interpretations(study, first.weights["full"])
+    candidates += steps.compare_interpretations(one, on_one)
     return Results(
+        case=case,
         study=study,
         draws=tuple(drawn),
         arrangements=arrangements,
-        candidates=candidates,
-        forms=forms,
-        covariance=steps.compare_covariances(study.layout, SIZES.find("forms", "noises")[0] * MM),
-        ranks=steps.compute_ranks(study, seed),
+        one_plane=on_one,
+        candidates=sorted(candidates, key=lambda candidate: candidate.distance),
+        ranks=steps.compute_ranks(study),
         pair=steps.compute_pair_rank(study),
-        gauge_effects=steps.compute_gauge_effects(study),
-        table_4={name: Stated(**given) for name, given in PRINTED.find("table_4").items()},
-        conclusion=PRINTED.find("conclusion"),
+        frame_effect=steps.compute_frame_effect(study),
+        undetermined=steps.list_undetermined(study),
+        table_4=steps.list_factors(),
+        conclusion=steps.list_conclusion(),
     )
 
 
-def compare_tables(results: Results) -> tuple[published.Comparison, published.Comparison]:
+def list_replaced(results: Results) -> tuple[str, ...]:
+    """Return sentences on further sizes that another robot replaces."""
+    if results.case.robot is None:
+        return ()
+    study, sentences = results.study, published.PaperFile(__file__, "text.yaml").find("replaced")
+    of = {"errors": study.describe_errors(steps.find_figure_5()[0]), "robot": study.robot.name,
+          "unit": study.unit[1]}  # fmt: skip
+    kept = ["errors", *(["fixed"] if len(study.parts) == 1 else [])]
+    return tuple(published.fill_template(sentences[name], **of) for name in kept)
+
+
+def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
     """Return the stated counts beside the computed ones, and figure 5 beside the nearest
-    interpretation.
+    interpretation; nothing for another robot.
     """
+    if results.case.robot is not None:
+        return ()
     counts = published.Printed.parse({
         "parameters identified": PRINTED.find("parameters"),
-        "iterations for 50 points, at most": "5",
+        "iterations for the measured points, at most": PRINTED.find("experiment", "iterations"),
     })  # fmt: skip
     rank = max(row["rank"] for row in results.ranks)
     iterations = max(int(cell.iterations.max()) for cell in results.draws[0].fifties.values())
     figure, nearest = PRINTED.find("figure_5"), results.candidates[0]
     stated = published.Printed.parse({name: given["stated"] for name, given in figure.items()})
-    names = ["parameters" if name == "estimation" else name for name in figure]
-    reductions = np.array([[nearest[name]] for name in names])
+    reductions = np.array([[nearest.medians[name]] for name in figure])
     return (
         TEXT.compare("counts", counts, np.array([[float(rank)], [float(iterations)]])),
         TEXT.compare("figure_5", stated, reductions, nearest=nearest),
@@ -137,86 +178,119 @@ def compare_tables(results: Results) -> tuple[published.Comparison, published.Co
 
 def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return all tables of the reproduction."""
-    first, trials = results.draws[0], results.trials
-    effects = zip(steps.GAUGE_NAMES, results.gauge_effects, strict=True)
-    gauge = [(name, MOTIONS[i // 3], effect) for i, (name, effect) in enumerate(effects)]
-    printed = ("as printed", "", "", "", *steps.list_printed(), None)
-    weights = [
-        (name, *(c.compute_median(m, e) for m in (LS, PRIOR) for e in (POSITION_ALIGNED, NO_GAUGE)))
-        for name, c in zip(WEIGHTS, first.weights.values(), strict=True)
-    ]
-    forms = [
-        (row["noise"], row["method"], f"{row['converged']} of {row['machines']}",
-         row["iterations"], ", ".join(map(str, row["ranks"])), row["median"], row["largest"])
-        for row in results.forms
-    ]  # fmt: skip
+    study, first, trials = results.study, results.draws[0], results.trials
+    parts, names = study.parts, list_printed_names(study)
+    printed = steps.list_printed()
+    readings: list[tuple[Any, ...]] = []
+    readings.append(("as printed", "", "", "", *(printed[name] for name in names), None))
+    for of in results.candidates:
+        place = (of.points, of.reading, of.truth, of.frame)
+        readings.append((*place, *(of.medians[name] for name in names), of.distance))
+    weights = [(WEIGHTS[w], *row) for w, cell in first.weights.items()
+               for row in list_methods(cell, (POSITION, DETERMINED), METHODS)]  # fmt: skip
     fifty = [
-        (f"{groups} {'plane, one line' if groups == 1 else 'planes, a line each'}", frame, method,
-         *compute_statistics(cell, method, frame))
-        for groups, cell in first.fifties.items() for method in (BEFORE, *METHODS)
-        for frame in steps.FRAMES
+        (steps.name_planes(groups), frame, *row)
+        for groups, cell in first.fifties.items() for frame in steps.FRAMES
+        for row in list_methods(cell, list_statistics(study, frame))
     ]  # fmt: skip
-    measures = (POSITION_ALIGNED, "orientation, aligned [deg]", NO_GAUGE)
-    absolute = ("position [mm]", "orientation [deg]", "parameters [mm]",
-                "position, gauge at nominal [mm]")  # fmt: skip
-    return (
-        _list_given(results.study),
-        TEXT.table("ranks", [tuple(row.values())[:-1] for row in results.ranks]),
-        TEXT.table("gauge", gauge),
-        _list_table_3(results, "table_3", measures),
-        _list_table_3(results, "table_3_absolute", absolute),
-        TEXT.table("figure_5_readings", [printed, *results.candidates]),
-        TEXT.table("arrangements", results.arrangements, trials=trials),
-        TEXT.table("weights", weights),
-        TEXT.table("table_4", fifty, trials=trials, noise=PRINTED.number("accuracy", "accuracy"),
-                   failed=sum(cell.failed for cell in first.fifties.values())),
-        TEXT.table("forms", forms, errors=SIZES.find("forms", "errors"),
-                   covariance=results.covariance),
-        _list_arithmetic(results),
+    figure_5, experiment = (
+        {"errors": study.describe_errors(cell.size), "noise": cell.noise}
+        for cell in (results.figure_5, next(iter(first.fifties.values())))
+    )
+    more = [(f"{name} [%]", ".0f") for name in names] + [("largest difference", ".0f")]
+    statistics = [(study.label(name_measure(what, "", s)).replace(", ,", ","), ".3g")
+                  for what in parts for s in steps.STATISTICS[1:]]  # fmt: skip
+    aligned = tuple(name_measure(what, ALIGNED) for what in parts)
+    absolute = tuple(name_measure(what, ABSOLUTE) for what in parts)
+    at_nominal = name_measure("position", AT_NOMINAL)
+    tables = (
+        _list_given(study),
+        TEXT.table("ranks", [tuple(row.values()) for row in results.ranks],
+                   parameters=len(study.planned.free)),
+        TEXT.table("gauge", results.undetermined, count=len(results.undetermined)),
+        _list_table_3(results, "table_3", (*aligned, DETERMINED)),
+        _list_table_3(results, "table_3_absolute", (*absolute, at_nominal, PARAMETERS)),
+        TEXT.table("figure_5_readings", readings, "", more),
+        TEXT.table("arrangements", results.arrangements, trials=trials, unit=study.unit[1],
+                   rank=len(study.observable), **figure_5),
+        TEXT.table("weights", weights, "",
+                   [(study.label(name), ".3g") for name in (POSITION, DETERMINED)], **figure_5),
+        TEXT.table("table_4", fifty, "", statistics, trials=trials, **experiment),
     )  # fmt: skip
+    return (*tables, _list_arithmetic(results)) if results.case.robot is None else tables
 
 
-def compute_statistics(cell: Cell, method: str, frame: str) -> FloatArray:
-    """Return the medians (4,) of STATISTICS in a frame."""
-    return np.array([cell.compute_median(method, f"{s}, {frame}") for s in steps.STATISTICS])
+def list_printed_names(study: steps.Study) -> list[str]:
+    """Return which errors of figure 5 the robot has."""
+    return [name for name in steps.list_printed() if name in (PARAMETERS, *study.parts)]
+
+
+def list_statistics(study: steps.Study, frame: str) -> list[str]:
+    """Return the means and standard deviations of Table 4 in a frame."""
+    return [name_measure(what, frame, s) for what in study.parts for s in steps.STATISTICS[1:]]
+
+
+def list_methods(
+    cell: Cell, measures: Sequence[str], methods: Sequence[str] = (BEFORE, *METHODS)
+) -> Iterator[tuple[Any, ...]]:
+    """Yield method, number of machines and medians; machines on which a method did not converge
+    have a row of their own.
+    """
+    for method in methods:
+        for is_lost in (False, True):
+            count = int((cell.converged[method] != is_lost).sum())
+            medians = (cell.compute_median(method, measure, is_lost) for measure in measures)
+            if count or not is_lost:
+                name = f"{method}, not converged" if is_lost else method
+                yield (name, count, *(x if np.isfinite(x) else None for x in medians))
 
 
 def _list_given(study: steps.Study) -> published.Table:
-    rows = [("robot", f"{steps.ROBOT}, 42 parameters, nominal geometry of Nategh and Agheli 2009")]
-    for name, (low, high) in study.robot.assembly.workspace.items():
-        scale, unit = (np.pi / 180.0, "deg") if name in {"roll", "pitch", "yaw"} else (MM, "mm")
-        rows.append((f"workspace, {name}", f"{low / scale:.4g} to {high / scale:.4g} {unit}"))
+    robot, scale = study.robot, {"m": (steps.MM, "mm"), "rad": (steps.DEGREE, "deg")}
+    rows = [("robot", f"{robot.name}, {len(study.planned.free)} free parameters")]
+    for name, (low, high) in robot.assembly.workspace.items():
+        unit, symbol = scale["m" if name in POSITION_AXES else "rad"]
+        rows.append((f"workspace, {name}", f"{low / unit:.4g} to {high / unit:.4g} {symbol}"))
     groups, points = study.layout.groups, study.layout.points
     each = f"{groups} planes of equal z, {points // groups} points each with their line"
+    sets = ", ".join(study.describe_errors(level.tolerance_factor)
+                     for level in study.grid.errors.values())  # fmt: skip
     history = ", ".join(f"{v:.1f}" for v in study.optimized.history)
-    exchange = f"log det {history} [tolerance 1 mm, noise 1 mm]"
-    return TEXT.table("given", [*rows, ("points", each), ("coordinate exchange", exchange)])
+    exchange = f"log det {history} [tolerances, noise 1 mm]"
+    rows += [("standard deviations of the errors", sets), ("points", each)]
+    return TEXT.table("given", [*rows, ("coordinate exchange", exchange)])
 
 
 def _list_table_3(results: Results, name: str, measures: tuple[str, ...]) -> published.Table:
-    methods = (BEFORE, LS, PRIOR)
-    rows = [
-        (*key, *(c.compute_median(m, measure) for measure in measures for m in methods),
-         *(c.count_worse(m, measures[0]) for m in (LS, PRIOR)))
-        for key, c in results.cells.items()
-    ]  # fmt: skip
-    failed = sum(c.failed for c in results.cells.values())
-    more = [(f"{measure}, {m}", ".2g") for measure in measures for m in methods]
-    more += [(f"{m} worse than before", "d") for m in (LS, PRIOR)]
-    return TEXT.table(name, rows, "", more, trials=results.trials, failed=failed)
+    rows, study, last = list[tuple[Any, ...]](), results.study, ""
+    for (given, noise), cell in sorted(results.cells.items(), key=lambda of: of[1].size):
+        errors = study.describe_errors(given)
+        for method, *numbers in list_methods(cell, measures):
+            if method == BEFORE and given == last:
+                continue
+            left = cell.compute_left(method, measures[0]) if method in METHODS else None
+            worse = None if left is None else int((left > 1.0).sum())
+            rows.append((errors, "-" if method == BEFORE else noise, method, *numbers, worse))
+        last = given
+    more = [(study.label(measure), ".2g") for measure in measures]
+    more.append((f"worse than before in {measures[0]}", "d"))
+    return TEXT.table(name, rows, "", more, trials=results.trials,
+                      poses=study.grid.scores.held_out)  # fmt: skip
 
 
 def _list_arithmetic(results: Results) -> published.Table:
     rows: list[tuple[Any, ...]] = []
+    word = {True: "yes", False: "no", None: "if rounded so"}
     for name, given in results.table_4.items():
-        numbers = (given.before, given.after, given.stated, given.factor)
+        numbers = (*given.before, *given.after, given.stated, given.factor)
         possible = "{:.2f} to {:.2f}".format(*given.possible)
-        rows.append((f"Table 4, {name}", *numbers, possible, given.excess == 0.0))
-    for name in ("position", "orientation"):
-        given = Stated(**PRINTED.find("figure_5", name))
-        follows = abs(given.reduction - float(given.stated)) <= 0.5
-        numbers = (given.before, given.after, given.stated, given.reduction)
-        rows.append((f"Figure 5, {name} [%]", *numbers, None, follows))
+        rows.append((f"Table 4, {name}", *numbers, possible, word[given.follows]))
+    for name, reduction in steps.list_printed().items():
+        given = PRINTED.find("figure_5", name)
+        if "before" in given:
+            follows = abs(reduction - float(given["stated"])) <= 0.5
+            numbers = (given["before"], given["after"], given["stated"], reduction)
+            rows.append((f"Figure 5, {name} [%]", *numbers, None, word[follows]))
     return TEXT.table("arithmetic", rows)
 
 
@@ -227,13 +301,13 @@ def make_figures(results: Results) -> tuple[published.Figure, ...]:
 
 def _draw_figure_4(results: Results) -> published.Figure:
     """Return pose error over parameter error, both after / before, so that growth has a place."""
-    frames = {"": ("parameters [mm]", "position [mm]"), ", aligned": (NO_GAUGE, POSITION_ALIGNED)}
+    absolute = (PARAMETERS, name_measure("position", ABSOLUTE))
     lines = []
-    for frame, measures in frames.items():
+    for frame, measures in {"": absolute, ", aligned": (DETERMINED, POSITION)}.items():
         for method in METHODS:
             both = sorted(
-                tuple(c.compute_median(method, m) / c.compute_median(BEFORE, m) for m in measures)
-                for c in results.cells.values()
+                tuple(steps.take_median(cell.compute_left(method, m)) for m in measures)
+                for cell in results.cells.values()
             )
             lines.append(published.Series.of(f"{method}{frame}", *zip(*both, strict=True)))
     return TEXT.figure("figure_4", lines, joined=False, count=len(results.cells))
@@ -241,222 +315,246 @@ def _draw_figure_4(results: Results) -> published.Figure:
 
 def _draw_figure_5(results: Results) -> published.Figure:
     """Return position errors of single poses of the first machine, before and after."""
-    given, study = SIZES.find("figure_5"), results.study
-    made = results.cells[f"{given['errors']:g}", f"{given['noise']:g}"]
-    true, sizes = study.solve(made.truth[:1]), {}
-    for name in (BEFORE, *METHODS):
-        T = study.solve(made.values.get(name, study.robot.parameters.nominal[None])[:1])
+    study, made, sizes = results.study, results.figure_5, {}
+    true = study.solve(made.truth[:1])
+    for name, values in made.values.items():
+        T = study.solve(values[:1])
         for frame in (ABSOLUTE, ALIGNED):
             twists = study.compute_twists(T, true, frame)[0]
             label = name if frame == ABSOLUTE else f"{name}, {frame}"
-            sizes[label] = np.linalg.norm(twists[:, 3:], axis=1) / MM
+            sizes[label] = np.linalg.norm(twists[:, 3:], axis=1) / steps.MM
     order = np.argsort(sizes[BEFORE])
     x = range(1, len(order) + 1)
     lines = [published.Series.of(label, x, size[order]) for label, size in sizes.items()]
-    return TEXT.figure("figure_5", lines, joined=False, **given, count=len(order))
+    return TEXT.figure("figure_5", lines, joined=False, errors=study.describe_errors(made.size),
+                       noise=made.noise, count=len(order))  # fmt: skip
 
 
 def _draw_table_3(results: Results) -> published.Figure:
     """Return the position error by noise, for each set of errors."""
     lines, levels = [], {}
-    for given in PRINTED.find("sets").split():
-        cells = [c for (of_set, _), c in results.cells.items() if of_set == given]
-        before = cells[0].compute_median(BEFORE, POSITION_ALIGNED)
-        levels[f"before, errors of {given} mm"] = before
-        for method in (LS, PRIOR):
-            y = [c.compute_median(method, POSITION_ALIGNED) for c in cells]
-            x = [c.noise / MM for c in cells]
-            lines.append(published.Series.of(f"{method}, errors of {given} mm", x, y))
+    for given in results.study.grid.errors:
+        cells = [cell for (of_set, _), cell in results.cells.items() if of_set == given]
+        name = f"errors of {results.study.describe_errors(given)}"
+        levels[f"before, {name}"] = cells[0].compute_median(BEFORE, POSITION)
+        for method in METHODS:
+            y = [cell.compute_median(method, POSITION) for cell in cells]
+            lines.append(published.Series.of(f"{method}, {name}", [c.noise for c in cells], y))
     return TEXT.figure("table_3", lines, levels, trials=results.trials)
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
-    """Return a verdict for each claim."""
-    groups = (_judge_equations, _judge_table_3, _judge_figure_5, _judge_points, _judge_arithmetic,
-              _judge_methods, _judge_forms)  # fmt: skip
+    """Return a verdict for each claim; without those on printed numbers alone for another robot."""
+    groups = [_judge_equations, _judge_table_3, _judge_figure_5, _judge_experiment,
+              _judge_points, _judge_methods]  # fmt: skip
+    if results.case.robot is None:
+        groups.append(_judge_arithmetic)
     return tuple(verdict for judge in groups for verdict in judge(results))
 
 
+def decide_all(decisions: Sequence[bool | None]) -> bool | None:
+    """Return True if all are true, False if all are false, else None."""
+    return decide(all(d is True for d in decisions), all(d is False for d in decisions))
+
+
 def _judge_equations(results: Results) -> tuple[published.Verdict, ...]:
-    points, rank = results.pair
-    effect, parameters = results.gauge_effects[:6].max(), int(PRINTED.find("parameters"))
-    ranks = sorted({row["rank"] for row in results.ranks})
-    groups = [row["groups"] for row in results.ranks]
-    unused = max((row["unused"] or 0.0) / row["largest"] for row in results.ranks)
+    (points, rank), effect = results.pair, results.frame_effect
     missing, judge = points - rank, TEXT.judge
+    last = [row["last"] for row in results.ranks]
+    regular = [decide(smallest > 1e-8, smallest < 1e-12) for smallest in last]
+    groups = [row["groups"] for row in results.ranks]
     return (
-        judge("independent", effect < 1e-9, effect=effect),
-        judge("counted", published.decide(missing == 1, missing != 2), points=points, rank=rank,
+        judge("independent", decide(effect < 1e-9, effect > 1e-6), effect=effect),
+        judge("counted", decide(missing == 1, missing != 2), points=points, rank=rank,
               missing=missing),
-        judge("least_squares", ranks[0] == parameters, parameters=parameters, ranks=ranks,
-              fewest=min(groups), most=max(groups), largest=unused),
+        judge("least_squares", decide_all(regular), parameters=len(results.study.planned.free),
+              ranks=sorted({row["rank"] for row in results.ranks}), fewest=min(groups),
+              most=max(groups), largest=max(last), count=len(results.undetermined)),
     )  # fmt: skip
 
 
 def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
     from scipy.stats import beta
 
-    draws, cells, judge = results.draws, results.cells, TEXT.judge
-    shares, better, place = [], [], steps.MEASURES.index("parameters [mm]")
-    for draw in draws:  # by how much the parameter errors decrease with the least noise
-        quiet = draw.cells["1", "0.0001"]
-        left = (quiet.errors[LS] / quiet.errors[BEFORE])[quiet.converged[LS], place]
-        mean = 100.0 * (1.0 - left.mean()) if len(left) else np.nan
-        shares.append({"mean": mean, "reached": int((left <= 0.25).sum()), "count": len(left)})
-        medians = _list_medians(draw)
-        worse = [f"errors {s} mm with noise {n} mm" for (s, n), (before, ls, _) in medians.items()
-                 if not ls <= before]  # fmt: skip
-        ratio = np.median([medians[key][1] * MM / c.noise for key, c in draw.cells.items()])
-        number = len(medians) - len(worse)
-        better.append({"better": number, "worse": worse or ["none"], "ratio": ratio})
-    ranks = [
-        {m: steps.compute_rank_correlation(draw.cells.values(), m) for m in METHODS}
-        for draw in draws
-    ]
-    cell, count = cells["1", "0.01"], len(cells)
+    study, cells, cell, judge = results.study, results.cells, results.figure_5, TEXT.judge
+    p, left = len(study.planned.free), len(study.planned.free) - len(study.observable)
+    stated, falls = PRINTED.number("figure_5", PARAMETERS, "stated"), results.reduce(PARAMETERS)
+    reached = steps.decide_each(falls >= stated - 0.5, np.isfinite(falls))
+    chance = float(beta.cdf((1.0 - stated / 100.0) ** 2, left / 2, (p - left) / 2)) if left else 1.0
+    aligned = [name_measure(what, ALIGNED) for what in study.parts]
+    better = {
+        key: decide_share(results.pool(lambda draw, k=key: draw.cells[k].are_reduced(LS, aligned)))
+        for key in cells
+    }
+    worse = [f"errors {study.describe_errors(s)} with noise {n} mm"
+             for (s, n), decision in better.items() if decision is False]  # fmt: skip
+    ranks = {
+        m: np.concatenate([steps.rank_correlations(d.cells.values(), m) for d in results.draws])
+        for m in METHODS
+    }
+    good = SIZES.find("good")
+    correlated = steps.decide_each(ranks[LS] > good, np.isfinite(ranks[LS]))
+    ratio = np.median([c.compute_median(LS, POSITION) / c.noise for c in cells.values()])
+    absolute = name_measure("position", ABSOLUTE)
+    sizes = {"errors": study.describe_errors(cell.size), "noise": cell.noise}
     return (
-        judge("three_quarters", [share["mean"] >= 75.0 for share in shares],
-              noise=cells["1", "0.0001"].noise / MM,
-              chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)), **shares[0]),
-        judge("better", [of["better"] == count for of in better], count=count, **better[0]),
-        judge("correlation", [min(of.values()) > 0.7 for of in ranks], count=count,
-              ratios=len({c.ratio for c in cells.values()}), ranks=ranks[0],
-              least={m: min(of[m] for of in ranks) for m in METHODS},
-              parameters=cell.compute_reduction(LS, "parameters [mm]"),
-              position=cell.compute_reduction(LS, "position [mm]"),
-              aligned=cell.compute_reduction(LS, POSITION_ALIGNED)),
+        judge("three_quarters", reached, elsewhere=results.case.robot is not None, stated=stated,
+              parameters=p, left=left, best=100.0 * (1.0 - np.sqrt(left / p)),
+              chance=100.0 * chance, median=steps.take_median(falls), **sizes),
+        judge("better", decide(True in better.values(), set(better.values()) == {False}),
+              better=sum(d is True for d in better.values()), count=len(cells),
+              worse=worse or ["none"], parts=study.parts, ratio=ratio),
+        judge("correlation", correlated, good=good, count=len(cells),
+              ratios=len({c.ratio for c in cells.values()}),
+              ranks={m: steps.take_median(r) for m, r in ranks.items()},
+              parameters=steps.take_median(falls), aligned=steps.take_median(
+                  results.reduce(POSITION)), position=steps.take_median(results.reduce(absolute)),
+              **sizes),
     )  # fmt: skip
 
 
-def _list_medians(draw: Draw) -> dict[tuple[str, str], list[float]]:
-    """Return the median position errors of each cell, before and by LS and MAP."""
-    return {
-        key: [c.compute_median(m, POSITION_ALIGNED) for m in (BEFORE, LS, PRIOR)]
-        for key, c in draw.cells.items()
-    }
-
-
 def _judge_figure_5(results: Results) -> tuple[published.Verdict, ...]:
-    ranked = sorted(results.candidates, key=lambda row: row["distance"])
-    deviation, variance = (
-        next(row for row in ranked if row["reading"] == reading)
-        for reading in (steps.SD, steps.VARIANCE)
-    )
-    literal = next(r for r in ranked if (r["truth"], r["frame"]) == ("all 42", ABSOLUTE))
-    texts = [
-        [f"{row[name]:.0f} %" for name in ("parameters", "position", "orientation")]
-        for row in (deviation, variance, literal)
-    ]
-    noise = SIZES.find("figure_5", "noise")
+    """Judge the printed reductions, and their interpretations."""
+    printed, study, elsewhere = steps.list_printed(), results.study, results.is_elsewhere
+    on_planes = [c for c in results.candidates if c.points == results.arrangements[0]["name"]]
+    deviation, variance = ([c for c in on_planes if c.reading == reading]
+                           for reading in (steps.SD, steps.VARIANCE))  # fmt: skip
+    stated = PRINTED.find("figure_5")
+    falls = {what: results.reduce(name_measure(what, ABSOLUTE)) for what in study.parts}
+    each = np.min([x - float(stated[what]["stated"]) for what, x in falls.items()], axis=0)
+    nearest = [np.min([c.distances for c in kind], axis=0) for kind in (deviation, variance)]
+    names, cell = list_printed_names(study), results.figure_5
+
+    def word(numbers: Mapping[str, float]) -> list[str]:
+        return [f"{name} {numbers[name]:.0f} %" for name in names]
+
+    def word_poses(numbers: Mapping[str, float]) -> list[str]:
+        return [f"{what} {numbers[what]:.3g} {steps.PARTS[what][2]}" for what in study.parts]
+
+    before = {w: cell.compute_median(BEFORE, name_measure(w, ABSOLUTE)) for w in study.parts}
+    noise, nearest_one = float(steps.find_figure_5()[1]), results.candidates[0]
     return (
-        TEXT.judge("variances", variance["distance"] < deviation["distance"], deviation=deviation,
-                   variance=variance, deviations=texts[0], variances=texts[1], given=noise,
-                   root=np.sqrt(noise)),
-        TEXT.judge("figure_5", literal["distance"] < 10.0, literal=literal, reductions=texts[2],
-                   nearest=ranked[0]),
+        TEXT.judge("figure_5", steps.decide_each(each >= -0.5, np.isfinite(each)),
+                   elsewhere=elsewhere,
+                   stated=[f"{what} {stated[what]['stated']} %" for what in study.parts],
+                   reductions=[f"{w} {steps.take_median(x):.0f} %" for w, x in falls.items()],
+                   before=word_poses(before),
+                   printed=word_poses({w: float(stated[w]["before"]) for w in study.parts}),
+                   nearest=nearest_one, nearest_medians=word(nearest_one.medians)),
+        TEXT.judge("variances", steps.decide_each(
+                       nearest[1] < nearest[0], np.isfinite(nearest[0] + nearest[1])),
+                   elsewhere=elsewhere,
+                   printed=word(printed), deviation=deviation[0], variance=variance[0],
+                   deviations=word(deviation[0].medians), variances=word(variance[0].medians),
+                   given=noise, root=np.sqrt(noise)),
+    )  # fmt: skip
+
+
+def _judge_experiment(results: Results) -> tuple[published.Verdict, ...]:
+    """Judge iterations, time and full poses of the points of the experiment."""
+    fifties, study, elsewhere = results.draws[0].fifties, results.study, results.is_elsewhere
+    stated, falling, within = PRINTED.find("experiment"), dict[Any, bool | None](), []
+    most = int(stated["iterations"])
+    for groups in fifties:
+        is_within = results.pool(lambda d, g=groups: d.fifties[g].is_within(most).tolist())
+        within.append((steps.name_planes(groups), published.estimate_share(is_within),
+                       decide_share(is_within)))  # fmt: skip
+        for frame in steps.FRAMES:
+            measures = list_statistics(study, frame)
+            falling[groups, frame] = decide_share(results.pool(
+                lambda d, g=groups, m=measures: d.fifties[g].are_reduced(LS, m)))  # fmt: skip
+    places = {"ls": (ABSOLUTE, LS), "nominal": (AT_NOMINAL, LS), "aligned": (ALIGNED, LS),
+              "prior": (ALIGNED, PRIOR), "absolute_prior": (ABSOLUTE, PRIOR)}  # fmt: skip
+    changes = {
+        name: [
+            "{:.2g} to {:.2g} mm on {}".format(
+                *(cell.compute_median(m, name_measure("position", frame, ", mean"))
+                  for m in (BEFORE, method)), steps.name_planes(groups))
+            for groups, cell in fifties.items()
+        ]
+        for name, (frame, method) in places.items()
+    }  # fmt: skip
+    seconds = [s for draw in results.draws for s in draw.seconds]
+    limit, longest = float(stated["seconds"]), max(seconds)
+    return (
+        TEXT.judge("iterations", decide_all([decision for _, _, decision in within]),
+                   elsewhere=elsewhere, points=PRINTED.find("points", "measured"), stated=most,
+                   shares=[f"{100 * s.value:.0f} % (95 % interval {100 * s.low:.0f} to "
+                           f"{100 * s.high:.0f} %) on {name}" for name, s, _ in within]),
+        TEXT.judge("seconds", [s <= limit for s in seconds], stated=limit, longest=longest,
+                   ratio=limit / longest),
+        TEXT.judge("full_poses", decide_all(list(falling.values())), elsewhere=elsewhere,
+                   falling=sum(d is True for d in falling.values()),
+                   rising=sum(d is False for d in falling.values()), ways=len(falling), **changes),
     )  # fmt: skip
 
 
 def _judge_points(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge the exchange, the number of planes, and fifty points."""
+    """Judge the exchange and the number of planes."""
     ten, one, free = results.arrangements
-    fifties, judge = results.draws[0].fifties, TEXT.judge
-    places = {"ls": (ABSOLUTE, LS), "nominal": (AT_NOMINAL, LS), "aligned": (ALIGNED, LS),
-              "prior": (ALIGNED, PRIOR)}  # fmt: skip
-    changes = {name: [] for name in places}
-    for name, (frame, method) in places.items():
-        for cell in fifties.values():
-            before, after = (compute_statistics(cell, m, frame)[0] for m in (BEFORE, method))
-            changes[name].append(f"{before:.2g} to {after:.2g} mm")
-    factors = {
-        (groups, frame, m): compute_statistics(c, BEFORE, frame) / compute_statistics(c, m, frame)
-        for groups, c in fifties.items() for frame in steps.FRAMES for m in METHODS
-    }  # fmt: skip
-    falling = sum(bool((of > 1.0).all()) for of in factors.values())
-    gains = [draw.points["gain"] for draw in results.draws]
-    least, most = min(fifties), max(fifties)
-    within = [draw.fifties[least].within_five for draw in results.draws]
-    agrees = published.decide(falling == len(factors), falling == 0)
+    gains, unit = [draw.points["gain"] for draw in results.draws], results.study.unit[1]
+    on_one, on_ten = results.one_plane, results.figure_5
+    close = on_one.errors[LS][POSITION] < 1.5 * on_ten.errors[LS][POSITION]
+    close = steps.decide_each(close, on_one.converged[LS] & on_ten.converged[LS])
+    sizes = {"noise": results.figure_5.noise, "unit": unit}
     return (
-        judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains), ten=ten,
-              one=one),
-        judge("one_plane", one[LS] < 1.5 * ten[LS], one=one, ten=ten, free=free,
-              noise=SIZES.find("figure_5", "noise"), cost_one=one[LS], cost_ten=ten[LS]),
-        judge("iterations", [share >= 90.0 for share in within], within=within[0],
-              one=int(fifties[least].iterations.max()), five=int(fifties[most].iterations.max()),
-              five_within=fifties[most].within_five, least=min(within), most=max(within)),
-        judge("full_poses", agrees, falling=falling, ways=len(factors), **changes,
-              factors=", ".join(f"{f:.1f}" for f in factors[most, ABSOLUTE, PRIOR]),
-              stated=", ".join(given.stated for given in results.table_4.values())),
+        TEXT.judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains),
+                   ten=ten, one=one, unit=unit),
+        TEXT.judge("one_plane", close, one=one, ten=ten, free=free, cost_one=one[LS],
+                   cost_ten=ten[LS], **sizes),
     )  # fmt: skip
 
 
 def _judge_arithmetic(results: Results) -> tuple[published.Verdict, ...]:
     """Judge the factors of Table 4, and those of root mean squares: rms^2 = mean^2 + sd^2."""
-    table, possible, stated = results.table_4, {}, results.conclusion
-    for name in stated:
-        mean, sd = (table[f"{name}, {what}"] for what in ("mean", "standard deviation"))
-        possible[name] = steps.bound_factor((mean.before, sd.before), (mean.after, sd.after))
-    excess = max(steps.compute_excess(stated[name], possible[name]) for name in possible)
+    follows = [of.follows for of in results.conclusion.values()]
+    units = {name: given["unit"] for name, given in PRINTED.find("table_4").items()}
     return (
-        *(TEXT.judge("factor", given.excess == 0.0, name=name, given=given)
-          for name, given in table.items()),
-        TEXT.judge("conclusion", excess == 0.0, stated=stated, possible=possible),
+        *(TEXT.judge("factor", given.follows, name=name, given=given, unit=units[name],
+                     before=given.before[0], after=given.after[0])
+          for name, given in results.table_4.items()),
+        TEXT.judge("conclusion", decide(all(follows), False in follows), of=results.conclusion),
     )  # fmt: skip
 
 
 def _judge_methods(results: Results) -> tuple[published.Verdict, published.Verdict]:
     """Judge the prior, and the weights of the rows."""
-    sure, given, first = SIZES.find("sure"), SIZES.find("figure_5"), results.draws[0]
-    priors, positions = [], []
-    for draw in results.draws:
-        medians = _list_medians(draw)
-        better = sum(prior <= (1.0 + sure) * ls for _, ls, prior in medians.values())
-        harmed = sum(not prior <= before for before, _, prior in medians.values())
-        least = medians["0.01", "0.1"]
-        priors.append({"better": better, "harmed": harmed, "medians": least})
-        weights = draw.weights.items()
-        positions.append({name: c.compute_median(LS, POSITION_ALIGNED) for name, c in weights})
-    count, position = len(results.cells), positions[0]
-    less = [{n: 100.0 * (1.0 - p["full"] / p[n]) for n in p} for p in positions]
-    from_printed = [of["printed"] for of in less]
+    sure, cells, study = SIZES.find("sure"), results.cells, results.study
+
+    def judge_prior(cell: Cell) -> list[bool | None]:
+        before, ls, prior = (cell.errors[m][POSITION] for m in (BEFORE, LS, PRIOR))
+        good = (prior <= (1.0 + sure) * ls) & (prior <= before)
+        usable = cell.converged[LS] & cell.converged[PRIOR]
+        return steps.decide_each(good, usable)
+
+    priors = {
+        key: decide_share(results.pool(lambda draw, k=key: judge_prior(draw.cells[k])))
+        for key in cells
+    }
+    key = max(cells, key=lambda k: cells[k].ratio)  # the hardest
+    left = {m: cells[key].compute_median(m, POSITION) for m in (BEFORE, LS, PRIOR)}
+    worse = published.estimate_share(results.pool(
+        lambda draw: [x > 1.0 for x in draw.cells[key].compute_left(PRIOR, POSITION)]))  # fmt: skip
+
+    def judge_weights(draw: Draw) -> list[bool | None]:
+        alike, full = (draw.weights[w].errors[LS][POSITION] for w in ("printed", "full"))
+        usable = draw.weights["printed"].converged[LS] & draw.weights["full"].converged[LS]
+        return steps.decide_each(alike < (1.0 + sure) * full, usable)
+
+    position, parameters = (
+        {w: cell.compute_median(m, x) for w, cell in results.draws[0].weights.items()}
+        for m, x in ((LS, POSITION), (PRIOR, DETERMINED))
+    )
+    less = {w: 100.0 * (1.0 - position["full"] / x) for w, x in position.items()}
+    cell = results.figure_5
+    given = {"errors": study.describe_errors(cell.size), "noise": cell.noise}
     return (
-        TEXT.judge("prior", [(p["better"], p["harmed"]) == (count, 0) for p in priors],
-                   sure=100 * sure, count=count, trials=results.trials,
-                   worse=results.cells["0.01", "0.1"].count_worse(PRIOR, POSITION_ALIGNED),
-                   **priors[0]),
-        TEXT.judge("weights", [p["printed"] < (1.0 + sure) * p["full"] for p in positions],
-                   parameters={n: c.compute_median(PRIOR, NO_GAUGE)
-                               for n, c in first.weights.items()},
-                   position=position, less=less[0], lowest=min(from_printed),
-                   highest=max(from_printed), set=given["errors"], noise=given["noise"],
+        TEXT.judge("prior", decide(all(d is True for d in priors.values()), False in
+                                   priors.values()), sure=100 * sure, count=len(cells),
+                   better=sum(d is True for d in priors.values()),
+                   worse=sum(d is False for d in priors.values()), share=100.0 * worse.value,
+                   errors=study.describe_errors(key[0]), noise=key[1], left=left),
+        TEXT.judge("weights", results.pool(judge_weights), sure=100 * sure, position=position,
+                   parameters=parameters, unit=study.unit[1], less=less, **given,
                    nearer=100.0 * (1.0 - position["distance"] / position["printed"])),
     )  # fmt: skip
-
-
-def _judge_forms(results: Results) -> tuple[published.Verdict, published.Verdict]:
-    """Judge the two forms of the equations."""
-    forms, (hardest, *others), judge = results.forms, results.forms, TEXT.judge
-    noises = sorted({row["noise"] for row in forms})
-    calm, loud = (
-        max(row["median"] for row in forms if row["noise"] == noise)
-        for noise in (noises[0], noises[-1])
-    )
-    compared, fits = (sum(row[key] for row in forms) for key in ("converged", "machines"))
-    largest = max((row["largest"] for row in forms if row["converged"]), default=np.nan)
-    agrees = published.decide(largest < 0.05 and results.covariance < 1e-6, compared > 0)
-    converged, rest = (sum(row[key] for row in others) for key in ("converged", "machines"))
-    return (
-        judge("forms", agrees, covariance=results.covariance, compared=compared, largest=largest,
-              fits=fits, noise=noises[-1], least=noises[0], loud=loud, calm=calm),
-        judge("converged", hardest["converged"] == hardest["machines"] and converged == rest,
-              hardest=hardest, noise=hardest["noise"], converged=converged, fits=rest,
-              most=max(row["iterations"] for row in forms),
-              ranks=sorted({rank for row in forms for rank in row["ranks"]}),
-              noises=[f"{noise:g}" for noise in noises]),
-    )  # fmt: skip
-
-
-def list_replaced(results: Results) -> tuple[str, ...]:
-    """Return sentences on further sizes that another robot replaces."""
-    return ()

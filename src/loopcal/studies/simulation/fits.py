@@ -35,6 +35,7 @@ from loopcal.studies.simulation.published_steps import (
     EPSILON,
     LEG_STEPS,
     LIMIT,
+    WEIGHTS,
     PaperRows,
     PerLegEstimate,
     StepRule,
@@ -206,7 +207,7 @@ def _fit_products(
     free, sd = select_free_parameters(robot), np.zeros(len(robot.parameters))
     sd[free.places] = free.tolerance
     sigma = float(trials.instrument.sensors[0].noise.sigma[0])
-    weights = "full" if method.rows == "products" else "printed"
+    weights = next((w for w in WEIGHTS if method.rows == f"products-{w}"), "full")
     chosen = make_fit_options(method).method
     assert trials.recorded is not None
     assert chosen is not None

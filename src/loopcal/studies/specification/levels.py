@@ -199,8 +199,9 @@ class MethodLevel(Limited):
     rows : "raw" gives all rows and parameters the weight one in millimeters and radians, takes full
         steps and filters the step, as published studies do; least-squares then has no rank
         detection, and ridge and truncated-svd need `lam` and `keep`. "products" takes products of
-        points on planes and lines with their covariance, and "products-printed" with the weight
-        one, as another study does. For comparisons.
+        points on planes and lines with their covariance, "products-printed" with the weight one, as
+        another study does, "products-distance" as distances from the plane, and "products-single"
+        with their own variances. For comparisons.
     epsilon : limit at which raw and per-leg fits end: of the largest component of a step [mm, rad]
         for raw fits (1e-6 by default), of what `stop` names for per-leg. steps : of these fits, at
         most; without epsilon, exactly (3 by default for per-leg).
@@ -220,7 +221,9 @@ class MethodLevel(Limited):
     keep: int | None = None
     loss: Annotated[str, NO_LOSS, LOSSES] = NO_LOSS
     noise: Noise = "given"
-    rows: Literal["weighted", "raw", "products", "products-printed"] = "weighted"
+    rows: Literal[
+        "weighted", "raw", "products", "products-printed", "products-distance", "products-single"
+    ] = "weighted"
     epsilon: float | None = None
     steps: int | None = None
     stop: Literal["step", "dQint"] | None = None
