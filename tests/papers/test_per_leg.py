@@ -74,9 +74,21 @@ def test_fixed_parameters_stay_and_the_others_are_identified():
     values = robot.values + np.where(robot.parameters.free, 2e-5, 0.0)
     poses = sample_workspace(robot, 12, 0).coordinates
     data = simulate(robot.with_values(values), poses, tracker(1e-12, 1e-12), 0, robot)
-    found = identify_per_leg(robot, data, 4).robot.values
+    estimate = identify_per_leg(robot, data, 4)
+    found = estimate.robot.values
+    rows = {row["name"]: row for row in estimate.to_dict()["parameters"]}
+    assert rows["leg4.length"]["estimate"] == rows["leg4.length"]["nominal"]
     np.testing.assert_array_equal(found[places], robot.values[places])
     np.testing.assert_allclose(found, values, rtol=0, atol=1e-9)  # [m], noise of 1e-12
+
+
+def test_steps_that_diverge_are_refused_with_their_number():
+    robot = load_robot("hexapod-octahedral")
+    poses = sample_workspace(robot, 12, 0).coordinates
+    errors = 0.04 * np.random.default_rng(0).normal(size=len(robot.values))  # [m], a tenth of it
+    data = simulate(robot, poses, tracker(1e-9, 1e-9), 0)
+    with pytest.raises(EstimationError, match=r"diverged: .* corrected by \d steps?, cannot reach"):
+        identify_per_leg(robot.with_values(robot.values + errors), data, 9)
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal import geometry
-from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.findings.wording import fill_template
 from loopcal.mechanism.solutions import inverse
 from loopcal.papers import published
@@ -267,21 +266,14 @@ def _make_own_tables(results: Results) -> tuple[published.Table, ...]:
     errors that are left by the rule.
     """
     setup, runs = results.setup, results.runs
-    factor, symbols = select_free_parameters(setup.robot).display()
     ends = {name: run.find_end(setup.epsilon) for name, run in runs.items()}
-    columns = [setup.robot.values, setup.truth.values - setup.robot.values]
-    columns += [
-        setup.truth.values - run.values[ends[name]]
-        for name, run in runs.items()
-        if name != "frozen"
-    ]
-    table = setup.robot.parameters
+    robot, truth = setup.robot, setup.truth.values
+    left = [truth - runs[name].values[ends[name]] for name in ("exact", PRESUMED, STATED)]
+    columns = list(map(robot.list_shown, (robot.values, truth - robot.values, *left)))
     parameters = [
-        (name, unit, *(column[i] / factor[i] for column in columns))
-        for i, (name, unit, is_free) in enumerate(
-            zip(table.names, symbols, table.free, strict=True)
-        )
-        if is_free
+        (p.name, robot.units[p.dimension], *(column[i] for column in columns))
+        for i, p in enumerate(robot.parameters.entries)
+        if p.free
     ]
     blocks = {"PT": setup.poses, "PP": setup.actual, "before": setup.actual - setup.poses,
               "after": runs[STATED].pose_errors[ends[STATED]]}  # fmt: skip

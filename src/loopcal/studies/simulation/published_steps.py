@@ -48,6 +48,7 @@ from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import Method
 from loopcal.estimate.problem import Problem, problem_of_trials
 from loopcal.findings import report_finding
+from loopcal.findings.wording import name_count
 from loopcal.measure.instrument import Gaussian, Instrument, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -397,16 +398,16 @@ class PerLegEstimate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the parameters in the units of the robot file, condition numbers, and steps."""
-        factor, symbols = select_free_parameters(self.robot).display()
-        table = zip(self.robot.parameters.entries, self.robot.values, factor, symbols, strict=True)
+        robot = self.robot
+        shown = map(robot.list_shown, (robot.parameters.nominal, robot.values))
         rows = [
             {
                 "name": p.name,
-                "unit": unit,
-                "nominal": p.nominal / unit_in_si,
-                "estimate": value / unit_in_si,
+                "unit": robot.units[p.dimension],
+                "nominal": nominal,
+                "estimate": value,
             }
-            for p, value, unit_in_si, unit in table
+            for p, nominal, value in zip(robot.parameters.entries, *shown, strict=True)
         ]
         return {
             "robot": self.robot.name,
@@ -460,9 +461,13 @@ def identify_per_leg(
         if is_met or len(history) > steps:
             break
         if not reached:
+            lost = f"cannot reach {int((~solution.converged).sum())} of these poses"
+            if len(history) == 1:
+                raise EstimationError(f"{robot.name} {lost}; check the readings")
+            done = name_count(len(history) - 1, "step")
             raise EstimationError(
-                f"{robot.name} cannot reach {int((~solution.converged).sum())} of these poses; "
-                "check the readings"
+                f"identification leg by leg diverged: {robot.name}, corrected by {done}, {lost}; "
+                "identify all parameters together, or begin closer to the true machine"
             )
         legs = LegForm.at(machine, solution)
         _check_members(robot, legs, len(q))
