@@ -90,7 +90,8 @@ def test_raw_rows_without_noise_find_the_machine_and_stop_at_epsilon():
     )
     assert_array_equal(fine["outcome"], 0.0)
     assert_array_equal(two["outcome"], 0.0)  # a fixed number of steps
-    assert {OUTCOMES[int(code)] for code in short["outcome"]} == {"study.out-of-iterations"}
+    assert {OUTCOMES[int(code)] for code in short["outcome"]} == {"study.steps-remain"}
+    assert_array_equal(short["position"], two["position"])  # the same values, another status
     assert_array_equal(two["iterations"], 2.0)
     assert fine["position"].max() < 1e-9  # [m]
     assert (coarse["iterations"] < fine["iterations"]).all()
@@ -110,6 +111,7 @@ def test_raw_least_squares_without_rank_detection_diverges_and_truncated_svd_doe
     ls, tsvd, ridge = compute_cells(replace(study, replicates=2, block=2))
     assert {OUTCOMES[int(code)] for code in ls["outcome"]} == {"study.diverged"}
     assert np.isnan(ls["position"]).all()
+    assert np.isfinite(ls["position_before"]).all()
     assert_array_equal(tsvd["outcome"], 0.0)
     assert_array_equal(ridge["iterations"], 3.0)
 

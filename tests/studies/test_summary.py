@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import tracemalloc
 from dataclasses import replace
 from itertools import pairwise
@@ -21,7 +22,14 @@ from loopcal.errors import DataError
 from loopcal.report.pictures import render_figure
 from loopcal.results.tables import render_text
 from loopcal.studies.files.store import read_store
-from loopcal.studies.results.questions import FRAMES, list_shown, view_summary, write_summary
+from loopcal.studies.results.questions import (
+    FRAMES,
+    list_shown,
+    say_failures,
+    tabulate_medians,
+    view_summary,
+    write_summary,
+)
 from loopcal.studies.results.study_result import (
     MEMORY,
     CellSummary,
@@ -144,11 +152,42 @@ def test_the_page_explains_failed_trials(result: StudyResult) -> None:
     page = render_text(view_summary(result.study, summary, ["position"]), 100)
     count = sum(cell.failed[OUTCOMES[FAILED]] for cell in summary.cells)
     assert f"Failed trials: {count} of 4800." in page
+    failed = [say_failures(cell.failed) for cell in summary.cells]
+    assert all(re.fullmatch(r"\d+ out of iterations", words) for words in failed)
+    assert [row[4] for row in tabulate_medians(result.study, summary, ()).rows] == failed
     assert "poses  noise  method" in page
     assert "without motions of frames that the measurements do not fix" in " ".join(page.split())
     assert list_shown(result.study, summary) == ("position", "orientation", "covered_parameters")
     with pytest.raises(DataError, match=r"score is 'positon' .did you mean 'position'"):
         list_shown(result.study, summary, ["positon"])
+
+
+def test_errors_before_stand_beside_those_after_and_results_at_the_step_limit_count(tmp_path):
+    diverged, remain = (OUTCOMES.index(f"study.{name}") for name in ("diverged", "steps-remain"))
+
+    def draw(cell: Cell) -> Scores:
+        outcome = np.repeat([0.0, diverged, remain], [200, 50, 150])
+        lost = outcome == diverged
+        return {
+            "outcome": outcome,
+            "position_before": np.where(lost, 5e-3, 1e-3),
+            "position": np.where(lost, np.nan, np.where(outcome == 0.0, 1e-5, 3e-5)),
+        }
+
+    result = store_scores(tmp_path / "study", make_study(), draw)
+    summary = result.summarize()
+    for cell in summary.cells:
+        assert (cell.failed, cell.unfinished) == ({"study.diverged": 50}, 150)
+        assert cell.converged.value == 0.5
+        assert find(cell, "position", "mean").value == pytest.approx((200 * 1 + 150 * 3) / 35e6)
+        assert find(cell, "position_before", "mean").value == pytest.approx(1.5e-3)
+    table = tabulate_medians(result.study, summary, ["position"])
+    shown = [column.heading for column in table.columns[3:]]
+    assert shown == ["trials", "failed", "at step limit", "position before [mm]", "position [mm]"]
+    assert {row[3:7] for row in table.rows} == {("400", "50 diverged", "150", "1")}
+    page = render_text(view_summary(result.study, summary, ["position"]), 100)
+    assert "Failed trials: 600 of 4800." in page
+    assert "Trials at their limit of steps: 1800 of 4800." in page
 
 
 def test_files_have_every_factor_as_a_column_and_are_read_back(result: StudyResult) -> None:
@@ -163,6 +202,8 @@ def test_files_have_every_factor_as_a_column_and_are_read_back(result: StudyResu
         assert float(row["position median [m]"]) == median.value
         assert float(row["position median low [m]"]) == median.low
         assert float(row["position mean high [m]"]) == find(cell, "position", "mean").high
+        assert (row["failed"], row["unfinished"]) == (row["out of iterations"], "0")
+        assert int(row["out of iterations"]) == cell.failed[OUTCOMES[FAILED]] > 0
     document = json.loads((result.folder / "summary.json").read_text("utf-8"))
     assert [cell["levels"] for cell in document["cells"]] == [c.levels for c in summary.cells]
     assert document["questions"] == []
@@ -315,7 +356,7 @@ def test_the_title_states_score_and_frame_and_a_line_the_limit_of_the_question(
         "Stated scores",
         "Held-out position error after calibration, rms",
         FRAMES["base"],
-        "n = 20 converged trials of each cell; bars are 95 % intervals",
+        "n = 20 trials of each cell that did not fail; bars are 95 % intervals",
     ]
     limits = [line for line in figure.axes[0].lines if np.array_equal(line.get_xdata(), [0, 1])]
     assert_allclose([np.asarray(line.get_ydata()) for line in limits], [[0.015, 0.015]])  # mm

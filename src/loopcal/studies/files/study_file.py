@@ -33,6 +33,7 @@ from loopcal.studies.simulation.machines import (
     check_effects,
     check_surfaces,
     make_fit_options,
+    make_groups,
     make_instrument,
     resolve_patterns,
 )
@@ -228,7 +229,7 @@ def check_levels(study: Study, robots: Sequence[Mechanism], content: StudyConten
     """Refuse levels that no block could be computed with, at their lines."""
     for key, check in (
         ("instruments", lambda level: make_instrument(level, NoiseLevel())),
-        ("poses", lambda level: _check_surfaces(level, study)),
+        ("poses", lambda level: _check_surfaces(level, study, robots)),
         ("methods", lambda level: _check_method(level, study)),
         ("errors", lambda level: _check_errors(level, robots)),
         ("questions", lambda question: check_question(study, question)),
@@ -243,9 +244,13 @@ def check_levels(study: Study, robots: Sequence[Mechanism], content: StudyConten
                 raise content.file.error(f"{name!r} of {key!r}: {error}", (*place, *step)) from None
 
 
-def _check_surfaces(level: PosesLevel, study: Study) -> None:
-    """Raise DataError where points on planes and lines, and instruments and effects do not fit."""
+def _check_surfaces(level: PosesLevel, study: Study, robots: Sequence[Mechanism]) -> None:
+    """Raise LoopcalError where points on planes and lines do not fit robots, instruments or
+    effects.
+    """
     if level.is_on_surfaces:
+        for robot in robots:
+            make_groups(robot, level)
         for instrument in study.instruments.values():
             check_surfaces(make_instrument(instrument, NoiseLevel()))
         for effects in study.effects.values():

@@ -28,6 +28,7 @@ from loopcal.io.core.text_file import to_json, write_bytes, write_text
 from loopcal.results.tables import ABSENT, Block, Column, Table, format_number, word_column
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import (
+    BEFORE,
     LEVEL,
     CellSummary,
     Interval,
@@ -36,6 +37,7 @@ from loopcal.studies.results.study_result import (
     find_columns,
     iterate_trials,
 )
+from loopcal.studies.simulation.fits import OUTCOMES, STEPS_REMAIN, has_result
 from loopcal.studies.specification.levels import Question, list_chains
 from loopcal.studies.specification.study import Cell, Study, check_question
 from loopcal.units import Unit, find_unit
@@ -199,16 +201,16 @@ def decide(
 def _count_reached(
     study: Study, store: StudyStore, cell: Cell, place: int, limit: float
 ) -> tuple[int, int]:
-    """Return how many converged trials of a cell have a score up to the limit, and all trials; none
-    where no converged trial has the score, such as a rotation error of a platform that only moves.
+    """Return how many trials of a cell have a score up to the limit, and all trials; none where no
+    trial with a result has the score, such as a rotation error of a platform that only moves.
     """
-    reached = trials = converged = defined = 0
+    reached = trials = counted = defined = 0
     for _, scores in iterate_trials(study, store, cell):
-        values = scores[scores[:, 0] == 0.0, place]
+        values = scores[has_result(scores[:, 0]), place]
         reached += int((values <= limit).sum())
         defined += int((~np.isnan(values)).sum())
-        trials, converged = trials + len(scores), converged + len(values)
-    return (0, 0) if converged and not defined else (reached, trials)
+        trials, counted = trials + len(scores), counted + len(values)
+    return (0, 0) if counted and not defined else (reached, trials)
 
 
 NOTE = (
@@ -291,8 +293,8 @@ JSON, CSV = "summary.json", "summary.csv"
 NO_FIGURES: Mapping[str, bytes] = {}
 
 SUMMARY_NOTE = (
-    "Medians of the converged trials, and their 95 % intervals by the number of trials. Shares of "
-    "coverage should be 0.95."
+    "Medians of the trials that did not fail, before calibration of all trials, and their 95 % "
+    "intervals by the number of trials. Shares of coverage should be 0.95."
 )
 FRAMES = {
     "fitted": "Pose errors are stated without motions of frames that the measurements do not fix.",
@@ -335,13 +337,18 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
         tabulate_medians(study, summary, shown),
     ]
     counts = sum((Counter(cell.failed) for cell in summary.cells), Counter[str]())
-    return [*page, *explain_failures(counts, summary.trials)]
+    counts[OUTCOMES[STEPS_REMAIN]] = sum(cell.unfinished for cell in summary.cells)
+    return [*page, *explain_failures(+counts, summary.trials)]
 
 
 def explain_failures(counts: Mapping[str, int], trials: int) -> list[Block]:
-    """Return a line for each code of failed trials (code -> trials): what it means, what to do."""
+    """Return a line for each code of failed or unfinished trials (code -> trials): what it means,
+    what to do.
+    """
+    unfinished = {OUTCOMES[STEPS_REMAIN]: "Trials at their limit of steps"}
     return [
-        f"Failed trials: {count} of {trials}. {report_finding(code)} {find_entry(code).action}"
+        f"{unfinished.get(code, 'Failed trials')}: {count} of {trials}. {report_finding(code)} "
+        f"{find_entry(code).action}"
         for code, count in counts.items()
     ]
 
@@ -370,23 +377,51 @@ def write_summary(
 
 
 def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) -> Table:
-    """Return a table of the varied factors, and of the medians or mean shares of some scores."""
+    """Return a table of the varied factors, the failed trials by reason, and the medians or mean
+    shares of some scores, those of pose errors beside the medians before calibration.
+    """
     factors = study.varied_factors or tuple(study.levels)[:1]
     units = {column.name: UNITS[column.unit] for column in study.columns}
+    is_unfinished = any(cell.unfinished for cell in summary.cells)
     columns = [word_column(factor, wraps=True) for factor in factors]
-    columns += [Column("trials"), Column("failed")]
-    for name in names:
+    columns += [Column("trials"), word_column("failed", wraps=True)]
+    columns += [Column("at step limit")] if is_unfinished else []
+    shown = [n for name in names for n in (_name_before(name), name) if n in units]
+    for name in shown:
         symbol = units[name].symbol
         columns.append(Column(name.replace("_", " "), "" if symbol == "1" else symbol))
     rows = []
     for cell in summary.cells:
-        row = [*(cell.levels[f] for f in factors), str(cell.trials), str(sum(cell.failed.values()))]
-        for name in names:
+        row = [*(cell.levels[f] for f in factors), str(cell.trials), say_failures(cell.failed)]
+        row += [str(cell.unfinished)] if is_unfinished else []
+        for name in shown:
             score = cell.find_score(name)
             interval = None if score is None else score.median or score.mean
-            row.append(ABSENT if interval is None else _say_interval(interval, units[name]))
+            if interval is None:
+                row.append(ABSENT)
+            elif name in names:
+                row.append(_say_interval(interval, units[name]))
+            else:
+                row.append(format_number(interval.value / units[name].factor_to_si, 3))
         rows.append(tuple(row))
     return Table("", tuple(columns), tuple(rows))
+
+
+def _name_before(name: str) -> str:
+    """Return the name of a score before calibration, such as position_before_max."""
+    kind = "_max" if name.endswith("_max") else ""
+    return f"{name.removesuffix('_max')}{BEFORE}{kind}"
+
+
+def say_failures(failed: Mapping[str, int]) -> str:
+    """Return the numbers of failed trials by reason (code -> trials), such as `2 diverged`."""
+    words = [f"{count} {name_outcome(code)}" for code, count in failed.items()]
+    return ", ".join(words) or "0"
+
+
+def name_outcome(code: str) -> str:
+    """Return the outcome of a code in words, such as `out of iterations`."""
+    return code.partition(".")[2].replace("-", " ")
 
 
 def _say_interval(interval: Interval, unit: Unit) -> str:
@@ -409,7 +444,9 @@ def tabulate_all(study: Study, summary: StudySummary) -> Table:
         if any(find(cell, column.name, kind) for cell in summary.cells)
     ]
     columns = [word_column(factor) for factor in study.levels]
-    columns += [Column(name) for name in ("trials", "failed", "converged")]
+    columns += [Column(name) for name in ("trials", "failed", "unfinished")]
+    reasons = dict.fromkeys(code for cell in summary.cells for code in cell.failed)
+    columns += [Column(name) for name in (*map(name_outcome, reasons), "converged")]
     columns += [
         Column(f"{c.name}{kinds[kind]}{suffix}", "" if c.unit == "1" else c.unit)
         for c, kind in present
@@ -422,7 +459,8 @@ def tabulate_all(study: Study, summary: StudySummary) -> Table:
             found = find(cell, column.name, kind)
             numbers += [math.nan] * 3 if found is None else [found.value, found.low, found.high]
         row = [*(cell.levels[factor] for factor in study.levels), str(cell.trials)]
-        row += [str(sum(cell.failed.values()))]
+        row += map(str, (sum(cell.failed.values()), cell.unfinished))
+        row += [str(cell.failed.get(code, 0)) for code in reasons]
         row += [repr(float(x)) if math.isfinite(x) else "" for x in numbers]
         rows.append(tuple(row))
     return Table("", tuple(columns), tuple(rows))

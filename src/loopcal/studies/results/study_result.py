@@ -26,7 +26,7 @@ from loopcal.studies.files.store import (
     read_store,
     read_study,
 )
-from loopcal.studies.simulation.fits import OUTCOMES
+from loopcal.studies.simulation.fits import OUTCOMES, STEPS_REMAIN, has_result
 from loopcal.studies.specification.levels import Question
 from loopcal.studies.specification.study import Cell, ScoreColumn, Study
 from loopcal.typing import FloatArray, Progress, report_no_progress
@@ -236,6 +236,9 @@ LEVEL = 0.95
 HIGH = 0.95
 """The quantile beside the median: 95 % of the machines are better."""
 
+BEFORE = "_before"
+"""Part of the names of scores before calibration, which failed trials have, too."""
+
 SHARE = "covered_"
 """Beginning of the names of scores that are shares; they have no quantiles."""
 
@@ -254,7 +257,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class ScoreSummary:
-    """One score of the converged trials of a cell [SI].
+    """One score of the trials of a cell that did not fail [SI].
 
     median, high : quantiles 0.5 and 0.95. mean : also of shares. What does not exist is None.
     """
@@ -268,13 +271,17 @@ class ScoreSummary:
 
 @dataclass(frozen=True)
 class CellSummary:
-    """The stored trials of one cell: their number, code of a failure -> trials, the share of the
-    converged ones, and the scores of these.
+    """The stored trials of one cell.
+
+    trials : their number. failed : code of a failure -> trials. unfinished : trials whose steps
+    reached their limit, whose results count. converged : share. scores : of trials that did not
+    fail; those before calibration of all trials.
     """
 
     levels: Mapping[str, str]
     trials: int
     failed: Mapping[str, int]
+    unfinished: int
     converged: Interval
     scores: tuple[ScoreSummary, ...]
 
@@ -310,21 +317,24 @@ def summarize_study(study: Study, store: StudyStore) -> StudySummary:
 def _summarize_cell(study: Study, store: StudyStore, cell: Cell) -> CellSummary:
     """Return the summary of the stored trials of a cell."""
     outcome = read_trials(study, store, cell, [0])[1][:, 0].astype(int)
-    is_good, columns = outcome == 0, study.columns
-    failed = {OUTCOMES[i]: int((outcome == i).sum()) for i in sorted(set(outcome.tolist()) - {0})}
+    is_good, columns = has_result(outcome), study.columns
+    failed = {OUTCOMES[i]: int((outcome == i).sum()) for i in np.unique(outcome[~is_good])}
     at_once = max(MEMORY // (8 * max(len(outcome), 1)), 1)
     scores: list[ScoreSummary] = []
     for first in range(1, len(columns), at_once):
         places = range(first, min(first + at_once, len(columns)))
-        values = read_trials(study, store, cell, places)[1][is_good]
-        scores += [summarize_score(columns[i], values[:, j]) for j, i in enumerate(places)]
-    share = estimate_share(is_good.astype(float))
+        values = read_trials(study, store, cell, places)[1]
+        for j, i in enumerate(places):
+            is_counted = is_good | (BEFORE in columns[i].name)
+            scores.append(summarize_score(columns[i], values[is_counted, j]))
+    share = estimate_share((outcome == 0).astype(float))
     kept = tuple(score for score in scores if score.median or score.mean)
-    return CellSummary(cell.levels, len(outcome), failed, share, kept)
+    unfinished = int((outcome == STEPS_REMAIN).sum())
+    return CellSummary(cell.levels, len(outcome), failed, unfinished, share, kept)
 
 
 def summarize_score(column: ScoreColumn, values: FloatArray) -> ScoreSummary:
-    """Return the summary of a score of converged trials (t,); NaN are trials without it."""
+    """Return the summary of a score of trials (t,); NaN are trials without it."""
     values = values[np.isfinite(values)]
     if not len(values):
         return ScoreSummary(column.name, column.unit)

@@ -308,4 +308,4 @@ def _list_titles(study: Study, summary: StudySummary, column: ScoreColumn, width
         if frame == "both":
             frame = "base" if column in BASE_COLUMNS else "fitted"
         lines += textwrap.wrap(FRAMES[frame], width)
-    return [*lines, f"n = {trials} converged trials of each cell; bars are 95 % intervals"]
+    return [*lines, f"n = {trials} trials of each cell that did not fail; bars are 95 % intervals"]

@@ -27,6 +27,7 @@ from loopcal.studies.simulation.fits import (
     NOT_REACHED,
     FittedTrials,
     fit_trials,
+    has_result,
     is_reached,
     solve_cell_poses,
     state_times,
@@ -186,7 +187,7 @@ def score_poses(
         readings = readings + drawn * sigma
     truth = forward_trials(robot, trials.truth, readings, held_out.state)
     state, reference = fits.states or solve_cell_poses(cell, fits.values)
-    is_lost = (fits.outcome == 0) & ~(is_reached(truth) & is_reached(state))
+    is_lost = has_result(fits.outcome) & ~(is_reached(truth) & is_reached(state))
     is_known = np.all(np.isfinite(fits.values), axis=1)[:, None, None, None]
     nominal = held_out.T[None], cell.reference.T[None]
     fitted = (np.where(is_known, s.T, np.nan) for s in (state, reference))

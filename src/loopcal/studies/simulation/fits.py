@@ -57,6 +57,7 @@ OUTCOMES: tuple[str, ...] = (
     "study.refused",
     "study.held-out-not-reached",
     "study.diverged",
+    "study.steps-remain",
 )
 """Codes of the outcomes of a trial, by their number; new ones are added at the end."""
 
@@ -68,10 +69,18 @@ _OF_STATUS = {
     DescentStatus.RUNNING: 1,
     DescentStatus.NO_PROGRESS: 2,
 }
-REFUSED, NOT_REACHED, DIVERGED, EXHAUSTED = (
+REFUSED, NOT_REACHED, DIVERGED, EXHAUSTED, STEPS_REMAIN = (
     OUTCOMES.index(f"study.{name}")
-    for name in ("refused", "held-out-not-reached", "diverged", "out-of-iterations")
+    for name in ("refused", "held-out-not-reached", "diverged", "out-of-iterations", "steps-remain")
 )
+
+
+def has_result(outcome: FloatArray | IntArray) -> BoolArray:
+    """Return which trials count by their outcome: those that converged, and those whose undamped
+    steps reached their limit, where the values of the last step are the result of the study.
+    """
+    return np.isin(outcome, (0, STEPS_REMAIN))
+
 
 POSE_TIME = 60.0
 """Seconds from one pose to the next."""
@@ -168,7 +177,7 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
         for i in range(t):
             with suppress(EstimationError, DataError):
                 fit = fit_per_leg(robot, trials.trial(i), method)
-                values[i], outcome[i] = fit.robot.values, 0 if fit.is_converged else EXHAUSTED
+                values[i], outcome[i] = fit.robot.values, 0 if fit.is_converged else STEPS_REMAIN
                 iterations[i] = fit.steps
     else:
         raw = make_raw_problem(robot, trials)
@@ -180,7 +189,7 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
             penalty = penalize_truncated(np.array([method.keep]), p)
         steps = take_steps(raw, penalty, choose_rule(method))
         is_counted = method.epsilon is None and method.steps is not None
-        outcome = np.where(steps.is_converged | is_counted, 0, EXHAUSTED)
+        outcome = np.where(steps.is_converged | is_counted, 0, STEPS_REMAIN)
         outcome = np.where(steps.is_diverged, DIVERGED, outcome)
         values, iterations = steps.values, steps.count
     return FittedTrials(

@@ -294,15 +294,21 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     return CellPoses(measured.tolist(), held_out.tolist())
 
 
+def make_groups(robot: Mechanism, level: PosesLevel) -> PlaneLineGroups:
+    """Return the groups of points on planes and lines of a level; EstimationError for a robot that
+    does not follow them.
+    """
+    return PlaneLineGroups(robot, level.count // level.groups, SURFACE_SIGMA, (level.axis,))
+
+
 def plan_plane_line_points(
     robot: Mechanism, level: PosesLevel, seed: int | np.random.Generator
 ) -> FloatArray:
     """Return coordinates (n, c) of points on planes and perpendicular lines; cells that differ in
     tolerances, noise or method have the same points.
     """
-    points = level.count // level.groups
-    planned = PlaneLineGroups(robot, points, SURFACE_SIGMA, (level.axis,))
-    drawn, equations = planned.draw(level.groups, seed), level.groups * (points - 2)
+    planned = make_groups(robot, level)
+    drawn, equations = planned.draw(level.groups, seed), level.count - 2 * level.groups
     is_complete = equations >= len(planned.free)
     design = improve_groups(planned, drawn, level.sweeps, is_complete).design
     return planned.place_points(design).reshape(level.count, -1)
