@@ -141,7 +141,7 @@ def test_per_leg_trials_are_those_of_identify_per_leg():
     assert_array_equal(poses.iterations, 1)
     assert poses.is_converged.all()
     assert_array_equal(never.iterations, 5)
-    assert {OUTCOMES[code] for code in never.outcome} == {"study.out-of-iterations"}
+    assert {OUTCOMES[code] for code in never.outcome} == {"study.steps-remain"}
     delta = {"delta": read_robot("linear-delta")}
     (refused,) = calibrate_cells(replace(study, robots=delta, methods={"m": methods["steps"]}))
     assert {OUTCOMES[code] for code in refused.outcome} == {"study.refused"}

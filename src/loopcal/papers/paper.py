@@ -12,7 +12,7 @@ replaces) yield what a page shows.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.resources import files
@@ -166,11 +166,17 @@ class StudyCase:
         nominal, robot = load_robot(of_paper.source), self.robot
         sentences = [f"The robot is {robot.name} in place of {nominal.name}."]
         for level, of_other in zip(first.poses.values(), other.poses.values(), strict=True):
-            if level.coordinates and not of_other.coordinates:
+            if level != of_other:
                 sentences.append(
                     f"{of_other.count} poses are drawn from the workspace of {robot.name} in place "
                     f"of the {level.count} of the study."
                 )
+        for kind in ("instruments", "methods"):
+            before, after = (list(getattr(study, kind)) for study in (first, other))
+            names = [[n for n in a if n not in b] for a, b in ((before, after), (after, before))]
+            if any(names):
+                left, new = map(_say_levels, names)
+                sentences.append(f"The {kind} {new} take the place of {left}.")
         for name, level, (of_robot, of_other) in zip(
             first.errors, first.errors.values(), other.errors.items(), strict=True
         ):
@@ -180,6 +186,13 @@ class StudyCase:
                 f"{before} of {name!r}."
             )
         return tuple(sentences)
+
+
+def _say_levels(names: Sequence[str]) -> str:
+    """Return names of levels, from the first to the last where they are many."""
+    if len(names) > 3:
+        return f"{names[0]} to {names[-1]}"
+    return list_names(names) if names else "none"
 
 
 def describe_errors(robot: Mechanism, level: ErrorsLevel) -> str:
@@ -242,12 +255,10 @@ class PaperStudyFile:
     """A study file to write.
 
     files : path -> text, of the study file and, beside it, of its poses. robot : that it names.
-    replaced : keys of the study that belonged to the robot of the paper and were replaced, too.
     """
 
     files: Mapping[Path, str]
     robot: str
-    replaced: tuple[str, ...] = ()
 
     @property
     def outputs(self) -> tuple[Path, ...]:
@@ -307,7 +318,7 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
     # a factor of tolerances is no size of the paper
     text = re.sub(r"^  [^:\n]+: (\{tolerance_factor: ([\d.]+)\})$", r"  \2 tolerances: \1", text,
                   flags=re.MULTILINE)  # fmt: skip
-    return PaperStudyFile({path: text}, wanted, tuple(changes)[1:])
+    return PaperStudyFile({path: text}, wanted)
 
 
 def _keep_position(text: str) -> str:

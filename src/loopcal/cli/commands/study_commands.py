@@ -143,7 +143,7 @@ def new(
     """Write a study file to fill in, with a comment for each setting.
 
     With --paper, write the study of a paper: its errors, noises and methods. --robot replaces its
-    robot.
+    robot; the command states which sizes that replaces, too.
 
     Examples:
       loopcal study new study.yaml
@@ -157,19 +157,15 @@ def new(
     if paper is not None:
         from loopcal.papers.paper import find_paper, make_paper_study
 
-        made = make_paper_study(find_paper(paper), study_file, robot)
+        chosen = find_paper(paper)
+        replaced = chosen.make_case(robot).list_replaced()  # refuses a robot that does not fit
+        made = make_paper_study(chosen, study_file, robot)
         refuse_outputs(made.outputs, (), force)
         made.write()
-        page = [f"Written: {', '.join(map(str, made.outputs))}"]
-        if made.replaced:
-            from loopcal.findings.wording import list_names
-
-            keys = list_names(made.replaced)
-            page.append(f"The {keys} of the paper belong to its robot and were replaced, too.")
-        page.append(following)
         written = [str(path) for path in made.outputs]
+        page = [f"Written: {', '.join(written)}", *replaced, following]
         return Output(
-            {"written": written, "paper": paper, "robot": made.robot, "replaced": made.replaced},
+            {"written": written, "paper": paper, "robot": made.robot, "replaced": replaced},
             lambda: page,
         )
     robot = "linear-delta" if robot is None else robot
