@@ -94,7 +94,7 @@ def test_the_sweeps_have_the_settings_and_poses_of_the_reproduction(name):
     (poses,) = study.poses.values()
     assert (poses.count, poses.choice) == (len(tsvd.read_noise()), "tilts")
     keeps = [level.keep for level in study.methods.values() if level.keep is not None]
-    assert keeps == list(range(p - 1, p // 3, -1))
+    assert keeps == list(range(p - 1, 0, -1))
     raw = [level for level in study.methods.values() if level.rows == "raw" and level.lam]
     assert_allclose([level.lam or 0.0 for level in raw], np.tile(tsvd.list_lambdas(), 2))
     assert {level.steps for level in raw} == {None, tsvd.SIZES.find("short")}

@@ -251,6 +251,79 @@ def test_interior_minimum_is_lower_than_both_ends() -> None:
         assert (steps.compute_rise(np.array(curve)) > 1.05) == is_inside
 
 
+@pytest.mark.parametrize(
+    ("best", "ends", "is_inside"),
+    [
+        (1e6, (1e-6, 1e7), True),  # beyond the first range
+        (1e-7, (1e-8, 1e4), True),
+        (1e20, (1e-6, 1e12), False),  # beyond every range
+        (0.0, (1e-6, 1e4), False),  # LS is best
+        (1e2, (1e-6, 1e4), True),
+    ],
+)
+def test_range_of_lambda_gets_decades_until_the_minimum_is_inside(best, ends, is_inside) -> None:
+    asked: list[float] = []
+
+    def run(lambdas: np.ndarray) -> list[np.ndarray]:
+        asked.extend(lambdas)
+        away = lambdas if best == 0.0 else abs(np.log(np.maximum(lambdas, 1e-30) / best))
+        return [np.repeat(away[None, :, None], 5, axis=2)]
+
+    lambdas, (curve,) = steps.widen(run, np.array([0.0, *np.logspace(-6, 4, 11)]), (0, 1), 1)
+    assert (lambdas[1], lambdas[-1]) == pytest.approx(ends)
+    assert sorted(asked) == list(lambdas)
+    bottom = int(np.argmin(curve[0, :, 0]))
+    assert (0 < bottom < len(lambdas) - 1) == is_inside
+
+
+@pytest.mark.slow
+def test_best_lambda_and_k_of_the_3_prs_are_those_of_independent_code(results) -> None:
+    """Numbers of an audit with other code: [mm], [deg]; `all steps` end after 87,048 steps."""
+    case = results.cases["3-PRS", 6]
+    for method, setting, errors in (
+        (steps.RE, 100.0, (0.0050, 0.0287)),
+        (steps.TSVD, 23.0, (0.0044, 0.026)),
+    ):
+        assert case.answers[method].settings[0] == setting
+        np.testing.assert_allclose(case.answers[method].errors[0, :2], errors, rtol=0.01)
+    assert case.answers[steps.RE].is_converged.all()
+    early = [lam for count, lam, *_ in results.ridge_steps if count != "all"]
+    assert min(early) > 0.005
+    assert max(early) < 0.15
+    assert not any(is_at_end for _, _, is_at_end, _ in results.ridge_steps)
+
+
+@pytest.mark.slow
+def test_a_minimum_is_inside_the_range_or_the_row_says_that_it_is_not(results) -> None:
+    for case in results.cases.values():
+        for algorithm, curves in case.sweep.curves.items():
+            product = curves[0, :, 0] * curves[0, :, 1]
+            is_inside = 0 < np.argmin(product) < len(product) - 1
+            assert ("end of the range" in case.describe_setting(algorithm)) == (not is_inside)
+    for draws in results.draws:
+        table = make_medians(draws)
+        ends = {row[0]: row[-1] for row in table.rows}
+        assert ends[steps.RAW_LS] is None
+        for method in (steps.RAW_EARLY, steps.RAW_RE, steps.RAW_TSVD):
+            curves = draws.sweeps[0].curves[steps.RAW[method][1]]
+            bottoms = np.argmin(curves[:, :, 0] * curves[:, :, 1], axis=1)
+            last = curves.shape[1] - 1
+            assert ends[method] == ((bottoms == 0) | (bottoms == last)).sum()
+            assert (bottoms < last).all()  # decades were added
+
+
+@pytest.mark.slow
+def test_drawn_iterations_are_computed_steps_that_do_not_rise_after_leaps(results) -> None:
+    figures = {f.name: f for f in PAPERS["tsvd-2016"].present(results, 0, DRAWS).content.figures}
+    lines = {s.label: s for s in figures["convergence"].series}
+    for name in ("3-PRS", "RU-PUS-PRS"):
+        early, whole = (lines[f"{a}, {name}"] for a in (steps.EARLY, steps.RE))
+        assert early.x == tuple(range(1, 21))
+        assert whole.x[:20] == early.x
+        y = np.array(whole.y[4:])
+        assert (y[1:] < 1.02 * np.minimum.accumulate(y)[:-1]).all()
+
+
 @pytest.mark.slow
 def test_same_seed_gives_the_same_numbers(results) -> None:
     draws, again = results.draws[1], steps.simulate_machines(DESIGN, 0, 2)
@@ -290,7 +363,7 @@ def test_tsvd_needs_fewest_iterations_and_ridge_most(results) -> None:
         assert case.answers[steps.TSVD].is_converged
         assert case.answers[steps.TSVD].iterations < ls.iterations
         assert case.answers[steps.RE].iterations > 100 * ls.iterations
-    lambdas = [lam for _, lam, _ in results.ridge_steps]  # rise with the iterations
+    lambdas = [lam for _, lam, *_ in results.ridge_steps]  # rise with the iterations
     assert lambdas == sorted(lambdas)
     assert lambdas[-1] > 5.0 * lambdas[0]
 
@@ -369,8 +442,7 @@ def flatten_sweep(sweep: steps.Sweep, t: int) -> steps.Sweep:
         for a in sweep.chosen
     }
     curves = {a: flat(len(settings)) for a, settings in sweep.settings.items()}
-    short = flat(len(sweep.settings[steps.RE]) - 1)
-    return replace(sweep, chosen=chosen, curves=curves, short=short, exact=flat())
+    return replace(sweep, chosen=chosen, curves=curves, exact=flat())
 
 
 def flatten(results: Results, t: int) -> Results:

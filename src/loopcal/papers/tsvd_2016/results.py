@@ -9,6 +9,7 @@ situations it speaks of, and a draw in which neither of two methods is better de
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -23,12 +24,15 @@ from loopcal.papers.tsvd_2016 import steps
 from loopcal.papers.tsvd_2016.steps import (
     BEFORE,
     CROSS,
+    EARLY,
     HINDSIGHT,
     LS,
     NARROW,
+    PICTURED,
     PRIOR,
     PRIOR_FIVE,
     RANKED,
+    RAW_EARLY,
     RAW_FIVE,
     RAW_LS,
     RAW_RE,
@@ -55,11 +59,11 @@ NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi 
 DIMENSIONS = ("platform_radius", "base_radius", "rod", "post")
 """Of a robot file, as far as it has them."""
 IDENTIFIED = (
-    (LS, 6), (RE, 6), (TSVD, 6), (RANKED, 5), (RE, 5), (TSVD, 5), (WHITENED, 6), (PRIOR, 6),
-    (PRIOR, 5),
+    (LS, 6), (EARLY, 6), (RE, 6), (TSVD, 6), (RANKED, 5), (EARLY, 5), (RE, 5), (TSVD, 5),
+    (WHITENED, 6), (PRIOR, 6), (PRIOR, 5),
 )  # fmt: skip
 """Methods and measured coordinates of the columns of the identified errors."""
-COMPARED = (RAW_LS, RAW_RE, RAW_TSVD, WHITENED, CROSS, NARROW, WIDE, HINDSIGHT)
+COMPARED = (RAW_LS, RAW_EARLY, RAW_RE, RAW_TSVD, WHITENED, CROSS, NARROW, WIDE, HINDSIGHT)
 """Methods that MAP is compared with, all with 6-DOF measurement."""
 TABLES = {"RU-PUS-PRS": (5, 7), "3-PRS": (6, 8)}
 """Tables of the paper with identified parameters and with output errors."""
@@ -70,6 +74,8 @@ HISTORIES = {6: 7, 5: 9}
 NAMED, LONG = 6, 50
 """Parameters named in a legend, and iterations above which their axis is logarithmic."""
 LABELS = ("position [mm]", "phi and theta [deg]")
+CURVES = {"RE": (RE, EARLY), "TSVD": (TSVD,)}
+"""In one figure."""
 SETTING, LOG = {RE: "lambda", TSVD: "k"}, {RE: "xy", TSVD: "y"}
 NAMES = {"ls": LS, "ridge": RE, "tsvd": TSVD}
 """Of the paper's methods in the evidence of claims."""
@@ -83,8 +89,8 @@ class Results:
     # all manipulators, each with 6- and 5-DOF measurement, or with the coordinates that it has
     cases: Mapping[tuple[str, int], Case]
     draws: tuple[Draws, ...]  # of all manipulators
-    # best lambda and errors of RE after some iterations, 3-PRS with 6-DOF measurement
-    ridge_steps: list[tuple[int | str, float, FloatArray]]
+    # see `steps.follow_ridge`, 3-PRS with 6-DOF measurement
+    ridge_steps: list[tuple[int | str, float, bool, FloatArray]]
     noise: published.Printed  # Appendix 1 as printed
     is_adapted: bool = False  # to another robot
 
@@ -108,7 +114,7 @@ def compute(
         for measured in steps.measure_case(design, seed).both:
             cases[design.name, measured.freedoms] = steps.solve_case(measured, progress)
     progress("ridge steps")
-    followed = next(case.study for (name, _), case in cases.items() if name == designs[-1].name)
+    followed = next(case for (name, _), case in cases.items() if name == designs[-1].name)
     draws = tuple(steps.simulate_machines(d, seed, trials, progress) for d in designs)
     noise = steps.PRINTED.table("appendix_1")
     is_adapted = case is not None and case.robot is not None
@@ -175,7 +181,8 @@ def make_tables(results: Results) -> Iterator[published.Table]:
     yield TEXT.table("convergence", iterations)
 
     last = draws[-1].design  # 3-PRS, where there are two
-    ridge = [(n, lam, *show_errors(last, errors[:2])) for n, lam, errors in results.ridge_steps]
+    ridge = [(n, lam, "no" if is_at_end else "yes", *show_errors(last, errors[:2]))
+             for n, lam, is_at_end, errors in results.ridge_steps]  # fmt: skip
     yield TEXT.table("ridge_steps", ridge, name=results.whole[last.name].study.label)
 
     for name, whole in results.whole.items():
@@ -199,7 +206,7 @@ def make_tables(results: Results) -> Iterator[published.Table]:
         study, name = case.study, f"history_{case.study.file}"
         history = [
             (algorithm, i, *show_all(values))
-            for algorithm in NAMES.values()
+            for algorithm in PICTURED
             for i, values in zip(*collect_history(case, algorithm), strict=True)
         ]
         more = [(f"{parameter} [{unit}]", ".3g") for parameter, unit in list_labels(study)]
@@ -249,11 +256,9 @@ def _list_outputs(name: str, results: Results) -> published.Table:
 
 def _list_curves(case: Case) -> published.Table:
     sweep, rows = case.sweep, []
-    for algorithm, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 is LS
+    for algorithm, first in ((EARLY, 1), (RE, 1), (TSVD, 0)):  # lambda = 0 is LS
         for i, setting in enumerate(sweep.settings[algorithm][first:]):
-            spacing = None
-            if algorithm == RE:
-                spacing = "equal intervals" if case.is_equal[i] else "equal ratios"
+            spacing = None if algorithm == TSVD else case.spacing[i]
             errors = show_errors(case.study.design, sweep.curves[algorithm][0, first + i, :3])
             count = sweep.counts[algorithm][0, first + i]
             rows.append((algorithm, setting, spacing, *errors, count))
@@ -275,7 +280,8 @@ def make_medians(draws: Draws) -> published.Table:
         if method in draws.commanded:
             after = show_errors(design, np.median(draws.commanded[method], axis=0))
         lost = np.isinf(draws.errors[method][:, 0]).sum()
-        rows.append((method, *cells, *after, show_number(middle[3]), lost))
+        ends = int(draws.at_end[method].sum()) if method in draws.at_end else None
+        rows.append((method, *cells, *after, show_number(middle[3]), lost, ends))
     name = f"draws_{design.file}"
     return TEXT.table("draws", rows, name, name=draws.name, trials=len(draws))
 
@@ -294,12 +300,10 @@ def make_ratios(draws: Draws) -> published.Table:
 
 def make_median_curves(sweep: Sweep) -> published.Table:
     """Return median errors at every lambda and k."""
-    rows, short, design = [], np.median(sweep.short, axis=0)[:, :2], sweep.study.design
+    rows, design = [], sweep.study.design
     for algorithm, settings in sweep.settings.items():
         for i, errors in enumerate(sweep.compute_median(algorithm)[:, :3]):
-            is_early = algorithm == RE and i > 0
-            early = show_errors(design, short[i - 1]) if is_early else [None, None]
-            rows.append((algorithm, settings[i], *show_errors(design, errors), *early))
+            rows.append((algorithm, settings[i], *show_errors(design, errors)))
     name, data = f"curves_{sweep.study.file}_machines", {"name": sweep.study.label}
     return TEXT.table("median_curves", rows, name, **data, trials=len(sweep))
 
@@ -314,13 +318,19 @@ def describe_end(case: Case, method: str) -> tuple[str, str]:
 
 
 def collect_history(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
-    """Return iterations (k + 1,) and identified errors (k + 1, p) [mm, rad] of LS, or of RE or TSVD
-    at their best setting; NaN after a step that diverged.
+    """Return iterations (k + 1,) and identified errors (k + 1, p) [mm, rad] of one of PICTURED;
+    NaN after a step that diverged.
     """
-    runs, i = case.sweep.runs, case.sweep.places[algorithm][0]
-    done, history = runs.done[:, i], runs.history[:, i]
-    end = int(np.searchsorted(done, done[-1])) + 1
-    return done[:end], to_paper_units(case.study, history[:end])
+    end = _count_drawn(case, algorithm) + 1
+    i, runs = PICTURED.index(algorithm), case.runs
+    return runs.done[:end, i], to_paper_units(case.study, runs.history[:end, i])
+
+
+def _count_drawn(case: Case, algorithm: str) -> int:
+    """Return how many steps of one of PICTURED are drawn."""
+    done = case.runs.done[:, PICTURED.index(algorithm)]
+    last = min(done[-1], steps.SHORT) if algorithm == EARLY else done[-1]
+    return int(np.searchsorted(done, last))
 
 
 def to_paper_units(study: steps.Study, values: FloatArray) -> FloatArray:
@@ -341,48 +351,53 @@ def make_figures(results: Results) -> Iterator[published.Figure]:
     for draws in results.draws:
         for sweep, method in zip(draws.sweeps, (PRIOR, PRIOR_FIVE), strict=False):
             prior, data = draws.compute_median(method), {"name": sweep.study.label}
-            for a, first in ((RE, 1), (TSVD, 0)):  # lambda = 0 has no place on its axis
-                errors = sweep.compute_median(a)[first:]
-                drawn = draws.design, a, sweep.settings[a][first:], errors, prior
+            for a, of in CURVES.items():
+                curves = {b: sweep.compute_median(b) for b in of}
                 file = f"medians_{sweep.study.file}_{a.lower()}"
-                yield _draw_curve("medians", file, *drawn, **data, trials=len(draws))
+                yield _draw_curve("medians", file, sweep, a, curves, prior, **data,
+                                  trials=len(draws))  # fmt: skip
     for case in results.cases.values():
         number = FIGURES.get((case.study.name, case.study.freedoms))
-        for a, first, part in ((RE, 1, "a"), (TSVD, 0, "b")):
-            errors = case.sweep.curves[a][0, first:]
-            prior = case.answers[PRIOR].errors[0]
-            drawn = case.study.design, a, case.sweep.settings[a][first:], errors, prior
+        for (a, of), part in zip(CURVES.items(), "ab", strict=True):
+            curves = {b: case.sweep.curves[b][0] for b in of}
             file = f"figure_{number}{part}" if number else f"curve_{case.study.file}_{a.lower()}"
             data = {"number": number and f"{number}({part})", "case": case.study.label,
-                    "best": case.describe_setting(a),
-                    "diverged": int(np.isinf(errors[:, 0]).sum())}  # fmt: skip
-            yield _draw_curve("curve", file, *drawn, **data)
+                    "best": "; ".join(f"{b}: {case.describe_setting(b)}" for b in of)}  # fmt: skip
+            prior = case.answers[PRIOR].errors[0]
+            yield _draw_curve("curve", file, case.sweep, a, curves, prior, **data)
     for (name, freedoms), case in results.cases.items():
         if name == "3-PRS" and not results.is_adapted:  # similar, says the paper
             continue
-        algorithms = (RE, TSVD) if freedoms == 5 else (LS, RE, TSVD)
+        algorithms = PICTURED[1:] if freedoms == 5 else PICTURED
         yield from (_draw_history(case, a, unit) for a in algorithms
                    for unit in dict.fromkeys(u for _, u in list_labels(case.study)))  # fmt: skip
     yield _draw_steps(results)
 
 
 def _draw_curve(
-    text: str, file: str, design: steps.Design, algorithm: str, settings: FloatArray,
-    errors: FloatArray, prior: FloatArray, **data: Any,
+    text: str, file: str, sweep: Sweep, kind: str, curves: Mapping[str, FloatArray],
+    prior: FloatArray, **data: Any,
 ) -> published.Figure:  # fmt: skip
-    """Return position and angle errors (s, ..) over the settings (s,), and those of MAP.
+    """Return position and angle errors of curves (s, ..) over their settings, and those of MAP.
 
     Settings that diverged have no error; they are a series of their own at the upper end.
     """
-    parts = design.parts
-    usable = np.isfinite(errors[:, parts]).all(axis=1)
-    lines = [published.Series.of(LABELS[i], settings[usable], errors[usable, i]) for i in parts]
-    if not usable.all():
-        top = float(errors[usable][:, parts].max(initial=0.0)) or 1.0
-        lines.append(published.Series.of(DIVERGED, settings[~usable], [top] * int((~usable).sum())))
+    main, parts = CURVES[kind][0], sweep.study.design.parts
+    first = int(main == RE)  # lambda = 0 has no place on its axis
+    lines, lost, top = list[published.Series](), set[float](), 1.0
+    for algorithm, curve in curves.items():
+        settings, errors = sweep.settings[algorithm][first:], curve[first:, parts]
+        usable = np.isfinite(errors).all(axis=1)
+        what = f", {algorithm}" if len(curves) > 1 else ""
+        lines += [published.Series.of(LABELS[part] + what, settings[usable], errors[usable, i])
+                  for i, part in enumerate(parts)]  # fmt: skip
+        lost |= {*settings[~usable]}
+        top = float(errors[usable].max(initial=0.0)) or top
+    if lost:
+        lines.append(published.Series.of(DIVERGED, sorted(lost), [top] * len(lost)))
     levels = {f"MAP, {LABELS[i]}": float(prior[i]) for i in parts}
-    data |= {"algorithm": algorithm, "setting": SETTING[algorithm]}
-    return TEXT.figure(text, lines, levels, file, LOG[algorithm], **data)
+    data |= {"algorithm": kind, "setting": SETTING[main], "diverged": len(lost)}
+    return TEXT.figure(text, lines, levels, file, LOG[main], **data)
 
 
 def _draw_history(case: Case, algorithm: str, unit: str) -> published.Figure:
@@ -406,8 +421,9 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> published.Figure:
         number = HISTORIES[case.study.freedoms]
     file = f"figure_{number}" if number else f"history_{case.study.file}"
     method = algorithm if algorithm == LS else f"{algorithm} ({case.describe_setting(algorithm)})"
+    slug = re.sub(r"\W+", "_", algorithm.lower())
     return TEXT.figure(
-        "history", lines, None, f"{file}_{algorithm.lower()}_{what}", log, number=number,
+        "history", lines, None, f"{file}_{slug}_{what}", log, number=number,
         method=f"{method}, {DIVERGED}" if is_diverged else method, what=what, unit=unit,
         case=case.study.label, chosen=len(chosen), count=len(names), named=len(named),
         file=case.study.file, diverged=is_diverged,
@@ -418,11 +434,9 @@ def _draw_steps(results: Results) -> published.Figure:
     """Return the largest component of each step."""
     lines, longest = [], 0
     for name, case in results.whole.items():
-        for algorithm in (LS, RE, TSVD):
-            runs, i = case.sweep.runs, case.sweep.places[algorithm][0]
-            done, sizes = runs.done[:, i], runs.steps[:, i]
-            end = int(np.searchsorted(done, done[-1]))
-            done, usable = done[:end] + 1, np.isfinite(sizes[:end])
+        for i, algorithm in enumerate(PICTURED):
+            end, sizes = _count_drawn(case, algorithm), case.runs.steps[:, i]
+            done, usable = case.runs.done[:end, i] + 1, np.isfinite(sizes[:end])
             label = f"{algorithm}, {name}{f' ({DIVERGED})' * case.is_diverged(algorithm)}"
             lines.append(published.Series.of(label, done[usable], sizes[:end][usable]))
             longest = max(longest, int(done.max(initial=0)))
@@ -677,7 +691,7 @@ def _judge_lambda(results: Results) -> published.Verdict:
                                                   ("high", np.max))}}
         for label in converged
     ]  # fmt: skip
-    lambdas = steps.list_lambdas()
+    lambdas = np.concatenate([sweep.settings[RE][1:] for sweep in results.sweeps.values()])
     ends = {"low": lambdas.min(), "high": lambdas.max(), "iterations": SIZES.find("short")}
     return TEXT.judge("lambda_range", [*decided], rows=rows, **ends,
                       smallest=smallest, largest=largest)  # fmt: skip

@@ -15,7 +15,7 @@ torsion, as in the paper.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -75,7 +75,11 @@ MEASURES = (
 """Root mean squares over the output range and over the parameters, and a share."""
 ERRORS, RESAMPLING = 3, 4  # purposes of random streams
 
-LS, RANKED, RE, TSVD = "LS", "LS with rank detection", "RE", "TSVD"
+SHORT, FINE = SIZES.find("short"), 0.05
+"""Iterations of the paper, and leaps of iterations that are drawn, see `StepRule.ahead`."""
+LS, RANKED, TSVD = "LS", "LS with rank detection", "TSVD"
+RE, EARLY = "RE, all steps", f"RE, {SHORT} steps"
+PICTURED = (LS, EARLY, RE, TSVD)
 WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"
 LIBRARY: Mapping[str, Method] = {
     WHITENED: lc.LeastSquares(), CROSS: lc.Ridge(lc.GCV()), PRIOR: lc.MAP(),
@@ -83,20 +87,21 @@ LIBRARY: Mapping[str, Method] = {
 """Methods of the library: rows whitened, columns scaled by tolerance."""
 
 BEFORE, TRUE = "before calibration", "true parameters known"
-RAW_LS, RAW_RE, RAW_TSVD = "raw LS", "raw RE at its best", "raw TSVD at its best"
-RAW_FIVE = "raw LS with rank detection, 5-DOF"
-RE_FIVE, TSVD_FIVE = "raw RE at its best, 5-DOF", "raw TSVD at its best, 5-DOF"
+RAW_LS, RAW_EARLY, RAW_RE, RAW_TSVD, RAW_FIVE, EARLY_FIVE, RE_FIVE, TSVD_FIVE = (
+    "raw LS", f"raw {EARLY}, at its best", f"raw {RE}, at its best", "raw TSVD at its best",
+    f"raw {RANKED}, 5-DOF", f"raw {EARLY}, at its best, 5-DOF", f"raw {RE}, at its best, 5-DOF",
+    "raw TSVD at its best, 5-DOF",
+)  # fmt: skip
 RAW = {
-    RAW_LS: (0, LS), RAW_RE: (0, RE), RAW_TSVD: (0, TSVD), RAW_FIVE: (1, RANKED), RE_FIVE: (1, RE),
-    TSVD_FIVE: (1, TSVD),
+    RAW_LS: (0, LS), RAW_EARLY: (0, EARLY), RAW_RE: (0, RE), RAW_TSVD: (0, TSVD),
+    RAW_FIVE: (1, RANKED), EARLY_FIVE: (1, EARLY), RE_FIVE: (1, RE), TSVD_FIVE: (1, TSVD),
 }  # fmt: skip
 """Methods of the paper: 0 with 6-DOF and 1 with 5-DOF measurement, and the algorithm."""
 HINDSIGHT = "whitened ridge, best lambda in hindsight"
 NARROW, WIDE = "MAP, tolerances a third of the spread", "MAP, tolerances three times the spread"
 WHITENED_FIVE, PRIOR_FIVE = "whitened LS, 5-DOF", "MAP, 5-DOF"
 METHODS = (
-    BEFORE, RAW_LS, RAW_RE, RAW_TSVD, RAW_FIVE, RE_FIVE, TSVD_FIVE, WHITENED, CROSS, PRIOR, NARROW,
-    WIDE, HINDSIGHT, WHITENED_FIVE, PRIOR_FIVE, TRUE,
+    BEFORE, *RAW, WHITENED, CROSS, PRIOR, NARROW, WIDE, HINDSIGHT, WHITENED_FIVE, PRIOR_FIVE, TRUE,
 )  # fmt: skip
 
 
@@ -114,7 +119,7 @@ def list_limits() -> FloatArray:
 
 
 def list_lambdas(key: str = "exponents") -> FloatArray:
-    """Return the lambdas of RE on drawn machines."""
+    """Return the lambdas of RE on drawn machines, see `widen`."""
     return np.logspace(*SIZES.find(key))
 
 
@@ -405,6 +410,37 @@ def find_bottom(errors: FloatArray) -> int:
     return int(np.argmin(np.where(np.isnan(product), np.inf, product)))
 
 
+def locate_bottoms(errors: FloatArray, parts: Sequence[int]) -> IntArray:
+    """Return the places (t, parts + 1) of the bottoms of curves (t, s, 5): of each part and, last,
+    of their product.
+    """
+    curves = errors[:, :, parts]
+    curves = np.concatenate([curves, curves.prod(axis=2, keepdims=True)], axis=2)
+    return np.argmin(np.where(np.isnan(curves), np.inf, curves), axis=1)
+
+
+def widen(
+    run: Callable[[FloatArray], list[np.ndarray]], lambdas: FloatArray, parts: Sequence[int],
+    curves: int,
+) -> tuple[FloatArray, list[np.ndarray]]:  # fmt: skip
+    """Run lambdas (s,), and more decade by decade until no curve has its bottom at an end, or up to
+    the range of sizes.yaml; lambda = 0 is no end.
+
+    run : arrays (t, s, ..) at lambdas (s,), of which the first ones, `curves`, are errors.
+    """
+    (low, high), found = (0.9, 1.1) * np.array(SIZES.find("range")), run(lambdas)
+    while True:
+        bottoms = np.concatenate([locate_bottoms(x, parts) for x in found[:curves]])
+        first, last = int(lambdas[0] == 0.0), len(lambdas) - 1
+        ends = {lambdas[first] / 10.0: first, lambdas[last] * 10.0: last}
+        more = [lam for lam, end in ends.items() if end in bottoms and low < lam < high]
+        if not more:
+            return lambdas, found
+        pairs = zip(found, run(np.array(more)), strict=True)
+        order = np.argsort(lambdas := np.array([*lambdas, *more]))
+        found, lambdas = [np.concatenate(p, axis=1)[:, order] for p in pairs], lambdas[order]
+
+
 def compute_rise(curve: FloatArray) -> float:
     """Return the lower end of a curve (s,), relative to its least inner value; 0 with no inside.
 
@@ -448,21 +484,30 @@ class Sweep:
     """The paper's methods on t machines, over their settings."""
 
     study: Study
-    # (s,) of RE (lambda, rising) and TSVD (k, falling); the first one of both is LS: lambda = 0,
+    # (s,) of RE and EARLY (lambda, rising) and TSVD (k, falling); the first one is LS: lambda = 0,
     # and k the number of parameters
     settings: Mapping[str, FloatArray]
     curves: Mapping[str, FloatArray]  # (t, s, 5) errors at them, see MEASURES, infinite if diverged
     counts: Mapping[str, IntArray]  # (t, s) iterations
-    # (t, s - 1, 5) errors of RE after the short iteration, infinite if diverged before
-    short: FloatArray
-    # of LS and RANKED, and of RE and TSVD at the bottom of their curves, without LS
+    # of LS and RANKED, and of the others at the bottom of their curves, without LS
     chosen: Mapping[str, Chosen]
     exact: FloatArray  # (t, 5) errors of LS with rank detection, measured without noise
-    runs: RawSteps  # of the last machines: for each machine all k, then all lambdas
-    places: Mapping[str, IntArray]  # (t,) of the chosen settings, among all of a machine
 
     def __len__(self) -> int:
         return len(self.exact)
+
+    @property
+    def short(self) -> FloatArray:
+        """(t, s - 1, 5) errors of EARLY, without LS."""
+        return self.curves[EARLY][:, 1:]
+
+    def are_at_end(self, algorithm: str) -> BoolArray:
+        """Return for which machines (t,) the bottom of a curve is no minimum: LS is as good, or the
+        last setting is the best.
+        """
+        curves = self.curves[algorithm]
+        bottoms = locate_bottoms(curves, self.study.design.parts)[:, -1]
+        return (bottoms == 0) | (bottoms == curves.shape[1] - 1)
 
     def compute_median(self, algorithm: str) -> FloatArray:
         """Return the median curve (s, 5)."""
@@ -491,58 +536,57 @@ class Sweep:
 def run_settings(
     study: Study, lambdas: FloatArray, progress: Callable[[str], None] = lambda _: None
 ) -> Sweep:
-    """Run the paper's methods on all machines, RE with these lambdas and TSVD with k from the
-    number of parameters to a third of it, or to the rank.
+    """Run the paper's methods on all machines: RE with these lambdas and as many more as `widen`
+    needs, after all steps and after the first ones, and TSVD with every k.
     """
     p, t, judged = len(study.design.free), len(study.trials), study.design.parts
-    null = p - find_rank(linearize(study))
-    ks = np.arange(p, min(p // 3, p - null - 1), -1)
-    k, together = len(ks), SIZES.find("together")
-    penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(lambdas, p)])
-    settings = np.concatenate([ks.astype(np.float64), lambdas])
-    parts, runs = [], []
-    for first in range(0, t, together):
-        progress(f"{study.label}, machine {first + 1} of {t}")
-        machines = np.arange(first, min(first + together, t))
-        machine = np.repeat(machines, len(penalty))
-        run = iterate(study, np.tile(penalty, (len(machines), 1)), machine)
-        runs = [run]  # of these machines; histories are large
-        state = np.searchsorted(run.done.max(axis=1), SIZES.find("short"))
-        is_ridge = np.tile(np.arange(len(penalty)) >= k, len(machines))
-        history = run.history[min(int(state), len(run.done) - 1), is_ridge]
-        short = study.compute_output_errors(history, machine[is_ridge])
-        errors = study.compute_output_errors(run.values, machine)
-        arrays = (errors, run.count, run.values, run.is_converged, short)
-        parts.append([x.reshape(len(machines), -1, *x.shape[1:]) for x in arrays])
-    errors, count, values, is_converged, short = (
-        np.concatenate(part) for part in zip(*parts, strict=True)
+    null, machines = p - find_rank(linearize(study)), np.arange(t)
+    ks, together = np.arange(p, 0, -1), SIZES.find("together")
+
+    def run(penalty: FloatArray) -> list[np.ndarray]:
+        """Return arrays (t, s, ..): errors after all steps and after SHORT, and for both the
+        values, the iterations, and whether they converged.
+        """
+        parts = []
+        for first in range(0, t, together):  # histories are large
+            progress(f"{study.label}, machine {first + 1} of {t}")
+            of = np.arange(first, min(first + together, t))
+            machine = np.repeat(of, len(penalty))
+            steps = iterate(study, np.tile(penalty, (len(of), 1)), machine)
+            place = np.searchsorted(steps.done.max(axis=1), SHORT)
+            early = steps.history[min(int(place), len(steps.done) - 1)]
+            errors = [study.compute_output_errors(v, machine) for v in (steps.values, early)]
+            arrays = (*map(mark_diverged, errors), steps.values, early, steps.count,
+                      np.minimum(steps.count, SHORT), steps.is_converged,
+                      steps.is_converged & (steps.count <= SHORT))  # fmt: skip
+            parts.append([x.reshape(len(of), -1, *x.shape[1:]) for x in arrays])
+        return [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+    truncated = run(penalize_truncated(ks, p))
+    lambdas, ridge = widen(
+        lambda more: run(penalize_ridge(more, p)), np.array([0.0, *lambdas]), judged, 2
     )
-    errors, machines = mark_diverged(errors), np.arange(t)
-    places = {
-        LS: np.zeros(t, np.int64),
-        RANKED: np.full(t, null),
-        RE: k + np.array([find_bottom(curve) for curve in errors[:, k:, judged]]),
-        TSVD: 1 + np.array([find_bottom(curve) for curve in errors[:, 1:k, judged]]),
-    }
-    chosen = {
-        algorithm: Chosen.judge(
-            study, settings[place], *(x[machines, place] for x in (values, count, is_converged))
-        )
-        for algorithm, place in places.items()
-    }
+    settings = {EARLY: lambdas, RE: lambdas, TSVD: ks.astype(np.float64)}
+    found = {EARLY: ridge[1::2], RE: ridge[::2], TSVD: truncated[::2]}
+    places = {a: 1 + locate_bottoms(of[0][:, 1:], judged)[:, -1] for a, of in found.items()}
+
+    def choose(algorithm: str, place: IntArray) -> Chosen:
+        values, count, is_converged = (x[machines, place] for x in found[algorithm][1:])
+        return Chosen.judge(study, settings[algorithm][place], values, count, is_converged)
+
     exact = study.with_noise(np.zeros(study.freedoms))
     free = iterate(exact, penalize_truncated(np.array([p - null]), p), machines)
-    with_ls = np.r_[0, k : len(penalty)]
     return Sweep(
         study=study,
-        settings={RE: np.array([0.0, *lambdas]), TSVD: ks.astype(np.float64)},
-        curves={RE: errors[:, with_ls], TSVD: errors[:, :k]},
-        counts={RE: count[:, with_ls], TSVD: count[:, :k]},
-        short=mark_diverged(short),
-        chosen=chosen,
+        settings=settings,
+        curves={a: of[0] for a, of in found.items()},
+        counts={a: of[2] for a, of in found.items()},
+        chosen={
+            LS: choose(TSVD, np.zeros(t, np.int64)),
+            RANKED: choose(TSVD, np.full(t, null)),
+            **{algorithm: choose(algorithm, place) for algorithm, place in places.items()},
+        },
         exact=mark_diverged(exact.compute_output_errors(free.values)),
-        runs=runs[0],
-        places=places,
     )
 
 
@@ -554,7 +598,8 @@ class Case:
     singular_values: FloatArray  # (p,) of the raw identification matrix at nominal parameters
     rank: int  # of them
     known: Identifiability  # identifiability of the same measurements
-    is_equal: BoolArray  # (s,) which lambdas have equal intervals
+    spacing: tuple[str, ...]  # of each lambda
+    runs: RawSteps  # of PICTURED at their settings, with FINE leaps
     answers: Mapping[str, Chosen]  # by method of the paper and of LIBRARY
     bracket: tuple[float, float]  # smallest and largest lambda of those tried that does not diverge
     # largest component [mm, rad] of the first step if (H'H)^-1 H'D is computed as printed
@@ -573,12 +618,16 @@ class Case:
         """Return lambda or k of a method."""
         form = {
             RANKED: f"rank {self.rank}",
+            EARLY: "lambda = {:.2g}",
             RE: "lambda = {:.2g}",
             TSVD: "k = {:.0f}",
             CROSS: "lambda = {:.2g}, chosen",
             PRIOR: "lambda = 1, by definition",
         }.get(method, "-")
-        return form.format(self.answers[method].settings[0])
+        text = form.format(self.answers[method].settings[0])
+        if method in self.sweep.curves and self.sweep.are_at_end(method)[0]:
+            return f"{text}, at the end of the range"
+        return text
 
 
 def solve_case(study: Study, progress: Callable[[str], None]) -> Case:
@@ -588,13 +637,21 @@ def solve_case(study: Study, progress: Callable[[str], None]) -> Case:
     s, rank, tried = known.singular_values[0], find_rank(known), np.array(SIZES.find("tried"))
     lambdas, is_equal = space_lambdas(s[rank - 1])
     sweep = run_settings(study, lambdas)
+    words = dict(zip(lambdas, np.where(is_equal, "equal intervals", "equal ratios"), strict=True))
+    k = {LS: p, TSVD: sweep.chosen[TSVD].settings[0]}
+    pictured = [
+        penalize_truncated(np.array([k[a]]), p) if a in k
+        else penalize_ridge(sweep.chosen[a].settings, p)
+        for a in PICTURED
+    ]  # fmt: skip
     safe = tried[~iterate(study, penalize_ridge(tried, p), limit=3).is_diverged]
     return Case(
         sweep=sweep,
         singular_values=s,
         rank=rank,
         known=lc.identifiability(study.robot.nominal, study.trials.trial(0)),
-        is_equal=is_equal,
+        spacing=tuple(str(words.get(lam, "more decades")) for lam in sweep.settings[RE][1:]),
+        runs=iterate(study, np.concatenate(pictured), ahead=FINE),
         answers={**sweep.chosen, **run_library(study)},
         bracket=(float(safe.min()), float(safe.max())),
         normal_equations=solve_normal_equations(study),
@@ -634,23 +691,22 @@ def run_library(study: Study, methods: Mapping[str, Method] = LIBRARY) -> dict[s
     return answers
 
 
-def follow_ridge(study: Study) -> list[tuple[int | str, float, FloatArray]]:
-    """Return the best lambda and its errors (5,) after each number of RE iterations, and at the end
-    of the iteration.
+def follow_ridge(case: Case) -> list[tuple[int | str, float, bool, FloatArray]]:
+    """Return the best lambda, whether it is at an end of the range, and its errors (5,) after each
+    number of RE iterations, and after all.
     """
-    counts = SIZES.find("ridge_steps")
-    known, parts = linearize(study), study.design.parts
-    smallest = float(known.singular_values[0, find_rank(known) - 1])
-    lambdas = np.geomspace(smallest, 1.0, SIZES.find("equal_ratios"))
+    study, sweep, counts = case.study, case.sweep, SIZES.find("ridge_steps")
+    lambdas = sweep.settings[RE]
     penalty = penalize_ridge(lambdas, len(study.design.free))
     history = iterate(study, penalty, limit=max(counts), ahead=0.0).history
-    ends: dict[int | str, FloatArray] = {n: history[min(n, len(history) - 1)] for n in counts}
-    ends["at convergence"] = iterate(study, penalty).values
-    rows = []
-    for count, values in ends.items():
-        errors = study.compute_output_errors(values, np.zeros(len(values), dtype=np.int64))
-        best = find_bottom(errors[:, parts])
-        rows.append((count, float(lambdas[best]), errors[best]))
+    machine, rows = np.zeros(len(lambdas), dtype=np.int64), []
+    for count in (*counts, "all"):
+        errors = sweep.curves[RE][0]
+        if count != "all":
+            values = history[min(count, len(history) - 1)]
+            errors = mark_diverged(study.compute_output_errors(values, machine))
+        best = int(locate_bottoms(errors[None], study.design.parts)[0, -1])
+        rows.append((count, float(lambdas[best]), best in (0, len(lambdas) - 1), errors[best]))
     return rows
 
 
@@ -666,6 +722,8 @@ class Draws:
     errors: Mapping[str, FloatArray]  # method -> (t, 5), see MEASURES, infinite if diverged
     # method -> (t, 2), see `Chosen`; without HINDSIGHT, which takes another lambda for each measure
     commanded: Mapping[str, FloatArray]
+    # method with a setting -> (t,) whether its curve has no minimum, see `Sweep.are_at_end`
+    at_end: Mapping[str, BoolArray]
 
     def __len__(self) -> int:
         return len(self.sweeps[0])
@@ -719,8 +777,7 @@ def simulate_machines(
     """Draw machines, measure and identify them by all methods."""
     truth = design.draw_true_values(trials, seed)
     whole = measure_machines(design, truth, seed)
-    lambdas = list_lambdas()
-    sweeps = tuple(run_settings(study, lambdas, progress) for study in whole.both)
+    sweeps = tuple(run_settings(study, list_lambdas(), progress) for study in whole.both)
     progress(f"{design.name}, methods of loopcal")
     factor = SIZES.find("factor")
     scaled = {NARROW: lc.Ridge(factor**2), WIDE: lc.Ridge(factor**-2)}
@@ -731,19 +788,28 @@ def simulate_machines(
             values[method] = lc.identify_trials(study.robot, study.trials, how).values
     errors = {m: whole.compute_output_errors(v) for m, v in values.items()}
     commanded = {m: whole.compute_commanded_errors(v) for m, v in values.items()}
-    start, tried = None, []
-    for lam in list_lambdas("hindsight_exponents"):  # each machine and measure takes the best one
-        options = lc.FitOptions(start=start)
-        fit = lc.identify_trials(whole.robot, whole.trials, lc.Ridge(float(lam)), options=options)
-        start = fit.values
-        tried.append(whole.compute_output_errors(fit.values))
-    errors[HINDSIGHT] = np.min(tried, axis=0)
+
+    def run(lambdas: FloatArray) -> list[np.ndarray]:
+        start, tried = None, []
+        for lam in lambdas:
+            options = lc.FitOptions(start=start)
+            fit = lc.identify_trials(whole.robot, whole.trials, lc.Ridge(lam), options=options)
+            start = fit.values
+            tried.append(mark_diverged(whole.compute_output_errors(fit.values)))
+        return [np.stack(tried, axis=1)]
+
+    parts, lambdas = design.parts, list_lambdas("hindsight_exponents")
+    lambdas, (tried,) = widen(run, lambdas, parts, 1)  # each machine and measure has its best one
+    bottoms, errors[HINDSIGHT] = locate_bottoms(tried, parts), tried.min(axis=1)
+    at_end = {HINDSIGHT: ((bottoms == 0) | (bottoms == len(lambdas) - 1)).any(axis=1)}
     for method, (place, algorithm) in RAW.items():
         if place == len(sweeps):  # without psi, which is not measured
             continue
         chosen = sweeps[place].chosen[algorithm]
         errors[method], commanded[method] = chosen.errors, chosen.commanded
+        if algorithm in sweeps[place].curves:
+            at_end[method] = sweeps[place].are_at_end(algorithm)
     errors, commanded = (
         {m: mark_diverged(of[m]) for m in METHODS if m in of} for of in (errors, commanded)
     )
-    return Draws(sweeps, errors, commanded)
+    return Draws(sweeps, errors, commanded, at_end)
