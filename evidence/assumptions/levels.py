@@ -14,7 +14,7 @@ STATED_LEVELS = {
     "residuals.heavy-tailed": 0.001,
     "residuals.model-discrepancy": 0.05,
     "residuals.patterns": 0.05,
-    "residuals.perhaps-correlated": 0.001,
+    "residuals.perhaps-correlated": 0.001,  # of results that were made before it was removed
 }
 """Stated probabilities of alarms where every assumption holds, by group of codes."""
 

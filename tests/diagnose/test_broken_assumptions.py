@@ -131,7 +131,6 @@ def test_levels_of_the_study_are_those_of_the_code():
     assert STATED_LEVELS["noise.doubtful"] == residual_test.DOUBT
     assert STATED_LEVELS["noise.residuals-too-large"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["noise.residuals-too-small"] == residual_test.SIGNIFICANCE
-    assert STATED_LEVELS["residuals.perhaps-correlated"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["prior.tolerances"] == prior_inflation.LEVEL
     assert STATED_LEVELS["residuals.heavy-tailed"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["residuals.model-discrepancy"] == residual_patterns.LEVEL

@@ -45,9 +45,6 @@ from loopcal.numerics.statistics import choose_evenly, compute_median, find_dist
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS
 
-# Factor of the uncertainty of the measured poses from which a correlation that no test shows is
-# allowed for.
-NOTICEABLE = 1.05
 # Code of the finding that independent errors would mean that sigma is too large.
 TOO_SMALL = "noise.residuals-too-small"
 # Codes of the findings on what residuals depend on.
@@ -90,8 +87,7 @@ def _add_patterns(
     """
     patterns = find_patterns(rows, data, fit.robot)
     effects = [e for e in patterns.effects if not (is_slow and e.effect.source == READING)]
-    is_small = any(finding.code == TOO_SMALL for finding in fit.findings)
-    if not (effects or patterns.is_correlated or is_small):
+    if not (effects or patterns.is_correlated):
         return fit
     # orientation and position (3 n, p) of evenly chosen measured poses, frames fitted, by the
     # parameters [per SI], and the sum of the variances of each that the fit states
@@ -109,18 +105,15 @@ def _add_patterns(
         )
         finding = _report_effect(effect, _measure_growth(tool, root))
         fit = add_covariance(fit, root, np.inf, finding)
-    if patterns.is_correlated or is_small:
+    if patterns.is_correlated:
         fit = _add_correlation(fit, patterns, tool)
-    return _without_doubt_of_sigma(fit) if effects or patterns.is_correlated else fit
+    return _without_doubt_of_sigma(fit)
 
 
 def _add_correlation(
     fit: Identification, patterns: ResidualPatterns, tool: Sequence[tuple[FloatArray, float]]
 ) -> Identification:
-    """Return a fit with what correlated errors add to the covariance by independent ones. Where
-    residuals are too small and no test shows a correlation, it is added if it matters: the
-    parameters may have taken up errors that are too slow for the tests.
-    """
+    """Return a fit with what correlated errors add to the covariance by independent ones."""
     rows = patterns.rows
     errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
     independent = np.zeros_like(errors.covariance)
@@ -132,15 +125,12 @@ def _add_correlation(
     covariance = errors.covariance
     more = take_root(covariance - independent, np.diag(covariance + independent))
     root = rows.root @ more
-    ratio = _measure_growth(tool, root)
-    if not patterns.is_correlated and ratio < NOTICEABLE:
-        return fit
     finding = report_finding(
-        "residuals.correlated" if patterns.is_correlated else "residuals.perhaps-correlated",
+        "residuals.correlated",
         correlation=errors.correlation,
         order=patterns.order,
-        ratio=ratio,
-        severity=choose_severity(patterns.p_value) if patterns.is_correlated else None,
+        ratio=_measure_growth(tool, root),
+        severity=choose_severity(patterns.p_value),
     )
     return add_covariance(fit, root, errors.degrees, finding)
 
@@ -206,9 +196,7 @@ DOUBT = 0.05  # probability from which no more draws are needed
 FEWEST = 5.0  # degrees of freedom of the residuals from which the test is made
 MOST_ROWS = 1000  # residuals that are tested at most, evenly chosen
 TESTABLE = 1e-6  # share of its variance that the fit must leave of a row to be tested
-# Beginning of the codes that say what the residuals of a fit depend on, and the one that does
-# not.
-PATTERNS, NO_PATTERN = "residuals.", "residuals.perhaps-correlated"
+PATTERNS = "residuals."  # beginning of the codes that say what the residuals of a fit depend on
 
 
 @dataclass(frozen=True)
@@ -253,7 +241,7 @@ def check_heavy_tails(
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
         return HeavyTails()
     reported = (f for f in fit.findings if f.severity is Severity.WARNING)
-    if any(f.code.startswith(PATTERNS) and f.code != NO_PATTERN for f in reported):
+    if any(f.code.startswith(PATTERNS) for f in reported):
         return HeavyTails()
     linear = linearize_fit(fit, data, linear)
     rows = collect_residual_rows(linear)

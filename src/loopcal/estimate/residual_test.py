@@ -9,10 +9,9 @@ nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, G.4.2), to which the residuals a
 
     s^2 = (nu0 + unexplained) / (nu0 + degrees)        with nu0 + degrees degrees of freedom
 
-u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. Residuals that exceed the stated
-noise beyond doubt contradict the stated sigma: then s is that of the residuals alone. Residuals
-that are far too small may be copies of each other, or averages: then s stays 1. See
-docs/theory/uncertainty.md.
+u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. Residuals that are larger or
+smaller than the stated noise explains contradict the stated sigma beyond doubt: then s is that of
+the residuals alone. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -186,14 +185,13 @@ def _estimate_scale(
     weighted: bool,
 ) -> tuple[float, float]:
     """Return the factor on the stated sigmas, and its degrees of freedom; see the module."""
-    if noise == "estimated" or p_value < SIGNIFICANCE:
+    is_contradicted = p_value < SIGNIFICANCE or p_value > 1.0 - SIGNIFICANCE
+    if noise == "estimated" or is_contradicted:
         return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
     stated = count_sigma_degrees(noise, uncertainty)
     if weighted or degrees <= 0 or np.isinf(stated):
         return 1.0, stated
     total = stated + degrees
-    if p_value > 1.0 - SIGNIFICANCE:
-        return 1.0, total
     return float(np.sqrt((stated + unexplained) / total)), total
 
 
