@@ -253,6 +253,22 @@ def test_settings_that_do_not_fit_are_refused_at_their_line(tmp_path, old, new, 
     assert words in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("robot", "words"),
+    [("tricept", "legs, not exactly one"), ("3-prs", "has 3 actuators"), ("6-rus", "")],
+)
+def test_a_robot_that_per_leg_does_not_fit_is_refused_before_the_study_runs(tmp_path, robot, words):
+    path = tmp_path / "study.yaml"
+    text = TEXT.replace("hexapod-42", robot).replace("least-squares", "per-leg")
+    path.write_text(text, encoding="utf-8")
+    if not words:
+        assert list(load_study(path).robots) == [robot]
+        return
+    with pytest.raises(FileError, match=words) as caught:
+        load_study(path)
+    assert "study.yaml:9:" in str(caught.value)
+
+
 def test_published_methods_know_no_verdict_and_no_adjusted_intervals(tmp_path):
     path = tmp_path / "study.yaml"
     for scores in ("verdict: true", "intervals: adjusted"):

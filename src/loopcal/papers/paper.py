@@ -48,7 +48,8 @@ class Paper:
     title: str
     source: str
     studies: Mapping[str, str]
-    has_epsilon: bool = False  # whether its steps end where max dQint is at most epsilon
+    # whether it identifies leg by leg, in steps that end where max dQint is at most epsilon
+    is_per_leg: bool = False
 
     @property
     def package(self) -> str:
@@ -85,15 +86,23 @@ class Paper:
         return self.present(results, seed, trials, case)
 
     def make_case(self, robot: str | Path | None = None, epsilon: float | None = None) -> StudyCase:
-        """Return the study of a robot, or its file; by default that of the robots of the paper."""
-        if epsilon is not None and not (self.has_epsilon and epsilon > 0.0):
-            able = ", ".join(paper.name for paper in PAPERS.values() if paper.has_epsilon)
+        """Return the study of a robot, or its file; by default that of the robots of the paper.
+
+        Raises DataError: as `run`. EstimationError: legs that cannot be identified one by one.
+        """
+        if epsilon is not None and not (self.is_per_leg and epsilon > 0.0):
+            able = ", ".join(paper.name for paper in PAPERS.values() if paper.is_per_leg)
             raise DataError(
                 f"epsilon is {epsilon:g} for {self.name}; give a number above 0, for {able} only"
             )
         if robot is None or str(robot) in self.studies:
             return StudyCase(self, epsilon=epsilon)
-        return StudyCase(self, str(robot), load_robot(robot), epsilon)
+        other = load_robot(robot)
+        if self.is_per_leg:
+            from loopcal.studies.simulation.published_steps import check_legs
+
+            check_legs(other)
+        return StudyCase(self, str(robot), other, epsilon)
 
     def present(
         self, results: Any, seed: int, trials: int, case: StudyCase | None = None
@@ -220,7 +229,7 @@ PAPERS: Mapping[str, Paper] = {
             "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no "
             "DOI known to us",
             {"hexapod-42": "study.yaml"},
-            has_epsilon=True,
+            is_per_leg=True,
         ),
         Paper(
             "tsvd-2016",

@@ -37,8 +37,10 @@ from loopcal.studies.simulation.machines import (
     make_instrument,
     resolve_patterns,
 )
+from loopcal.studies.simulation.published_steps import check_legs
 from loopcal.studies.specification.levels import (
     FACTORS,
+    PER_LEG,
     EffectsLevel,
     ErrorsLevel,
     InstrumentLevel,
@@ -230,7 +232,7 @@ def check_levels(study: Study, robots: Sequence[Mechanism], content: StudyConten
     for key, check in (
         ("instruments", lambda level: make_instrument(level, NoiseLevel())),
         ("poses", lambda level: _check_surfaces(level, study, robots)),
-        ("methods", lambda level: _check_method(level, study)),
+        ("methods", lambda level: _check_method(level, study, robots)),
         ("errors", lambda level: _check_errors(level, robots)),
         ("questions", lambda question: check_question(study, question)),
     ):
@@ -259,9 +261,13 @@ def _check_surfaces(level: PosesLevel, study: Study, robots: Sequence[Mechanism]
             raise DataError("points on planes and lines are studied without a verdict; remove it")
 
 
-def _check_method(level: MethodLevel, study: Study) -> None:
-    """Raise DataError where a method of published studies does not fit the poses or the scores."""
+def _check_method(level: MethodLevel, study: Study, robots: Sequence[Mechanism]) -> None:
+    """Raise DataError where a method of published studies does not fit the poses or the scores, and
+    EstimationError where a robot does not fit identification leg by leg.
+    """
     make_fit_options(level)
+    for robot in robots if level.method == PER_LEG else ():
+        check_legs(robot)
     if level.is_of_products and not all(poses.is_on_surfaces for poses in study.poses.values()):
         raise DataError(
             f"'rows: {level.rows}' needs points on planes and lines; write 'choice: plane-line' "

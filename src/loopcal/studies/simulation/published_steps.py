@@ -57,7 +57,7 @@ from loopcal.mechanism.kinematics import compute_readings, forward_trials, inver
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.solutions import Solution, forward
+from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.numerics.decomposition import Decomposition, are_nonzero, decompose, empty_factor
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -353,6 +353,10 @@ class LegForm:
             shares.append(float(explained / np.linalg.norm(lengths[:, leg])))
         return np.array(shares)
 
+    def count_legs(self) -> IntArray:
+        """Return the number (p,) of legs that each free parameter moves."""
+        return np.bincount(np.concatenate(self.members), minlength=self.G.shape[2])
+
     @property
     def conditions(self) -> FloatArray:
         """(6,) condition number of each leg's matrix, columns unscaled."""
@@ -442,9 +446,7 @@ def identify_per_leg(
     """
     if not epsilon >= 0.0:
         raise EstimationError(f"epsilon is {epsilon}; give a number above 0, or 0 for all steps")
-    if len(robot.actuators) != 6:
-        facts = {"robot": robot.name, "actuators": len(robot.actuators)}
-        raise EstimationError(report_finding("fit.no-six-legs", **facts))
+    _check_actuators(robot)
     observations = _select_full_poses(data)
     q = data.readings[observations.rows]
     values, history, conditions = robot.values.copy(), [robot.values.copy()], np.zeros(0)
@@ -481,16 +483,34 @@ def identify_per_leg(
     )
 
 
+def check_legs(robot: Mechanism) -> None:
+    """Refuse a robot whose legs cannot be identified one by one, as it stands at home.
+
+    Raises EstimationError: it has not six actuators, or a parameter moves several legs.
+    """
+    _check_actuators(robot)
+    count = LegForm.at(robot, inverse(robot, robot.home[None])).count_legs()
+    _refuse_coupled(robot, count, count > 1)  # one pose does not show that a parameter moves none
+
+
+def _check_actuators(robot: Mechanism) -> None:
+    if len(robot.actuators) != 6:
+        facts = {"robot": robot.name, "actuators": len(robot.actuators)}
+        raise EstimationError(report_finding("fit.no-six-legs", **facts))
+
+
+def _refuse_coupled(robot: Mechanism, count: IntArray, is_wrong: BoolArray) -> None:
+    """Raise EstimationError where a free parameter moves a wrong number of legs, count (p,)."""
+    places = np.flatnonzero(robot.parameters.free & is_wrong)
+    if places.size:
+        facts = {"parameter": robot.parameters.names[places[0]], "legs": int(count[places[0]])}
+        raise EstimationError(report_finding("fit.legs-coupled", robot=robot.name, **facts))
+
+
 def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
     """Refuse parameters that do not move exactly one leg, or that these poses do not determine."""
-    count = np.zeros(len(robot.parameters), dtype=int)
-    for members in legs.members:
-        count[members] += 1
-    is_shared = robot.parameters.free & (count != 1)
-    if is_shared.any():
-        place = int(np.argmax(is_shared))
-        facts = {"parameter": robot.parameters.names[place], "legs": int(count[place])}
-        raise EstimationError(report_finding("fit.legs-coupled", robot=robot.name, **facts))
+    count = legs.count_legs()
+    _refuse_coupled(robot, count, count != 1)
     most = max(len(members) for members in legs.members)
     if poses < most:
         raise EstimationError(
