@@ -195,7 +195,7 @@ def make_tables(results: Results) -> Iterator[published.Table]:
                 else show_all(to_paper_units(study, case.answers[method].values[0]))
             )  # fmt: skip
         rows = [(*label, *row) for label, *row in zip(list_labels(study), *columns, strict=True)]
-        number = TABLES.get(name, ("", ""))[0]
+        number = TABLES.get(study.design.printed, ("", ""))[0]
         file = f"table_{number}" if number else f"identified_{study.design.file}"
         yield TEXT.table("identified", rows, file, name=name, number=number)
 
@@ -249,7 +249,7 @@ def _list_outputs(name: str, results: Results) -> published.Table:
                        *show_errors(design, answer.commanded[0]))  # fmt: skip
             label = (f"{case.study.freedoms}-DOF", method, case.describe_setting(method))
             rows.append((*label, *numbers, answer.iterations[0], describe_end(case, method)[1]))
-    number = TABLES.get(name, ("", ""))[1]
+    number = TABLES.get(design.printed, ("", ""))[1]
     file = f"table_{number}" if number else f"outputs_{design.file}"
     return TEXT.table("outputs", rows, file, name=name, number=number)
 
@@ -357,7 +357,7 @@ def make_figures(results: Results) -> Iterator[published.Figure]:
                 yield _draw_curve("medians", file, sweep, a, curves, prior, **data,
                                   trials=len(draws))  # fmt: skip
     for case in results.cases.values():
-        number = FIGURES.get((case.study.name, case.study.freedoms))
+        number = FIGURES.get((case.study.design.printed, case.study.freedoms))
         for (a, of), part in zip(CURVES.items(), "ab", strict=True):
             curves = {b: case.sweep.curves[b][0] for b in of}
             file = f"figure_{number}{part}" if number else f"curve_{case.study.file}_{a.lower()}"
@@ -365,8 +365,8 @@ def make_figures(results: Results) -> Iterator[published.Figure]:
                     "best": "; ".join(f"{b}: {case.describe_setting(b)}" for b in of)}  # fmt: skip
             prior = case.answers[PRIOR].errors[0]
             yield _draw_curve("curve", file, case.sweep, a, curves, prior, **data)
-    for (name, freedoms), case in results.cases.items():
-        if name == "3-PRS" and not results.is_adapted:  # similar, says the paper
+    for (_, freedoms), case in results.cases.items():
+        if case.study.design.printed == "3-PRS":  # similar, says the paper
             continue
         algorithms = PICTURED[1:] if freedoms == 5 else PICTURED
         yield from (_draw_history(case, a, unit) for a in algorithms
@@ -417,7 +417,7 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> published.Figure:
     ]
     what = {"mm": "lengths", "rad": "angles"}.get(unit, "ratios")
     is_diverged, number = case.is_diverged(algorithm), None
-    if case.study.name in TABLES:
+    if case.study.design.printed:
         number = HISTORIES[case.study.freedoms]
     file = f"figure_{number}" if number else f"history_{case.study.file}"
     method = algorithm if algorithm == LS else f"{algorithm} ({case.describe_setting(algorithm)})"
@@ -524,7 +524,7 @@ def _judge_curve(sweep: Sweep) -> published.Verdict:
     return TEXT.judge(
         "u_shape", [*map(published.decide, holds, fails)], name=sweep.study.label, curves=curves,
         iterations=SIZES.find("short"),
-        number=FIGURES.get((sweep.study.name, sweep.study.freedoms)), short=short,
+        number=FIGURES.get((sweep.study.design.printed, sweep.study.freedoms)), short=short,
     )  # fmt: skip
 
 

@@ -139,6 +139,11 @@ class Design:
     errors: ErrorsLevel | None = None
 
     @property
+    def printed(self) -> str:
+        """Its name in the paper; empty of another robot."""
+        return self.name if self.errors is None else ""
+
+    @property
     def file(self) -> str:
         """Its name in names of files."""
         return re.sub(r"\W+", "_", self.name.lower())
