@@ -222,10 +222,11 @@ def test_readings_outside_the_stroke_and_duplicates_are_refused_by_default(tmp_p
     ):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_outside_stroke=True).n_poses == 2
-    path = write(tmp_path, GOOD.replace("b,1,1,1,1,1,1,201.1", "b,0,0,0,0,0,0,200"))
-    with pytest.raises(DataError, match=r"'a' and 'b' \(.*:5 and .*:6\) have the same"):
+    digits = "0,0,0,0,0,0,200.0012345"
+    path = write(tmp_path, f"{GOOD.replace('0,0,0,0,0,0,200', digits)}c,{digits}\n")
+    with pytest.raises(DataError, match=r"'a' and 'c' \(.*:5 and .*:7\) have the same"):
         load_measurements(path, robot)
-    assert load_measurements(path, robot, allow_duplicates=True).n_poses == 2
+    assert load_measurements(path, robot, allow_duplicates=True).n_poses == 3
 
 
 def test_sigma_columns_override_the_noise_of_the_settings(tmp_path, robot) -> None:

@@ -186,7 +186,7 @@ def test_readings_of_another_robot_are_refused_with_the_actuators(robot):
 
 def test_duplicate_row_is_refused():
     kind = Component(("z",), T_platform_tool=np.eye(4))
-    rows = Observations.from_sigma(kind, [0, 1, 2], [[1.0], [2.0], [1.0]], 1.0)
+    rows = Observations.from_sigma(kind, [0, 1, 2], [[0.123456789], [2.0], [0.123456789]], 1.0)
     once = Measurements("toy", np.array([[1.0], [1.0], [2.0]]), (rows,))
     check_duplicates(once)
     twice = Measurements("toy", np.ones((3, 1)), (rows,))

@@ -39,6 +39,7 @@ from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import list_instrument_frames
 from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
+from loopcal.measure.data_checks import check_duplicates
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import check_instruments
 from loopcal.measure.readings import fill_in_reading_sigma
@@ -105,6 +106,7 @@ def calibrate(
     instruments = (name for name, *_ in list_instrument_frames(data))
     check_choice("frame", options.frame, (FITTED, BASE, RELATIVE, *instruments))
     kept = exclude_poses(data, options.fit.excluded_poses)
+    check_duplicates(kept, allow=options.allow_duplicates)
     if options.prior is not None:
         filled = exclude_poses(fill_in_reading_sigma(robot, data), options.fit.excluded_poses)
         refuse_reused_rows(options.prior, filled)
@@ -278,7 +280,8 @@ def _validate(
     if not fit.converged:
         return None, []
     try:
-        return validate(fit, data, options.limit_position, options.limit_angle), []
+        limits = (options.limit_position, options.limit_angle)
+        return validate(fit, data, *limits, are_rows_known=True), []
     except DataError as error:
         if error.code in OUT_OF_REACH:
             return None, [report_finding("gates.poses-unreachable", reason=str(error))]

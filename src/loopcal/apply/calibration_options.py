@@ -62,6 +62,7 @@ class CalibrationOptions:
         frame of an instrument, see `loopcal.pose_uncertainty`.
     check_conventions : refuse data that fit far better in another unit, order, sign or column; see
         `loopcal.check_conventions`. allow_still : accept targets that no pose moves.
+    allow_duplicates : accept rows that copy others, perhaps with fewer digits.
 
     Raises
     ------
@@ -81,6 +82,7 @@ class CalibrationOptions:
     compare_with: Mapping[str, float] | Mechanism | None = None
     check_conventions: bool = True
     allow_still: bool = False
+    allow_duplicates: bool = False
 
     def __post_init__(self) -> None:
         check_type(self.fit, FitOptions, "fit", "such as FitOptions(method=MAP())")

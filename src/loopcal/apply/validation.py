@@ -314,6 +314,7 @@ def validate(
     refit: Sequence[str] = (),
     nuisance_values_before: Mapping[str, float] | None = None,
     uncertainty: FitUncertainty | None = None,
+    are_rows_known: bool = False,
 ) -> Validation:
     """Compare a calibrated robot with measurements, best with some that were not fitted.
 
@@ -330,6 +331,8 @@ def validate(
         which `fit` began.
     uncertainty : of the calibration, with which poses that do not fit are recognized; default: that
         of `fit`; of a robot, none.
+    are_rows_known : whether the caller knows which of the rows were fitted; otherwise a finding
+        names those that the identification was made from.
 
     Raises
     ------
@@ -339,9 +342,11 @@ def validate(
     check_limit("limit_position", limit_position)
     check_limit("limit_angle", limit_angle)
     robot, old, nuisance = fit, before, None
+    reused = []
     if isinstance(fit, Identification):
         robot, old, nuisance = fit.robot, before or fit.initial, fit.nuisance
         uncertainty = collect_uncertainty(fit) if uncertainty is None else uncertainty
+        reused = [] if are_rows_known else _report_reused(fit.posterior.fitted_rows, data)
     assert isinstance(robot, Mechanism)
     check_actuators(data, robot)
     if nuisance_values_before is None:
@@ -393,6 +398,7 @@ def validate(
             *report_conformity(conformity, limits, result.after, result.units),
             *_report_blunders(blunders, result, rest),
             *unpredicted,
+            *reused,
             *report_base_targets(data),
             *_report_moved_setup(robot, compared, kept),
             *_report_left_out(data, compared),
@@ -686,16 +692,18 @@ def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding
     """Return the finding that some rows for validation belong to a calibration, whose rows are
     `fitted`; None where no row does, or they are not known. Refuse half of the rows or more.
     """
+    for finding in _report_reused(fitted, data):
+        if finding.data["count"] >= REFUSED_SHARE * finding.data["total"]:
+            raise DataError(replace(finding, severity=Severity.REFUSAL))
+        return finding
+    return None
+
+
+def _report_reused(fitted: FittedRows | None, data: Measurements) -> list[Finding]:
     reused = (fitted or FittedRows()).find_in(data)
-    if not reused.count:
-        return None
-    is_refused = reused.count >= REFUSED_SHARE * reused.total
-    severity = Severity.REFUSAL if is_refused else Severity.WARNING
     stated: dict[str, Any] = reused._asdict()
-    finding = report_finding("validation.rows-reused", severity, **stated)
-    if is_refused:
-        raise DataError(finding)
-    return finding
+    finding = report_finding("validation.rows-reused", Severity.WARNING, **stated)
+    return [finding] if reused.count else []
 
 
 # A validation in a run folder: its numbers in result.json, and its differences as arrays.

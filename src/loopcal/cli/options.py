@@ -369,7 +369,7 @@ ALLOWED: Any = Group(
     allow_implausible=flag(
         "Accept values that fit far better in another unit, order, sign or column."
     ),
-    allow_duplicates=flag("Accept rows that repeat another row to the last digit."),
+    allow_duplicates=flag("Accept rows that copy others, up to rounding."),
 )
 """Accept suspicious measurements."""
 

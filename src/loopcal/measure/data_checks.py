@@ -19,11 +19,12 @@ from loopcal.findings import Quantity, report_finding
 from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import Observations, TextArray
+from loopcal.measure.observations import Observations
 from loopcal.measure.readings import resolve_reading_sigma
+from loopcal.measure.repeats import find_copies, find_reading_tolerance
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import find_distinct
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
 # Values of a target within the first number of standard deviations count as static; the check
@@ -130,11 +131,10 @@ def check_strokes(
 def check_duplicates(
     measurements: Measurements, *, allow: bool = False, places: Sequence[Sequence[str]] = ()
 ) -> None:
-    """Refuse a row that repeats another one to the last bit: readings, kind and values.
+    """Refuse rows that are copies of others, perhaps with fewer digits; see `find_copies`.
 
     Two copies of one measurement count as twice the information. True repeats differ by their
-    noise. Rows without a measured value repeat nothing. `allow` is for coarse instruments, which
-    show the same number again.
+    noise. Rows of weight 0 and rows without a measured value repeat nothing.
 
     places : place of each row of each of the observations, those of the base last, such as
         `data.csv:12`.
@@ -143,46 +143,58 @@ def check_duplicates(
         return
     places_of = dict(zip(map(id, measurements.all_observations), places, strict=False))
     for alike in _group_equal_kinds(measurements.all_observations):
-        poses = np.concatenate(
-            [rows.rows.reshape(len(rows), rows.kind.poses_per_row) for rows in alike]
-        )
-        if not len(poses):
+        kind = alike[0].kind
+        parts = [(o, np.flatnonzero(o.is_measured & (o.weight > 0.0))) for o in alike]
+        poses = np.concatenate([o.rows.reshape(len(o), -1)[rows] for o, rows in parts])
+        if len(poses) < 2:
             continue
-        measured = np.concatenate([rows.measured for rows in alike])
-        is_empty = ~np.concatenate([rows.is_measured for rows in alike])
-        own = np.where(is_empty, np.arange(1, len(poses) + 1), 0)[:, None]  # equal to no other row
-        content = np.concatenate(
-            [measurements.readings[poses].reshape(len(poses), -1), measured, own], axis=1
-        )
-        texts = [np.concatenate([getattr(o, name) for o in alike]) for name in ("session", "group")]
-        pair = _find_equal_rows(np.nan_to_num(content, nan=1e300), texts)
-        if pair is not None:
-            lines = [place for rows in alike for place in places_of.get(id(rows), ())]
-            where = tuple(lines[i] for i in pair) if lines else ()
-            described: dict[str, Any] = {"kind": alike[0].kind.name, "places": where}
-            if alike[0].kind.is_of_base:
-                raise DataError(report_finding("data.duplicate-base-rows", **described))
-            labels = tuple(measurements.labels[poses[i, 0]] for i in pair)
-            raise DataError(report_finding("data.duplicate-rows", poses=labels, **described))
+        values, sd, degrees = _list_compared_values(measurements, kind, parts, poses)
+        names = [
+            np.concatenate([getattr(o, name)[rows] for o, rows in parts])
+            for name in ("session", "group")
+        ]
+        numbers = [np.unique(of_rows, return_inverse=True)[1] for of_rows in names]
+        key = np.column_stack([measurements.repeats[poses], *numbers, np.isnan(values)])
+        member = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+        original = find_copies(member, values, sd, degrees)
+        copies = np.flatnonzero(original >= 0)
+        if not len(copies):
+            continue
+        pair = (int(original[copies[0]]), int(copies[0]))
+        lines = [
+            places_of[id(o)][i] for o, rows in parts if id(o) in places_of for i in rows.tolist()
+        ]
+        where = tuple(lines[i] for i in pair) if lines else ()
+        described: dict[str, Any] = {"kind": kind.name, "places": where, "more": len(copies) - 1}
+        if kind.is_of_base:
+            raise DataError(report_finding("data.duplicate-base-rows", **described))
+        labels = tuple(measurements.labels[poses[i, 0]] for i in pair)
+        raise DataError(report_finding("data.duplicate-rows", poses=labels, **described))
 
 
-def _find_equal_rows(content: FloatArray, texts: Sequence[TextArray]) -> tuple[int, int] | None:
-    """Return an earlier row and the first one with its numbers (r, c) and texts (r,), if any.
-
-    Only rows with an equal weighted sum of their numbers are compared, which are few.
+def _list_compared_values(
+    measurements: Measurements,
+    kind: Kind,
+    parts: Sequence[tuple[Observations, IntArray]],
+    poses: IntArray,
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return values (r, c) [SI] of the rows of a kind at poses (r, l), standard deviations (c,) of
+    their noise, and how many of the values are independent. A closure has those of the readings.
     """
-    key = (content * np.random.default_rng(0).uniform(0.5, 1.0, content.shape[1])).sum(axis=1)
-    order = np.argsort(key, kind="stable")
-    equal = np.flatnonzero(np.diff(key[order]) == 0.0)
-    rows = find_distinct(order[np.concatenate([equal, equal + 1])])
-    owners = [np.unique(text[rows], return_inverse=True)[1].reshape(-1, 1) for text in texts]
-    _, first, member = np.unique(
-        np.hstack([content[rows], *owners]), axis=0, return_index=True, return_inverse=True
-    )
-    repeated = np.flatnonzero(first[member.ravel()] != np.arange(len(rows)))
-    if not len(repeated):
-        return None
-    return int(rows[first[member.ravel()[repeated[0]]]]), int(rows[repeated[0]])
+    if not kind.columns:
+        readings, sigma = measurements.readings, measurements.reading_sigma
+        sd = find_reading_tolerance(readings, ())
+        known = sd if sigma is None else np.median(sigma, axis=0)
+        sd = np.where(np.isfinite(known) & (known > 0.0), known, sd)
+        return readings[poses[:, 0]], sd, len(sd)
+    values = np.concatenate([o.measured[rows] for o, rows in parts])
+    variance = np.concatenate([np.einsum("rii->ri", o.covariance)[rows] for o, rows in parts])
+    noise = np.sqrt(np.nanmedian(variance, axis=0))
+    named = {column.name: sd for column, sd in zip(kind.noise_columns, noise, strict=True)}
+    # several columns of an orientation share the noise of its angles
+    angles = [sd for name, sd in named.items() if name not in {c.name for c in kind.columns}]
+    usual = float(np.median(angles or noise))
+    return values, np.array([named.get(c.name, usual) for c in kind.columns]), len(noise)
 
 
 def check_targets_move(

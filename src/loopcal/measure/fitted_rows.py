@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.repeats import find_steps
 from loopcal.typing import BoolArray, FloatArray
 
 SAME = 1e-8  # share of what a column spans up to which two numbers are the same
@@ -24,8 +25,6 @@ SAME_READING = 1e-5  # the same for readings of rows whose measured values decid
 # of it, in standard deviations of the noise, and by less than the largest difference.
 CHANCE, LARGEST = 1e-6, 1e-2
 ENOUGH = 3  # equal values by which rows of different kinds are the same
-# Steps [SI] of lengths and of angles of which the rounding of values is a multiple.
-SMALLEST_STEPS = (1e-9, np.deg2rad(1e-7))
 ALONE = "readings"  # stands for the kind of rows that have readings alone
 PREFIX = "fitted"  # first word of the names of the stored arrays
 
@@ -74,9 +73,10 @@ def _estimate_chance(rows: ComparedRows, fitted: FloatArray, is_same_form: bool)
     compared = np.isfinite(rows.values)
     if is_same_form:
         compared &= np.isfinite(other).any(axis=0)
-    steps = _find_steps(other)
+    steps = find_steps(_mask_constants(other))
     step = np.minimum(
-        _find_steps(rows.values), np.where(np.isfinite(steps), steps, 0.0).max(initial=0.0)
+        find_steps(_mask_constants(rows.values)),
+        np.where(np.isfinite(steps), steps, 0.0).max(initial=0.0),
     )
     noise = rows.noise[:, rows.readings :]
     single = step / (2.0 * np.sqrt(np.pi) * np.where(noise > 0.0, noise, np.inf))
@@ -84,19 +84,6 @@ def _estimate_chance(rows: ComparedRows, fitted: FloatArray, is_same_form: bool)
     # the values that agree most easily; NaN is last
     easiest = -np.sort(-single, axis=1)[:, : None if is_same_form else ENOUGH]
     return np.asarray(np.nanprod(easiest, axis=1))
-
-
-def _find_steps(values: FloatArray) -> FloatArray:
-    """Return the step (c,) to which the values (r, c) of each column are rounded: the largest of
-    which all are multiples; infinite for columns that say nothing.
-    """
-    values = _mask_constants(values)
-    steps = []
-    for unit in SMALLEST_STEPS:
-        counts = np.rint(np.nan_to_num(values) / unit).astype(np.int64)
-        steps.append(unit * np.gcd.reduce(counts, axis=0, initial=0))
-    step = np.max(steps, axis=0)
-    return np.where(step > 0.0, step, np.inf)
 
 
 def _find_repeats(rows: ComparedRows, fitted: FloatArray) -> list[list[int]]:

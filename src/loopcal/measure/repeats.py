@@ -95,3 +95,63 @@ def _divide(values: FloatArray, gap: FloatArray, label: IntArray) -> IntArray:
             label = np.empty_like(label)
             label[order] = np.concatenate([[0], np.cumsum(is_new)])
     return label
+
+
+# Probability of refusing measurements in which every row was measured. Stated sigmas may be larger
+# than the noise of repeats by this factor: those of one session share errors of the instrument.
+CHANCE, OVERSTATED = 1e-5, 3.0
+LEVELS = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 1e-4, 1e-6, 1e-9)  # of agreement [standard deviations]
+# Steps [SI] of lengths and of angles of which the rounding of values is a multiple.
+SMALLEST_STEPS = (1e-9, np.deg2rad(1e-7))
+ROUNDED, FULL_DIGITS = 1e-3, 1e-13  # part of a step that is rounding, and step of unrounded numbers
+
+
+def find_copies(member: IntArray, values: FloatArray, sd: FloatArray, degrees: int) -> IntArray:
+    """Return which earlier row each row (r,) copies, perhaps with fewer digits; -1 for none.
+
+    Two measurements of one value differ by at most e standard deviations with the probability
+    `(2 floor(e sigma / s) + 1) s / (2 sqrt(pi) sigma)`, rounded to steps s. Rows are copies where
+    more of the repeats agree in all values than the binomial distribution explains. So an equal
+    height says nothing if the step is coarse, unless most heights of the file are equal.
+
+    member : (r,) equal for rows of one pose. values : (r, c) [SI], NaN where absent. sd : (c,)
+        [SI]. degrees : how many of the c values are independent.
+    """
+    result, sizes = np.full(len(member), -1), np.bincount(member)
+    rows = np.flatnonzero(sizes[member] > 1)
+    step, filled = find_steps(values) / sd, np.nan_to_num(values / sd, nan=MISSING)
+    repeats, pairs = int((sizes - 1).clip(0).sum()), float((sizes * (sizes - 1.0) / 2.0).sum())
+    for level in LEVELS:
+        if not len(rows):
+            break
+        label = _divide(filled[rows], np.full(len(sd), level), member[rows])
+        _, first, group = np.unique(label, return_index=True, return_inverse=True)
+        original, agreeing = rows[first[group.reshape(-1)]], len(rows) - len(first)
+        single = OVERSTATED * (2.0 * np.floor(level / step) + 1.0) * step / (2.0 * np.sqrt(np.pi))
+        single = np.sort(np.minimum(np.nan_to_num(single, nan=1.0), 1.0))
+        chance = min(pairs / repeats * float(np.prod(single[-degrees:])), 1.0)
+        if agreeing and _compute_binomial_tail(agreeing, repeats, chance) < CHANCE:
+            result[rows] = np.where(original < rows, original, -1)
+            break
+        rows = rows[np.bincount(label)[label] > 1]  # the others agree at no smaller level
+    return result
+
+
+def _compute_binomial_tail(count: int, trials: int, chance: float) -> float:
+    """Return the probability of `count` or more of all trials."""
+    from scipy.special import bdtrc
+
+    return float(bdtrc(count - 1, trials, chance))
+
+
+def find_steps(values: FloatArray) -> FloatArray:
+    """Return the step (c,) to which the values (r, c) of each column are rounded: the largest of
+    which all are multiples, `FULL_DIGITS` where there is none; infinite for columns of zeros.
+    """
+    numbers, steps = np.nan_to_num(values), np.full(values.shape[1], FULL_DIGITS)
+    for unit in SMALLEST_STEPS:
+        counts = np.rint(numbers / unit)
+        is_multiple = (np.abs(numbers / unit - counts) < ROUNDED).all(axis=0)
+        step = unit * np.gcd.reduce(counts.astype(np.int64), axis=0, initial=0)
+        steps = np.where(is_multiple, np.maximum(steps, step), steps)
+    return np.where(numbers.any(axis=0), steps, np.inf)

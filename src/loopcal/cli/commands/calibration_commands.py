@@ -108,6 +108,7 @@ def calibrate(
         compare_with=None if compare is None else lc.load_stored_values(compare, machine),
         check_conventions=not allowed.pop("allow_implausible"),
         allow_still=allowed.pop("allow_still"),
+        allow_duplicates=allowed["allow_duplicates"],
     )
     refuse_run_folder(output, force, list(inputs.values()))
     measurements = opt.read_measurements(data, machine, **allowed)
