@@ -195,8 +195,8 @@ class FitExamination(Result):
         findings = [*self.outliers.findings, *self.tails.findings]
         if self.gain.is_worthwhile is not None:
             findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
-        if self.lack_of_fit.groups:
-            findings += self.lack_of_fit.findings
+        lack = self.lack_of_fit
+        findings += [f for f in lack.findings if lack.groups or f.code == "residuals.no-repeats"]
         findings.append(self.clusters.finding)
         return (*findings, *(group.finding for group in self.correlated))
 

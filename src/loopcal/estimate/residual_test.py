@@ -11,7 +11,8 @@ nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, G.4.2), to which the residuals a
 
 u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. Residuals that are larger or
 smaller than the stated noise explains contradict the stated sigma beyond doubt: then s is that of
-the residuals alone. See docs/theory/uncertainty.md.
+the residuals alone; an exact sigma is replaced by a larger one only. See
+docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -185,10 +186,10 @@ def _estimate_scale(
     weighted: bool,
 ) -> tuple[float, float]:
     """Return the factor on the stated sigmas, and its degrees of freedom; see the module."""
-    is_contradicted = p_value < SIGNIFICANCE or p_value > 1.0 - SIGNIFICANCE
-    if noise == "estimated" or is_contradicted:
-        return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
     stated = count_sigma_degrees(noise, uncertainty)
+    is_too_large = p_value > 1.0 - SIGNIFICANCE and np.isfinite(stated)
+    if noise == "estimated" or p_value < SIGNIFICANCE or is_too_large:
+        return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
     if weighted or degrees <= 0 or np.isinf(stated):
         return 1.0, stated
     total = stated + degrees
