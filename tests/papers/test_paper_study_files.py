@@ -149,7 +149,12 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
             ),
             {"method": "TSVD 14"},
         ),
-        ("tsvd-2016", "3-rps", ("TSVD 11 and TSVD 10 take the place",), {"method": "TSVD 26"}),
+        (
+            "tsvd-2016",
+            "3-rps",
+            ("TSVD 32 to TSVD 27 are left out", "rings of equal tilt"),
+            {"method": "TSVD 26"},
+        ),
         (
             "tsvd-2016",
             "five-bar",

@@ -180,12 +180,19 @@ class StudyCase:
                     f"{of_other.count} poses are drawn from the workspace of {robot.name} in place "
                     f"of the {level.count} of the study."
                 )
+            elif of_other.choice == "tilts":
+                sentences.append(
+                    f"{of_other.count} poses lie on rings of equal tilt in the workspace of "
+                    f"{robot.name} in place of that of {nominal.name}."
+                )
         for kind in ("instruments", "methods"):
             before, after = (list(getattr(study, kind)) for study in (first, other))
             names = [[n for n in a if n not in b] for a, b in ((before, after), (after, before))]
-            if any(names):
-                left, new = map(_say_levels, names)
+            left, new = map(_say_levels, names)
+            if left and new:
                 sentences.append(f"The {kind} {new} take the place of {left}.")
+            elif left or new:
+                sentences.append(f"The {kind} {left or new} are {'left out' if left else 'added'}.")
         for name, level, (of_robot, of_other) in zip(
             first.errors, first.errors.values(), other.errors.items(), strict=True
         ):
@@ -201,7 +208,7 @@ def _say_levels(names: Sequence[str]) -> str:
     """Return names of levels, from the first to the last where they are many."""
     if len(names) > 3:
         return f"{names[0]} to {names[-1]}"
-    return list_names(names) if names else "none"
+    return list_names(names)
 
 
 def describe_errors(robot: Mechanism, level: ErrorsLevel) -> str:
@@ -339,13 +346,13 @@ def _keep_position(text: str) -> str:
 
 def _list_directions(text: str, parameters: int) -> str:
     """Return the text of a study file in which truncated SVD keeps each number of directions from
-    one fewer than the parameters to a third of them, if it lists such numbers.
+    one fewer than the parameters to 1, if it lists such numbers.
     """
     listed = re.compile(r"(?:^  [^:\n]*\d+: \{[^\n]*keep: \d+\}\n)+", re.MULTILINE)
 
     def list_all(found: re.Match[str]) -> str:
         line = found[0].splitlines(keepends=True)[0]
-        numbers = range(parameters - 1, parameters // 3, -1)
+        numbers = range(parameters - 1, 0, -1)
         return "".join(re.sub(r"\d+(?=: \{|\})", str(number), line) for number in numbers)
 
     return listed.sub(list_all, text)
