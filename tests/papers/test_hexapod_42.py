@@ -21,7 +21,13 @@ from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, LoopcalError
 from loopcal.papers.hexapod_42 import results as results_module
 from loopcal.papers.hexapod_42 import steps
-from loopcal.papers.hexapod_42.results import Results, compute, count_printed, judge_claims
+from loopcal.papers.hexapod_42.results import (
+    Results,
+    compute,
+    count_printed,
+    judge_claims,
+    make_tables,
+)
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.published import PaperFile
 from loopcal.papers.reproduction import write_page
@@ -371,6 +377,16 @@ def test_every_claim_can_agree_disagree_and_stay_undecided(results, claim) -> No
 
 def test_every_claim_has_results_for_all_outcomes(results) -> None:
     assert {verdict.name for verdict in judge_claims(results)} == set(OUTCOMES)
+
+
+def test_lost_draws_are_dashes_and_count_against_an_improvement(results) -> None:
+    lost = np.where(np.arange(TRIALS) < 9, np.nan, 0.01)
+    places = dict.fromkeys(results.methods["alone"].places, lost)
+    changed = with_draws(results, parameters=lost, places=places)
+    methods = next(table for table in make_tables(changed) if table.name == "methods")
+    assert methods.text()[1][1:] == ("-", "-", "-")
+    judged = {verdict.name: verdict.agrees for verdict in judge_claims(changed)}
+    assert judged["positions_improve"] is judged["leg_by_leg"] is False
 
 
 @pytest.fixture

@@ -60,8 +60,10 @@ class Table:
         """Rows as a page shows them; a dash for what does not exist."""
 
         def show(cell: Cell, spec: str) -> str:
-            if cell is None or isinstance(cell, bool):
-                return {None: "-", True: "yes", False: "no"}[cell]
+            if cell is None or (isinstance(cell, float) and np.isnan(cell)):
+                return "-"
+            if isinstance(cell, bool):
+                return "yes" if cell else "no"
             return cell if isinstance(cell, str) else format(cell, spec)
 
         assert all(len(row) == len(self.formats) for row in self.rows), self.name

@@ -208,12 +208,8 @@ def list_replaced(results: Results) -> tuple[str, ...]:
 def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return the tables beyond those of the paper."""
     setup, tables, levels = results.setup, results.tables, results.levels
-    runs, trials, (_, high) = results.runs.values(), len(levels[STATED].needed), SIZES.find("wide")
-    rule = {
-        "threshold": setup.epsilon,
-        "limit": SIZES.find("iterations"),
-        "count": len(setup.poses),
-    }
+    runs, trials, count = results.runs.values(), len(levels[STATED].needed), len(setup.poses)
+    rule = {"threshold": setup.epsilon, "limit": SIZES.find("iterations"), "count": count}
     states = zip(*(run.integrated for run in runs), strict=True)
     figure_4 = [(str(k), *sizes) for k, sizes in enumerate(states)]
     figure_4.append(("iterations needed", *(run.count_needed(setup.epsilon) for run in runs)))
@@ -234,14 +230,14 @@ def make_tables(results: Results) -> tuple[published.Table, ...]:
     return (
         TEXT.table("figure_4", figure_4, "", (), presumed=_describe_noise(PRESUMED),
                    stated=_describe_noise(STATED), **rule),
-        TEXT.table("conditions", conditions, count=len(setup.poses)),
-        *(() if tables is None else _make_printed_tables(tables)),
-        *(() if tables is not None else _make_own_tables(results)),
+        TEXT.table("conditions", conditions, count=count),
+        *(_make_own_tables(results) if tables is None else _make_printed_tables(tables)),
         TEXT.table("noise", noise, "", of_published, **rule),
         TEXT.table("methods", methods, "", places, limits=levels[STATED].limits, trials=trials,
-                   unmeasured=SIZES.find("unmeasured"), count=len(setup.poses)),
-        TEXT.table("poses", results.poses, trials=trials, high=high, before=before,
-                   is_printed=setup.is_printed),
+                   unmeasured=SIZES.find("unmeasured"), count=count),
+        TEXT.table("poses", results.poses, trials=trials, before=before, wide=SIZES.find("wide"),
+                   printed=tables and (setup.poses.max(axis=0) * TO_PRINTED).tolist(),
+                   tilt=np.rad2deg(setup.poses[:, 3:].max())),
     )  # fmt: skip
 
 
