@@ -102,6 +102,11 @@ class Paper:
             from loopcal.studies.simulation.published_steps import check_legs
 
             check_legs(other)
+        if not any(entry.tolerance for entry in other.parameters.entries):
+            raise DataError(
+                f"{other.name} has no tolerances, from which a study draws the errors of its "
+                "machines; add tolerances to the robot file"
+            )
         return StudyCase(self, str(robot), other, epsilon)
 
     def present(

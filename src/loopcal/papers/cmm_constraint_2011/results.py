@@ -212,7 +212,7 @@ def make_tables(results: Results) -> tuple[published.Table, ...]:
         _list_table_3(results, "table_3_absolute", (*absolute, at_nominal, PARAMETERS)),
         TEXT.table("figure_5_readings", readings, "", more),
         TEXT.table("arrangements", results.arrangements, trials=trials, unit=study.unit[1],
-                   rank=len(study.observable), **figure_5),
+                   **figure_5),
         TEXT.table("weights", weights, "",
                    [(study.label(name), ".3g") for name in (POSITION, DETERMINED)], **figure_5),
         TEXT.table("table_4", fifty, "", statistics, trials=trials, **experiment),

@@ -27,6 +27,7 @@ from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.papers.paper import PAPERS, StudyCase
 from loopcal.papers.published import PaperFile, Row, decide, last_digit
 from loopcal.planning.design_space import ObservableSpace, PriorInformation, find_observable_space
@@ -45,7 +46,7 @@ from loopcal.studies.simulation.published_steps import (
     linearize_products,
     map_displacements,
 )
-from loopcal.studies.specification.levels import PosesLevel
+from loopcal.studies.specification.levels import FEWEST_POINTS, PosesLevel
 from loopcal.studies.specification.study import Study as GridStudy
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -69,6 +70,10 @@ SD, VARIANCE = "standard deviation", "variance"
 """Interpretations of a printed "variance of 0.01mm"."""
 ANY_TRUTH, OBSERVABLE = "all parameters", "gauge-free"
 """True errors: of all parameters, or without their part that plane and line cannot determine."""
+SQUARED_ROUNDING = 1e-7
+"""Singular values, relative to the largest, whose squares are rounding: log det cannot use them."""
+MORE_GROUPS = 3
+"""Groups that show whether the drawn ones determine all that planes and lines can determine."""
 Key = tuple[str, str]
 """A set of errors and a noise, as printed or as numbers in mm."""
 
@@ -101,7 +106,12 @@ def find_figure_5() -> Key:
 
 
 def load_grid(case: StudyCase, seed: int, trials: int) -> GridStudy:
-    """Return study.yaml of the robot with the printed sets, noises and numbers of points."""
+    """Return study.yaml of the robot with the printed sets, noises and numbers of points.
+
+    Raises EstimationError: the end point of the robot cannot follow planes and lines.
+    """
+    if case.robot is not None:
+        PlaneLineGroups(case.robot, FEWEST_POINTS, MM)
     grid = set_size(case.load_study(), seed, trials)
     (name, poses), points = next(iter(grid.poses.items())), PRINTED.find("points")
     sets, noises = (PRINTED.find(key).split() for key in ("sets", "noises"))
@@ -158,9 +168,7 @@ class Study:
     @cached_property
     def observable(self) -> ObservableSpace:
         """The directions of the free parameters, in tolerances, that plane and line determine."""
-        return find_observable_space(
-            self.optimized.rows, PriorInformation.none(len(self.planned.free))
-        )
+        return find_directions(self.planned, self.optimized.design)
 
     @cached_property
     def unit(self) -> tuple[float, str]:
@@ -250,11 +258,21 @@ def plan_points(
     points = level.count // level.groups
     planned = PlaneLineGroups(build_robot_of(robot.text).nominal, points, MM, axes)
     first = planned.draw(level.groups, grid.seed)
-    is_complete = level.groups * (points - 2) >= len(planned.free)
-    improved = improve_groups(planned, first, level.sweeps, is_complete)
+    more = planned.draw(level.groups + MORE_GROUPS, grid.seed)
+    known, possible = (
+        int(are_nonzero(s, SQUARED_ROUNDING).sum())
+        for s in (find_directions(planned, x).singular_values for x in (first, more))
+    )
+    improved = improve_groups(planned, first, level.sweeps, known == possible)
     coordinates = planned.place_points(improved.design).reshape(level.count, -1)
     held = replace(level, coordinates=tuple(map(tuple, coordinates.tolist())))
     return Study(replace(grid, poses={name: held}), planned, first, improved)
+
+
+def find_directions(planned: PlaneLineGroups, design: FloatArray) -> ObservableSpace:
+    """Return the directions of the free parameters that groups determine without tolerances."""
+    none = PriorInformation.none(len(planned.free))
+    return find_observable_space(planned.linearize(design), none)
 
 
 def fit_motions(T: FloatArray, others: FloatArray) -> FloatArray:
@@ -279,13 +297,11 @@ def compute_ranks(study: Study) -> list[Row]:
     ranks = []
     for groups, points in SIZES.find("ranks"):
         planned = replace(study.planned, points=points)
-        rows, p = planned.linearize(planned.draw(groups, study.grid.seed)), len(planned.free)
-        s = find_observable_space(rows, PriorInformation.none(p)).singular_values
-        rank = len(find_observable_space(rows, PriorInformation.none(p)))
-        s = np.pad(s, (0, p - len(s)))
-        count = rows.shape[0] * rows.shape[1]
-        ranks.append({"groups": groups, "points": points, "rows": count, "rank": rank,
-                      "used": s[rank - 1] / s[0], "last": s[-1] / s[0]})  # fmt: skip
+        space = find_directions(planned, planned.draw(groups, study.grid.seed))
+        rank, s = len(space), space.singular_values / space.singular_values[0]
+        last = s[-1] if len(s) == len(planned.free) else 0.0
+        ranks.append({"groups": groups, "points": points, "rows": groups * (points - 2),
+                      "rank": rank, "used": s[rank - 1], "last": last})  # fmt: skip
     return ranks
 
 
@@ -435,6 +451,7 @@ def describe_points(study: Study, cell: Cell, axes: str = "") -> Row:
     drawn, optimized = study.spreads
     medians = {m: cell.compute_median(m, name_measure("position", ALIGNED)) for m in METHODS}
     row = {"name": name_planes(study.layout.groups) + axes, "rows": study.layout.equations}
+    row |= {"rank": len(study.observable)}
     row |= {"drawn": drawn, "optimized": optimized, "gain": drawn / optimized, **medians}
     return row | {"lost": sum(int((~c).sum()) for c in cell.converged.values())}
 
