@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, MechanismError, suggest_names
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names, round_to_digits
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
 from loopcal.mechanism.workspace import list_tilt_rings
@@ -102,11 +103,9 @@ class Paper:
             from loopcal.studies.simulation.published_steps import check_legs
 
             check_legs(other)
-        if not any(entry.tolerance for entry in other.parameters.entries):
-            raise DataError(
-                f"{other.name} has no tolerances, from which a study draws the errors of its "
-                "machines; add tolerances to the robot file"
-            )
+        table = other.parameters
+        if not (table.free * [bool(entry.tolerance) for entry in table.entries]).any():
+            raise DataError(report_finding("data.no-errors-drawn", robot=other.name))
         return StudyCase(self, str(robot), other, epsilon)
 
     def present(
