@@ -730,13 +730,12 @@ def test_evidence_position_after_commanding_is_that_of_the_true_parameters() -> 
 
 
 @pytest.mark.evidence
-def test_evidence_curves_of_the_ru_pus_prs_are_u_shaped_in_angle_only() -> None:
+def test_evidence_curves_of_the_ru_pus_prs_are_u_shaped_where_the_range_is_wide_enough() -> None:
     document = load_evidence("ru_pus_prs_draws")
     for freedoms in ("6", "5"):
         for algorithm in document["minimum_inside"][freedoms].values():
-            assert algorithm["phi and theta [deg]"]["median"]
-            assert algorithm["phi and theta [deg]"]["machines"] > 0.8 * document["draws"]
-            assert not algorithm["position [mm]"]["median"]
-            assert algorithm["position [mm]"]["machines"] < 0.3 * document["draws"]
+            for name, share in (("position [mm]", 0.7), ("phi and theta [deg]", 0.9)):
+                assert algorithm[name]["median"]
+                assert algorithm[name]["machines"] > share * document["draws"]
     for method in (steps.RAW_LS, steps.RAW_RE, steps.RAW_TSVD):
         assert read_column(document, "ratios", 4)[f"MAP over {method}"] < 1.0

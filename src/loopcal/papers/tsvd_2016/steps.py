@@ -641,7 +641,8 @@ def solve_case(study: Study, progress: Callable[[str], None]) -> Case:
     p, known = len(study.design.free), linearize(study)
     s, rank, tried = known.singular_values[0], find_rank(known), np.array(SIZES.find("tried"))
     lambdas, is_equal = space_lambdas(s[rank - 1])
-    sweep = run_settings(study, lambdas)
+    wide = list_lambdas()
+    sweep = run_settings(study, np.array([*lambdas, *wide[wide > lambdas[-1]]]))
     words = dict(zip(lambdas, np.where(is_equal, "equal intervals", "equal ratios"), strict=True))
     k = {LS: p, TSVD: sweep.chosen[TSVD].settings[0]}
     pictured = [
