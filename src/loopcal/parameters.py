@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.errors import MechanismError, suggest_names
+from loopcal.errors import DataError, MechanismError, suggest_names
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -159,3 +160,17 @@ def _freeze(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """Return the array, made read-only."""
     array.setflags(write=False)
     return array
+
+
+def match_names(names: Sequence[str], pattern: str) -> list[str]:
+    """Return the names of parameters that fit a name or a pattern, such as `leg*.length`.
+
+    Raises DataError: none does.
+    """
+    fitting = [name for name in names if fnmatchcase(name, pattern)]
+    if not fitting:
+        raise DataError(
+            f"no parameter is named {pattern!r}{suggest_names(pattern, names)}; correct the name; "
+            "a pattern such as 'leg*.length' names several"
+        )
+    return fitting

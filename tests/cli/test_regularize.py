@@ -51,6 +51,25 @@ def test_folder_has_the_points_the_choices_and_the_picture(loopcal, tmp_path) ->
     assert (folder / "curves.png").read_bytes() == first
 
 
+def test_one_lambda_per_parameter_is_stated_by_pattern_or_in_a_file(loopcal, tmp_path) -> None:
+    words = "calibrate linear-delta data.csv --method ridge --json --lam"
+    (tmp_path / "weights.yaml").write_text('"*": 0.01\n"*.length": 100\n', "utf-8")
+    fits = {}
+    for i, lam in enumerate(("0.01", "*.length=100,*=0.01", "weights.yaml")):
+        estimate = loopcal(f"{words} {lam} -o run{i}").json["fit"]["parameters"]
+        fits[lam] = {p["name"]: p["estimate"] - p["nominal"] for p in estimate}
+    alike, named, filed = fits.values()
+    assert named == filed
+    ratio = {name: abs(named[name] / alike[name]) for name in alike if alike[name]}
+    assert max(share for name, share in ratio.items() if name.endswith(".length")) < 0.1
+    for wrong in ("*.lengths=1", "*=-1", "*=much", "nofile.yaml", "*"):
+        loopcal(
+            f"{words} {wrong} -o wrong",
+            "--lam" if "lengths" not in wrong else "no parameter",
+            code=1,
+        )
+
+
 def test_chosen_values_are_those_of_calibrate(loopcal) -> None:
     out = loopcal("regularize linear-delta data.csv --json").out
     chosen = {c["rule"]: c["value"] for c in json.loads(out)["ridge"]["chosen"]}

@@ -6,7 +6,9 @@ lambda or the rank.
 import numpy as np
 import pytest
 
-from loopcal.errors import EstimationError
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import (
     GCV,
     MAP,
@@ -17,7 +19,7 @@ from loopcal.estimate.penalties import (
     TruncationGCV,
 )
 from loopcal.numerics.decomposition import decompose
-from tests.estimate.problems import fold_rows
+from tests.estimate.problems import fold_rows, hexapod, hexapod_data
 
 P, M, T = 6, 50, 4
 
@@ -65,6 +67,38 @@ def test_ridge_with_lambda_per_parameter_equals_penalty_rows(rows):
     np.testing.assert_allclose(
         estimate(rows, Ridge(tuple(lam))), solve_with_penalty_rows(rows, lam), rtol=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    ("lam", "expected"),
+    [
+        ({"*": 0.01, "*.length": 1.0}, [0.01, 1.0, 0.01, 1.0]),
+        ({"*.length": 1.0, "*": 0.01}, [0.01, 1.0, 0.01, 1.0]),  # in any order
+        ({"leg1.*": 2.0, "leg2.length": 3.0}, [2.0, 2.0, 0.0, 3.0]),
+        ({"leg[12].length": 4.0, "leg?.length": 5.0}, [0.0, 5.0, 0.0, 5.0]),  # the last of equals
+    ],
+)
+def test_lambda_by_pattern_is_that_of_the_most_exact_pattern_and_zero_without_one(lam, expected):
+    names = ["leg1.base.x", "leg1.length", "leg2.base.x", "leg2.length"]
+    assert Ridge(lam).resolve(names) == Ridge(tuple(expected))
+    with pytest.raises(DataError, match=r"no parameter is named 'leg3\.\*'"):
+        Ridge({**lam, "leg3.*": 1.0}).resolve(names)
+    with pytest.raises(EstimationError, match="a finite number >= 0"):
+        Ridge({**lam, "*": -1.0})
+    with pytest.raises(EstimationError, match=r"call resolve\(names\)"):
+        Ridge(lam).required_equations(4)
+
+
+def test_a_fit_with_lambda_by_pattern_equals_one_with_a_vector_and_keeps_its_options():
+    robot, data = hexapod(), hexapod_data(12)
+    named = FitOptions(Ridge({"*.length": 10.0, "*": 0.1}))
+    lam = [10.0 if name.endswith(".length") else 0.1 for name in robot.parameters.names]
+    by_name = identify(robot, data, options=FitOptions.from_dict(named.to_dict()))
+    by_array = identify(robot, data, Ridge(np.array(lam)))
+    assert np.array_equal(by_name.estimate, by_array.estimate)
+    assert by_name.options.method == by_array.options.method == Ridge(tuple(lam))
+    alike = identify(robot, data, Ridge(0.1))
+    assert np.abs(by_name.estimate - alike.estimate).max() > 1e-6  # [m]
 
 
 def test_parameter_with_lambda_zero_is_unpenalized(rows):

@@ -20,12 +20,14 @@ from loopcal.studies.simulation.block import (
     compute_block,
     find_cells,
     list_tasks,
+    make_stream,
     replay_trial,
     set_size,
+    simulate_block,
 )
 from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.machines import draw_machines, prepare_cell
-from loopcal.studies.simulation.published_steps import identify_per_leg
+from loopcal.studies.simulation.published_steps import identify_per_leg, make_raw_problem
 from loopcal.studies.specification.levels import (
     EffectsLevel,
     ErrorsLevel,
@@ -114,6 +116,58 @@ def test_raw_least_squares_without_rank_detection_diverges_and_truncated_svd_doe
     assert np.isfinite(ls["position_before"]).all()
     assert_array_equal(tsvd["outcome"], 0.0)
     assert_array_equal(ridge["iterations"], 3.0)
+
+
+def test_one_lambda_per_parameter_takes_the_step_of_equation_11():
+    six = InstrumentLevel(("component",), ("x", "y", "z", "phi", "theta", "psi"), "tilt-torsion")
+    lam = {"*": 0.01, "a*": 1.0, "q*": 0.0}
+    levels = {
+        "vector": MethodLevel("ridge", rows="raw", lam=lam, steps=1),
+        "alike": MethodLevel("ridge", rows="raw", lam={"*": 0.01}, steps=1),
+        "number": MethodLevel("ridge", rows="raw", lam=0.01, steps=1),
+    }
+    study = make_study("3-prs", instruments={"6": six}, methods=levels, poses={"36": POSES})
+    study = replace(study, replicates=2, block=2)
+    vector, alike, number = calibrate_cells(study)
+    assert_allclose(alike.values, number.values, rtol=0, atol=1e-12)
+    task = next(list_tasks(study))
+    cell = prepare_cell(json.loads(task.content))
+    trials = simulate_block(cell, make_stream(study.seed, 0))
+    raw = make_raw_problem(cell.robot, trials)
+    free = raw.problem.free
+    weight = np.array([{"a": 1.0, "q": 0.0}.get(name[0], 0.01) for name in free.names])
+    z = np.zeros((2, len(free)))
+    factor = raw.problem.linearize(z, raw.start).factor
+    H, D = factor[:, :, :-1], -factor[:, :, -1:]
+    step = np.linalg.solve(H.mT @ H + np.diag(weight), H.mT @ D)[..., 0]
+    expected = cell.robot.values + 0.0 * vector.values
+    expected[:, free.places] += step * free.tolerance
+    moved = np.abs(step * free.tolerance).max()
+    assert_allclose(vector.values, expected, rtol=0, atol=1e-9 * moved)  # condition of H'H
+    assert np.abs(vector.values - number.values).max() > 1e-3 * moved
+
+
+@pytest.mark.parametrize("rows", ["weighted", "raw"])
+def test_a_study_file_states_lambda_by_pattern(tmp_path, rows):
+    text = """
+format: 1
+title: One lambda for each parameter
+seed: 1
+robots: [hexapod-42]
+replicates: 2
+block: 2
+poses: [12]
+methods:
+  m: {method: ridge, rows: ROWS, lam: {"*.length": 1.0, "*": 0.01}}
+scores: {held_out: 3}
+"""
+    path = tmp_path / "study.yaml"
+    path.write_text(text.replace("ROWS", rows), "utf-8")
+    (scores,) = compute_cells(load_study(path))
+    assert np.isfinite(scores["position"]).all()
+    path.write_text(path.read_text("utf-8").replace("*.length", "*.lengths"), "utf-8")
+    with pytest.raises(FileError, match=r"study.yaml:10: 'm' of 'methods': no parameter is named"):
+        load_study(path)
 
 
 def test_per_leg_trials_are_those_of_identify_per_leg():

@@ -513,6 +513,25 @@ def _make_fit_options(stated: Mapping[str, Any]) -> lc.FitOptions:
     return lc.FitOptions.from_dict(stated)
 
 
+def _parse_weights(text: str) -> float | dict[str, float]:
+    """Return the weight of ridge, or weights by name or pattern of parameters, also from a file."""
+    from loopcal.io.core.yaml_file import read_yaml
+
+    pairs = [part.rpartition("=")[::2] for part in text.split(",")]
+    if Path(text).is_file():
+        pairs = list(read_yaml(text, "file of weights").content.items())
+    try:
+        weights = {str(pattern): float(number) for pattern, number in pairs}
+    except (TypeError, ValueError):
+        weights = {}
+    if not weights or not all(0.0 <= weight < float("inf") for weight in weights.values()):
+        raise DataError(
+            f"{text!r} states no weights of 0 or more; write a number, '*.length=1,*=0.01', or a "
+            "YAML file with lines '*.length: 1'"
+        )
+    return weights.pop("") if list(weights) == [""] else weights
+
+
 def _describe_methods() -> str:
     """Return the methods with their short names, and what they are."""
     from loopcal.estimate.methods import METHODS
@@ -539,8 +558,10 @@ FIT: Any = Group(
         type=Words("loopcal.estimate.tolerance_components:By", "none"),
     ),
     lam=option(
-        "For ridge: weight of the penalty; by default chosen by cross-validation.",
-        type=click.FloatRange(min=0),
+        "For ridge: weight of the penalty; by default chosen by cross-validation. Or a weight for "
+        "each parameter: patterns such as '*.length=1,*=0.01', or a YAML file of such lines "
+        "'*.length: 1'; the most exact pattern counts, and 0 where none fits.",
+        type=Parsed("weight", _parse_weights),
         metavar="WEIGHT",
     ),
     keep=option(

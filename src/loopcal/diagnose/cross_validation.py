@@ -217,7 +217,12 @@ def score_leave_one_out(
     linearization = problem.linearize(z, problem.start(z))
     d = decompose(linearization.factor, linearization.equations, z)
     stated = np.zeros(len(free), dtype=bool)
-    adapted = [adapt_method(method, stated, "given") for method in methods]
+    adapted = [adapt_method(method, free.names, stated, "given") for method in methods]
+    if any(method.root(len(free)) is not None for method in adapted):
+        raise EstimationError(
+            "leave-one-out of many methods penalizes all parameters alike; use cross_validate for "
+            "one lam per parameter"
+        )
     penalty = np.concatenate([method.penalty(d) for method in adapted])
     # 1 / (s^2 + penalty) and the coordinates y, both (k, p); zero for unused directions
     s, total = d.singular_values[0], d.singular_values[0] ** 2 + penalty

@@ -345,7 +345,9 @@ def identify(
     refuse_reused_rows(options.prior, data)
     unknowns = len(free) + (0 if problem.nuisance is None else problem.nuisance.unpenalized_count)
     options = choose_noise(options, data, int(problem.equations[0]) - unknowns)
-    method = adapt_method(options.method or default, free.assumed, options.noise, free.correlation)
+    method = adapt_method(
+        options.method or default, free.names, free.assumed, options.noise, free.correlation
+    )
     options = replace(options, method=method)
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
@@ -697,7 +699,7 @@ def identify_trials(
     problem = problem_of_trials(free, trials)
     values = np.atleast_2d(robot.values if options.start is None else np.asarray(options.start))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
-    method = adapt_method(options.method, free.assumed, options.noise, free.correlation)
+    method = adapt_method(options.method, free.names, free.assumed, options.noise, free.correlation)
     options = replace(options, method=method)
     shared = None
     if chord_start and options.begin == "kinematics" and len(values) == 1:

@@ -213,6 +213,8 @@ def _to_plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, tuple | list):
         return [_to_plain(item) for item in value]
+    if isinstance(value, Mapping):
+        return {key: _to_plain(item) for key, item in value.items()}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return _name_entry(RULES, value) if callable(value) else {OBJECT: repr(value)}
@@ -243,7 +245,7 @@ def _list_settings(value: Any) -> dict[str, Any]:
 
 def _from_plain(value: Any) -> Any:
     """Return the value of an option from plain data."""
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) and ("name" in value or OBJECT in value):
         return _make_entry(RULES, value)
     return tuple(_from_plain(item) for item in value) if isinstance(value, list) else value
 

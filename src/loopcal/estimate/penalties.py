@@ -19,7 +19,8 @@ its line in `loopcal.estimate.methods`. See docs/theory/estimation.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Protocol
 
@@ -37,6 +38,7 @@ from loopcal.estimate.tolerance_components import (
 )
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
+from loopcal.parameters import match_names
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 Rule = Callable[[Decomposition], FloatArray | IntArray]
@@ -271,56 +273,87 @@ class Ridge(Method):
     Parameters
     ----------
     lam : a number, one number per free parameter in the order of the parameter table (0 for an
-        unpenalized one), or a rule that chooses one number, by default cross-validation.
+        unpenalized one), numbers by name or pattern (see `resolve`), or a rule that chooses one
+        number, by default cross-validation.
 
     Raises
     ------
     EstimationError : lam is negative or not finite.
+
+    Examples
+    --------
+    >>> Ridge({"*": 0.01, "*.length": 1.0}).resolve(("leg1.length", "leg1.base.x"))
+    Ridge(lam=(1.0, 0.01))
     """
 
     name: ClassVar[str] = "ridge"
     what: ClassVar[str] = "least squares with a penalty on deviations in tolerances"
-    lam: float | tuple[float, ...] | Rule = GCV()
+    lam: float | tuple[float, ...] | Mapping[str, float] | Rule = GCV()
 
     def __post_init__(self) -> None:
         if callable(self.lam):
             return
-        values = np.asarray(self.lam, dtype=np.float64)
+        stated = list(self.lam.values()) if isinstance(self.lam, Mapping) else self.lam
+        values = np.asarray(stated, dtype=np.float64)
         if values.ndim > 1 or not np.all(np.isfinite(values)) or np.any(values < 0.0):
             raise EstimationError(
                 f"ridge with lam = {self.lam}: give a finite number >= 0, one per parameter, or a "
                 "rule such as GCV()"
             )
-        if values.ndim == 1:
+        if values.ndim == 1 and not isinstance(self.lam, Mapping):
             object.__setattr__(self, "lam", tuple(float(v) for v in values))
+
+    def resolve(self, names: Sequence[str]) -> Ridge:
+        """Return this method with one number per free parameter of these names, where lam states
+        numbers by name or pattern.
+
+        The name or pattern with the most characters besides wildcards counts, the last of equal
+        ones; parameters that none fits have 0. DataError for a pattern that no parameter has.
+        """
+        if not isinstance(self.lam, Mapping):
+            return self
+        lam = dict.fromkeys(names, 0.0)
+        for pattern in sorted(self.lam, key=lambda text: len(re.sub(r"[*?]|\[.*?\]", "", text))):
+            lam |= dict.fromkeys(match_names(names, pattern), float(self.lam[pattern]))
+        return Ridge(tuple(lam.values()))
+
+    @property
+    def weights(self) -> float | tuple[float, ...] | Rule:
+        """`lam`, with numbers by name resolved; EstimationError where they are not."""
+        if isinstance(self.lam, Mapping):
+            raise EstimationError(
+                "ridge with lam by name needs the names of the parameters; call resolve(names), or "
+                "give it to identify"
+            )
+        return self.lam
 
     def required_equations(self, parameters: int) -> int:
         """Return the number of unpenalized parameters."""
-        if isinstance(self.lam, tuple):
-            return sum(value == 0.0 for value in self.lam)
-        return parameters if self.lam == 0.0 else 0
+        if isinstance(self.weights, tuple):
+            return sum(value == 0.0 for value in self.weights)
+        return parameters if self.weights == 0.0 else 0
 
     def unpenalized(self, parameters: int) -> BoolArray | None:
         """Return which parameters have lam = 0, where there is one lam per parameter."""
-        if isinstance(self.lam, tuple) and 0.0 in self.lam:
-            return np.array(self.lam) == 0.0
+        if isinstance(self.weights, tuple) and 0.0 in self.weights:
+            return np.array(self.weights) == 0.0
         return None
 
     def root(self, parameters: int) -> FloatArray | None:
         """Return diag(1 / sqrt(lam)) for one lam per parameter: penalty 1 on u is lam on z."""
-        if not isinstance(self.lam, tuple):
+        if not isinstance(self.weights, tuple):
             return None
-        if len(self.lam) != parameters:
+        lam = np.asarray(self.weights)
+        if len(lam) != parameters:
             raise EstimationError(
-                f"ridge with {len(self.lam)} values of lam for {parameters} free parameters: give "
-                "one value per parameter"
+                f"ridge with {len(lam)} values of lam for {parameters} free parameters: give one "
+                "value per parameter"
             )
-        lam = np.asarray(self.lam)
         return np.diag(1.0 / np.sqrt(np.where(lam > 0.0, lam, 1.0)))
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return lam for every direction; with lam = 0 directions beyond the rank are not used."""
-        lam = 1.0 if isinstance(self.lam, tuple) else self.lam
+        lam = 1.0 if isinstance(self.weights, tuple) else self.weights
         values = _apply_rule(lam, decomposition) if callable(lam) else np.atleast_1d(lam)
         return _penalize(decomposition, values)
 
@@ -334,7 +367,7 @@ class Ridge(Method):
         correlated, or where different parameters have different lam: then the coordinates are
         correlated.
         """
-        lam = np.array(self.lam if isinstance(self.lam, tuple) else [1.0])
+        lam = np.array(self.weights if isinstance(self.weights, tuple) else [1.0])
         penalized = lam[lam > 0.0]
         is_known = (
             free.correlation is None
@@ -345,12 +378,12 @@ class Ridge(Method):
 
     def lacks_tolerances(self, free: FreeParameters) -> BoolArray:
         """Return which parameters (p,) are penalized without a stated tolerance."""
-        lam = 1.0 if callable(self.lam) else np.asarray(self.lam)
+        lam = 1.0 if callable(self.weights) else np.asarray(self.weights)
         return np.asarray(free.assumed & np.broadcast_to(lam > 0.0, free.assumed.shape))
 
     def choice(self) -> tuple[str, float | tuple[float, ...] | Rule]:
         """Return the ridge parameter."""
-        return "lam", self.lam
+        return "lam", self.weights
 
 
 @dataclass(frozen=True)
@@ -495,14 +528,18 @@ def make_default_method(inflation: By | Literal["none"] = "auto") -> Method | No
 
 def adapt_method(
     method: Method | None,
+    names: Sequence[str],
     assumed: BoolArray,
     noise: Literal["given", "estimated"],
     correlation: FloatArray | None = None,
 ) -> Method:
-    """Return the method of a fit: the default where it is None; MAP with what it must know, which
-    tolerances (p,) are assumed and the correlation (p, p) of the deviations by common errors.
+    """Return the method of a fit: the default where it is None; ridge with a number for each of the
+    names (p,); MAP with what it must know, which tolerances (p,) are assumed and the correlation
+    (p, p) of the deviations by common errors.
     """
     method = MAP(InflatedTolerances()) if method is None else method
+    if isinstance(method, Ridge):
+        return method.resolve(names)
     if not isinstance(method, MAP):
         return method
     free = method.free or (tuple(assumed.tolist()) if assumed.any() else ())
@@ -578,8 +615,8 @@ def fix_penalty(method: Method, parameters: int) -> FloatArray | None:
     """
     if type(method) is LeastSquares:
         value = 0.0
-    elif type(method) is Ridge and not callable(method.lam):
-        value = 1.0 if isinstance(method.lam, tuple) else float(method.lam)
+    elif type(method) is Ridge and not callable(lam := method.weights):
+        value = 1.0 if isinstance(lam, tuple) else float(lam)
     elif type(method) is MAP and not callable(method.inflation) and method.noise == "given":
         value = 1.0 / method.inflation**2
     else:

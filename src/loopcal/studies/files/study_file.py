@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from loopcal.errors import DataError, LoopcalError
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.penalties import Ridge
 from loopcal.io.core.records import read_record
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import (
@@ -262,12 +264,15 @@ def _check_surfaces(level: PosesLevel, study: Study, robots: Sequence[Mechanism]
 
 
 def _check_method(level: MethodLevel, study: Study, robots: Sequence[Mechanism]) -> None:
-    """Raise DataError where a method of published studies does not fit the poses or the scores, and
-    EstimationError where a robot does not fit identification leg by leg.
+    """Raise DataError where a method does not fit the robots, or one of published studies the poses
+    or the scores, and EstimationError where a robot does not fit identification leg by leg.
     """
     make_fit_options(level)
-    for robot in robots if level.method == PER_LEG else ():
-        check_legs(robot)
+    for robot in robots:
+        if level.method == PER_LEG:
+            check_legs(robot)
+        if isinstance(level.lam, Mapping):
+            Ridge(level.lam).resolve(select_free_parameters(robot).names)
     if level.is_of_products and not all(poses.is_on_surfaces for poses in study.poses.values()):
         raise DataError(
             f"'rows: {level.rows}' needs points on planes and lines; write 'choice: plane-line' "

@@ -22,6 +22,7 @@ from loopcal.engine import State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import IdentifiedTrials, identify, identify_trials
+from loopcal.estimate.penalties import Ridge
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials
 from loopcal.mechanism.kinematics import forward_trials
@@ -180,11 +181,14 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
                 values[i], outcome[i] = fit.robot.values, 0 if fit.is_converged else STEPS_REMAIN
                 iterations[i] = fit.steps
     else:
-        raw = make_raw_problem(robot, trials)
-        p = raw.problem.parameters
+        names = select_free_parameters(robot).names
+        ridge = Ridge(method.lam or 0.0).resolve(names)
+        raw = make_raw_problem(robot, trials, ridge)
+        p = len(names)
         penalty = np.zeros((1, p))
         if method.method == "ridge":
-            penalty = penalize_ridge(np.array([method.lam]), p)
+            lam = 1.0 if isinstance(ridge.lam, tuple) else ridge.lam
+            penalty = penalize_ridge(np.array([lam]), p)
         elif method.method == "truncated-svd":
             penalty = penalize_truncated(np.array([method.keep]), p)
         steps = take_steps(raw, penalty, choose_rule(method))
@@ -220,6 +224,8 @@ def _fit_products(
     chosen = make_fit_options(method).method
     assert trials.recorded is not None
     assert chosen is not None
+    if isinstance(chosen, Ridge):
+        chosen = chosen.resolve(robot.parameters.names)
     rows = PaperRows(cell.layout, trials.recorded, sd, sigma, weights)
     fit = identify_from_rows(rows, chosen)
     outcome = np.where(fit.status == DescentStatus.CONVERGED, 0, EXHAUSTED)

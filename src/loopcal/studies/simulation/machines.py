@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import list_tilt_rings, sample_workspace
-from loopcal.parameters import ParameterTable
+from loopcal.parameters import ParameterTable, match_names
 from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.plane_line_planning import (
     PlaneLineGroups,
@@ -114,13 +113,7 @@ def resolve_patterns(table: ParameterTable, values: Mapping[str, str]) -> dict[s
     """
     resolved: dict[str, float] = {}
     for pattern, text in values.items():
-        fitting = [entry for entry in table.entries if fnmatchcase(entry.name, pattern)]
-        if not fitting:
-            raise DataError(
-                f"no parameter is named {pattern!r}{suggest_names(pattern, table.names)}; correct "
-                "the name; a pattern such as 'leg*.length' names several"
-            )
-        for entry in fitting:
+        for entry in (table.entries[table.index(n)] for n in match_names(table.names, pattern)):
             try:
                 resolved[entry.name] = parse_quantity(text, entry.dimension)
             except UnitError as error:

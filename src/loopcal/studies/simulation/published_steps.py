@@ -5,8 +5,9 @@ Full steps on raw rows: every row has weight one in millimeters and radians, eve
 counted in millimeters and radians, steps are neither damped nor checked, and the filter acts on the
 step. The iteration ends when the largest component of a step is at most epsilon. With H = U S V'
 and s_i = S_ii the step is sum f_i (u_i'D / s_i) v_i, where f_i = 1 for least squares (without rank
-detection), s_i^2 / (s_i^2 + lam) for ridge, and 1 for i <= k, else 0, for truncated SVD. The result
-depends on the number of steps and on the units; use `identify` for real work. Source: "least
+detection), s_i^2 / (s_i^2 + lam) for ridge, and 1 for i <= k, else 0, for truncated SVD. One lam
+per parameter, (H'H + diag(lam))^-1 H'D, is the same filter with lam = 1 for H diag(lam)^(-1/2). The
+result depends on the number of steps and on the units; use `identify` for real work. Source: "least
 squares, ridge estimation and truncated SVD", Advances in Mechanical Engineering 2016,
 doi:10.1177/1687814016667908.
 
@@ -33,7 +34,7 @@ directions. Derivation, and why this equals surfaces as unknowns: docs/theory/co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -45,7 +46,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.descent import Descent, StepControl, descend
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.penalties import LeastSquares, Method
 from loopcal.estimate.problem import Problem, problem_of_trials
 from loopcal.findings import report_finding
 from loopcal.findings.wording import name_count
@@ -161,18 +162,20 @@ class RawProblem:
     Attributes
     ----------
     problem : with a noise of one millimeter and one radian as whitener, and with parameters in
-        millimeters and radians. start : the poses of the nominal robot.
+        millimeters and radians. start : the poses of the nominal robot. method : in whose
+        coordinates H is decomposed, a ridge with one lam per parameter or any other method.
     """
 
     problem: Problem
     start: Start
+    method: Method = field(default_factory=LeastSquares)
 
     def __len__(self) -> int:
         return len(self.problem)
 
     def take(self, trials: IntArray) -> RawProblem:
         """Return the problem of some trials, which may repeat."""
-        return RawProblem(self.problem.take(trials), self.start.take(trials))
+        return replace(self, problem=self.problem.take(trials), start=self.start.take(trials))
 
     def linearize(self, values: FloatArray) -> tuple[Decomposition, BoolArray]:
         """Return the decomposition of H at values (t, p) [SI], and which trials reach all poses."""
@@ -182,10 +185,13 @@ class RawProblem:
         reached = np.isfinite(linearized.cost) & np.isfinite(factor).all(axis=(1, 2))
         safe = np.where(reached[:, None, None], factor, 0.0)
         safe[:, :, -1] *= -1.0  # the rows end with predicted minus measured
-        return decompose(safe, linearized.equations, tolerance=0.0), reached
+        p, how = z.shape[1], self.method
+        unpenalized, root = how.unpenalized(p), how.root(p)
+        d = decompose(safe, linearized.equations, tolerance=0.0, unpenalized=unpenalized, root=root)
+        return d, reached
 
 
-def make_raw_problem(robot: Mechanism, trials: Trials) -> RawProblem:
+def make_raw_problem(robot: Mechanism, trials: Trials, method: Method | None = None) -> RawProblem:
     """Return the raw rows of trials, which begin with the values of the robot."""
     free = select_free_parameters(robot)
     dimensions = [robot.parameters.dimensions[i] for i in free.places]
@@ -197,7 +203,7 @@ def make_raw_problem(robot: Mechanism, trials: Trials) -> RawProblem:
     problem = problem_of_trials(free, replace(trials, instrument=Instrument(sensors)))
     z = np.repeat(free.deviation(robot.values[None]), len(trials), axis=0)
     start = problem.linearize(z, problem.start(z)).next_start
-    return RawProblem(problem, replace(start, is_near=False))
+    return RawProblem(problem, replace(start, is_near=False), method or LeastSquares())
 
 
 def take_steps(raw: RawProblem, penalty: FloatArray, rule: StepRule | None = None) -> RawSteps:
@@ -205,8 +211,9 @@ def take_steps(raw: RawProblem, penalty: FloatArray, rule: StepRule | None = Non
 
     Parameters
     ----------
-    raw : of t trials. penalty : (t | 1, p) of the directions: 0 for least squares, lam for ridge,
-        infinite for directions that truncated SVD does not use. rule : when the steps end.
+    raw : of t trials. penalty : (t | 1, p) of the directions: 0 for least squares, lam for ridge (1
+        where `raw.method` has one lam per parameter), infinite for directions that truncated SVD
+        does not use. rule : when the steps end.
     """
     rule = rule or StepRule()
     free, t = raw.problem.free, len(raw)
@@ -222,14 +229,16 @@ def take_steps(raw: RawProblem, penalty: FloatArray, rule: StepRule | None = Non
         if not active.size:
             break
         decomposition, reached = raw.take(active).linearize(values[active])
-        wanted = rule.plan_leap(count[active])
-        taken = _count_steps(decomposition, penalty[active], wanted, rule.epsilon)
-        size = _measure_step(decomposition, penalty[active], np.zeros(len(active), np.int64))
+        wanted, penalized = rule.plan_leap(count[active]), penalty[active]
+        if decomposition.unpenalized is not None:
+            penalized = np.where(decomposition.unpenalized, 0.0, penalized)
+        taken = _count_steps(decomposition, penalized, wanted, rule.epsilon)
+        size = _measure_step(decomposition, penalized, np.zeros(len(active), np.int64))
         is_leap = taken > 1
         start = (before[active] - values[active])[:, free.places] / free.tolerance
         start *= is_leap[:, None]
         total = taken + np.where(is_leap, last[active], 0)
-        change = _sum_steps(decomposition, penalty[active], total, start)
+        change = _sum_steps(decomposition, penalized, total, start)
         good = reached & (size < LOST) & (np.abs(change).max(axis=1) < LOST)
         moved = np.where(good[:, None], change, np.nan) * free.tolerance
         before[active], last[active] = values[active], taken

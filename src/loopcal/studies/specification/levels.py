@@ -193,8 +193,9 @@ class MethodLevel(Limited):
     ----------
     method : "auto" is the default of `identify`, see `loopcal.estimate.methods`. "per-leg"
         identifies a hexapod leg by leg from full poses, as a published study does.
-    lam : weight of the penalty of ridge. keep : directions of truncated-svd. Both are chosen by
-        cross-validation where they are not stated.
+    lam : weight of the penalty of ridge, or one by name or pattern of parameters, such as `{"*":
+        0.01, "*.length": 1}`, see `Ridge.resolve`. keep : directions of truncated-svd. Both are
+        chosen by cross-validation where they are not stated.
     loss, noise : as in `FitOptions`.
     rows : "raw" gives all rows and parameters the weight one in millimeters and radians, takes full
         steps and filters the step, as published studies do; least-squares then has no rank
@@ -211,13 +212,16 @@ class MethodLevel(Limited):
 
     PLAIN: ClassVar[str] = "method"
     LIMITS: ClassVar[Mapping[str, Limit]] = {
-        "lam": NOT_NEGATIVE,
+        "lam": Limit(
+            lambda lam: all(x >= 0 for x in (lam.values() if isinstance(lam, Mapping) else [lam])),
+            "0 or more",
+        ),
         "keep": NOT_NEGATIVE,
         "epsilon": POSITIVE,
         "steps": whole_numbers(1, 1_000_000),
     }
     method: Annotated[str, METHODS, PER_LEG] = "auto"
-    lam: float | None = None
+    lam: float | Mapping[str, float] | None = None
     keep: int | None = None
     loss: Annotated[str, NO_LOSS, LOSSES] = NO_LOSS
     noise: Noise = "given"
