@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 import loopcal as lc
+from evidence.assumptions.hexapod import ROBOT, draw_repeatability, make_backlash, measure_hexapod
 from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.diagnose.drive_errors import (
     differentiate_by_readings,
@@ -20,55 +20,20 @@ from loopcal.diagnose.drive_errors import (
 from loopcal.diagnose.residual_patterns import collect_residual_rows
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
-from loopcal.measure.kinds.poses import Pose
-from loopcal.measure.observations import Observations
 from loopcal.mechanism.solutions import forward
 
 test_independent_errors.__test__ = False  # type: ignore[attr-defined] - no test of pytest
-ROBOT = lc.load_robot("hexapod-42")
-SIGMA = np.array([25e-6] * 3 + [5e-6] * 3)  # [rad, m] of the instrument
-PLACES = [
-    np.array([[ROBOT.parameters.index(f"leg{i}.{end}.{a}") for a in "xyz"] for i in range(1, 7)])
-    for end in ("base", "platform")
-]
-LENGTHS = np.array([ROBOT.parameters.index(f"leg{i}.length") for i in range(1, 7)])
+SIGMA = (5e-6, 25e-6)  # [m, rad] of the instrument
+REPEATABILITY, PLAY = draw_repeatability(6e-6), make_backlash(10e-6)
 
 
-def simulate(seed: int, error, n: int = 60, sigma=SIGMA):
-    """Return n measured poses of a drawn machine, and 12 poses (readings, positions) that are not
-    measured; error(q, rng) are errors of the readings [m].
-    """
-    rng = np.random.default_rng([31, seed])
-    table, workspace = ROBOT.parameters, ROBOT.assembly.workspace
-    truth = table.nominal + np.asarray(table.tolerance) * rng.standard_normal(len(table))
-    low, high = np.array([workspace[c] for c in ("x", "y", "z", "roll", "pitch", "yaw")]).T
-    x = rng.uniform(low, high, (n + 12, 6))
-    R = Rotation.from_euler("xyz", x[:, 3:])
-    base, platform = (truth[places] for places in PLACES)
-    legs = x[:, None, :3] + np.einsum("nij,kj->nki", R.as_matrix(), platform) - base
-    q = np.linalg.norm(legs, axis=2) - truth[LENGTHS]
-    q = q - error(q, rng)
-    noise = rng.standard_normal((n, 6)) * sigma
-    turned = (Rotation.from_rotvec(noise[:, :3]) * R[:n]).as_rotvec()
-    measured = np.hstack([turned, x[:n, :3] + noise[:, 3:]])
-    kind = Pose().with_tool(ROBOT.tool)
-    rows = Observations.from_sigma(kind, np.arange(n), measured, SIGMA)
-    labels = tuple(str(i + 1) for i in range(n))
-    data = lc.Measurements(ROBOT.name, q[:n], (rows,), labels=labels)
-    return data, q[n:], x[n:, :3]
-
-
-def no_error(q, _):
-    return np.zeros_like(q)
-
-
-def drift_of_drives(q, rng):
-    return 6e-6 * rng.standard_normal(q.shape)
-
-
-def play(q, rng):
-    """Half of a backlash of 10 um, in the direction of travel."""
-    return 5e-6 * np.sign(np.diff(np.vstack([q[0] - rng.standard_normal(6), q]), axis=0))
+def collect(linear):
+    """Return the residual rows of a fit, and their derivatives by the readings."""
+    rows = collect_residual_rows(linear)
+    assert rows is not None
+    columns = differentiate_by_readings(linear, rows)
+    assert columns is not None
+    return rows, columns
 
 
 def linearize(data):
@@ -78,18 +43,14 @@ def linearize(data):
 def test_probability_is_uniform_without_errors_of_the_drives() -> None:
     p_values = []
     for seed in range(60):
-        linear = linearize(simulate(seed, no_error, 25)[0])
-        rows = collect_residual_rows(linear)
-        columns = differentiate_by_readings(linear, rows)
+        rows, columns = collect(linearize(measure_hexapod(seed, SIGMA, 25).data))
         p_values.append(test_independent_errors(rows, columns, np.inf))
     assert kstest(p_values, "uniform").pvalue > 0.01
 
 
 @pytest.mark.parametrize("known", [0.0, 8.0, np.inf])
 def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: float) -> None:
-    linear = linearize(simulate(3, drift_of_drives, 12)[0])
-    rows = collect_residual_rows(linear)
-    columns = differentiate_by_readings(linear, rows)
+    rows, columns = collect(linearize(measure_hexapod(3, SIGMA, 12, error=REPEATABILITY).data))
     n, a = columns.count, 6
     Z = np.zeros((len(rows.residual), n * a))
     for i, pose in enumerate(columns.poses[:, 0]):
@@ -102,7 +63,7 @@ def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: f
         square, count = y @ np.linalg.solve(V, y), len(y) + known
         scale = 1.0 if np.isinf(known) else (square + known) / count
         by_size = square if np.isinf(known) else count * np.log(scale)
-        return -0.5 * (np.linalg.slogdet(V)[1] + by_size), tau * np.sqrt(scale)
+        return float(-0.5 * (np.linalg.slogdet(V)[1] + by_size)), float(tau * np.sqrt(scale))
 
     sizes = np.geomspace(1e-7, 1e-4, 400)
     likelihoods, scaled = np.array([compute_likelihood(tau) for tau in sizes]).T
@@ -113,7 +74,9 @@ def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: f
 def test_errors_of_the_drives_are_found_with_their_size() -> None:
     sizes = []
     for seed in range(8):
-        drives = find_drive_errors(linearize(simulate(seed, drift_of_drives)[0]))
+        drives = find_drive_errors(
+            linearize(measure_hexapod(seed, SIGMA, error=REPEATABILITY).data)
+        )
         assert drives is not None
         assert drives.findings[-1].code == "residuals.drive-errors"
         sizes.append(float(drives.sigma.mean()))
@@ -122,7 +85,7 @@ def test_errors_of_the_drives_are_found_with_their_size() -> None:
 
 
 def test_backlash_is_named_with_its_size() -> None:
-    drives = find_drive_errors(linearize(simulate(1, play)[0]))
+    drives = find_drive_errors(linearize(measure_hexapod(1, SIGMA, error=PLAY).data))
     assert drives is not None
     finding = drives.findings[0]
     assert finding.code == "residuals.backlash"
@@ -131,9 +94,9 @@ def test_backlash_is_named_with_its_size() -> None:
 
 
 def test_errors_of_the_instrument_are_no_errors_of_the_drives() -> None:
-    wrong = SIGMA * 1.6  # the stated noise is too small
     found = [
-        find_drive_errors(linearize(simulate(seed, no_error, sigma=wrong)[0])) for seed in range(15)
+        find_drive_errors(linearize(measure_hexapod(seed, SIGMA, noise=1.6).data))
+        for seed in range(15)
     ]
     # the test has a level of 10 % where residuals contradict the stated noise
     assert sum(drives is not None for drives in found) <= 5
@@ -142,13 +105,14 @@ def test_errors_of_the_instrument_are_no_errors_of_the_drives() -> None:
 def test_uncertainty_of_poses_contains_errors_of_the_drives() -> None:
     covered, old = [], []
     for seed in range(10):
-        data, q, true = simulate(seed, drift_of_drives)
+        hexapod = measure_hexapod(seed, SIGMA, error=REPEATABILITY)
+        data = hexapod.data
         drives = find_drive_errors(linearize(data))
         assert drives is not None
         sigma = np.broadcast_to(drives.sigma, data.readings.shape)
         fit = drives.add_to(identify(ROBOT, replace(data, reading_sigma=sigma)))
-        predicted = forward(fit.robot, q)
-        gap = np.linalg.norm(predicted.T[:, :3, 3] - true, axis=1)
+        predicted = forward(fit.robot, hexapod.readings)
+        gap = np.linalg.norm(predicted.T[:, :3, 3] - hexapod.positions, axis=1)
         without = replace(fit.posterior, reading_sigma=None)
         covered += list(gap <= pose_uncertainty(fit, predicted, frame="base").expanded_position)
         old += list(gap <= pose_uncertainty(without, predicted, frame="base").expanded_position)
@@ -158,17 +122,17 @@ def test_uncertainty_of_poses_contains_errors_of_the_drives() -> None:
 
 
 def test_calibration_and_its_run_folder_state_the_errors_of_the_drives(tmp_path) -> None:
-    report = lc.calibrate(ROBOT, simulate(2, drift_of_drives)[0])
+    report = lc.calibrate(ROBOT, measure_hexapod(2, SIGMA, error=REPEATABILITY).data)
     assert "residuals.drive-errors" in {finding.code for finding in report.findings}
     assert report.identification.residual_test.p_value > 1e-3
     lc.save_run(tmp_path / "run", report)
     kept = lc.load_run(tmp_path / "run").load_posterior().repeatability
-    np.testing.assert_allclose(kept, report.identification.posterior.reading_sigma, rtol=1e-12)
+    assert kept.tolist() == report.identification.posterior.repeatability.tolist()
     assert kept.min() > 3e-6
 
 
 def test_sensed_joints_and_uncertain_readings_are_not_tested() -> None:
-    data = simulate(2, drift_of_drives)[0]
+    data = measure_hexapod(2, SIGMA, error=REPEATABILITY).data
     uncertain = replace(data, reading_sigma=np.full(data.readings.shape, 1e-5))
     assert find_drive_errors(linearize(uncertain)) is None
     assert (list_units(linearize(data)) == 1.0).all()  # lengths count in meters
