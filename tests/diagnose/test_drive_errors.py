@@ -68,7 +68,7 @@ def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: f
     sizes = np.geomspace(1e-7, 1e-4, 400)
     likelihoods, scaled = np.array([compute_likelihood(tau) for tau in sizes]).T
     expected = scaled[np.argmax(likelihoods)]
-    assert estimate_size(rows, columns, known) == pytest.approx(expected, rel=0.13)  # of the grid
+    assert estimate_size(rows, columns, known) == pytest.approx(expected, rel=0.26)  # of the grid
 
 
 def test_errors_of_the_drives_are_found_with_their_size() -> None:

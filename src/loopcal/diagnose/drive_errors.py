@@ -51,7 +51,7 @@ have errors, and their pattern decides.
 SLOW = (DISCREPANCY, "residuals.depend-on-reading")
 """Codes of findings on errors that depend on the pose in another way."""
 
-SIZES = np.geomspace(0.03, 300.0, 81)
+SIZES = np.geomspace(0.03, 300.0, 41)
 """Sizes of the errors that are compared, in units in which they double the variance of the rows."""
 
 
@@ -262,26 +262,21 @@ def estimate_size(rows: ResidualRows, columns: ReadingColumns, known: float) -> 
     """Return the standard deviation tau [SI, scaled] of the errors of the readings at which the
     restricted likelihood of the rows is largest, their noise at its best size.
     """
-    both = np.column_stack([rows.basis, rows.residual])
+    both, q = np.column_stack([rows.basis, rows.residual]), rows.basis.shape[1]
     B, (c, Q) = columns.project(both), np.linalg.eigh(columns.square_poses())
-    B, c = Q.swapaxes(1, 2) @ B, np.maximum(c, 0.0)
-    whole, q = both.T @ both, rows.basis.shape[1]
+    B, c = Q.swapaxes(1, 2) @ B, np.maximum(c, 0.0)[..., None]
     unit = float(np.sqrt(len(both) / (columns.values**2).sum()))
     best, size = -np.inf, 0.0
     for tau in SIZES * unit:
-        weight = tau**2 / (1.0 + tau**2 * c)
-        # columns are orthonormal and residuals orthogonal to them, so products lose no digits
-        left = whole - np.einsum("nac,na,nad->cd", B, weight, B)
-        triangle = np.linalg.cholesky(left).T
-        square = float(triangle[-1, -1] ** 2)
-        log_det = float(np.log1p(tau**2 * c).sum()) + 2.0 * float(
-            np.log(np.diag(triangle)[:q]).sum()
-        )
-        n, scale = rows.degrees + known, 1.0
+        # (1 + tau^2 Z Z')^(-1/2) = 1 - Z Q diag(g) Q'Z', with g c = 1 - (1 + tau^2 c)^(-1/2)
+        root = np.sqrt(1.0 + tau**2 * c)
+        white = both - columns.expand(Q @ (tau**2 / (root * (1.0 + root)) * B))
+        diagonal = np.abs(np.diag(np.linalg.qr(white, mode="r")))
+        square, n, scale = float(diagonal[-1] ** 2), rows.degrees + known, 1.0
         if np.isfinite(known):
             scale = (square + known) / n
             square = n * np.log(scale)
-        likelihood = -0.5 * (log_det + square)
-        if likelihood > best:
-            best, size = likelihood, tau * np.sqrt(scale)
+        log_det = 2.0 * float(np.log(root).sum() + np.log(diagonal[:q]).sum())
+        if -0.5 * (log_det + square) > best:
+            best, size = -0.5 * (log_det + square), tau * np.sqrt(scale)
     return float(size)
