@@ -28,6 +28,11 @@ from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
+from loopcal.estimate.determinable_setup import (
+    fix_undetermined_setup,
+    report_equal_setup,
+    report_fixed_setup,
+)
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import check_types, exclude_poses, identify
@@ -103,6 +108,7 @@ def calibrate(
     options = CalibrationOptions() if options is None else options
     check_types(robot, data)
     check_type(options, CalibrationOptions, "options", "such as CalibrationOptions(hold_out=0.25)")
+    data = fix_undetermined_setup(robot, data)
     instruments = (name for name, *_ in list_instrument_frames(data))
     check_choice("frame", options.frame, (FITTED, BASE, RELATIVE, *instruments))
     kept = exclude_poses(data, options.fit.excluded_poses)
@@ -240,6 +246,8 @@ def _report(
         *([report_finding("workflow.held-out-repeats", names=repeats)] if repeats else []),
         *check_instruments(split.list_observations()),
         *report_freedoms(fit, fitted),
+        *report_fixed_setup(fitted),
+        *(report_equal_setup(fit, fitted) if fit.converged else ()),
         *report_scale(fit, fitted),
         *report_base_targets(fitted),
         start.finding,

@@ -18,6 +18,7 @@ import numpy as np
 
 from loopcal.diagnose.gauge_freedoms import interpret_combinations, probe_readings
 from loopcal.errors import DataError, EstimationError, MechanismError
+from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.free_parameters import FreeParameters, free_only, select_free_parameters
 from loopcal.estimate.information import (
     ObservedPoses,
@@ -341,6 +342,7 @@ def identifiability(
         coordinates = sample_workspace(robot, poses, seed).coordinates
         data = simulate(robot, coordinates, data, seed=0, controller=robot)
     check_actuators(data, robot)
+    data = fix_undetermined_setup(robot, data)
     free = select_free_parameters(robot)
     if not len(free):
         total = len(robot.parameters)

@@ -20,6 +20,7 @@ import numpy as np
 
 from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.descent import Descent, LinearModel, descend
+from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.fit_descent import (
     add_loss_uncertainty,
     fit_rows,
@@ -340,6 +341,7 @@ def identify(
     free = select_free_parameters(robot)
     default = LeastSquares() if options.prior is not None else None
     data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
+    data = data if options.nuisance is not None else fix_undetermined_setup(robot, data)
     problem = problem_of(free, data, options.nuisance)
     check_rows(problem, data, robot)
     refuse_reused_rows(options.prior, data)

@@ -23,6 +23,11 @@ from loopcal.measure.observations import Observations
 from loopcal.numerics.gauss_newton import STEPS, minimize_from_starts, sum_squares
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
+ALIKE = 1.0
+"""Sum of squares, in variances of the noise, by which one solution fits better than another without
+being told from it: one standard deviation.
+"""
+
 
 class EvaluatedRows(NamedTuple):
     """Residuals and derivatives of one kind; l poses per row, l = 1 unless rows compare poses."""
@@ -157,9 +162,39 @@ def guess_nuisance_values_batch(
             continue
         chosen = observations[i].take(members)
         given = (measured[i][:, members], T[:, chosen.rows], values[:, indices], is_kept)
-        values[:, indices] = _refine_best_candidate(chosen, *given, most, steps)
+        refined, cost = _refine_candidates(chosen, *given, most, steps)
+        values[:, indices] = refined[np.arange(len(refined)), np.argmin(cost, axis=1)]
         known[indices] = True
     return values
+
+
+def find_equal_values(
+    measurements: Measurements, T: FloatArray, nuisance: NuisanceParameters, values: FloatArray
+) -> FloatArray:
+    """Return other values (k, U) of the nuisance parameters that fit all measurements at poses
+    (n, 4, 4) as well as given ones (U,), up to `ALIKE`; fixed ones and those with a prior stay.
+    """
+    known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
+    observations = measurements.all_observations
+    others = [values]
+    for i, members, indices in _list_groups(measurements, nuisance):
+        is_kept = known[indices] | observations[i].kind.is_drift
+        if not is_kept.all():
+            chosen = observations[i].take(members)
+            given = (chosen.measured[None], T[None, chosen.rows], values[None, indices], is_kept)
+            try:
+                refined = _refine_candidates(chosen, *given)[0][0]
+            except DataError:  # too few rows for candidates
+                continue
+            for candidate in refined:
+                other = values.copy()
+                other[indices] = candidate
+                others.append(other)
+    tested = np.array(others)
+    evaluated = evaluate_measurements(measurements, T[None], tested, nuisance)
+    rows = whiten_rows(evaluated, np.zeros((1, len(T), 6, 0)))
+    cost = sum_squares(rows[..., -1])
+    return tested[1:][cost[1:] <= cost[0] + ALIKE]
 
 
 def _list_groups(
@@ -195,20 +230,20 @@ def _list_groups(
     )
 
 
-def _refine_best_candidate(
+def _refine_candidates(
     rows: Observations,
     measured: FloatArray,
     poses: FloatArray,
     values: FloatArray,
     known: BoolArray,
-    most: int | None,
-    steps: int,
-) -> FloatArray:
-    """Return the best candidates (t, u) for rows that share their parameters; known ones keep their
-    values (t, u).
+    most: int | None = None,
+    steps: int = STEPS,
+) -> tuple[FloatArray, FloatArray]:
+    """Return refined candidates (t, k, u) for rows that share their parameters, and their sums of
+    squares (t, k); known parameters keep their values (t, u).
     """
     kind, t = rows.kind, len(measured)
-    candidates = _collect_candidates(kind, poses, measured)
+    candidates = _collect_candidates(kind, poses, measured, bool(known.any()))
     k = candidates.shape[1]
     candidates = np.where(known, values[:, None, :], candidates).reshape(t * k, -1)
 
@@ -229,12 +264,14 @@ def _refine_best_candidate(
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
     refined, cost = minimize_from_starts(lambda x, which: whiten(x, sets[which]), candidates, steps)
-    return refined.reshape(t, k, -1)[np.arange(t), np.argmin(cost.reshape(t, k), axis=1)]
+    return refined.reshape(t, k, -1), cost.reshape(t, k)
 
 
-def _collect_candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> FloatArray:
+def _collect_candidates(
+    kind: Kind, poses: FloatArray, measured: FloatArray, is_partly_known: bool
+) -> FloatArray:
     """Return the candidates of a kind for each set of measured values, the nominal values last, (t,
-    k, u).
+    k, u). Data that leave some parameters open may do for the others, if any are known.
     """
     offered = []
     for j, of_set in enumerate(measured):
@@ -244,9 +281,9 @@ def _collect_candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> 
             shared = len(kind.nominal_values) - guesses.shape[1]  # a bias or drift begins at zero
             guesses = np.pad(guesses, ((0, 0), (0, shared)))
         except DataError:
-            if len(measured) == 1:
+            if len(measured) == 1 and not is_partly_known:
                 raise
-            guesses = kind.nominal_values[None]
+            guesses = kind.spread_frames()
         offered.append(np.concatenate([guesses, kind.nominal_values[None]]))
     k = max(len(guesses) for guesses in offered)
     return np.stack([np.concatenate([g, np.repeat(g[-1:], k - len(g), axis=0)]) for g in offered])

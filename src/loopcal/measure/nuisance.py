@@ -35,6 +35,7 @@ class StatedValue:
     name : full name, such as `monday.tracker.x`.
     sd : standard deviation of a prior [SI]; 0 fixes the parameter.
     nominal : fixed value, or center of the prior [SI]; default: the nominal value of the kind.
+    is_undetermined : whether it is fixed because no motion of the machine determines it.
 
     Raises
     ------
@@ -44,6 +45,7 @@ class StatedValue:
     name: str
     sd: float = 0.0
     nominal: float | None = None
+    is_undetermined: bool = False
 
     def __post_init__(self) -> None:
         if self.sd != 0.0 and not is_sd(self.sd):

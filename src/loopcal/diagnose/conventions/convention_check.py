@@ -230,7 +230,8 @@ def find_contradiction(stated: Comparison, misfit: float, better: float) -> Cont
     without which measurements fit better by this factor; None without any.
     """
     present = set(stated.data.nuisance_parameters.table.names)
-    names = tuple(value.name for value in stated.data.stated_values if value.name in present)
+    values = (value for value in stated.data.stated_values if not value.is_undetermined)
+    names = tuple(value.name for value in values if value.name in present)
     if not names:
         return None
     together = _estimate_stated(stated, names)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from loopcal.errors import DataError, FileError, suggest_names
+from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import Table, read_table, read_template, require_columns
 from loopcal.io.core.text_file import as_path, name_files
@@ -553,7 +554,7 @@ def join_tables(
     for file, left in zip(files, read, strict=True):
         if left or not file.kinds:
             is_named[[pose for members in file.members for pose in members]] = True
-    return data if is_named.all() else data.take(is_named)
+    return fix_undetermined_setup(robot, data if is_named.all() else data.take(is_named))
 
 
 def list_unfilled_files(tables: Sequence[Table], data: Measurements) -> tuple[Path, ...]:

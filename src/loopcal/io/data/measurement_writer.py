@@ -117,7 +117,8 @@ def format_measurements(
         for rows, (noise, _) in zip(observations, tables, strict=True)
     ]
     lines = _format_settings(robot, list(zip(labels, settings, strict=True)), remark)
-    knowledge = describe_stated_values(data.stated_values, data.nuisance_parameters.table.entries)
+    stated = tuple(value for value in data.stated_values if not value.is_undetermined)
+    knowledge = describe_stated_values(stated, data.nuisance_parameters.table.entries)
     for key, content in (("unknowns", knowledge), ("reading_noise", reading_noise)):
         lines += [f"# {key}: {format_flow(content)}"] if content else []
 

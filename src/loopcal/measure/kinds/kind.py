@@ -31,7 +31,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
-from loopcal.measure.kinds.setup_parameters import SetupItem
+from loopcal.measure.kinds.setup_parameters import SetupItem, encode_frame
 from loopcal.mechanism.chains import name_platform_entries
 from loopcal.numerics.elimination import without_rounding
 from loopcal.numerics.statistics import find_distinct
@@ -413,6 +413,16 @@ class Kind(ABC):
         ]
         count = max(len(values) for values in columns)
         return np.concatenate([np.broadcast_to(v, (count, v.shape[1])) for v in columns], axis=-1)
+
+    def spread_frames(self) -> FloatArray:
+        """Return candidates (k, u): 24 evenly spread orientations of an unknown frame, with its
+        origin where it is stated; the nominal values without one.
+        """
+        stated = getattr(self, "T_base_frame", None)
+        if stated is None or "frame" not in self.own_items:
+            return self.nominal_values[None]
+        frames = geometry.make_pose(geometry.OCTAHEDRAL_ROTATIONS @ stated[:3, :3], stated[:3, 3])
+        return self.assemble_values({"frame": encode_frame(stated, frames)})
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return candidates (k, u) for the nuisance parameters that rows share, from poses T

@@ -12,7 +12,7 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.errors import DataError
-from loopcal.geometry import OCTAHEDRAL_ROTATIONS, OrientationForm, align_point_sets, solve_hand_eye
+from loopcal.geometry import OrientationForm, align_point_sets, solve_hand_eye
 from loopcal.measure.array_checks import check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import (
@@ -112,12 +112,9 @@ class ToolKind(Kind):
         return geometry.invert_pose(self.T_base_frame)
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """Return 24 evenly spread orientations of the frame, with its origin where it is stated."""
-        if "frame" not in self.unknown:
-            return self.nominal_values[None]
-        stated = self.T_base_frame
-        frames = geometry.make_pose(OCTAHEDRAL_ROTATIONS @ stated[:3, :3], stated[:3, 3])
-        return self.assemble_values({"frame": setup.encode_frame(stated, frames)})
+        """Return 24 evenly spread orientations of the frame."""
+        del T, measured
+        return self.spread_frames()
 
     @property
     def stated_tool(self) -> FloatArray:
