@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
 from loopcal.apply.calibration_report import CalibrationReport, Provenance
@@ -12,6 +15,9 @@ from loopcal.apply.error_budget import compute_error_budget
 from loopcal.apply.height_errors import map_height_errors
 from loopcal.apply.validation import Validation, validate
 from loopcal.apply.verdict import (
+    ALL_POSES,
+    FEW_POSES,
+    SEARCH_LEVEL,
     report_fit,
     report_freedoms,
     report_scale,
@@ -26,6 +32,7 @@ from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
+from loopcal.diagnose.outliers import find_outliers
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
 from loopcal.estimate.determinable_setup import (
@@ -71,6 +78,7 @@ STEPS = 8
 # Standard deviations (rms) by which targets on the base contradict each other or their stated
 # places, above which their unit, order or places are wrong: one that was hit moves by less.
 GROSS = 1000.0
+ENOUGH_ROWS = 4  # fitted values for each parameter from which the fitted poses show a wrong one
 
 
 def calibrate(
@@ -150,7 +158,8 @@ def calibrate(
         refit, _, change = _fit(fit.initial, split.fitted, again, count, held_out)
         if refit.converged:
             fit = adjust_uncertainty(drives.add_to(refit), split.fitted)
-    return _report(fit, choice, change, split, conventions, options, count)
+    outliers = _search_before_split(fit, split, kept, options)
+    return _report(fit, choice, change, split, conventions, options, count, outliers)
 
 
 def _fit(
@@ -210,6 +219,7 @@ def _report(
     conventions: ConventionCheck,
     options: CalibrationOptions,
     count: StepCounter,
+    outliers: Sequence[Finding],
 ) -> CalibrationReport:
     """Validate and examine a fit, and return the report."""
     fit, fitted, held_out = interpret_fit(fit), split.fitted, split.held_out
@@ -235,6 +245,8 @@ def _report(
         comparison = compare_with_values(fit, options.compare_with)
     examined = () if examination is None else examination.findings
     doubts = () if conventions.finding is None else (conventions.finding,)
+    if outliers:  # that none were found among fewer poses says nothing then
+        examined = tuple(finding for finding in examined if finding.code != "outliers.none")
     repeats = tuple(f"pose {label}" for label in split.repeats)
     findings = [
         # fit and validation answer doubts about conventions
@@ -251,6 +263,7 @@ def _report(
         *report_scale(fit, fitted),
         *report_base_targets(fitted),
         start.finding,
+        *outliers,
         *examined,
         *(() if choice is None else (choice.finding,)),
         *(() if comparison is None else (comparison.outcome,)),
@@ -275,6 +288,28 @@ def _report(
         comparison=comparison,
         provenance=Provenance(collect_versions(), {"hold_out": options.seed}, options.to_dict()),
     )
+
+
+def _search_before_split(
+    fit: Identification, split: DataSplit, data: Measurements, options: CalibrationOptions
+) -> list[Finding]:
+    """Return the outliers among all poses, fitted and held out, where the fitted ones are few.
+
+    A wrong pose that is fitted hides among few others, and one that is held out is compared with a
+    fit of few. The level is low, because fitted and held-out poses are searched again alone.
+    """
+    has_few = split.fitted.n_rows < ENOUGH_ROWS * len(fit.names) and data.n_poses <= FEW_POSES
+    if split.held_out is None or options.prior is not None or not has_few:
+        return []
+    together = replace(data, is_held_out=np.zeros(data.n_poses, dtype=bool))
+    whole = identify(fit.initial, together, options=options.fit)
+    if not (fit.converged and whole.converged):
+        return []
+    check = find_outliers(whole, together, level=SEARCH_LEVEL)
+    if not check.names:
+        return []
+    found: dict[str, Any] = {"poses": check.names, "blocks": check.blocks}
+    return [report_finding(ALL_POSES, **found)]
 
 
 def _validate(

@@ -13,9 +13,18 @@ import numpy as np
 from loopcal.apply import height_errors
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit
 from loopcal.apply.validation import store_differences
-from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict, recommend_values
+from loopcal.apply.verdict import (
+    ALL_POSES,
+    FEW_POSES,
+    LEAVE_OUT,
+    SEARCH_LEVEL,
+    Verdict,
+    choose_next_step,
+    decide_verdict,
+    recommend_values,
+)
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Severity
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import name_count
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import InstrumentRecord, list_instruments
@@ -156,10 +165,23 @@ class CalibrationReport(TableResult):
         """The two or three most important findings; all failures among them."""
         return self.findings[: max(TOP, len(self.failures))]
 
+    def list_outliers(self, level: float = 1.0) -> tuple[str, ...]:
+        """Return labels of poses that do not fit the other fitted poses, or all other poses.
+
+        level : probability, of all tests of the fitted poses, below which one is listed.
+        """
+        labels = [label for f in self.findings if f.code == ALL_POSES for label in f.data["poses"]]
+        if self.examination is not None:
+            check = self.examination.outliers
+            clear = (o.poses for o in check.outliers if o.p_value * check.blocks < level)
+            labels += [label for poses in clear for label in poses]
+        return tuple(dict.fromkeys(labels))
+
     @cached_property
     def next_step(self) -> Finding:
         """The step that helps most now."""
-        outliers = () if self.examination is None else self.examination.outliers.names
+        if self.recommendation.code == LEAVE_OUT:
+            return report_finding("workflow.next-check-outliers", **self.recommendation.data)
         repeatability = {}
         if self.budget is not None and self.states_expected_error:
             sources = {"position": self.budget.position, "orientation": self.budget.orientation}
@@ -169,14 +191,23 @@ class CalibrationReport(TableResult):
                 if sum(errors) > 0.0
             }
         return choose_next_step(
-            self.verdict, self.findings, outliers, self.recommendation.code, repeatability
+            self.verdict,
+            self.findings,
+            self.list_outliers(),
+            self.recommendation.code,
+            repeatability,
         )
 
     @cached_property
     def recommendation(self) -> Finding:
         """Whether to apply the identified values or to keep the current ones."""
         test = self.identification.residual_test
-        return recommend_values(self.verdict, self.start, test, self.validation, self.findings)
+        advice = recommend_values(self.verdict, self.start, test, self.validation, self.findings)
+        fitted = _count_fitted_poses(self.identification, self.split.fitted)
+        outliers = tuple(f"pose {label}" for label in self.list_outliers(SEARCH_LEVEL))
+        if advice.code.startswith("values.apply") and outliers and fitted <= FEW_POSES:
+            return report_finding(LEAVE_OUT, poses=outliers)
+        return advice
 
     @property
     def states_expected_error(self) -> bool:

@@ -61,7 +61,7 @@ def word_hint(finding: Finding, hint: str | None) -> str | None:
     links = data.get("links") or data.get("platforms")
     if "--platform LINK" in hint and links:
         return hint.replace("--platform LINK", name_options("--platform", links[:1]))
-    if code == "workflow.next-check-outliers":
+    if code in ("workflow.next-check-outliers", "outliers.all-poses"):
         poses = [str(label).removeprefix("pose ") for label in data["poses"]]
         return f"use {name_options('--drop', poses)}, or --loss huber"
     if code == "validation.setup-moved":

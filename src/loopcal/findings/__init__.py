@@ -97,7 +97,8 @@ fit.bad-start fit.no-descent fit.no-progress fit.out-of-iterations
 gates.poses-unreachable gates.errors-grew
 noise.residuals-too-large residuals.frame-moved residuals.base-targets-moved
 gates.limit-exceeded gates.limit-not-measured conformity.fails conformity.undecided
-outliers.some outliers.pose outliers.ambiguous outliers.search-not-converged outliers.conflict
+outliers.all-poses outliers.some outliers.pose outliers.ambiguous outliers.search-not-converged
+outliers.conflict
 workflow.no-held-out-poses workflow.few-held-out-poses workflow.held-out-setup
 workflow.undetermined-combinations validation.setup-moved
 prior.machine-changed prior.agrees-too-well prior.tolerances-inflated
