@@ -142,3 +142,15 @@ def test_no_second_place_is_stated_where_only_one_fits(name, kind):
     robot = load_robot(name)
     data = measure(robot, kind, (0.02, -0.01, 0.03, 2.0, -1.2, 0.5))
     assert report_equal_setup(lc.identify(robot, data), data) == []
+
+
+def test_trials_have_the_same_fixed_coordinates_as_single_fits():
+    robot = load_robot("five-bar")
+    sensor = Sensor(CAMERA, Gaussian(np.full(2, 2e-5)))
+    poses = lc.sample_workspace(robot, 30, 1).coordinates
+    truth = sample_truth(robot, 2, 3)
+    trials = lc.simulate_trials(robot, truth, poses, Instrument((sensor,)), 1, robot)
+    together = lc.identify_trials(robot, trials)
+    for i in range(2):
+        single = lc.identify(robot, trials.trial(i))
+        np.testing.assert_allclose(together.values[i], single.robot.values, rtol=0, atol=1e-9)

@@ -698,7 +698,8 @@ def identify_trials(
                 "for every trial"
             )
     free = select_free_parameters(robot)
-    problem = problem_of_trials(free, trials)
+    setup = fix_undetermined_setup(robot, trials.trial(0)).nuisance_parameters
+    problem = problem_of_trials(free, trials, setup)
     values = np.atleast_2d(robot.values if options.start is None else np.asarray(options.start))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
     method = adapt_method(options.method, free.names, free.assumed, options.noise, free.correlation)

@@ -519,10 +519,12 @@ def problem_of(
     )
 
 
-def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
-    """Return the problem of t simulated machines."""
+def problem_of_trials(
+    free: FreeParameters, trials: Trials, nuisance: NuisanceParameters | None = None
+) -> Problem:
+    """Return the problem of t simulated machines; `nuisance`: other than those of the kinds."""
     sensors, first = trials.instrument.sensors, trials.trial(0)
-    local = collect_nuisance_parameters(first.all_observations, first.labels)
+    local = nuisance or collect_nuisance_parameters(first.all_observations, first.labels)
     order = sorted(range(len(sensors)), key=lambda i: sensors[i].kind.is_of_base)  # stable
     rows = []
     for i, (number, o) in enumerate(zip(order, first.all_observations, strict=True)):
