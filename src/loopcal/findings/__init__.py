@@ -107,6 +107,7 @@ model.no-expected-gain model.nothing-gained
 residuals.lack-of-fit residuals.repeatability-larger residuals.common-errors
 residuals.heavy-tailed
 noise.doubtful noise.no-degrees-of-freedom workflow.undetermined-scale
+setup.two-solutions setup.fixed
 noise.consistent noise.estimated outliers.none outliers.one-degree workflow.frame-freedoms
 prior.machine-unchanged model.simpler-suffices model.all-needed model.expected-gain
 residuals.start-not-calibrated residuals.start-within-noise residuals.start-is-best
