@@ -128,7 +128,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
             "cmm-constraint-2011",
             "hexapod-octahedral",
             (),
-            {"errors": "1 tolerances", "method": "MAP"},
+            {"errors": "1 tolerance", "method": "MAP"},
         ),
         (
             "hexapod-42",

@@ -336,8 +336,12 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
     title = quote_scalar(f"{paper.name} with {loaded.name}")
     text = re.sub(r"^title: .*$", lambda _: f"title: {title}", text, flags=re.MULTILINE)
     # a factor of tolerances is no size of the paper
-    text = re.sub(r"^  [^:\n]+: (\{tolerance_factor: ([\d.]+)\})$", r"  \2 tolerances: \1", text,
-                  flags=re.MULTILINE)  # fmt: skip
+    text = re.sub(
+        r"^  [^:\n]+: (\{tolerance_factor: ([\d.]+)\})$",
+        lambda found: f"  {found[2]} tolerance{'s' * (found[2] != '1')}: {found[1]}",
+        text,
+        flags=re.MULTILINE,
+    )
     return PaperStudyFile({path: text}, wanted)
 
 

@@ -40,6 +40,7 @@ from loopcal.studies.simulation.published_steps import (
     PaperRows,
     PerLegEstimate,
     StepRule,
+    Weights,
     identify_from_rows,
     identify_per_leg,
     make_raw_problem,
@@ -220,7 +221,8 @@ def _fit_products(
     free, sd = select_free_parameters(robot), np.zeros(len(robot.parameters))
     sd[free.places] = free.tolerance
     sigma = float(trials.instrument.sensors[0].noise.sigma[0])
-    weights = next((w for w in WEIGHTS if method.rows == f"products-{w}"), "full")
+    stated = [w for w in WEIGHTS if method.rows == f"products-{w}"]
+    weights: Weights = stated[0] if stated else "full"
     chosen = make_fit_options(method).method
     assert trials.recorded is not None
     assert chosen is not None
