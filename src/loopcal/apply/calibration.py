@@ -27,7 +27,7 @@ from loopcal.apply.verdict import (
 from loopcal.checks import check_choice
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.drive_errors import find_drive_errors
+from loopcal.diagnose.drive_errors import are_outliers, find_drive_errors
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
@@ -152,8 +152,9 @@ def calibrate(
     count.begin("testing the residuals for patterns and slow errors")
     linear = linearize_fit(fit, split.fitted) if fit.converged else None
     drives = None if linear is None else find_drive_errors(linear)
-    fit = adjust_uncertainty(fit, split.fitted, linear)
-    if drives is not None and drives.explain_better(fit):
+    plain, fit = fit, adjust_uncertainty(fit, split.fitted, linear)
+    is_of_drives = drives is not None and drives.explain_better(fit)
+    if drives is not None and is_of_drives and not are_outliers(plain, split.fitted):
         split, again = split.with_reading_sigma(drives.sigma), replace(options, choose_model=False)
         refit, _, change = _fit(fit.initial, split.fitted, again, count, held_out)
         if refit.converged:

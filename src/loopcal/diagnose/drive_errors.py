@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.diagnose.outliers import find_outliers
 from loopcal.diagnose.residual_patterns import (
     FEWEST_LEFT,
     ResidualRows,
@@ -29,12 +30,14 @@ from loopcal.diagnose.residual_patterns import (
     span_columns,
     test_effect,
 )
-from loopcal.estimate.fit_linearization import FitLinearization
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import evaluate_rows
 from loopcal.estimate.posterior import DISCREPANCY
 from loopcal.estimate.residual_test import choose_severity, count_sigma_degrees
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import compute_chi_square_tail, compute_single_level
@@ -47,6 +50,9 @@ DOUBTED = 0.1
 """The same where residuals contradict the stated noise: then either that is wrong, or the drives
 have errors, and their pattern decides.
 """
+
+OUTLYING = 0.1
+"""Largest share of the poses that may be outliers in place of errors of the drives."""
 
 SLOW = (DISCREPANCY, "residuals.depend-on-reading")
 """Codes of findings on errors that depend on the pose in another way."""
@@ -146,6 +152,18 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
     if not findings:
         return None
     return DriveErrors(np.hypot(sigma, backlash), min(p_values), tuple(findings))
+
+
+def are_outliers(fit: Identification, data: Measurements) -> bool:
+    """Return whether errors of the drives vanish without the poses that do not fit, of which there
+    are few: then these are wrong, and not the drives.
+    """
+    suspects = find_outliers(fit, data).suspects
+    if not 0 < len(suspects) <= max(OUTLYING * data.n_poses, 1.0):
+        return False
+    excluded = (*fit.options.excluded_poses, *suspects)
+    fewer = identify(fit.initial, data, options=replace(fit.options, excluded_poses=excluded))
+    return fewer.converged and find_drive_errors(linearize_fit(fewer, data)) is None
 
 
 def list_units(linear: FitLinearization) -> FloatArray:

@@ -221,7 +221,7 @@ def _fit_products(
     free, sd = select_free_parameters(robot), np.zeros(len(robot.parameters))
     sd[free.places] = free.tolerance
     sigma = float(trials.instrument.sensors[0].noise.sigma[0])
-    stated = [w for w in WEIGHTS if method.rows == f"products-{w}"]
+    stated: list[Weights] = [w for w in WEIGHTS if method.rows == f"products-{w}"]
     weights: Weights = stated[0] if stated else "full"
     chosen = make_fit_options(method).method
     assert trials.recorded is not None
