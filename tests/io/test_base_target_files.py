@@ -98,7 +98,6 @@ MISTAKES = {
         ),
         "base.csv:3: the places of N1, N2, N3 on the base are neither stated nor unknown",
     ),
-    "the same row twice": (("am,300.02", "am,300.01"), "base.csv:8 and "),
     "a frame of its own": (
         ("unknown: [frame]", "unknown: [frame]\n# frame: tracker"),
         "base.csv:6: The frame 'tracker' of targets on the base",

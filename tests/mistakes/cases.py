@@ -172,7 +172,7 @@ SIX_PUS = {
     "a row is pasted twice": Mistake(
         lambda files: files | {DATA: files[DATA] + files[DATA].splitlines()[-1] + "\n"},
         1,
-        ("poses '40' and '40'", "data.csv:47 and data.csv:48", "remove one of them"),
+        ("poses '40' and '40'", "data.csv:47 and data.csv:48", "remove the copies"),
     ),
     "only six poses are measured": Mistake(
         take_rows(slice(6)), 1, ("equations cannot determine 54 parameters", "more poses")

@@ -130,6 +130,7 @@ def _add_correlation(
         correlation=errors.correlation,
         order=patterns.order,
         ratio=_measure_growth(tool, root),
+        p_value=patterns.p_value,
         severity=choose_severity(patterns.p_value),
     )
     return add_covariance(fit, root, errors.degrees, finding)
@@ -170,6 +171,7 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
         size=size,
         error=error,
         ratio=ratio,
+        p_value=effect.p_value,
         severity=choose_severity(effect.p_value),
     )
 

@@ -33,7 +33,6 @@ from loopcal.diagnose.residual_patterns import (
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import evaluate_rows
-from loopcal.estimate.posterior import DISCREPANCY
 from loopcal.estimate.residual_test import choose_severity, count_sigma_degrees
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -54,9 +53,6 @@ have errors, and their pattern decides.
 OUTLYING = 0.1
 """Largest share of the poses that may be outliers in place of errors of the drives."""
 
-SLOW = (DISCREPANCY, "residuals.depend-on-reading")
-"""Codes of findings on errors that depend on the pose in another way."""
-
 SIZES = np.geomspace(0.03, 300.0, 41)
 """Sizes of the errors that are compared, in units in which they double the variance of the rows."""
 
@@ -74,11 +70,11 @@ class DriveErrors:
     findings: tuple[Finding, ...]
 
     def explain_better(self, fit: Identification) -> bool:
-        """Return whether they are less likely to be chance than what a fit, with its uncertainty
-        adjusted, found of errors that depend on the pose.
+        """Return whether they are less likely to be chance than the patterns of residuals that a
+        fit, with its uncertainty adjusted, states.
         """
-        found = (f.data["p_value"] for f in fit.findings if "p_value" in f.data and f.code in SLOW)
-        return self.p_value < min(found, default=1.0)
+        patterns = (f for f in fit.findings if f.code.startswith("residuals."))
+        return self.p_value < min((f.data.get("p_value", 1.0) for f in patterns), default=1.0)
 
     def add_to(self, fit: Identification) -> Identification:
         """Return a fit with readings of these standard deviations, which says so."""
