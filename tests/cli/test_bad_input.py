@@ -218,8 +218,8 @@ def test_export_without_a_line_that_matches_the_profile_is_refused(run_refused) 
 def test_too_few_equations_for_least_squares_are_refused_with_both_counts(run_refused) -> None:
     found = run_refused("calibrate hexapod-42 data.csv -o run --method ls", data_csv=DATA)
     assert (
-        "3 equations from 3 poses cannot determine 42 parameters. Measure at least 42 poses"
-        in found
+        "3 equations from 3 poses cannot determine 42 parameters. Measure more poses like these "
+        "(at most 42 are needed" in found
     )
 
 

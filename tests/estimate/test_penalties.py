@@ -263,3 +263,10 @@ def test_rules_choose_for_each_trial_separately(rows):
 def test_invalid_method_settings_are_refused(make, words):
     with pytest.raises(EstimationError, match=words):
         make()
+
+
+def test_a_fit_with_one_lambda_per_parameter_says_so():
+    fit = identify(hexapod(), hexapod_data(15), Ridge({"*": 0.01, "*.length": 1.0}))
+    assert fit.regularization is not None
+    assert "lam = up to 1 " in str(fit.regularization.finding)
+    assert "given for each parameter" in str(fit.regularization.finding)

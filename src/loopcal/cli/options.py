@@ -524,10 +524,13 @@ def _parse_weights(text: str) -> float | dict[str, float]:
         weights = {str(pattern): float(number) for pattern, number in pairs}
     except (TypeError, ValueError):
         weights = {}
-    if not weights or not all(0.0 <= weight < float("inf") for weight in weights.values()):
+    is_unique = len(weights) == len(pairs)
+    if not (weights and is_unique) or not all(
+        0.0 <= weight < float("inf") for weight in weights.values()
+    ):
         raise DataError(
-            f"{text!r} states no weights of 0 or more; write a number, '*.length=1,*=0.01', or a "
-            "YAML file with lines '*.length: 1'"
+            f"{text!r} states no weights of 0 or more, each pattern once; write a number, "
+            "'*.length=1,*=0.01', or a YAML file with lines '*.length: 1'"
         )
     return weights.pop("") if list(weights) == [""] else weights
 

@@ -556,7 +556,8 @@ class Regularization:
     parameter : "lam", the ridge parameter in squared standard deviations of the noise per squared
         tolerance, or "k", the number of directions of a truncated SVD.
     value : of the parameter; the largest one where each parameter has its own `lam`.
-    rule : name of the rule that chose it, such as "GCV"; "fixed" where it was given.
+    rule : name of the rule that chose it, such as "GCV"; "fixed" where it was given, "each" where
+        one was given for each parameter.
     score : what the rule minimizes, at `value`; None where it was given or the rule has no score.
     effective : sum of the filter factors, the number of directions that the data determine after
         regularization. parameters, rank : p, and the number of directions without regularization.
@@ -585,7 +586,7 @@ def describe_regularization(
     """Return the regularization of trial 0; None for methods without a parameter to choose."""
     if (choice := method.choice()) is None:
         return None
-    (name, stated), score, is_at_limit, rule = choice, None, False, "fixed"
+    (name, stated), score, is_at_limit = choice, None, False
     if callable(stated):
         value = float(np.atleast_1d(np.asarray(stated(decomposition)))[0])
         rule = getattr(stated, "__name__", type(stated).__name__)
@@ -594,7 +595,7 @@ def describe_regularization(
         if callable(is_limit := getattr(stated, "is_limit", None)):
             is_at_limit = bool(np.asarray(is_limit(decomposition, np.full(1, value)))[0])
     else:
-        value = float(np.max(stated))
+        value, rule = float(np.max(stated)), "each" if isinstance(stated, tuple) else "fixed"
     return Regularization(
         parameter=name,
         value=value,

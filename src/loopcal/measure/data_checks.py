@@ -145,7 +145,9 @@ def check_duplicates(
     for alike in _group_equal_kinds(measurements.all_observations):
         kind = alike[0].kind
         parts = [(o, np.flatnonzero(o.is_measured & (o.weight > 0.0))) for o in alike]
-        poses = np.concatenate([o.rows.reshape(len(o), -1)[rows] for o, rows in parts])
+        poses = np.concatenate(
+            [o.rows.reshape(len(o), kind.poses_per_row)[rows] for o, rows in parts]
+        )
         if len(poses) < 2:
             continue
         values, sd, degrees = _list_compared_values(measurements, kind, parts, poses)
