@@ -120,7 +120,6 @@ def calibrate(
     instruments = (name for name, *_ in list_instrument_frames(data))
     check_choice("frame", options.frame, (FITTED, BASE, RELATIVE, *instruments))
     kept = exclude_poses(data, options.fit.excluded_poses)
-    check_duplicates(kept, allow=options.allow_duplicates)
     if options.prior is not None:
         filled = exclude_poses(fill_in_reading_sigma(robot, data), options.fit.excluded_poses)
         refuse_reused_rows(options.prior, filled)
@@ -132,6 +131,8 @@ def calibrate(
         for shape in compare_shapes(data):
             if shape.chi_square > GROSS**2 * shape.degrees:
                 raise DataError(shape.finding)
+    # after wrong units, in which repeats seem to agree too well
+    check_duplicates(kept, allow=options.allow_duplicates)
     count = StepCounter(progress, STEPS)
     count.begin("checking conventions")
     allowed = {"allow_still": options.allow_still}
