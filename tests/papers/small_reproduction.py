@@ -18,7 +18,7 @@ def build_reproduction(*more: Verdict) -> Reproduction:
     verdict = Verdict("It holds.", False, "It does not.", OWN_CHECK, draws=(False, False))
     content = Content(
         comparisons=(Comparison("one", "Table 1", columns, printed, computed, printed.unit),),
-        tables=(Table("extra", "Extra", ("case", "value"), rows, ("", ".1f"), shown=2),),
+        tables=(Table("extra", "Extra", ("case", "value"), rows, ("", ".1f"), shown=(0, 1)),),
         verdicts=(verdict, *more),
         figures=(Figure("curve", "Curve", *labels, (line,), {"rule": 0.5}),),
     )

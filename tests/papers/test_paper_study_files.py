@@ -135,7 +135,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
             "hexapod-nategh-agheli",
             (
                 "10 poses are drawn from the workspace",
-                "Errors '1' have the standard deviations 1 mm",
+                "drawn errors with standard deviations of 1 mm in place of those of one machine",
             ),
             {"method": "per leg"},
         ),
@@ -145,7 +145,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
             (
                 "The robot is linear-delta-6 in place of 3-prs",
                 "36 poses are drawn",
-                "in place of 0.076 mm",
+                "in place of 0.076 mm and 0.022 deg of 3-prs",
             ),
             {"method": "TSVD 14"},
         ),

@@ -40,7 +40,7 @@ def test_page_shows_published_and_computed_numbers_and_marks_differences() -> No
             "   True in 0 of 2 draws (95 % interval of the share: 0 to 84 %). It does not."
         ),
         "| q | - |",
-        "The first 2 of 3 rows",
+        "2 of 3 rows. All rows",
         "(figures/curve.png)",
     ):
         assert part in text
@@ -101,7 +101,10 @@ def test_sizes_that_another_robot_replaces_are_stated(paper, tmp_path) -> None:
     sentences = case.list_replaced()
     assert sentences[0].startswith("The robot is ")
     assert any("standard deviations" in sentence for sentence in sentences)
-    assert PAPERS[paper].make_case(next(iter(PAPERS[paper].studies))).list_replaced() == ()
+    *_, own = PAPERS[paper].studies
+    stated = (f"{own} is a robot of the paper: the study runs for all, 3-prs and {own}.",)
+    assert PAPERS[paper].make_case(own).list_replaced() == stated * (paper == "tsvd-2016")
+    assert PAPERS[paper].make_case().list_replaced() == ()
     assert [level.text for level in case.load_study().robots.values()] == [text]
 
 
@@ -204,8 +207,9 @@ def test_reproduce_prints_tables_and_statements(capsys, monkeypatch) -> None:
     monkeypatch.setattr(Paper, "run", lambda _, seed=0, trials=2, *__: build_reproduction())
     assert main(["reproduce", "hexapod-42"]) == 0
     printed = capsys.readouterr().out
-    for part in ("small: A title", "Extra", "Our own checks", "NOT CONFIRMED: It holds.",
-                 "True in 0 of 2 draws (95 %", "Add -o FOLDER"):  # fmt: skip
+    for part in ("small: A title", "Extra", "2 of 3 rows. All: -o FOLDER.", "Our own checks",
+                 "NOT CONFIRMED: It holds.", "True in 0 of 2 draws (95 %",
+                 "Add -o FOLDER"):  # fmt: skip
         assert part in printed
 
 

@@ -640,6 +640,24 @@ def test_another_robot_has_the_tables_figures_and_claims_of_its_freedoms(
     curves = [figure for figure in content.figures if figure.name.startswith("curve_")]
     labels = {series.label.split(", ")[0] for figure in curves for series in figure.series}
     assert set(measures) <= labels <= {*measures, DIVERGED}
+    shown = next(t for t in content.tables if t.name.startswith("curves") and t.shown)
+    places, column = shown.shown or (), shown.columns.index(measures[0])
+    for algorithm in (steps.RE, steps.TSVD):
+        rows = [(row[column], i) for i, row in enumerate(shown.rows) if row[0] == algorithm]
+        inside = rows if algorithm == steps.RE else rows[1:]  # k of all parameters is LS
+        finite = [pair for pair in inside if isinstance(pair[0], float)]
+        assert min(finite)[1] in places
+    medians = [figure for figure in content.figures if figure.name.startswith("medians")]
+    assert all(s.joined != ("bottom of each" in s.label) for s in medians[0].series)
+    assert sum(not s.joined for s in medians[0].series) == len(measures)
+    compared = {"ls_not_best", "tsvd_best", "ls_fails", "six_better", "faster", "no_rule"}
+    for verdict in content.verdicts:
+        assert ("RE, 20 steps" in verdict.why) >= (verdict.name in compared), verdict.name
+        assert not re.search(r"\binf\b", verdict.why)
+    words = " ".join([*made.about, *(figure.caption for figure in content.figures)])
+    assert "ours" not in words
+    assert "our dimensions" not in words
+    assert "0 settings" not in words
     assert "36 poses of" in text
     assert "free parameters" in text
     assert ("the angles are left out" in text) == (robot != "agile-eye")

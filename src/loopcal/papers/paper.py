@@ -97,7 +97,7 @@ class Paper:
                 f"epsilon is {epsilon:g} for {self.name}; give a number above 0, for {able} only"
             )
         if robot is None or str(robot) in self.studies:
-            return StudyCase(self, epsilon=epsilon)
+            return StudyCase(self, str(robot or ""), epsilon=epsilon)
         other = load_robot(robot)
         if self.is_per_leg:
             from loopcal.studies.simulation.published_steps import check_legs
@@ -126,7 +126,7 @@ class Paper:
             self.name,
             self.title,
             self.source,
-            PaperText(str(module.__file__)).about(),
+            PaperText(str(module.__file__)).about(case.robot.name if case.robot else ""),
             {"seed": seed, "trials": trials}
             | ({"robot": case.source} if case.robot else {})
             | ({"epsilon": case.epsilon} if case.epsilon else {}),
@@ -150,7 +150,7 @@ class Paper:
 class StudyCase:
     """The study of a paper with its own robots, or with another one.
 
-    source : name or file of the other robot, "" for those of the paper. robot : it, None for those
+    source : name or file of the robot that was asked for, "" for none. robot : it, None for those
     of the paper. epsilon : in place of the limit of the paper's rule.
     """
 
@@ -173,7 +173,10 @@ class StudyCase:
     def list_replaced(self) -> tuple[str, ...]:
         """Return sentences that state which sizes of the study the other robot replaces."""
         if self.robot is None:
-            return ()
+            if len(robots := self.paper.studies) == 1 or not self.source:
+                return ()
+            names = list_names(tuple(robots))
+            return (f"{self.source} is a robot of the paper: the study runs for all, {names}.",)
         first, other = self.paper.load_study(), self.load_study()
         (of_paper,) = first.robots.values()
         nominal, robot = load_robot(of_paper.source), self.robot
@@ -197,13 +200,14 @@ class StudyCase:
                 sentences.append(f"The {kind} {new} take the place of {left}.")
             elif left or new:
                 sentences.append(f"The {kind} {left or new} are {'left out' if left else 'added'}.")
-        for name, level, (of_robot, of_other) in zip(
-            first.errors, first.errors.values(), other.errors.items(), strict=True
+        for level, (of_robot, of_other) in zip(
+            first.errors.values(), other.errors.items(), strict=True
         ):
             before, after = describe_errors(nominal, level), describe_errors(robot, of_other)
+            which = f" ({of_robot})" * (len(first.errors) > 1)
             sentences.append(
-                f"Errors {of_robot!r} have the standard deviations {after}, in place of "
-                f"{before} of {name!r}."
+                f"True machines{which} have drawn errors with standard deviations of {after} in "
+                f"place of {before}{'' if level.deviations else f' of {nominal.name}'}."
             )
         return tuple(sentences)
 
@@ -218,7 +222,7 @@ def _say_levels(names: Sequence[str]) -> str:
 def describe_errors(robot: Mechanism, level: ErrorsLevel) -> str:
     """Return the standard deviations of the errors of a level, such as `0.1 to 1 mm`."""
     if level.deviations:
-        return "the errors of one machine"
+        return "those of one machine"
     free = select_free_parameters(robot)
     factor, symbols = free.display()
     sd = free.tolerance * level.tolerance_factor * level.error_factor / factor

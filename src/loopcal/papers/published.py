@@ -45,7 +45,7 @@ ROUNDING = 1e-9
 @dataclass(frozen=True)
 class Table:
     """Rows of text and numbers; name : of its file. formats : of the columns on a page ("" for
-    text). shown : rows on a page, None for all.
+    text). shown : places of the rows on a page, None for all.
     """
 
     name: str
@@ -54,7 +54,13 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     formats: tuple[str, ...]
     note: str = ""
-    shown: int | None = None
+    shown: tuple[int, ...] | None = None
+
+    @property
+    def cut(self) -> str:
+        """How many of its rows a page shows, as a sentence; empty where it shows all."""
+        shown, count = self.shown, len(self.rows)
+        return "" if shown is None or len(shown) == count else f"{len(shown)} of {count} rows."
 
     def text(self) -> list[tuple[str, ...]]:
         """Rows as a page shows them; a dash for what does not exist."""
@@ -67,7 +73,8 @@ class Table:
             return cell if isinstance(cell, str) else format(cell, spec)
 
         assert all(len(row) == len(self.formats) for row in self.rows), self.name
-        return [tuple(map(show, row, self.formats)) for row in self.rows[: self.shown]]
+        shown = self.rows if self.shown is None else [self.rows[i] for i in self.shown]
+        return [tuple(map(show, row, self.formats)) for row in shown]
 
     def to_dict(self) -> dict[str, Any]:
         """Return name, title, note, columns and all rows, for JSON."""
@@ -76,16 +83,19 @@ class Table:
 
 @dataclass(frozen=True)
 class Series:
-    """A line of a figure: points x, y. A label that begins with _ is not in the legend."""
+    """A line of a figure: points x, y. A label that begins with _ is not in the legend. joined :
+    whether a line joins the points.
+    """
 
     label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
+    joined: bool = True
 
     @classmethod
-    def of(cls, label: str, x: Iterable[Any], y: Iterable[Any]) -> Series:
+    def of(cls, label: str, x: Iterable[Any], y: Iterable[Any], joined: bool = True) -> Series:
         """Return a line of numbers."""
-        return cls(label, tuple(map(float, x)), tuple(map(float, y)))
+        return cls(label, tuple(map(float, x)), tuple(map(float, y)), joined)
 
 
 @dataclass(frozen=True)
@@ -307,10 +317,12 @@ class PaperText:
     def _find(self, *keys: str) -> Any:
         return PaperFile(self.module, "text.yaml").find(*keys)
 
-    def about(self) -> tuple[str, ...]:
-        """Return the paragraphs at the beginning of the page."""
+    def about(self, robot: str = "") -> tuple[str, ...]:
+        """Return the paragraphs at the beginning of the page; robot : name of another one."""
         source = PaperFile(self.module, "published.yaml").find("source")
-        return tuple(fill_template(text, source=source) for text in self._find("about"))
+        return tuple(
+            fill_template(text, source=source, robot=robot) for text in self._find("about")
+        )
 
     def judge(
         self, name: str, agrees: Decision | Sequence[Decision] | BoolArray, /,
@@ -335,22 +347,26 @@ class PaperText:
 
     def table(
         self, name: str, rows: Iterable[Row | Sequence[Any]], file_name: str = "",
-        more: Sequence[tuple[str, str]] = (), /, **data: Any,
+        more: Sequence[tuple[str, str]] = (), shown: Iterable[int] | None = None, /, **data: Any,
     ) -> Table:  # fmt: skip
-        """Return a table of computed rows; more : titles and formats of further columns."""
+        """Return a table of computed rows; more : titles and formats of further columns. shown :
+        places of the rows on a page, by default the first ones, as many as text.yaml says.
+        """
         text = self._find("tables", name)
         titles = (text["title"], text.get("note", ""), *text["columns"], *(t for t, _ in more))
         title, note, *columns = (fill_template(part, **data) for part in titles)
         formats = (*text["formats"], *(spec for _, spec in more))
-        cells = (
+        cells = tuple(
             tuple(
                 cell.item() if isinstance(cell, np.generic) else cell
                 for cell in (row.values() if isinstance(row, Mapping) else row)
             )
             for row in rows
         )
-        name, shown = file_name or name, text.get("shown")
-        return Table(name, title, tuple(columns), tuple(cells), formats, note, shown)
+        if shown is None and "shown" in text:
+            shown = range(min(text["shown"], len(cells)))
+        places = None if shown is None else tuple(shown)
+        return Table(file_name or name, title, tuple(columns), cells, formats, note, places)
 
     def compare(
         self, name: str, published: Printed, computed: FloatArray, step: FloatArray | None = None,

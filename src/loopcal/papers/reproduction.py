@@ -163,7 +163,8 @@ def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
             axes.plot(series.x, series.y, color=style.PALE, lw=style.THIN)
             continue
         handles += axes.plot(
-            series.x, series.y, label=series.label, ms=style.DOT, lw=style.LINE * figure.joined,
+            series.x, series.y, label=series.label, ms=style.DOT,
+            lw=style.LINE * (figure.joined and series.joined),
             fillstyle="full" if figure.joined else "none",  # points on points stay visible
             **styles[series.label],
         )  # fmt: skip

@@ -153,7 +153,8 @@ def _view_reproduction(result: Reproduction) -> list[Block]:
     """Return the summary, the tables and the statements of the paper."""
     page: list[Block] = [f"{result.paper}: {result.title}", *result.replaced]
     summary = (result.summary(),) if result.content.comparisons else ()
-    page += [_make_table(table) for table in (*summary, *result.content.tables)]
+    for table in (*summary, *result.content.tables):
+        page += [_make_table(table), *([f"{table.cut} All: -o FOLDER."] if table.cut else [])]
     for title, verdicts in result.verdict_groups.items():
         page += ["", title]
         for number, verdict in verdicts:

@@ -10,7 +10,7 @@ situations it speaks of, and a draw in which neither of two methods is better de
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
@@ -78,7 +78,9 @@ CURVES = {"RE": (RE, EARLY), "TSVD": (TSVD,)}
 """In one figure."""
 SETTING, LOG = {RE: "lambda", TSVD: "k"}, {RE: "xy", TSVD: "y"}
 NAMES = {"ls": LS, "ridge": RE, "tsvd": TSVD}
-"""Of the paper's methods in the evidence of claims."""
+"""Of the paper's methods that claims are judged by."""
+SHOWN = NAMES | {"early": EARLY}
+"""Of those in the evidence of claims."""
 Place = TypeVar("Place")
 
 
@@ -154,7 +156,8 @@ def compare_tables(results: Results) -> Iterator[published.Comparison]:
 def make_tables(results: Results) -> Iterator[published.Table]:
     """Yield all tables: the analogues of Tables 1 to 8, and the figures as numbers."""
     cases, draws, noise = results.cases.values(), results.draws, results.noise.values
-    yield TEXT.table("given", [row for draw in draws for row in _list_machine(draw.design)])
+    data = describe_design(draws[0].design)
+    yield TEXT.table("given", [row for draw in draws for row in _list_machine(draw.design)], **data)
 
     limits = steps.list_limits() * np.array([1e3] * 3 + [1.0] * 3)
     largest, rms = np.abs(noise).max(axis=0), np.sqrt(np.mean(noise**2, axis=0))
@@ -197,7 +200,8 @@ def make_tables(results: Results) -> Iterator[published.Table]:
         rows = [(*label, *row) for label, *row in zip(list_labels(study), *columns, strict=True)]
         number = TABLES.get(study.design.printed, ("", ""))[0]
         file = f"table_{number}" if number else f"identified_{study.design.file}"
-        yield TEXT.table("identified", rows, file, name=name, number=number)
+        data = describe_design(study.design)
+        yield TEXT.table("identified", rows, file, name=name, number=number, **data)
 
     yield from map(_list_curves, cases)
     yield from map(make_median_curves, results.sweeps.values())
@@ -211,6 +215,14 @@ def make_tables(results: Results) -> Iterator[published.Table]:
         ]
         more = [(f"{parameter} [{unit}]", ".3g") for parameter, unit in list_labels(study)]
         yield TEXT.table("history", history, name, more, case=study.label)
+
+
+def describe_design(design: steps.Design) -> dict[str, Any]:
+    """Return what claims, captions and notes say of a structure and of its measurement."""
+    return {"robot": design.name, "is_ours": bool(design.printed),
+            "measured": f"{len(design.columns)}-DOF", "poses": len(design.poses),
+            "checked": len(design.output_range),
+            "parts": [("position", "angle")[i] for i in design.parts]}  # fmt: skip
 
 
 def _list_machine(design: steps.Design) -> list[tuple[str, str, str]]:
@@ -251,20 +263,28 @@ def _list_outputs(name: str, results: Results) -> published.Table:
             rows.append((*label, *numbers, answer.iterations[0], describe_end(case, method)[1]))
     number = TABLES.get(design.printed, ("", ""))[1]
     file = f"table_{number}" if number else f"outputs_{design.file}"
-    return TEXT.table("outputs", rows, file, name=name, number=number)
+    data = describe_design(design)
+    return TEXT.table("outputs", rows, file, name=name, number=number, **data)
 
 
 def _list_curves(case: Case) -> published.Table:
-    sweep, rows = case.sweep, []
+    """Return errors at every lambda and k; a page shows the bottom of each curve, and beside it."""
+    sweep, rows, shown, parts = case.sweep, [], list[int](), case.study.design.parts
     for algorithm, first in ((EARLY, 1), (RE, 1), (TSVD, 0)):  # lambda = 0 is LS
+        curve, start = sweep.curves[algorithm][:, first:], len(rows)
+        bottom = int(steps.locate_bottoms(curve, parts)[0, -1])
+        shown += range(start + max(bottom - 1, 0), start + min(bottom + 2, curve.shape[1]))
         for i, setting in enumerate(sweep.settings[algorithm][first:]):
             spacing = None if algorithm == TSVD else case.spacing[i]
             errors = show_errors(case.study.design, sweep.curves[algorithm][0, first + i, :3])
             count = sweep.counts[algorithm][0, first + i]
             rows.append((algorithm, setting, spacing, *errors, count))
     low, high = case.bracket
+    tried = min(steps.SIZES.find("tried")), max(steps.SIZES.find("tried"))
+    data = {"low": low, "high": high, "tried": tried, "lost": case.bracket != tried,
+            **describe_design(case.study.design)}  # fmt: skip
     name = f"curves_{case.study.file}"
-    return TEXT.table("curves", rows, name, case=case.study.label, low=low, high=high)
+    return TEXT.table("curves", rows, name, (), shown, case=case.study.label, **data)
 
 
 def make_medians(draws: Draws) -> published.Table:
@@ -283,7 +303,8 @@ def make_medians(draws: Draws) -> published.Table:
         ends = int(draws.at_end[method].sum()) if method in draws.at_end else None
         rows.append((method, *cells, *after, show_number(middle[3]), lost, ends))
     name = f"draws_{design.file}"
-    return TEXT.table("draws", rows, name, name=draws.name, trials=len(draws))
+    data = describe_design(design)
+    return TEXT.table("draws", rows, name, name=draws.name, trials=len(draws), **data)
 
 
 def make_ratios(draws: Draws) -> published.Table:
@@ -294,8 +315,8 @@ def make_ratios(draws: Draws) -> published.Table:
         columns = np.concatenate([ratio, draws.compute_ratio_interval(PRIOR, other)])
         cells = [show_all(columns[:, parts.index(i)]) if i in parts else [None] * 3 for i in (0, 1)]
         rows.append((f"MAP over {other}", *cells[0], *cells[1]))
-    name = f"ratios_{draws.design.file}"
-    return TEXT.table("ratios", rows, name, name=draws.name, trials=len(draws))
+    name, data = f"ratios_{draws.design.file}", describe_design(draws.design)
+    return TEXT.table("ratios", rows, name, name=draws.name, trials=len(draws), **data)
 
 
 def make_median_curves(sweep: Sweep) -> published.Table:
@@ -352,10 +373,16 @@ def make_figures(results: Results) -> Iterator[published.Figure]:
         for sweep, method in zip(draws.sweeps, (PRIOR, PRIOR_FIVE), strict=False):
             prior, data = draws.compute_median(method), {"name": sweep.study.label}
             for a, of in CURVES.items():
-                curves = {b: sweep.compute_median(b) for b in of}
+                curves, chosen = {b: sweep.compute_median(b) for b in of}, sweep.chosen[of[0]]
+                bottoms = [
+                    published.Series.of(f"bottom of each machine, {LABELS[part]}",
+                                        chosen.settings[usable], errors[usable], False)
+                    for part in sweep.study.design.parts
+                    for errors in [chosen.errors[:, part]] for usable in [np.isfinite(errors)]
+                ]  # fmt: skip
                 file = f"medians_{sweep.study.file}_{a.lower()}"
-                yield _draw_curve("medians", file, sweep, a, curves, prior, **data,
-                                  trials=len(draws))  # fmt: skip
+                yield _draw_curve("medians", file, sweep, a, curves, prior, bottoms, **data,
+                                  trials=len(draws), early=EARLY in of)  # fmt: skip
     for case in results.cases.values():
         number = FIGURES.get((case.study.design.printed, case.study.freedoms))
         for (a, of), part in zip(CURVES.items(), "ab", strict=True):
@@ -376,15 +403,16 @@ def make_figures(results: Results) -> Iterator[published.Figure]:
 
 def _draw_curve(
     text: str, file: str, sweep: Sweep, kind: str, curves: Mapping[str, FloatArray],
-    prior: FloatArray, **data: Any,
+    prior: FloatArray, points: Sequence[published.Series] = (), **data: Any,
 ) -> published.Figure:  # fmt: skip
-    """Return position and angle errors of curves (s, ..) over their settings, and those of MAP.
+    """Return position and angle errors of curves (s, ..) over their settings, those of MAP, and
+    further points.
 
     Settings that diverged have no error; they are a series of their own at the upper end.
     """
     main, parts = CURVES[kind][0], sweep.study.design.parts
     first = int(main == RE)  # lambda = 0 has no place on its axis
-    lines, lost, top = list[published.Series](), set[float](), 1.0
+    lines, lost, top = [*points], set[float](), 1.0
     for algorithm, curve in curves.items():
         settings, errors = sweep.settings[algorithm][first:], curve[first:, parts]
         usable = np.isfinite(errors).all(axis=1)
@@ -394,9 +422,10 @@ def _draw_curve(
         lost |= {*settings[~usable]}
         top = float(errors[usable].max(initial=0.0)) or top
     if lost:
-        lines.append(published.Series.of(DIVERGED, sorted(lost), [top] * len(lost)))
+        lines.append(published.Series.of(DIVERGED, sorted(lost), [top] * len(lost), False))
     levels = {f"MAP, {LABELS[i]}": float(prior[i]) for i in parts}
-    data |= {"algorithm": kind, "setting": SETTING[main], "diverged": len(lost)}
+    data |= {"algorithm": kind, "setting": SETTING[main], "diverged": len(lost),
+             **describe_design(sweep.study.design)}  # fmt: skip
     return TEXT.figure(text, lines, levels, file, LOG[main], **data)
 
 
@@ -441,14 +470,16 @@ def _draw_steps(results: Results) -> published.Figure:
             lines.append(published.Series.of(label, done[usable], sizes[:end][usable]))
             longest = max(longest, int(done.max(initial=0)))
     log = "xy" if longest > LONG else "y"
-    return TEXT.figure("convergence", lines, {"end of the iteration": 1e-6}, "", log)
+    data = describe_design(results.draws[0].design)
+    return TEXT.figure("convergence", lines, {"end of the iteration": 1e-6}, "", log, **data)
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim; of another robot without those on printed numbers and on
     different manipulators, and without those on coordinates that it does not have.
     """
-    draws, sweeps, judge = results.draws, results.sweeps, _judge_places
+    draws, sweeps = results.draws, results.sweeps
+    judge = partial(_judge_places, **describe_design(draws[0].design))
     six = {d.sweeps[0].study.label: d for d in draws}
     five = {d.sweeps[1].study.label: d for d in draws if len(d.sweeps) > 1}
     whole = {draw.name: draw for draw in draws}
@@ -525,6 +556,7 @@ def _judge_curve(sweep: Sweep) -> published.Verdict:
         "u_shape", [*map(published.decide, holds, fails)], name=sweep.study.label, curves=curves,
         iterations=SIZES.find("short"),
         number=FIGURES.get((sweep.study.design.printed, sweep.study.freedoms)), short=short,
+        **describe_design(sweep.study.design),
     )  # fmt: skip
 
 
@@ -557,9 +589,9 @@ def _compare_ls(draw: Draws) -> Held:
     """Compare LS with RE and TSVD at settings that were best on other machines. At its own best
     each is as good as LS at least, because a small lambda is LS.
     """
-    unseen = {name: draw.sweeps[0].compare_unseen(a) for name, a in NAMES.items() if a != LS}
+    unseen = {name: draw.sweeps[0].compare_unseen(a) for name, a in SHOWN.items() if a != LS}
     row = {name: format_pair(np.median(ratio, axis=0)) for name, ratio in unseen.items()}
-    ratios = np.array([*unseen.values()])
+    ratios = np.array([ratio for name, ratio in unseen.items() if name in NAMES])
     is_worse, is_best = np.any(np.all(ratios < 1.0, axis=2), axis=0), np.all(ratios > 1.0, (0, 2))
     return Held(is_worse, is_best, row)
 
@@ -569,7 +601,7 @@ def _compare_best(sweep: Sweep) -> Held:
     parts = sweep.study.design.parts
     errors = {name: sweep.chosen[a].errors[:, parts] for name, a in NAMES.items()}
     tsvd, others = errors["tsvd"], (errors["ls"], errors["ridge"])
-    medians = {name: np.median(sweep.chosen[a].errors, axis=0) for name, a in NAMES.items()}
+    medians = {name: np.median(sweep.chosen[a].errors, axis=0) for name, a in SHOWN.items()}
     commanded = (sweep.chosen[a].commanded[:, parts] for a in (TSVD, RE))
     row = {"commanded": int(np.less_equal(*commanded).all(axis=1).sum()),
            **format_all(parts, **medians)}  # fmt: skip
@@ -580,10 +612,10 @@ def _compare_best(sweep: Sweep) -> Held:
 def _compare_five(draw: Draws) -> Held:
     """Return where LS diverges with 5-DOF measurement, and by how much RE and TSVD improve."""
     chosen = draw.sweeps[1].chosen
-    ridge, tsvd = (_compare_with_before(draw, chosen[a].errors) for a in (RE, TSVD))
+    ridge, early, tsvd = (_compare_with_before(draw, chosen[a].errors) for a in (RE, EARLY, TSVD))
     is_lost = np.isinf(chosen[LS].errors[:, 0])
     row = {"diverged": int(is_lost.sum()), "of": len(is_lost), "ridge": float(np.median(ridge)),
-           "tsvd": float(np.median(tsvd))}  # fmt: skip
+           "early": float(np.median(early)), "tsvd": float(np.median(tsvd))}  # fmt: skip
     holds = is_lost & (ridge < 1.0) & (tsvd < 1.0)
     return Held(holds, ~holds, row)
 
@@ -600,8 +632,8 @@ def _compare_exact(draw: Draws) -> Held:
     """
     limit = SIZES.find("reached") * draw.errors[BEFORE][:, 3]
     six, five = (sweep.exact[:, 3] for sweep in draw.sweeps)
-    left = "{:.0e} mm / {:.0e} deg".format(*draw.sweeps[1].exact.max(axis=0)[:2])
-    row = {"left": left, "six": float(np.median(six)), "five": float(np.median(five))}
+    row = {"six": float(np.median(six)), "five": float(np.median(five)),
+           **format_all(draw.design.parts, left=draw.sweeps[1].exact.max(axis=0))}  # fmt: skip
     is_decided = (six <= limit) & np.isfinite(five)
     return Held(is_decided & (five > limit), is_decided & (five <= limit), row)
 
@@ -609,10 +641,11 @@ def _compare_exact(draw: Draws) -> Held:
 def _compare_parameters(draw: Draws) -> Held:
     """Compare the parameter errors of the paper's RE and TSVD with 5- and 6-DOF measurement."""
     better, worse, row = [], [], {}
-    for name, algorithm in (("ridge", RE), ("tsvd", TSVD)):
+    for name, algorithm in (("ridge", RE), ("early", EARLY), ("tsvd", TSVD)):
         six, five = (sweep.chosen[algorithm].errors[:, 3] for sweep in draw.sweeps)
-        better.append(six < five)
-        worse.append(six > five)
+        if name in NAMES:
+            better.append(six < five)
+            worse.append(six > five)
         row |= {f"{name}_six": float(np.median(six)), f"{name}_five": float(np.median(five))}
     row |= {"six": draw.compute_median(PRIOR)[3], "five": draw.compute_median(PRIOR_FIVE)[3]}
     return Held(np.all(better, axis=0), np.all(worse, axis=0), row)
@@ -634,7 +667,7 @@ def _compare_deviations(place: tuple[Draws, Sweep]) -> Held:
 
 def _compare_speed(sweep: Sweep) -> Held:
     """Compare iterations; a fit that does not converge needs infinitely many."""
-    used = zip(NAMES, (sweep.chosen[a] for a in (RANKED, RE, TSVD)), strict=True)
+    used = zip(SHOWN, (sweep.chosen[a] for a in (RANKED, RE, TSVD, EARLY)), strict=True)
     counts = {name: np.where(c.is_converged, c.iterations, np.inf) for name, c in used}
     least, tsvd = np.minimum(counts["ls"], counts["ridge"]), counts["tsvd"]
     row = {name: show_count(np.median(count)) for name, count in counts.items()}
@@ -651,7 +684,9 @@ def _compare_rule(draw: Draws) -> Held:
     parts = draw.design.parts
     found, best = (draw.errors[method][:, parts] for method in (CROSS, RAW_RE))
     works, ratio = _are_better(found, best, SIZES.find("rule")), draw.compute_ratio(CROSS, RAW_RE)
-    return Held(~works, works, {"ratio": format_pair(ratio[[*parts]])})
+    early = draw.compute_ratio(CROSS, RAW_EARLY)
+    row = {"ratio": format_pair(ratio[[*parts]]), "early": format_pair(early[[*parts]])}
+    return Held(~works, works, row)
 
 
 def _find_best_k(sweep: Sweep) -> Held:
@@ -726,6 +761,7 @@ def _judge_own_checks(draws: Mapping[str, Draws]) -> tuple[published.Verdict, ..
     def judge(
         claim: str, limits: Mapping[tuple[str, str], float], first: int = 0, **data: Any
     ) -> published.Verdict:
+        data |= describe_design(next(iter(draws.values())).design)
         compare = partial(_compare_methods, limits=limits, first=first)
         return _judge_places(claim, draws, compare, trials=len(next(iter(draws.values()))), **data)
 
@@ -746,7 +782,7 @@ def _compare_methods(draw: Draws, limits: Mapping[tuple[str, str], float], first
     errors = {m: of[:, parts] for m, of in draw.errors.items()}
     holds = np.all([_are_better(errors[a], errors[b], x) for (a, b), x in limits.items()], axis=0)
     methods = {"prior": PRIOR, "narrow": NARROW, "wide": WIDE, "ls": RAW_LS, "six": RAW_LS,
-               "ridge": RAW_RE, "tsvd": RAW_TSVD, "five": RAW_FIVE}  # fmt: skip
+               "ridge": RAW_RE, "early": RAW_EARLY, "tsvd": RAW_TSVD, "five": RAW_FIVE}  # fmt: skip
     medians = {key: draw.compute_median(m) for key, m in methods.items() if m in errors}
     ratios = {"gcv": (PRIOR, CROSS), "hindsight": (PRIOR, HINDSIGHT), "ratio": next(iter(limits))}
     row = format_all(draw.design.parts, **medians)
@@ -782,7 +818,7 @@ def list_replaced(results: Results) -> tuple[str, ...]:
     }
     data = {"robot": design.name, "parameters": len(design.free), "poses": len(design.poses),
             "checked": len(design.output_range),
-            "paper_poses": len(of_paper.output_range), "first": len(design.free) - 1,
+            "paper_poses": len(of_paper.output_range),
             "last": int(results.draws[0].sweeps[0].settings[TSVD][-1]), **ranges}  # fmt: skip
     is_fixed = "psi" not in design.columns
     kept = ["poses", "range", "settings", *(["fixed"] if is_fixed else [])]
