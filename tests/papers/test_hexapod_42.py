@@ -296,10 +296,10 @@ def make_offset(results: Results, standard_errors: float) -> Results:
     return with_tables(results, noise=noise + standard_errors * sd)
 
 
-def make_places(results: Results, near: float, wide: float) -> Results:
+def make_places(results: Results, near: np.ndarray, wide: np.ndarray) -> Results:
     """Return results whose position errors are factors of those before."""
     before, factors = results.methods["before"].places, {"as in the paper": near, "wide": wide}
-    places = {name: before[name] * np.full(TRIALS, factor) for name, factor in factors.items()}
+    places = {name: before[name] * factor for name, factor in factors.items()}
     return with_draws(results, places=places)
 
 
@@ -331,7 +331,8 @@ OUTCOMES: dict[str, tuple[Callable[[Results], Results], ...]] = {
     ),
     "exact": tuple(partial(make_exact, left=x) for x in (0.01, 1.5, 0.5)),
     "converges": tuple(
-        (lambda r, x=x: with_draws(r, largest=x)) for x in (draw(0.01), draw(9.0), draw(9.0, 0.01))
+        (lambda r, x=x: with_draws(r, largest=x))
+        for x in (draw(0.01), draw(0.62), draw(0.62, 0.01))
     ),
     "threshold": (
         lambda r: r, lambda r: make_never(r, "exact", "frozen"), lambda r: make_never(r, "frozen"),
@@ -348,15 +349,15 @@ OUTCOMES: dict[str, tuple[Callable[[Results], Results], ...]] = {
     "milliradians": tuple(partial(make_before, factor=f) for f in (1e-3, 1.0, -9.0)),
     "mean_noise": tuple(partial(make_offset, standard_errors=x) for x in (1.0, 99.0, 5.0)),
     "parameters_improve": tuple(
-        (lambda r, s=s, h=h: with_draws(r, smaller=draw(s), halved=draw(h)))
-        for s, h in ((0.9, 0.8), (0.4, 0.1), (0.9, 0.2))
+        (lambda r, h=h: with_draws(r, smaller=draw(0.9), halved=h))
+        for h in (draw(0.8), draw(0.2), draw(0.2, 0.8))
     ),
     "poses_improve": tuple(
-        (lambda r, x=x: with_stated(r, sizes=draw(x, 1.1 * x)[:, None] * [1.0, 1e-3, 9.0, 1.0]))
-        for x in (1e-4, 1.0, 0.025)
+        (lambda r, x=x: with_stated(r, sizes=x[:, None] * [1.0, 1e-3, 9.0, 1.0]))
+        for x in (draw(1e-4, 1.1e-4), draw(0.025, 0.026), draw(1e-4, 0.025))
     ),
     "positions_improve": tuple(
-        partial(make_places, near=n, wide=w) for n, w in ((0.1, 0.9), (2.0, 2.0), (0.1, 2.0))
+        partial(make_places, near=draw(0.1), wide=w) for w in (draw(0.9), draw(2.0), draw(0.9, 2.0))
     ),
     "leg_by_leg": tuple(
         (lambda r, x=x: with_draws(r, parameters=r.methods["together"].parameters * x))
@@ -367,10 +368,13 @@ OUTCOMES: dict[str, tuple[Callable[[Results], Results], ...]] = {
 
 
 @pytest.mark.parametrize("claim", OUTCOMES)
-def test_every_claim_can_agree_disagree_and_stay_undecided(results, claim) -> None:
+def test_every_claim_can_agree_disagree_and_stay_undecided_and_every_draw_decides(
+    results, claim
+) -> None:
     found = []
     for make in OUTCOMES[claim]:
         (verdict,) = (v for v in judge_claims(make(results)) if v.name == claim)
+        assert None not in verdict.draws
         found.append(verdict.agrees)
     assert found == [True, False, None]
 
@@ -501,6 +505,12 @@ def test_study_of_another_hexapod_has_its_tables_figures_and_claims(tmp_path) ->
     assert all(verdict.reason in text for verdict in shown.content.verdicts)
 
 
+def test_a_hexapod_with_more_parameters_is_said_to_have_the_poses_that_are_measured() -> None:
+    case = PAPERS["hexapod-42"].make_case("6-rus")
+    assert len(steps.make_setup(case).poses) == 14
+    assert "14 poses are drawn from the workspace of 6-rus" in " ".join(case.list_replaced())
+
+
 def test_another_epsilon_ends_the_steps_and_is_stated() -> None:
     paper = PAPERS["hexapod-42"]
     case = paper.make_case(epsilon=0.01)
@@ -518,6 +528,19 @@ def test_another_epsilon_ends_the_steps_and_is_stated() -> None:
     assert needed == ("iterations needed", 1, 1, 1, 1)
     with pytest.raises(DataError, match="epsilon is 1 for tsvd-2016"):
         PAPERS["tsvd-2016"].make_case(epsilon=1.0)
+    for wrong in (np.inf, np.nan, 0.0):
+        with pytest.raises(DataError, match="give a finite number above 0, for hexapod-42 only"):
+            paper.make_case(epsilon=wrong)
+
+
+@pytest.mark.parametrize("wrong", ["inf", "1e999", "nan", "0", "-1"])
+@pytest.mark.parametrize("command", ["reproduce hexapod-42 --trials 2", "per-leg hexapod-42 DATA"])
+def test_an_epsilon_that_ends_no_steps_is_refused(capsys, tmp_path, command, wrong) -> None:
+    data = tmp_path / "data.csv"
+    assert main(["simulate", "hexapod-42", "--draw", "8", "-o", str(data)]) == 0
+    words = command.replace("DATA", str(data)).split()
+    assert main([*words, "--epsilon", wrong]) == 1
+    assert "epsilon" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -551,4 +574,8 @@ def test_page_shows_all_tables_figures_and_statements(results) -> None:
     text, content = write_page(reproduction, MADE_BY), reproduction.content
     titles = [item.title for item in (*content.comparisons, *content.tables, *content.figures)]
     assert [title for title in titles if f"## {title}\n" not in text] == []
+    columns = {table.name: " ".join(table.columns) for table in content.tables}
+    assert columns["methods"].count("rms over draws") == 3
+    assert columns["poses"].count("rms over draws") == 1  # "the same" is beside it
+    assert columns["noise"].count("of one draw") == 1
     assert all(verdict.reason in text for verdict in content.verdicts)

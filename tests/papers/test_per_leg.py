@@ -55,8 +55,9 @@ def test_epsilon_ends_the_steps_at_the_error_of_poses_or_at_the_size_of_a_step()
     assert change[1] > errors[2]  # the rules differ
     short = identify_per_leg(robot, data, 1, epsilon=0.9 * errors[1])
     assert (short.steps, short.is_converged) == (1, False)
-    with pytest.raises(EstimationError, match="epsilon is nan"):
-        identify_per_leg(robot, data, epsilon=float("nan"))
+    for wrong in (np.nan, np.inf, -1.0):
+        with pytest.raises(EstimationError, match=f"epsilon is {wrong}; give a finite number"):
+            identify_per_leg(robot, data, epsilon=wrong)
 
 
 def test_integrated_error_adds_millimeters_and_radians_of_the_worst_pose():
@@ -116,6 +117,16 @@ def test_per_leg_command_finds_the_true_machine_from_precise_poses(run, tmp_path
     document = json.loads(run("per-leg hexapod-42 data.csv --json")[1])
     estimates = [row["estimate"] * MM for row in document["parameters"]]
     np.testing.assert_allclose(estimates, found.values, atol=1e-12)
+
+
+def test_per_leg_command_shows_values_that_are_zero_but_for_rounding_as_zero(run):
+    noise = "--sigma-position 1e-6um --sigma-angle 1e-6urad"
+    assert run(f"simulate hexapod-42 --draw 12 {noise} -o d.csv")[0] == 0
+    rows = [line.split() for line in run("per-leg hexapod-42 d.csv")[1].splitlines()]
+    shown = {words[0]: words[3] for words in rows if len(words) == 5 and words[1] == "mm"}
+    assert len(shown) == 42
+    assert shown["leg1.base.z"] == "0"
+    assert shown["leg1.base.x"] == "120"
 
 
 def test_per_leg_command_ends_by_epsilon_and_says_where_it_is_not_met(run):

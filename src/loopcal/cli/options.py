@@ -651,7 +651,7 @@ DRAW: Any = option(
 EPSILON: Any = option(
     "End the steps when the largest error of a pose after a step, max dQint = position error [mm] "
     "+ angle [rad], is at most this number.",
-    type=click.FloatRange(min=0, min_open=True),
+    type=click.FloatRange(0, math.inf, min_open=True, max_open=True),
     metavar="NUMBER",
 )
 

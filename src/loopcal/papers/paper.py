@@ -11,6 +11,7 @@ replaces) yield what a page shows.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -91,10 +92,11 @@ class Paper:
 
         Raises DataError: as `run`. EstimationError: legs that cannot be identified one by one.
         """
-        if epsilon is not None and not (self.is_per_leg and epsilon > 0.0):
+        if epsilon is not None and not (self.is_per_leg and 0.0 < epsilon < math.inf):
             able = ", ".join(paper.name for paper in PAPERS.values() if paper.is_per_leg)
             raise DataError(
-                f"epsilon is {epsilon:g} for {self.name}; give a number above 0, for {able} only"
+                f"epsilon is {epsilon:g} for {self.name}; give a finite number above 0, for {able} "
+                "only"
             )
         if robot is None or str(robot) in self.studies:
             return StudyCase(self, str(robot or ""), epsilon=epsilon)
@@ -302,8 +304,9 @@ class PaperStudyFile:
 def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> PaperStudyFile:
     """Return the study file of a paper, for its robot or for another one.
 
-    Another robot gets as many poses of its own workspace in place of a file of poses, and of rings
-    that it does not reach, errors by its tolerances in place of the errors of one machine, as many
+    Another robot gets as many poses of its own workspace in place of a file of poses (three more
+    than its parameters need by the count of equations, at least), and of rings that it does not
+    reach, errors by its tolerances in place of the errors of one machine, as many
     directions of truncated SVD as it has parameters, and no angles that it does not have.
     """
     from loopcal.io.core.yaml_file import quote_scalar
@@ -320,13 +323,12 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
         beside = path.with_name(f"{path.stem}-poses.csv")
         text = text.replace(f"{{file: {file[1]}}}", f"{{file: {quote_scalar(beside.name)}}}")
         return PaperStudyFile({path: text, beside: poses}, wanted)
-    changes = {"robots": f"robots: [{quote_robot(path, wanted)}]"}
+    changes, loaded = {"robots": f"robots: [{quote_robot(path, wanted)}]"}, load_robot(wanted)
     if file is not None:
-        count = len(poses.splitlines()) - 1
+        count = max(len(poses.splitlines()) - 1, -(-int(loaded.parameters.free.sum()) // 6) + 3)
         changes["poses"] = f"poses: [{count}]  # drawn from the workspace"
     if re.search(r"^ +deviations:", text, re.MULTILINE):
         changes["errors"] = ANY_ERRORS
-    loaded = load_robot(wanted)
     if (rings := re.search(r"count: (\d+), choice: tilts", text)) is not None:
         try:
             list_tilt_rings(loaded.nominal, int(rings[1]))

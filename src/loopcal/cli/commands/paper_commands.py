@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import sys
 import textwrap
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import loopcal as lc
 from loopcal.cli import options as opt
@@ -130,10 +131,17 @@ def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> lis
     from loopcal.results.tables import Column, Table, word_column
 
     columns = (word_column("parameter"), *map(Column, ("unit", "nominal", "estimate", "change")))
+    parameters = estimate.to_dict()["parameters"]
+
+    def show(row: Mapping[str, Any], key: str) -> str:
+        """Return six digits; 0 below a hundredth of the last digit of the largest in its unit."""
+        size = max(abs(other[key]) for other in parameters if other["unit"] == row["unit"])
+        return f"{row[key] if abs(row[key]) > 1e-8 * size else 0.0:.6g}"
+
     rows = [
-        (row["name"], row["unit"], f"{row['nominal']:.6g}", f"{row['estimate']:.6g}",
+        (row["name"], row["unit"], show(row, "nominal"), show(row, "estimate"),
          f"{row['estimate'] - row['nominal']:+.3g}")
-        for row in estimate.to_dict()["parameters"]
+        for row in parameters
     ]  # fmt: skip
     conditions = ", ".join(f"{condition:.0f}" for condition in estimate.conditions)
     errors = ", ".join(f"{error:.2g}" for error in estimate.integrated_errors)

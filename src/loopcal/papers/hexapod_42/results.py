@@ -199,7 +199,7 @@ def list_replaced(results: Results) -> tuple[str, ...]:
     """
     setup, printed = results.setup, PRINTED.number("threshold", "value")
     data = {"epsilon": setup.epsilon, "printed": printed, "robot": setup.robot.name,
-            "count": len(setup.poses), "noise": PRINTED.number("noise", "value")}  # fmt: skip
+            "noise": PRINTED.number("noise", "value")}  # fmt: skip
     is_replaced = {"epsilon": setup.epsilon != printed, "robot": not setup.is_printed}
     texts = published.PaperFile(__file__, "text.yaml").find("replaced")
     return tuple(fill_template(texts[key], **data) for key, yes in is_replaced.items() if yes)
@@ -218,12 +218,13 @@ def make_tables(results: Results) -> tuple[published.Table, ...]:
     for level in levels.values():
         met = f"{np.isfinite(level.needed).sum()} of {len(level.needed)}"
         p_value = () if tables is None else (level.test(tables.sizes),)
-        noise.append(("computed, median", *level.limits, *level.median, met, *p_value))
+        noise.append(("computed, median over draws", *level.limits, *level.median, met, *p_value))
     if tables is not None:
         noise.insert(0, ("published, Tables 5 and 6", None, None, *tables.sizes, None, None))
     of_published = () if tables is None else (("p-value of the published sizes", ".2g"),)
     places = [
-        (f"position error rms, poses {name} [mm]", ".2g") for name in steps.list_places(setup)
+        (f"position error, rms over draws, poses {name} [mm]", ".2g")
+        for name in steps.list_places(setup)
     ]
     methods = [(METHODS[key], *draws.rms.values()) for key, draws in results.methods.items()]
     before = results.methods["before"].rms["parameters"]
@@ -315,7 +316,7 @@ def _draw_noise(results: Results) -> published.Figure:
         if np.isclose(level.limits[1], 1e-3 * level.limits[0], atol=0.0)
     ]
     x = [level.limits[0] for level in levels]
-    places = {"parameter error rms [mm]": (2, 5), "pose residual rms [mm]": (0, 6)}
+    places = {"parameter error": (2, 5), "position residual": (0, 6)}
     lines = [
         published.Series.of(label, x, [level.median[i] for level in levels])
         for label, (i, _) in places.items()
@@ -323,8 +324,8 @@ def _draw_noise(results: Results) -> published.Figure:
     marks = {}
     if results.tables is not None:
         sizes = results.tables.sizes
-        marks = {f"published, Table {number}": float(sizes[i]) for i, number in places.values()}
-    marks["before calibration"] = results.methods["before"].rms["parameters"]
+        marks = {f"{k}, published in Table {n}": float(sizes[i]) for k, (i, n) in places.items()}
+    marks["parameter error before calibration"] = results.methods["before"].rms["parameters"]
     stated, trials = results.levels[STATED].limits[0], len(levels[0].needed)
     return TEXT.figure("noise", lines, marks, trials=trials, noise=stated, tables=results.tables,
                        presumed=results.levels[PRESUMED].limits[0])  # fmt: skip
@@ -411,7 +412,7 @@ def _judge_steps(results: Results) -> tuple[published.Verdict, ...]:
     return (
         judge("exact", decide(largest[used] <= share * largest[0], largest[used] >= largest[0]),
               iterations=used, largest=largest[used], more=largest[used + 1], share=100.0 * share),
-        judge("converges", [_decide(r, (share, 1.0)) for r in alone.largest], elsewhere=elsewhere,
+        judge("converges", alone.largest <= share, elsewhere=elsewhere,
               parameters=_count(setup.robot.parameters.free), iterations=used, noise=noise,
               ratio=np.median(alone.largest), share=100.0 * share),
         judge("threshold", decide(counts == [used, used], used not in counts), elsewhere=elsewhere,
@@ -451,11 +452,10 @@ def _judge_noise(results: Results, tables: PrintedTables) -> tuple[published.Ver
 
 
 def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge what calibration improves, for each draw of noise."""
+    """Judge what calibration improves, for each draw of noise; a lost draw improves nothing."""
     setup, elsewhere = results.setup, not results.setup.is_printed
     alone, together, before = (results.methods[key] for key in ("alone", "together", "before"))
     rms = {key: draws.rms for key, draws in results.methods.items()}
-    shares = zip(alone.smaller, alone.halved, strict=True)
     at_measured = compute_rms(results.runs["exact"].pose_errors[0][:, :3] / MM)
     residuals = results.levels[STATED].sizes[:, 0]
     improved = np.array([alone.places[name] < before.places[name] for name in before.places])
@@ -471,14 +471,13 @@ def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:
         left is not None and left < EXACT, left is None or left >= rms["before"]["parameters"]
     )
     return (
-        TEXT.judge("parameters_improve", [decide(h > 0.5, s <= 0.5) for s, h in shares],
-                   elsewhere=elsewhere, noise=results.levels[STATED].limits[0],
+        TEXT.judge("parameters_improve", alone.halved > 0.5, elsewhere=elsewhere,
+                   noise=results.levels[STATED].limits[0],
                    smaller=100.0 * np.median(alone.smaller), halved=100.0 * np.median(alone.halved),
                    ratio=rms["alone"]["parameters"] / rms["before"]["parameters"], rms=rms),
-        TEXT.judge("poses_improve", [_decide(r / at_measured, (0.5, 1.0)) for r in residuals],
-                   elsewhere=elsewhere, before=at_measured, after=np.median(residuals)),
-        TEXT.judge("positions_improve", [decide(x.all(), not x.any()) for x in improved.T],
-                   elsewhere=elsewhere, places=places),
+        TEXT.judge("poses_improve", residuals <= 0.5 * at_measured, elsewhere=elsewhere,
+                   before=at_measured, after=np.median(residuals)),
+        TEXT.judge("positions_improve", improved.all(axis=0), elsewhere=elsewhere, places=places),
         TEXT.judge("leg_by_leg", alone.parameters <= AS_GOOD * together.parameters, ratio=ratio,
                    rms=rms),
         TEXT.judge("fewest_poses", enough, elsewhere=elsewhere, least=least, own=own,

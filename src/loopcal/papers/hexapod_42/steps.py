@@ -122,7 +122,7 @@ class Setup:
         """Poses with as many equations, six each, as there are parameters."""
         if self.is_printed:
             return int(PRINTED.find("poses", "least"))
-        return count_fewest(self.robot)
+        return -(-int(self.robot.parameters.free.sum()) // 6)
 
     def compute_reached(self, machine: Mechanism) -> FloatArray:
         """Return the poses (n, 6) [m, rad] of a machine at the readings of the nominal one."""
@@ -178,8 +178,7 @@ def make_setup(case: StudyCase | None = None, seed: int = 0, leg_lengths: bool =
         if np.array_equal(truth, robot.values):
             raise DataError(report_finding("data.no-errors-drawn", robot=robot.name))
         (level,) = study.poses.values()
-        count = max(level.count, count_fewest(robot) + 3)  # three to spare, as in the paper
-        coordinates = draw_reached(robot, robot.with_values(truth), count, seed)
+        coordinates = draw_reached(robot, robot.with_values(truth), level.count, seed)
     table = robot.parameters
     deviations = {
         name: f"{error!r} {SI_SYMBOLS[dimension]}"
@@ -221,11 +220,6 @@ def list_noises() -> dict[str, tuple[float, float]]:
         name: (float(f"{share * printed:.6g}"), float(f"{share * printed * angle:.6g}"))
         for name, (share, angle) in SIZES.find("noises").items()
     }
-
-
-def count_fewest(robot: Mechanism) -> int:
-    """Return the number of poses with as many equations as the robot has free parameters."""
-    return -(-int(robot.parameters.free.sum()) // 6)
 
 
 def draw_reached(

@@ -451,10 +451,13 @@ def identify_per_leg(
     ------
     EstimationError
         The robot has not six actuators, the data are not full poses in known frames or too few, a
-        parameter moves no leg or several, a pose is out of reach, or epsilon is below zero.
+        parameter moves no leg or several, a pose is out of reach, or epsilon is below zero
+        or infinite.
     """
-    if not epsilon >= 0.0:
-        raise EstimationError(f"epsilon is {epsilon}; give a number above 0, or 0 for all steps")
+    if not 0.0 <= epsilon < np.inf:
+        raise EstimationError(
+            f"epsilon is {epsilon}; give a finite number above 0, or 0 for all steps"
+        )
     _check_actuators(robot)
     observations = _select_full_poses(data)
     q = data.readings[observations.rows]
