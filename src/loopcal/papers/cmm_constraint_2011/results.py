@@ -75,17 +75,18 @@ class Results:
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether errors before calibration that are printed for figure 5 are outside of those of
-        all machines, so that the dimensions must be others.
-        """
-        errors, figure = self.figure_5.errors[BEFORE], PRINTED.find("figure_5")
-        printed = {name_measure(w, ABSOLUTE): float(figure[w]["before"]) for w in self.study.parts}
-        return any(not errors[w].min() <= x <= errors[w].max() for w, x in printed.items())
+        """Whether the dimensions are others than those of the paper."""
+        return self.case.robot is not None or SIZES.find("dimensions") == "ours"
 
     def reduce(self, measure: str) -> FloatArray:
         """Return the reductions of an error [%] by least squares, figure 5, all machines."""
         cells = [draw.weights["full"] for draw in self.draws]
         return 100.0 * (1.0 - np.concatenate([c.compute_left(LS, measure) for c in cells]))
+
+    def word_reduction(self, measure: str) -> str:
+        """Return the median reduction of an error on the machines of the tables in words."""
+        left = self.figure_5.compute_left(LS, measure)
+        return word_change(steps.take_median(100.0 * (1.0 - left)))
 
     def pool(self, judge: Callable[[Draw], Sequence[bool | None]]) -> list[bool | None]:
         """Return the decisions on the machines of all draws."""
@@ -142,6 +143,11 @@ def compute(
         table_4=steps.list_factors(),
         conclusion=steps.list_conclusion(),
     )
+
+
+def word_change(reduction: float) -> str:
+    """Return the reduction of an error [%] in words, such as "51 % smaller" or "2 % larger"."""
+    return f"{abs(reduction):.0f} % {'smaller' if reduction >= -0.5 else 'larger'}"
 
 
 def list_replaced(results: Results) -> tuple[str, ...]:
@@ -380,7 +386,10 @@ def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
     p, left = len(study.planned.free), len(study.planned.free) - len(study.observable)
     stated, falls = PRINTED.number("figure_5", PARAMETERS, "stated"), results.reduce(PARAMETERS)
     reached = steps.decide_each(falls >= stated - 0.5, np.isfinite(falls))
-    chance = float(beta.cdf((1.0 - stated / 100.0) ** 2, left / 2, (p - left) / 2)) if left else 1.0
+    best = chance = 1.0
+    if left:  # distribution of the share of undetermined directions in the squared norm
+        share = beta(left / 2, (p - left) / 2)
+        best, chance = 1.0 - np.sqrt(share.median()), share.cdf((1.0 - stated / 100.0) ** 2)
     aligned = [name_measure(what, ALIGNED) for what in study.parts]
     better = {
         key: decide_share(results.pool(lambda draw, k=key: draw.cells[k].are_reduced(LS, aligned)))
@@ -388,28 +397,27 @@ def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
     }
     worse = [f"errors {study.describe_errors(s)} with noise {n} mm"
              for (s, n), decision in better.items() if decision is False]  # fmt: skip
-    ranks = {
-        m: np.concatenate([steps.rank_correlations(d.cells.values(), m) for d in results.draws])
-        for m in METHODS
-    }
-    good = SIZES.find("good")
-    correlated = steps.decide_each(ranks[LS] > good, np.isfinite(ranks[LS]))
+    good, ranks = SIZES.find("good"), [
+        {m: steps.rank_correlations(d.cells.values(), m) for m in METHODS} for d in results.draws
+    ]  # fmt: skip
+    of_ls = np.concatenate([of[LS] for of in ranks])
+    correlated = steps.decide_each(of_ls > good, np.isfinite(of_ls))
     ratio = np.median([c.compute_median(LS, POSITION) / c.noise for c in cells.values()])
-    absolute = name_measure("position", ABSOLUTE)
-    sizes = {"errors": study.describe_errors(cell.size), "noise": cell.noise}
+    change, elsewhere = results.word_reduction(PARAMETERS), results.is_elsewhere
+    sizes = {"errors": study.describe_errors(cell.size), "noise": cell.noise,
+             "trials": results.trials}  # fmt: skip
     return (
-        judge("three_quarters", reached, elsewhere=results.case.robot is not None, stated=stated,
-              parameters=p, left=left, best=100.0 * (1.0 - np.sqrt(left / p)),
-              chance=100.0 * chance, median=steps.take_median(falls), **sizes),
+        judge("three_quarters", reached, elsewhere=elsewhere, stated=stated, parameters=p,
+              left=left, best=100.0 * best, chance=100.0 * chance, change=change, **sizes),
         judge("better", decide(True in better.values(), set(better.values()) == {False}),
+              elsewhere=elsewhere,
               better=sum(d is True for d in better.values()), count=len(cells),
               worse=worse or ["none"], parts=study.parts, ratio=ratio),
-        judge("correlation", correlated, good=good, count=len(cells),
+        judge("correlation", correlated, elsewhere=elsewhere, good=good, count=len(cells),
               ratios=len({c.ratio for c in cells.values()}),
-              ranks={m: steps.take_median(r) for m, r in ranks.items()},
-              parameters=steps.take_median(falls), aligned=steps.take_median(
-                  results.reduce(POSITION)), position=steps.take_median(results.reduce(absolute)),
-              **sizes),
+              ranks={m: steps.take_median(r) for m, r in ranks[0].items()}, parameters=change,
+              position=results.word_reduction(name_measure("position", ABSOLUTE)),
+              aligned=results.word_reduction(POSITION), **sizes),
     )  # fmt: skip
 
 
@@ -426,7 +434,7 @@ def _judge_figure_5(results: Results) -> tuple[published.Verdict, ...]:
     names, cell = list_printed_names(study), results.figure_5
 
     def word(numbers: Mapping[str, float]) -> list[str]:
-        return [f"{name} {numbers[name]:.0f} %" for name in names]
+        return [f"{name} {word_change(numbers[name])}" for name in names]
 
     def word_poses(numbers: Mapping[str, float]) -> list[str]:
         return [f"{what} {numbers[what]:.3g} {steps.PARTS[what][2]}" for what in study.parts]
@@ -435,9 +443,10 @@ def _judge_figure_5(results: Results) -> tuple[published.Verdict, ...]:
     noise, nearest_one = float(steps.find_figure_5()[1]), results.candidates[0]
     return (
         TEXT.judge("figure_5", steps.decide_each(each >= -0.5, np.isfinite(each)),
-                   elsewhere=elsewhere,
+                   elsewhere=elsewhere, trials=results.trials,
                    stated=[f"{what} {stated[what]['stated']} %" for what in study.parts],
-                   reductions=[f"{w} {steps.take_median(x):.0f} %" for w, x in falls.items()],
+                   reductions=[f"{what} {results.word_reduction(name_measure(what, ABSOLUTE))}"
+                               for what in study.parts],
                    before=word_poses(before),
                    printed=word_poses({w: float(stated[w]["before"]) for w in study.parts}),
                    nearest=nearest_one, nearest_medians=word(nearest_one.medians)),
@@ -479,6 +488,7 @@ def _judge_experiment(results: Results) -> tuple[published.Verdict, ...]:
     return (
         TEXT.judge("iterations", decide_all([decision for _, _, decision in within]),
                    elsewhere=elsewhere, points=PRINTED.find("points", "measured"), stated=most,
+                   aligned=changes["aligned"],
                    shares=[f"{100 * s.value:.0f} % (95 % interval {100 * s.low:.0f} to "
                            f"{100 * s.high:.0f} %) on {name}" for name, s, _ in within]),
         TEXT.judge("seconds", [s <= limit for s in seconds], stated=limit, longest=longest,
@@ -545,7 +555,10 @@ def _judge_methods(results: Results) -> tuple[published.Verdict, published.Verdi
         {w: cell.compute_median(m, x) for w, cell in results.draws[0].weights.items()}
         for m, x in ((LS, POSITION), (PRIOR, DETERMINED))
     )
-    less = {w: 100.0 * (1.0 - position["full"] / x) for w, x in position.items()}
+    pairs = {"full": ("full", "printed"), "single": ("full", "single"),
+             "distance": ("distance", "printed")}  # fmt: skip
+    change = {name: word_change(100.0 * (1.0 - position[a] / position[b]))
+              for name, (a, b) in pairs.items()}  # fmt: skip
     cell = results.figure_5
     given = {"errors": study.describe_errors(cell.size), "noise": cell.noise}
     return (
@@ -555,6 +568,5 @@ def _judge_methods(results: Results) -> tuple[published.Verdict, published.Verdi
                    worse=sum(d is False for d in priors.values()), share=100.0 * worse.value,
                    errors=study.describe_errors(key[0]), noise=key[1], left=left),
         TEXT.judge("weights", results.pool(judge_weights), sure=100 * sure, position=position,
-                   parameters=parameters, unit=study.unit[1], less=less, **given,
-                   nearer=100.0 * (1.0 - position["distance"] / position["printed"])),
+                   parameters=parameters, unit=study.unit[1], change=change, **given),
     )  # fmt: skip

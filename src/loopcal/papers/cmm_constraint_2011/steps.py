@@ -19,7 +19,10 @@ from time import process_time
 import numpy as np
 
 from loopcal import geometry
+from loopcal.diagnose.gauge_freedoms import NO_MOTION, SAME_MOTION, sample_motions, weigh_motions
 from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.estimate.null_space import Combination
+from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names
 from loopcal.measure.instrument import Gaussian
 from loopcal.measure.simulation import sample_truth
@@ -605,9 +608,38 @@ def list_undetermined(study: Study) -> list[tuple[str, float]]:
         robot, axes, number.reshape(layout.groups, -1), lambda _, n: Gaussian(np.full(n, MM))
     )
     exact = measure_held_points(layout, robot.values[None], instrument, 0, is_exact=True)
+    combinations = identifiability(robot, exact.trial(0)).unidentifiable
+    taken = list[tuple[str, FloatArray]]()
+    others = [(str(c.meaning) or f"Changes of {list_names(c.names)}", c.direction)
+              for c in combinations]  # fmt: skip
+    for words, direction in [*find_frame_motions(study, combinations), *others]:
+        unit = direction / np.linalg.norm(direction)
+        basis = np.stack([*(n for _, n in taken), unit])
+        if np.linalg.matrix_rank(basis, rtol=SAME_MOTION) == len(basis):
+            taken.append((words, unit))
     largest = study.observable.singular_values[0]
-    return [
-        (str(c.meaning) or f"Changes of {list_names(c.names)}",
-         float(np.linalg.norm(rows @ c.direction) / np.linalg.norm(c.direction) / largest))
-        for c in identifiability(robot, exact.trial(0)).unidentifiable
-    ]  # fmt: skip
+    return [(words, float(np.linalg.norm(rows @ n) / largest)) for words, n in taken]
+
+
+def find_frame_motions(
+    study: Study, combinations: tuple[Combination, ...]
+) -> list[tuple[str, FloatArray]]:
+    """Return shifts along and rotations about the axes of the base and of the platform that lie in
+    the span of combinations, in words, and as directions (p,) in tolerances.
+    """
+    if not combinations:
+        return []
+    robot, free = study.robot, study.planned.free
+    null = np.stack([c.direction for c in combinations], axis=1)
+    T, D, _ = sample_motions(robot)
+    moved, *frames = weigh_motions(T, robot.size, D[:, :, free.places] * free.tolerance @ null)
+    motions = []
+    for name, frame in zip(("base", "platform"), frames, strict=True):
+        for motion, columns in (("translation", frame[:, 3:]), ("rotation", frame[:, :3])):
+            weights = np.linalg.lstsq(moved, columns, rcond=NO_MOTION)[0]
+            off = np.linalg.norm(moved @ weights - columns, axis=0)
+            for i in np.flatnonzero(off <= SAME_MOTION * np.linalg.norm(columns, axis=0)):
+                words = report_finding("identifiability.frame-moves", frame=name, motion=motion,
+                                       axis="xyz"[i], through_origin=True)  # fmt: skip
+                motions.append((str(words), null @ weights[:, i]))
+    return motions
