@@ -203,7 +203,7 @@ def make_tables(results: Results) -> tuple[published.Table, ...]:
         {"errors": study.describe_errors(cell.size), "noise": cell.noise}
         for cell in (results.figure_5, next(iter(first.fifties.values())))
     )
-    more = [(f"{name} [%]", ".0f") for name in names] + [("largest difference", ".0f")]
+    more = [(f"{name} [%]", ".0f") for name in names] + [("largest difference [%]", ".0f")]
     statistics = [(study.label(name_measure(what, "", s)).replace(", ,", ","), ".3g")
                   for what in parts for s in steps.STATISTICS[1:]]  # fmt: skip
     aligned = tuple(name_measure(what, ALIGNED) for what in parts)
