@@ -546,6 +546,6 @@ def _word(
         poses=poses,
         is_workspace=is_workspace,
         tolerances_assumed=bool(fit.free_parameters.assumed.any()),
-        repeatability_stated=any(actuator.sigma for actuator in fit.robot.actuators),
+        repeatability_stated=bool(fit.posterior.repeatability.any()),
         **reference.data,
     )

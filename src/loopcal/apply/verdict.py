@@ -36,7 +36,7 @@ ALL_POSES = "outliers.all-poses"  # finding on outliers before poses were held o
 LEAVE_OUT = "values.leave-out"  # recommendation to calibrate without a wrong pose
 # Number of poses up to which one that is wrong changes the values by more than their uncertainty.
 FEW_POSES = 50
-SEARCH_LEVEL = 0.01  # probability of excluding a pose of all where none is wrong
+SEARCH_LEVEL = 0.001  # probability of excluding a pose of all where none is wrong
 LIMIT_EXCEEDED = "gates.limit-exceeded"  # finding that an error is above a stated limit
 # Finding that a limit was stated for something that no row measures.
 LIMIT_NOT_MEASURED = "gates.limit-not-measured"

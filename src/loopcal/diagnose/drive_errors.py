@@ -50,6 +50,9 @@ DOUBTED = 0.1
 have errors, and their pattern decides.
 """
 
+FEWEST_VALUES = 2
+"""Measured values of a pose without which its errors have no pattern, such as single heights."""
+
 OUTLYING = 0.1
 """Largest share of the poses that may be outliers in place of errors of the drives."""
 
@@ -119,11 +122,12 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
     where they show none, or cannot.
     """
     fit, poses = linear.fit, linear.solution.linearized
-    is_tested = fit.converged and fit.residual_test.intervals and fit.options.loss is None
-    if not is_tested or poses is None or fit.options.prior is not None:
+    test = fit.residual_test  # with unknown sigmas, kinds of different noise show a pattern, too
+    is_tested = fit.converged and test.intervals and test.noise == "given"
+    if not is_tested or poses is None or {fit.options.loss, fit.options.prior} != {None}:
         return None
     rows = collect_residual_rows(linear)
-    if rows is None or rows.degrees < FEWEST_LEFT:
+    if rows is None or len(rows.residual) < FEWEST_VALUES * linear.data.n_poses:
         return None
     columns = differentiate_by_readings(linear, rows)
     if columns is None:
