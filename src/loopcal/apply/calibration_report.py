@@ -205,7 +205,8 @@ class CalibrationReport(TableResult):
         advice = recommend_values(self.verdict, self.start, test, self.validation, self.findings)
         fitted = _count_fitted_poses(self.identification, self.split.fitted)
         outliers = tuple(f"pose {label}" for label in self.list_outliers(SEARCH_LEVEL))
-        if advice.code.startswith("values.apply") and outliers and fitted <= FEW_POSES:
+        is_open = advice.code.startswith(("values.apply", "values.keep-not-calibrated"))
+        if is_open and outliers and fitted <= FEW_POSES:
             return report_finding(LEAVE_OUT, poses=outliers)
         return advice
 
