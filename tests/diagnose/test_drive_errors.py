@@ -53,8 +53,8 @@ def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: f
     rows, columns = collect(linearize(measure_hexapod(3, SIGMA, 12, error=REPEATABILITY).data))
     n, a = columns.count, 6
     Z = np.zeros((len(rows.residual), n * a))
-    for i, pose in enumerate(columns.poses[:, 0]):
-        Z[i, pose * a : pose * a + a] = columns.values[i, 0]
+    for i, pose in enumerate(columns.poses):
+        Z[i, pose * a : pose * a + a] = columns.values[i]
     noise = np.linalg.qr(np.c_[rows.basis, np.eye(len(Z))])[0][:, rows.basis.shape[1] : len(Z)]
     y, A = noise.T @ rows.residual, noise.T @ Z  # what nothing estimated explains
 

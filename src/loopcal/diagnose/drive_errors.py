@@ -89,7 +89,7 @@ class DriveErrors:
 class ReadingColumns:
     """Whitened derivatives of R rows by the a readings of their poses [1 / SI].
 
-    values : (R, links, a). poses : (R, links) poses of the rows. count : n of all poses.
+    values : (R, a). poses : (R,) pose of each row. count : n of all poses.
     """
 
     values: FloatArray
@@ -98,23 +98,17 @@ class ReadingColumns:
 
     def project(self, columns: FloatArray) -> FloatArray:
         """Return Z' columns (n, a, c) of columns (R, c)."""
-        total = np.zeros((self.count, self.values.shape[-1], columns.shape[1]))
-        for link in range(self.poses.shape[1]):
-            products = self.values[:, link, :, None] * columns[:, None, :]
-            np.add.at(total, self.poses[:, link], products)
-        return total
-
-    def square_poses(self) -> FloatArray:
-        """Return the blocks (n, a, a) of Z'Z of each pose; those of two linked poses count as 0."""
-        total = np.zeros((self.count, *self.values.shape[-1:] * 2))
-        for link in range(self.poses.shape[1]):
-            v = self.values[:, link]
-            np.add.at(total, self.poses[:, link], v[:, :, None] * v[:, None, :])
+        total = np.zeros((self.count, self.values.shape[1], columns.shape[1]))
+        np.add.at(total, self.poses, self.values[:, :, None] * columns[:, None, :])
         return total
 
     def expand(self, errors: FloatArray) -> FloatArray:
         """Return Z errors (R, c) of errors (n, a, c) of the readings."""
-        return np.einsum("rla,rlac->rc", self.values, errors[self.poses])
+        return np.einsum("ra,rac->rc", self.values, errors[self.poses])
+
+    def square(self) -> FloatArray:
+        """Return the blocks (n, a, a) of Z'Z."""
+        return self.project(self.values)
 
 
 def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
@@ -180,30 +174,24 @@ def list_units(linear: FitLinearization) -> FloatArray:
 def differentiate_by_readings(
     linear: FitLinearization, rows: ResidualRows
 ) -> ReadingColumns | None:
-    """Return the derivatives of the rows by the readings of their poses; None where rows sense
-    joints, which follow the readings in another way.
+    """Return the derivatives of the rows by the readings of their poses; None where rows compare
+    poses, or sense joints, which follow the readings in another way.
     """
     poses, robot, problem = linear.solution.linearized, linear.fit.robot, linear.problem
     assert poses is not None
     kinds = [r for r in problem.rows if len(r.poses)]
-    if any(r.kind.sensed_joints for r in kinds):
+    if any(r.kind.sensed_joints or r.kind.poses_per_row > 1 for r in kinds):
         return None
     solution = forward(robot, linear.data.readings)
     S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).readings[0]
-    links = max(r.kind.poses_per_row for r in kinds)
-    values = np.zeros((len(rows.residual), links, S.shape[-1]))
-    places = np.zeros((len(rows.residual), links), dtype=np.int64)
+    values = np.zeros((len(rows.residual), S.shape[-1]))
+    places = np.zeros(len(rows.residual), dtype=np.int64)
     for number, r in enumerate(kinds):
         evaluated, white = evaluate_rows(r, poses, np.zeros(1, np.int64), linear.solution.nuisance)
-        own = np.flatnonzero(rows.kind == number)
-        for link in range(r.kind.poses_per_row):
-            by_twist = (
-                evaluated.jacobian if r.kind.poses_per_row == 1 else evaluated.jacobian[:, :, link]
-            )
-            of_link = r.poses_by_link[:, link]
-            Z = r.whiten_columns(white, by_twist)[0] @ S[of_link]
-            values[own, link] = Z[rows.row[own], rows.column[own]]
-            places[own, link] = of_link[rows.row[own]]
+        Z = r.whiten_columns(white, evaluated.jacobian)[0] @ S[r.poses]
+        own = rows.kind == number
+        values[own] = Z[rows.row[own], rows.column[own]]
+        places[own] = r.poses[rows.row[own]]
     return ReadingColumns(values, places, len(S))
 
 
@@ -226,7 +214,7 @@ def _find_backlash(
     x = np.apply_along_axis(scale_to_range, 0, readings)
 
     def shift(errors: FloatArray) -> FloatArray:
-        return np.einsum("rla,rla->ra", columns.values, errors[columns.poses]) * unit
+        return columns.values * errors[columns.poses] * unit
 
     effect = shift(direction)
     # the direction of travel goes with the reading: a pose at an end was reached towards it
@@ -257,7 +245,7 @@ def test_independent_errors(rows: ResidualRows, columns: ReadingColumns, known: 
     U, nu = rows.basis, rows.degrees
     own = columns.project(U)  # Z'U
     square = columns.project(rows.residual[:, None])
-    total, gram = float((columns.values**2).sum()), columns.square_poses()
+    total, gram = float((columns.values**2).sum()), columns.square()
     inner = np.einsum("nac,nad->cd", own, own)
     spread = columns.expand(own)
     first = total - float(np.trace(inner))
@@ -281,7 +269,7 @@ def estimate_size(rows: ResidualRows, columns: ReadingColumns, known: float) -> 
     restricted likelihood of the rows is largest, their noise at its best size.
     """
     both, q = np.column_stack([rows.basis, rows.residual]), rows.basis.shape[1]
-    B, (c, Q) = columns.project(both), np.linalg.eigh(columns.square_poses())
+    B, (c, Q) = columns.project(both), np.linalg.eigh(columns.square())
     B, c = Q.swapaxes(1, 2) @ B, np.maximum(c, 0.0)[..., None]
     unit = float(np.sqrt(len(both) / (columns.values**2).sum()))
     best, size = -np.inf, 0.0
