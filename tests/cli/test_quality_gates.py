@@ -75,7 +75,7 @@ def test_larger_errors_on_held_out_poses_fail_the_quality_gate(
 def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
     loopcal, folder_with_wrong_cell, monkeypatch, hold_out
 ) -> None:
-    def raise_data_error(*_):
+    def raise_data_error(*_, **__):
         code = "residuals.calibrated-out-of-reach"
         raise lc.DataError(report_finding(code, robot="hexapod-42", poses=10, before=10, after=0))
 

@@ -251,14 +251,16 @@ scores: {{held_out: 3}}
 
 
 def test_failed_trials_lead_to_the_reason_in_check_summary_and_replay(loopcal, tmp_path) -> None:
-    file = write_study(tmp_path, 4, 2, PER_LEG.replace("{robot}", "linear-delta")).name
+    file = write_study(
+        tmp_path, 4, 2, f"poses: [5]\n{PER_LEG}".replace("{robot}", "hexapod-42")
+    ).name
     out = loopcal(f"check {file}", "1 cell, 4 trials").out
     advice = "Replay one of these trials to see the reason."
     assert "Failed trials: 2 of 2. The trial was refused" in " ".join(out.split())
     assert advice in " ".join(out.split())
     loopcal(f"run {file} -o f {ONE}")
     loopcal("summary f", advice)
-    loopcal("replay f 0/1 -o trial", "linear-delta has 3 actuators", code=1)
+    loopcal("replay f 0/1 -o trial", "5 poses are too few for the 7 parameters of a leg", code=1)
     assert not (tmp_path / "trial").exists()
 
 
