@@ -87,7 +87,7 @@ def test_truncation_reports_the_directions_that_remain(data):
     ("method", "parameter", "value", "rule"),
     [
         (Ridge(2.5), "lam", 2.5, "fixed"),
-        (Ridge(tuple([2.0] * 32 + [3.0])), "lam", 3.0, "fixed"),
+        (Ridge(tuple([2.0] * 32 + [3.0])), "lam", 3.0, "each"),
         (TruncatedSVD(20), "k", 20.0, "fixed"),
         (Ridge(MarginalLikelihood()), "lam", None, "MarginalLikelihood"),
     ],
@@ -99,7 +99,7 @@ def test_every_rule_is_reported(data, method, parameter, value, rule):
     assert chosen is not None
     assert (chosen.parameter, chosen.rule) == (parameter, rule)
     assert value is None or chosen.value == value
-    assert (chosen.score is None) == (rule == "fixed")
+    assert (chosen.score is None) == (rule in ("fixed", "each"))
     assert chosen.finding.code in [finding.code for finding in fit.findings]
     document = to_json(fit.to_dict()["regularization"])
     assert document["value"] == chosen.value
