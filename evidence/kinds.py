@@ -221,7 +221,8 @@ def recover_machine(case: Case, seed: int = SEED) -> Recovery:
     except LoopcalError as error:
         return Recovery(0, len(robot.parameters), np.nan, np.nan, np.nan, np.nan, (), 0, str(error))
     checked = validate(fit, others)
-    motions = find_gauge_freedoms(fit.posterior)
+    known = fit.posterior
+    motions = find_gauge_freedoms(known.robot, known.places, known.unit, known.undetermined)
     left = len(fit.names) - fit.rank - motions.count
     return Recovery(
         rank=fit.rank,

@@ -23,7 +23,7 @@ from evidence.assumptions.hexapod import (
 from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.mechanism.solutions import forward
 
-FITS = 200
+FITS = 40
 SIGMAS = ((5e-6, 2.5e-5), (2e-5, 1e-4))
 """Stated noise of positions [m] and angles [rad]."""
 CASES: tuple[tuple[str, float, DriveError | None], ...] = (

@@ -244,7 +244,7 @@ NOISE = report_finding(
     "noise.residuals-too-large", Severity.FAILURE, ratio=3.9, degrees=81.0, p_value=1e-9
 )
 SESSIONS = report_finding(
-    "residuals.sessions-differ", component="x", size=SMALL, error=SMALL, ratio=1.8
+    "residuals.sessions-differ", component="x", size=SMALL, error=SMALL, ratio=1.8, p_value=0.01
 )
 MISSING = report_finding("gates.limit-not-measured", quantity="orientation")
 EXCEEDED = report_finding(

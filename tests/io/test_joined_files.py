@@ -164,11 +164,6 @@ REFUSED = {
         {"poses": POSES, "tilts": TILTS.replace(" [m]", " [mm]")},
         r"tilts.csv:4: pose 'b' has other readings here than in",
     ),
-    "the same rows in two files": (
-        {"poses": POSES, "heights": HEIGHTS, "copy": "## a copy\n" + HEIGHTS},
-        (r"'b' and 'b' \(.*heights.csv:5 and .*copy.csv:6\) have the same readings and the same "
-         r"component"),
-    ),
     "an empty cell of the readings": (
         {"poses": POSES.replace("b,1,", "b,,"), "heights": HEIGHTS},
         ("poses.csv:3: column 'q1' is empty; write its value, or state 'reading_noise'"),

@@ -725,7 +725,7 @@ SMALLEST_EFFECT = 1e-7
 """Share of all that the machine does to a nuisance parameter below which a direction does not move
 it: rounding."""
 
-UNDETERMINED = 1e3
+UNDETERMINED = 1.0
 """Standard deviation [m] or [rad] that stands for that of a direction that no row determines."""
 
 

@@ -329,7 +329,7 @@ def test_taped_lengths_bring_a_real_machine_closer_to_its_published_anchors(
     assert (round(before, 1), round(after, 1)) == (18.7, 12.7)  # [mm], the numbers of the page
 
 
-def test_tape_reduces_the_uncertainty_of_the_anchors_along_their_lines_to_a_quarter(
+def test_tape_reduces_the_uncertainty_of_the_anchors_along_their_lines_to_a_third(
     tmp_path, data_folder, root
 ) -> None:
     samples = load_real_samples(data_folder)
