@@ -94,7 +94,7 @@ def test_a_fit_with_lambda_by_pattern_equals_one_with_a_vector_and_keeps_its_opt
     named = FitOptions(Ridge({"*.length": 10.0, "*": 0.1}))
     lam = [10.0 if name.endswith(".length") else 0.1 for name in robot.parameters.names]
     by_name = identify(robot, data, options=FitOptions.from_dict(named.to_dict()))
-    by_array = identify(robot, data, Ridge(np.array(lam)))
+    by_array = identify(robot, data, Ridge(tuple(np.array(lam).tolist())))
     assert np.array_equal(by_name.estimate, by_array.estimate)
     assert by_name.options.method == by_array.options.method == Ridge(tuple(lam))
     alike = identify(robot, data, Ridge(0.1))

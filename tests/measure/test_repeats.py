@@ -58,7 +58,7 @@ def test_slow_scan_is_no_cluster_of_repeats_in_any_order() -> None:
     alone = np.random.default_rng(2).uniform(-0.1, 0.1, (500, 6))
     visits = np.repeat(np.random.default_rng(3).uniform(-0.1, 0.1, (100, 6)), 5, axis=0)
     visits += np.random.default_rng(4).uniform(-JITTER, JITTER, visits.shape)
-    readings = np.concatenate([scan, scan[[500, 500]], alone, visits])
+    readings = np.concatenate([scan, scan[[500, 500]], alone, visits]).astype(np.float64)
     label = find_repeats(readings, np.full(6, 0.5 * UM))
     assert np.bincount(label)[label[:1000]].tolist() == [1] * 500 + [3] + [1] * 499
     assert (np.bincount(label)[label[1002:1502]] == 1).all()

@@ -347,7 +347,7 @@ def change_draws(results: Results, change: Change, good: np.ndarray, count: int 
 
 def leave_errors(draw: steps.Draw, good: np.ndarray) -> steps.Draw:
     """Both methods take 99 % of the errors of good machines away, and double the others."""
-    left = dict.fromkeys((LS, PRIOR), np.where(good > 0.0, 0.01, 2.0))
+    left: dict[str, np.ndarray] = dict.fromkeys((LS, PRIOR), np.where(good > 0.0, 0.01, 2.0))
     cells, fifties = (
         {key: set_left(cell, left) for key, cell in of.items()} for of in (draw.cells, draw.fifties)
     )
@@ -441,8 +441,9 @@ def on_draws(change: Change) -> Callable[[Results, np.ndarray], Results]:
 CHANGES: Mapping[str, Callable[[Results, np.ndarray], Results]] = {
     "independent": change_numbers("frame_effect", (1e-15, 1e-2, 1e-7)),
     "counted": change_numbers("pair", ((10, 9), (10, 5), (10, 8))),
-    "least_squares": change_numbers("ranks", tuple(
-        [{"groups": 1, "rank": 42, "last": x}] for x in (1e-3, 1e-17, 1e-10))),
+    "least_squares": change_numbers("ranks", (
+        [{"groups": 1, "rank": 42, "last": 1e-3}], [{"groups": 1, "rank": 42, "last": 1e-17}],
+        [{"groups": 1, "rank": 42, "last": 1e-10}])),
     "three_quarters": on_draws(leave_errors), "better": on_draws(leave_errors),
     "figure_5": on_draws(leave_errors), "full_poses": on_draws(leave_errors),
     "correlation": on_draws(order_errors), "weights": on_draws(weigh_errors),
@@ -596,7 +597,7 @@ def test_fits_that_did_not_converge_have_a_row_of_their_own() -> None:
         LS: np.array([True, True, False]),
         PRIOR: np.zeros(3, dtype=bool),
     }
-    of_methods = dict.fromkeys((BEFORE, LS, PRIOR), errors)
+    of_methods: dict[str, dict[str, np.ndarray]] = dict.fromkeys((BEFORE, LS, PRIOR), errors)
     cell = steps.Cell(1.0, 0.01, of_methods, np.zeros(3, dtype=int), converged, np.zeros(3), {})
     assert list(list_methods(cell, [POSITION])) == [
         (BEFORE, 3, 2.0), (LS, 2, 1.5), (f"{LS}, not converged", 1, 100.0),

@@ -96,7 +96,8 @@ def test_the_sweeps_have_the_settings_and_poses_of_the_reproduction(name):
     keeps = [level.keep for level in study.methods.values() if level.keep is not None]
     assert keeps == list(range(p - 1, 0, -1))
     raw = [level for level in study.methods.values() if level.rows == "raw" and level.lam]
-    assert_allclose([level.lam or 0.0 for level in raw], np.tile(tsvd.list_lambdas(), 2))
+    lambdas = np.array([level.lam for level in raw], dtype=float)
+    assert_allclose(lambdas, np.tile(tsvd.list_lambdas(), 2))
     assert {level.steps for level in raw} == {None, tsvd.SIZES.find("short")}
     for level in study.instruments.values():
         assert np.sqrt(3.0) * level.sigma_position == pytest.approx(tsvd.list_limits()[0])
