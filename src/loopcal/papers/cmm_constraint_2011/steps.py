@@ -63,7 +63,9 @@ ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "align
 as the least deviation leaves them; with poses nearest to the nominal ones, which needs no truth;
 with poses nearest to the true ones.
 """
-PARTS = {"position": (np.s_[3:], MM, "mm"), "orientation": (np.s_[:3], DEGREE, "deg")}
+PARTS: Mapping[str, tuple[slice, float, str]] = {
+    "position": (slice(3, None), MM, "mm"), "orientation": (slice(3), DEGREE, "deg"),
+}  # fmt: skip
 """Error of a pose -> its components of a twist, and its unit."""
 STATISTICS = ("", ", mean", ", standard deviation")
 """Of the errors over poses: the root mean square, the mean, the standard deviation."""

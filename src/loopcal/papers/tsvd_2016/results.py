@@ -74,7 +74,7 @@ HISTORIES = {6: 7, 5: 9}
 NAMED, LONG = 6, 50
 """Parameters named in a legend, and iterations above which their axis is logarithmic."""
 LABELS = ("position [mm]", "phi and theta [deg]")
-CURVES = {"RE": (RE, EARLY), "TSVD": (TSVD,)}
+CURVES: Mapping[str, tuple[str, ...]] = {"RE": (RE, EARLY), "TSVD": (TSVD,)}
 """In one figure."""
 SETTING, LOG = {RE: "lambda", TSVD: "k"}, {RE: "xy", TSVD: "y"}
 NAMES = {"ls": LS, "ridge": RE, "tsvd": TSVD}
