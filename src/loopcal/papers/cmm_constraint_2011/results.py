@@ -315,7 +315,8 @@ def _draw_figure_4(results: Results) -> published.Figure:
                 tuple(steps.take_median(cell.compute_left(method, m)) for m in measures)
                 for cell in results.cells.values()
             )
-            lines.append(published.Series.of(f"{method}{frame}", *zip(*both, strict=True)))
+            x, y = zip(*both, strict=True)
+            lines.append(published.Series.of(f"{method}{frame}", x, y))
     return TEXT.figure("figure_4", lines, joined=False, count=len(results.cells))
 
 
