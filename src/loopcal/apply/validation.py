@@ -42,7 +42,7 @@ from loopcal.diagnose.row_errors import (
 )
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertainty
-from loopcal.estimate.result import SMALLEST_EFFECT, Identification
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.findings.wording import list_names, name_count, round_to_digits
 from loopcal.measure.data_checks import check_actuators
@@ -597,15 +597,8 @@ def _find_unpredicted(
     for i, name in enumerate(after.setup.table.names):
         if uncertainty is not None and name in places:
             root[i] = uncertainty.root[places[name]] / uncertainty.noise_scale
-    # what the setup parameters do together is rounding beside what each does by itself
-    together, alone = (
-        after.setup_deviations(compared.data.observations, each)
-        for each in (root, np.diag(np.linalg.norm(root, axis=1)))
-    )
-    return [
-        (both > SETUP_KNOWN) & (both > SMALLEST_EFFECT * one)
-        for both, one in zip(together, alone, strict=True)
-    ]
+    sizes = after.setup_deviations(compared.data.observations, root)
+    return [of_kind > SETUP_KNOWN for of_kind in sizes]
 
 
 def _report_unpredicted(

@@ -38,9 +38,9 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import compute_chi_square_tail, compute_single_level
 from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
 
 LEVEL = 0.01
 """Probability that independent errors of the instrument show errors of the drives."""
@@ -64,12 +64,11 @@ SIZES = np.geomspace(0.03, 300.0, 41)
 class DriveErrors:
     """Errors of the readings that every pose has by itself.
 
-    sigma : (a,) their standard deviations [SI]. p_value : of independent errors of the instrument
-    alone. findings : which errors, and how they show.
+    sigma : (a,) their standard deviations [SI]. findings : which errors, and the probability that
+    independent errors of the instrument show them.
     """
 
     sigma: FloatArray
-    p_value: float
     findings: tuple[Finding, ...]
 
     def explain_better(self, fit: Identification) -> bool:
@@ -77,7 +76,8 @@ class DriveErrors:
         fit, with its uncertainty adjusted, states.
         """
         patterns = (f for f in fit.findings if f.code.startswith("residuals."))
-        return self.p_value < min((f.data.get("p_value", 1.0) for f in patterns), default=1.0)
+        chance = min((f.data.get("p_value", 1.0) for f in patterns), default=1.0)
+        return any(f.data["p_value"] < chance for f in self.findings)
 
     def add_to(self, fit: Identification) -> Identification:
         """Return a fit with readings of these standard deviations, which says so."""
@@ -127,10 +127,9 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
     if columns is None:
         return None
     unit = list_units(linear)
-    level = DOUBTED if fit.residual_test.failed else compute_single_level(LEVEL, 2)
+    level = DOUBTED if test.failed else compute_single_level(LEVEL, 2)
     rows, backlash, findings = _find_backlash(linear, rows, columns, unit, level)
-    p_values = [float(f.data["p_value"]) for f in findings]
-    known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
+    known = count_sigma_degrees(test.noise, fit.options.sigma_uncertainty)
     scaled = ReadingColumns(columns.values * unit, columns.poses, columns.count)
     p_value, sigma = test_independent_errors(rows, scaled, known), np.zeros_like(unit)
     if p_value < level:
@@ -142,10 +141,7 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
             "residuals.drive-errors", size=size, p_value=p_value, severity=severity
         )
         findings.append(found)
-        p_values.append(p_value)
-    if not findings:
-        return None
-    return DriveErrors(np.hypot(sigma, backlash), min(p_values), tuple(findings))
+    return DriveErrors(np.hypot(sigma, backlash), tuple(findings)) if findings else None
 
 
 def are_outliers(fit: Identification, data: Measurements) -> bool:
@@ -165,9 +161,7 @@ def list_units(linear: FitLinearization) -> FloatArray:
     angles that turn the size of the robot by them.
     """
     robot = linear.fit.robot
-    is_angle = np.array(
-        [robot.actuators[i].dimension.value == "angle" for i in range(len(robot.actuators))]
-    )
+    is_angle = [actuator.dimension is Dimension.ANGLE for actuator in robot.actuators]
     return np.where(is_angle, 1.0 / robot.size, 1.0)
 
 
@@ -177,13 +171,14 @@ def differentiate_by_readings(
     """Return the derivatives of the rows by the readings of their poses; None where rows compare
     poses, or sense joints, which follow the readings in another way.
     """
-    poses, robot, problem = linear.solution.linearized, linear.fit.robot, linear.problem
+    poses, states, robot = linear.solution.linearized, linear.solution.states, linear.fit.robot
     assert poses is not None
-    kinds = [r for r in problem.rows if len(r.poses)]
+    assert states is not None
+    kinds = [r for r in linear.problem.rows if len(r.poses)]
     if any(r.kind.sensed_joints or r.kind.poses_per_row > 1 for r in kinds):
         return None
-    solution = forward(robot, linear.data.readings)
-    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).readings[0]
+    readings = linear.data.readings[None]
+    S = differentiate_pose(robot, robot.values[None], readings, states.state).readings[0]
     values = np.zeros((len(rows.residual), S.shape[-1]))
     places = np.zeros(len(rows.residual), dtype=np.int64)
     for number, r in enumerate(kinds):

@@ -23,6 +23,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.estimate.pose_estimate import PoseFit, fit_poses, predict_from_readings
+from loopcal.estimate.result import SMALLEST_EFFECT
 from loopcal.findings import report_finding
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.kind import list_error_groups
@@ -423,8 +424,10 @@ class PosePredictions:
         self, observations: Sequence[Observations], root: FloatArray
     ) -> list[FloatArray]:
         """Return how far the setup parameters with a square root (U, w) [SI] of their covariance
-        move the predictions (r,) of every kind, in standard deviations of its noise.
+        move the predictions (r,) of every kind, in standard deviations of its noise; 0 where that
+        is rounding beside what each of them does by itself.
         """
+        alone = np.linalg.norm(root, axis=1)
         sizes = []
         for i, o in enumerate(observations):
             by_setup = o.evaluate(self.T, *self._inputs_of(i, o)).nuisance
@@ -433,7 +436,9 @@ class PosePredictions:
                 sizes.append(np.zeros(len(o)))
                 continue
             moved = o.whitener @ by_setup[0] * (1.0 if factor is None else factor[:, None])
-            sizes.append(np.linalg.norm(np.matmul(moved, root[used]), axis=(1, 2)))
+            together = np.linalg.norm(np.matmul(moved, root[used]), axis=(1, 2))
+            most = np.linalg.norm(moved * alone[used][:, None], axis=(1, 2))
+            sizes.append(np.where(together > SMALLEST_EFFECT * most, together, 0.0))
         return sizes
 
     def _inputs_of(self, i: int, o: Observations) -> tuple[FloatArray | None, FloatArray | None]:

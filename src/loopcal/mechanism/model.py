@@ -352,6 +352,11 @@ class Mechanism(DrawnResult):
         return self.assembly.freedoms
 
     @property
+    def can_rotate(self) -> bool:
+        """Whether the platform can rotate."""
+        return not {0, 1, 2}.isdisjoint(self.program.freedoms)
+
+    @property
     def controlled(self) -> tuple[str, ...]:
         """Coordinates in which the machine is commanded."""
         return self.assembly.controlled

@@ -334,7 +334,7 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
             list_tilt_rings(loaded.nominal, int(rings[1]))
         except MechanismError:
             changes["poses"] = f"poses: [{rings[1]}]  # drawn from the workspace"
-    if "unused: [psi]" in text and not set(loaded.program.freedoms) & {0, 1, 2}:
+    if "unused: [psi]" in text and not loaded.can_rotate:
         changes["instruments"] = _keep_position(text)
     for key, content in changes.items():
         text = _replace_key(text, key, content)

@@ -21,7 +21,6 @@ import numpy as np
 import loopcal as lc
 from loopcal import geometry
 from loopcal.errors import DataError, EstimationError
-from loopcal.findings import report_finding
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.measurements import Measurements
@@ -160,7 +159,7 @@ def make_setup(case: StudyCase | None = None, seed: int = 0, leg_lengths: bool =
     The printed radians are whole degrees to their last digit. Without `leg_lengths` the errors of
     the leg lengths are zero.
 
-    Raises DataError: another robot states no tolerances, or reaches too few poses.
+    Raises DataError: another robot reaches too few poses.
     """
     case = case or StudyCase(PAPERS["hexapod-42"])
     robot, study = case.robot, case.load_study()
@@ -175,8 +174,6 @@ def make_setup(case: StudyCase | None = None, seed: int = 0, leg_lengths: bool =
         truth[find_places(robot)] += errors
     else:
         robot, truth = robot.nominal, sample_truth(robot, 1, seed)[0]
-        if np.array_equal(truth, robot.values):
-            raise DataError(report_finding("data.no-errors-drawn", robot=robot.name))
         (level,) = study.poses.values()
         coordinates = draw_reached(robot, robot.with_values(truth), level.count, seed)
     table = robot.parameters

@@ -156,7 +156,7 @@ class Design:
     @property
     def columns(self) -> tuple[str, ...]:
         """Coordinates that are measured: all, or x, y and z of a platform that cannot rotate."""
-        return COLUMNS if set(self.robot.program.freedoms) & {0, 1, 2} else COLUMNS[:3]
+        return COLUMNS if self.robot.can_rotate else COLUMNS[:3]
 
     @property
     def parts(self) -> tuple[int, ...]:
@@ -192,11 +192,6 @@ def adapt_design(case: StudyCase) -> Design:
         raise DataError(
             f"{robot.name} has {len(design.free)} free parameters; the study needs 2 or more, and "
             "a platform that moves or tilts"
-        )
-    if np.isnan(robot.parameters.tolerance).all():
-        raise DataError(
-            f"{robot.name} states no tolerances, so its machines have no errors to identify; add "
-            "`tolerances:` to its file"
         )
     return design
 

@@ -195,7 +195,7 @@ def score_poses(
     for when, (T, measured) in {"_before": nominal, "": tuple(fitted)}.items():
         tools = np.broadcast_to(T, truth.T.shape) @ robot.tool
         error = geometry.pose_difference(tools, truth.T @ robot.tool)
-        if all(freedom >= 3 for freedom in robot.program.freedoms):  # the platform cannot rotate
+        if not robot.can_rotate:
             error[..., :3] = np.nan
         if cell.content.scores.frame == "both":
             for name, part in PARTS.items():
