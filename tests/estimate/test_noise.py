@@ -101,6 +101,14 @@ def test_contradicted_sigmas_are_replaced_by_those_of_the_residuals(factor):
     assert test.sigma_scale**2 == pytest.approx(test.chi_square / 48.0)
 
 
+def test_computed_values_without_noise_keep_the_stated_sigma():
+    """Residuals of exactly zero would state no uncertainty, and divide by zero."""
+    data = hexapod_data(15)
+    fit = identify(hexapod(), scale_sigma(data, 1e4), LeastSquares())
+    assert fit.residual_test.sigma_scale == 1.0
+    assert "Intervals assume 1 times" in str(fit.residual_test.finding)
+
+
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
 def test_variance_of_map_is_the_sandwich(scale):
     """B (s^2 A'A + 1) B, and not s^2 B, for noise that is s times the stated one."""

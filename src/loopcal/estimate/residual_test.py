@@ -11,8 +11,8 @@ nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, G.4.2), to which the residuals a
 
 u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. Residuals that are larger or
 smaller than the stated noise explains contradict the stated sigma beyond doubt: then s is that of
-the residuals alone; an exact sigma is replaced by a larger one only. See
-docs/theory/uncertainty.md.
+the residuals alone. An exact sigma is replaced by a larger one only, and none by residuals without
+noise, such as those of computed values. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ that do not agree with the data.
 
 DOUBT = 1e-2
 """Probability below which a test does not accept either."""
+
+NO_NOISE = 1e-3
+"""Share of the stated noise up to which residuals (rms) are no noise, but computed values."""
 
 SIGMA_UNCERTAINTY = 0.25
 """Relative standard uncertainty of the stated sigmas, where nothing else is said: the reliability
@@ -187,12 +190,15 @@ def _estimate_scale(
 ) -> tuple[float, float]:
     """Return the factor on the stated sigmas, and its degrees of freedom; see the module."""
     stated = count_sigma_degrees(noise, uncertainty)
-    is_too_large = p_value > 1.0 - SIGNIFICANCE and np.isfinite(stated)
+    is_noise = degrees > 0 and unexplained > NO_NOISE**2 * degrees
+    is_too_large = p_value > 1.0 - SIGNIFICANCE and np.isfinite(stated) and is_noise
     if noise == "estimated" or p_value < SIGNIFICANCE or is_too_large:
         return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
     if weighted or degrees <= 0 or np.isinf(stated):
         return 1.0, stated
     total = stated + degrees
+    if not is_noise:
+        return 1.0, total
     return float(np.sqrt((stated + unexplained) / total)), total
 
 
