@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from evidence.starts import (
     DRAWS,
@@ -25,6 +25,7 @@ from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.directions import Direction
 from loopcal.measure.kinds.distance import Distance
 from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.setup_parameters import shorten_rotations
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -180,3 +181,22 @@ def test_trilateration_gives_both_sides_of_a_plane():
     assert_allclose(np.sort(found[:, 2]), [-0.7, 0.7], atol=1e-9)
     assert_allclose(found[:, :2], np.tile(centre[:2], (2, 1)), atol=1e-9)
     assert_allclose(offsets, 0.1, atol=1e-9)
+
+
+def test_rotations_of_a_start_are_at_most_half_a_turn():
+    """A descent may end one or more complete turns away, where the values say another angle."""
+    names = ["camera.rx", "camera.ry", "camera.rz", "camera.x", "plate.u", "plate.rx"]
+    rng = np.random.default_rng(4)
+    axis = rng.normal(size=(200, 3))
+    angle = rng.uniform(0.0, 20.0, 200)
+    axis *= (angle / np.linalg.norm(axis, axis=1))[:, None]
+    values = np.concatenate([axis, rng.normal(size=(200, 2)), np.full((200, 1), 6.0)], axis=1)
+    shortest = shorten_rotations(names, values)
+    assert np.linalg.norm(shortest[:, :3], axis=1).max() <= np.pi + 1e-12
+    assert_allclose(
+        geometry.exp_so3(shortest[:, :3]),
+        geometry.exp_so3(axis),
+        atol=1e-13,  # rounding of 20 rad
+    )
+    assert_array_equal(shortest[:, 3:], values[:, 3:])
+    assert_array_equal(shortest[angle <= np.pi], values[angle <= np.pi])

@@ -17,6 +17,7 @@ import numpy as np
 from loopcal.errors import DataError
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.setup_parameters import shorten_rotations
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
@@ -264,7 +265,10 @@ def _refine_candidates(
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
     refined, cost = minimize_from_starts(lambda x, which: whiten(x, sets[which]), candidates, steps)
-    return refined.reshape(t, k, -1), cost.reshape(t, k)
+    names = [parameter.name for parameter in kind.nuisance_parameters]
+    shortest = shorten_rotations(names, refined)
+    is_kept = ((shortest == refined) | ~known).all(axis=1, keepdims=True)
+    return np.where(is_kept, shortest, refined).reshape(t, k, -1), cost.reshape(t, k)
 
 
 def _collect_candidates(

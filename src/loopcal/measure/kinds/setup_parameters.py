@@ -86,6 +86,22 @@ def encode_rotation(stated: FloatArray, rotation: FloatArray) -> FloatArray:
     return geometry.log_so3(rotation @ stated.T)
 
 
+def shorten_rotations(names: Sequence[str], values: FloatArray) -> FloatArray:
+    """Return values (.., u) of parameters with given names in which each rotation vector has a
+    length of at most pi: `w (1 - 2 pi k / |w|)`, `k` the rounded number of complete turns.
+    """
+    shortest = values.copy()
+    for owner in {name.rpartition(".")[0] for name in names}:
+        axes = [f"{owner}.{axis}" for axis in ROTATION_AXES]
+        if set(axes) <= set(names):
+            places = [names.index(axis) for axis in axes]
+            angle = np.linalg.norm(values[..., places], axis=-1, keepdims=True)
+            turns = np.round(angle / (2.0 * np.pi))
+            turned = values[..., places] * (1.0 - 2.0 * np.pi * turns / np.maximum(angle, np.pi))
+            shortest[..., places] = np.where(turns > 0.0, turned, values[..., places])
+    return shortest
+
+
 def linearize_frame(values: FloatArray) -> FloatArray:
     """Return the derivative (.., 6, 6) of a frame's twist by its values (.., 6)."""
     return stack_diagonally(geometry.left_jacobian_so3(values[..., :3]), np.eye(3))
