@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal import geometry
 from loopcal.findings.wording import fill_template
-from loopcal.mechanism.solutions import inverse
 from loopcal.papers import published
 from loopcal.papers.hexapod_42 import steps
 from loopcal.papers.hexapod_42.steps import (
@@ -28,7 +26,7 @@ from loopcal.papers.hexapod_42.steps import (
 )
 from loopcal.papers.paper import StudyCase
 from loopcal.papers.published import decide
-from loopcal.studies.simulation.published_steps import list_raw_units
+from loopcal.studies.simulation.published_steps import integrate_errors, list_raw_units
 from loopcal.typing import BoolArray, FloatArray
 
 TEXT = published.PaperText(__file__)
@@ -44,28 +42,11 @@ RUNS = ("without noise", "without noise, one matrix throughout")
 
 # Limits of decisions; a number between the two of a pair decides nothing.
 UNITS = (1.0, 2.0)  # of the last digit: a second one can come from the rounding of other tables
-ROUNDING = 2.0  # rms differences over the rounding; numbers within one unit cannot exceed 3.5
-OF_NOISE = (1.3, 2.0)  # factor between the rms of 27 numbers and that of their noise: 3 sd are 1.3
 P_VALUES = (0.05, 0.001)
-EXPLAINED = (25.0, 50.0)  # % of the residuals of a leg; 0 for least squares, 84 expected for noise
-STANDARD_ERRORS = (4.0, 7.0)  # largest of six means of ten poses: 2 % and 0.04 % exceed these
 OF_RULE = ("converges", "threshold_noise", "noise_size")
 """Claims on what the rule of the paper leaves."""
 AS_GOOD = 1.1  # ratio of errors
 EXACT = 1e-6  # [mm] parameter error that steps without noise leave
-
-
-@dataclass(frozen=True, eq=False)
-class PrintedTables:
-    """What the printed tables say by themselves."""
-
-    comparisons: Mapping[str, published.Comparison]  # of Tables 2 to 6, by name
-    orders: list[published.Row]  # the best first
-    outliers: steps.Outliers
-    rounding: list[published.Row]
-    sizes: FloatArray  # (4,) of Tables 5 and 6, see `Level`
-    explained: FloatArray  # (6,) share of the residuals of Table 6 that parameters explain
-    noise: FloatArray  # (n, 6) [m, rad] that Tables 5 and 6 imply
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +59,8 @@ class Results:
     levels: Mapping[str, steps.Level]  # by noise of sizes.yaml
     methods: Mapping[str, Draws]  # by key of METHODS
     poses: list[published.Row]
-    tables: PrintedTables | None  # None for another robot
+    comparisons: Mapping[str, published.Comparison]  # of Tables 3 to 6; none of another robot
+    printed: FloatArray | None  # (4,) sizes of Tables 5 and 6, see `Level`; None of another robot
 
 
 def compute(
@@ -97,35 +79,13 @@ def compute(
     for name in (PRESUMED, STATED):
         drawn = steps.draw_measured_poses(setup, steps.list_noises()[name], seed)
         runs[name] = steps.iterate(setup, drawn)
-    tables = None
-    if setup.is_printed:
-        progress("Euler orders and outliers of Table 4")
-        tables = read_tables(setup, runs)
     progress("levels of noise")
     levels = steps.sweep_noise(setup, seed, trials)
     progress("methods and numbers of poses")
     methods = steps.compare_methods(setup, seed, trials)
-    return Results(setup, runs, levels, methods, steps.compare_poses(setup, seed, trials), tables)
-
-
-def read_tables(setup: Setup, runs: Mapping[str, steps.Iterations]) -> PrintedTables:
-    """Examine the printed tables, and put the computed ones beside them."""
-    measured, printed = PRINTED.table("table_4", "PP"), PRINTED.table("table_6", "after").values
-    good = np.array([label != ODD_POSE for label in measured.labels])
-    places, sd = measured.values / TO_PRINTED, steps.find_rounding(measured)
-    residual = printed / TO_PRINTED
-    parameters = PRINTED.table("table_5", "after").values * 1e-3
-    rms = [compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:], parameters)]
-    odd = steps.make_setup(leg_lengths=False).actual[~good]
-    return PrintedTables(
-        comparisons={c.name: c for c in _compare(setup, runs["exact"], runs[PRESUMED], odd)},
-        orders=steps.rank_euler_orders(setup, setup.poses[good], places[good], sd[good]),
-        outliers=steps.search_outliers(setup, measured),
-        rounding=steps.calibrate_from_print(setup, measured),
-        sizes=np.array([*rms, steps.integrate_errors(residual)]),
-        explained=steps.linearize_truth(setup).explain(setup.to_twists(residual, setup.actual)),
-        noise=steps.recover_noise(setup),
-    )
+    poses = steps.compare_poses(setup, seed, trials)
+    of_paper = (compare_printed(setup, runs), measure_printed()) if setup.is_printed else ({}, None)
+    return Results(setup, runs, levels, methods, poses, *of_paper)
 
 
 def count_printed() -> int:
@@ -133,49 +93,40 @@ def count_printed() -> int:
     return int(PRINTED.find("iterations", "value"))
 
 
+def measure_printed() -> FloatArray:
+    """Return the sizes (4,) of Tables 5 and 6, see `Level`."""
+    residual = PRINTED.table("table_6", "after").values / TO_PRINTED
+    parameters = PRINTED.table("table_5", "after").values * 1e-3
+    rms = [compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:], parameters)]
+    return np.array([*rms, integrate_errors(residual)])
+
+
 def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
-    """Return Tables 2 to 6, printed beside computed."""
-    return () if results.tables is None else tuple(results.tables.comparisons.values())
+    """Return Tables 3 to 6, printed beside computed."""
+    return tuple(results.comparisons.values())
 
 
-def _compare(
-    setup: Setup, exact: steps.Iterations, noisy: steps.Iterations, odd: FloatArray
-) -> tuple[published.Comparison, ...]:
-    used = count_printed()
-    robot, measured = setup.robot, PRINTED.table("table_4", "PP")
-    errors = setup.truth.values - noisy.values
-    places = find_places(robot)
+def compare_printed(
+    setup: Setup, runs: Mapping[str, steps.Iterations]
+) -> dict[str, published.Comparison]:
+    """Return Tables 3 to 6 beside the computed numbers, by name."""
+    used, robot, exact, noisy = count_printed(), setup.robot, runs["exact"], runs[PRESUMED]
+    errors, places = setup.truth.values - noisy.values, find_places(robot)
     before, after = errors[0][places] / MM, errors[used][places] / (1e-3 * MM)
-    first = (setup.actual - setup.poses) * TO_PRINTED
     identified = (exact.values[used + 1] - robot.values)[places] / MM
-    printed_row = published.Printed({ODD_POSE: measured.rows[ODD_POSE]})
     noise, six = _describe_noise(PRESUMED), PRINTED.table("table_6", "before")
+    first, unit = (setup.actual - setup.poses) * TO_PRINTED, PRINTED.table("table_4", "PP").unit
     compare, printed = TEXT.compare, PRINTED.table
-    return (
-        compare("table_2", printed("table_2"), make_symmetric(setup)),
+    compared = (
         compare("table_3", printed("table_3"), identified, iterations=used + 1),
         _compare_table_4(setup),
-        compare("table_4_a2", printed_row, odd * TO_PRINTED),
         compare("table_5_before", printed("table_5", "before"), before),
         compare("table_5_after", printed("table_5", "after"), after, noise=noise),
-        compare("table_6_before", six, first, np.maximum(six.unit, measured.unit)),
+        compare("table_6_before", six, first, np.maximum(six.unit, unit)),
         compare("table_6_after", printed("table_6", "after"), noisy.pose_errors[used] * TO_PRINTED,
                 noise=noise),
     )  # fmt: skip
-
-
-def make_symmetric(setup: Setup) -> FloatArray:
-    """Return Table 2 (6, 7) [mm] of a hexapod with threefold symmetry, from its first two legs."""
-    robot, printed = setup.robot, PRINTED.table("table_2").values
-    table = printed.copy()
-    for leg, (source, angle) in enumerate(((0, 0), (1, 0), (0, 120), (1, 120), (0, 240), (1, 240))):
-        turn = geometry.rotation_about_axis(np.deg2rad(angle), 2)
-        for part in (slice(0, 3), slice(4, 7)):
-            table[leg, part] = turn @ printed[source, part]
-    place = steps.PARAMETERS.index("length")
-    length = robot.values[find_places(robot)[:, place]] + inverse(robot, robot.home[None]).q[0]
-    table[:, place] = length / MM
-    return table
+    return {comparison.name: comparison for comparison in compared}
 
 
 def _compare_table_4(setup: Setup) -> published.Comparison:
@@ -207,7 +158,7 @@ def list_replaced(results: Results) -> tuple[str, ...]:
 
 def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return the tables beyond those of the paper."""
-    setup, tables, levels = results.setup, results.tables, results.levels
+    setup, printed, levels = results.setup, results.printed, results.levels
     runs, trials, count = results.runs.values(), len(levels[STATED].needed), len(setup.poses)
     rule = {"threshold": setup.epsilon, "limit": SIZES.find("iterations"), "count": count}
     states = zip(*(run.integrated for run in runs), strict=True)
@@ -217,11 +168,11 @@ def make_tables(results: Results) -> tuple[published.Table, ...]:
     noise = []
     for level in levels.values():
         met = f"{np.isfinite(level.needed).sum()} of {len(level.needed)}"
-        p_value = () if tables is None else (level.test(tables.sizes),)
+        p_value = () if printed is None else (level.test(printed),)
         noise.append(("computed, median over draws", *level.limits, *level.median, met, *p_value))
-    if tables is not None:
-        noise.insert(0, ("published, Tables 5 and 6", None, None, *tables.sizes, None, None))
-    of_published = () if tables is None else (("p-value of the published sizes", ".2g"),)
+    if printed is not None:
+        noise.insert(0, ("published, Tables 5 and 6", None, None, *printed, None, None))
+    of_published = () if printed is None else (("p-value of the published sizes", ".2g"),)
     places = [
         (f"position error, rms over draws, poses {name} [mm]", ".2g")
         for name in steps.list_places(setup)
@@ -232,29 +183,13 @@ def make_tables(results: Results) -> tuple[published.Table, ...]:
         TEXT.table("figure_4", figure_4, "", (), presumed=_describe_noise(PRESUMED),
                    stated=_describe_noise(STATED), **rule),
         TEXT.table("conditions", conditions, count=count),
-        *(_make_own_tables(results) if tables is None else _make_printed_tables(tables)),
+        *(() if setup.is_printed else _make_own_tables(results)),
         TEXT.table("noise", noise, "", of_published, **rule),
         TEXT.table("methods", methods, "", places, limits=levels[STATED].limits, trials=trials,
                    unmeasured=SIZES.find("unmeasured"), count=count),
         TEXT.table("poses", results.poses, trials=trials, before=before, wide=SIZES.find("wide"),
-                   printed=tables and (setup.poses.max(axis=0) * TO_PRINTED).tolist(),
+                   printed=setup.is_printed and (setup.poses.max(axis=0) * TO_PRINTED).tolist(),
                    tilt=np.rad2deg(setup.poses[:, 3:].max())),
-    )  # fmt: skip
-
-
-def _make_printed_tables(tables: PrintedTables) -> tuple[published.Table, ...]:
-    """Return what the tables of the paper say by themselves."""
-    formula = steps.write_rotation(PRINTED.find("rotation", "order"))
-    orders = [
-        (o["formula"], i, o["position"], o["rotation"], o["rounding"], o["formula"] == formula)
-        for i, o in enumerate(tables.orders, 1)
-    ]
-    labels, first, last = tables.outliers
-    return (
-        TEXT.table("euler_orders", orders),
-        TEXT.table("outliers", [(*fit.values(), fit["label"] in labels) for fit in first],
-                   largest=max(fit["drop"] for fit in last)),
-        TEXT.table("rounding", tables.rounding, rotation=steps.write_rotation(steps.ORDER)),
     )  # fmt: skip
 
 
@@ -305,7 +240,7 @@ def _draw_figure_4(results: Results) -> published.Figure:
     ]
     levels = {f"rule {threshold:g}": threshold}
     return TEXT.figure("figure_4", lines, levels, threshold=threshold, count=count,
-                       iterations=count_printed(), tables=results.tables)  # fmt: skip
+                       iterations=count_printed(), tables=results.setup.is_printed)  # fmt: skip
 
 
 def _draw_noise(results: Results) -> published.Figure:
@@ -322,12 +257,11 @@ def _draw_noise(results: Results) -> published.Figure:
         for label, (i, _) in places.items()
     ]
     marks = {}
-    if results.tables is not None:
-        sizes = results.tables.sizes
+    if (sizes := results.printed) is not None:
         marks = {f"{k}, published in Table {n}": float(sizes[i]) for k, (i, n) in places.items()}
     marks["parameter error before calibration"] = results.methods["before"].rms["parameters"]
     stated, trials = results.levels[STATED].limits[0], len(levels[0].needed)
-    return TEXT.figure("noise", lines, marks, trials=trials, noise=stated, tables=results.tables,
+    return TEXT.figure("noise", lines, marks, trials=trials, noise=stated, tables=sizes is not None,
                        presumed=results.levels[PRESUMED].limits[0])  # fmt: skip
 
 
@@ -335,11 +269,10 @@ def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim; those on the printed tables belong to their machine, and
     `OF_RULE` to the paper's rule.
     """
-    tables = results.tables
+    printed = results.printed
     verdicts = (
-        *(() if tables is None else _judge_tables(tables)),
+        *(() if printed is None else (_judge_table_4(results), _judge_noise(results, printed))),
         *_judge_steps(results),
-        *(() if tables is None else _judge_noise(results, tables)),
         *_judge_methods(results),
     )
     is_rule = results.setup.epsilon == PRINTED.number("threshold", "value")
@@ -350,51 +283,15 @@ def _count(values: BoolArray) -> int:
     return int(values.sum())
 
 
-def _decide(value: float, limits: tuple[float, float]) -> bool | None:
-    """Return whether a value is up to the first limit; False beyond the second."""
-    return decide(value <= limits[0], value > limits[1])
-
-
-def _count_units(comparison: published.Comparison, rows: BoolArray | slice = slice(None)) -> float:
-    """Return the largest difference in units of the last digit."""
-    difference = abs(comparison.difference) / comparison.step
-    return float(difference[rows].max()) / (1.0 + published.ROUNDING)
-
-
-def _judge_tables(tables: PrintedTables) -> tuple[published.Verdict, ...]:
-    """Judge Tables 2 and 4."""
-    judge, (best, second, *_) = TEXT.judge, tables.orders
-    printed = steps.write_rotation(PRINTED.find("rotation", "order"))
-    stated = next(order for order in tables.orders if order["formula"] == printed)
-    fits = [o["formula"] for o in tables.orders if o["rounding"] <= ROUNDING]
-    symmetric, fourth, odd = (tables.comparisons[n] for n in ("table_2", "table_4", "table_4_a2"))
-    labels = fourth.published.labels
-    is_actual = np.array([not label.endswith("PT") for label in labels])
-    is_odd = np.array([label.startswith(f"{ODD_POSE} ") for label in labels])
-    good, bad = fourth.within[is_actual & ~is_odd], fourth.within[is_actual & is_odd]
-    without = next(fit for fit in tables.outliers.first if fit["label"] == ODD_POSE)
-    units, named = _count_units(fourth, is_actual & is_odd), tables.outliers.labels
-    rms = PRINTED.number("noise", "value") / np.sqrt(3.0)
-    rounded = compute_rms(steps.find_rounding(PRINTED.table("table_4", "PP"))[:, :3] / MM)
-    factor = best["position"] / np.hypot(rms, rounded)
-    short = ("before", "as printed", "row corrected", "without row", "in full", "weighted", "prior")
-    errors = {name: row["error"] for name, row in zip(short, tables.rounding, strict=True)}
-    tried = [errors[name] for name in short[1:4]]
-    return (
-        judge("symmetric", _decide(_count_units(symmetric), UNITS), table=symmetric,
-              differing=_count(~symmetric.within)),
-        judge("rotation", decide(fits == [printed], bool(fits) and printed not in fits),
-              printed=printed, count=len(tables.orders), best=best, second=second, stated=stated),
-        judge("table_4", _decide(_count_units(fourth, is_actual & ~is_odd), UNITS), row=ODD_POSE,
-              agreeing=_count(good), count=good.size),
-        judge("odd_row", decide(units <= UNITS[0], units > UNITS[1] and ODD_POSE in named),
-              row=ODD_POSE, differing=_count(~bad), count=bad.size, without=without,
-              agreeing_odd=_count(odd.within), size=odd.within.size, named=named or ("no pose",)),
-        judge("table_4_noise", _decide(max(factor, 1.0 / factor), OF_NOISE), best=best, stated=rms,
-              noise=PRINTED.number("noise", "value")),
-        judge("rounding", decide(max(tried) < errors["before"], min(tried) >= errors["before"]),
-              row=ODD_POSE, errors=errors),
-    )  # fmt: skip
+def _judge_table_4(results: Results) -> published.Verdict:
+    """Judge the actual poses of Table 4, by the largest difference in units of the last digit."""
+    fourth = results.comparisons["table_4"]
+    rows = np.array([not x.endswith("PT") and x.split()[0] != ODD_POSE
+                     for x in fourth.published.labels])  # fmt: skip
+    units = (abs(fourth.difference) / fourth.step)[rows].max() / (1.0 + published.ROUNDING)
+    good = fourth.within[rows]
+    return TEXT.judge("table_4", decide(units <= UNITS[0], units > UNITS[1]), row=ODD_POSE,
+                      agreeing=_count(good), count=good.size)  # fmt: skip
 
 
 def _judge_steps(results: Results) -> tuple[published.Verdict, ...]:
@@ -422,33 +319,15 @@ def _judge_steps(results: Results) -> tuple[published.Verdict, ...]:
     )  # fmt: skip
 
 
-def _judge_noise(results: Results, tables: PrintedTables) -> tuple[published.Verdict, ...]:
-    """Judge the origin of Tables 5 and 6."""
-    levels, sizes, judge = results.levels, tables.sizes, TEXT.judge
-    stated, p_values = levels[STATED], {k: level.test(sizes) for k, level in levels.items()}
+def _judge_noise(results: Results, printed: FloatArray) -> published.Verdict:
+    """Judge the noise of Tables 5 and 6 by their sizes (4,)."""
+    levels = results.levels
+    stated, p_values = levels[STATED], {k: level.test(printed) for k, level in levels.items()}
     holding = [k for k, p in p_values.items() if p >= P_VALUES[0]]
     agrees = decide(holding == [STATED], p_values[STATED] < P_VALUES[1])
-    explained, before = 100.0 * tables.explained, tables.comparisons["table_6_before"]
-    is_good = np.array([label != ODD_POSE for label in before.published.labels])
-    as_rad, as_mrad = (
-        _count(before.agrees_with(factor * before.computed)[is_good, 3:]) for factor in (1.0, 1e3)
-    )
-    noise, presumed = tables.noise * TO_PRINTED, levels[PRESUMED].limits[0]
-    mean, scatter = noise.mean(axis=0), noise.std(axis=0, ddof=1)
-    offset = (np.abs(mean) * np.sqrt(len(noise)) / scatter).max()
-    lengths, angles = (", ".join(f"{x:.1e}" for x in part) for part in (mean[:3], mean[3:]))
     names = ["+-{:g} mm with +-{:g} rad".format(*levels[k].limits) for k in holding]
-    return (
-        judge("noise_size", agrees, printed=sizes, noise=PRINTED.number("noise", "value"),
-              holding=names, stated=stated.median),
-        judge("residuals", _decide(explained.max(), EXPLAINED), least=explained.min(),
-              most=explained.max(), random=100.0 * np.sqrt(0.7)),
-        judge("milliradians", decide(as_mrad > as_rad, as_rad > as_mrad), as_rad=as_rad,
-              as_mrad=as_mrad, count=3 * _count(is_good), row=ODD_POSE),
-        judge("mean_noise", _decide(offset, STANDARD_ERRORS), offset=offset, lengths=lengths,
-              angles=angles, scatter_mm=scatter[:3].max(), scatter_rad=scatter[3:].max(),
-              limit=presumed, limit_sd=presumed / np.sqrt(3.0)),
-    )  # fmt: skip
+    return TEXT.judge("noise_size", agrees, printed=printed, holding=names, stated=stated.median,
+                      noise=PRINTED.number("noise", "value"))  # fmt: skip
 
 
 def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ten steps of the paper's section 5 (docs/papers/hexapod-42.md), repeated with other noises,
-methods and poses, and the origin of its Table 4.
+methods and poses.
 
 Least squares is `identify_per_leg`, one step at a time, every equation of weight one and every
 parameter of scale one. Poses are (x, y, z, alpha, beta, gamma) [m, rad] in the paper's order.
@@ -13,8 +13,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import permutations
-from typing import NamedTuple
 
 import numpy as np
 
@@ -30,9 +28,9 @@ from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.numerics.statistics import compute_chi_square_quantile, compute_f_tail
+from loopcal.numerics.statistics import compute_f_tail
 from loopcal.papers.paper import PAPERS, StudyCase
-from loopcal.papers.published import PaperFile, Printed, Row
+from loopcal.papers.published import PaperFile, Row
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
 from loopcal.studies.simulation.published_steps import (
     MM,
@@ -46,18 +44,15 @@ from loopcal.studies.specification.study import Study
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS, Dimension
 
-TO_SI, TO_PRINTED = np.array([MM] * 3 + [1.0] * 3), np.array([1.0 / MM] * 3 + [1.0] * 3)
-"""From the units of Tables 4 and 6 to [m, rad], and from [m, rad] to them."""
+TO_PRINTED = np.array([1.0 / MM] * 3 + [1.0] * 3)
+"""From [m, rad] to the units of Tables 4 and 6."""
 PARAMETERS = ("base.x", "base.y", "base.z", "length", "platform.x", "platform.y", "platform.z")
 """Our names for the columns of Tables 2, 3 and 5."""
 ODD_POSE = "A2"
-"""The row of Table 4 that belongs to another machine; the outlier search finds it by itself."""
+"""The row of Table 4 that belongs to another machine."""
 ORDER = "xyz"
-"""R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made. Equation (2) differs, see
-`rank_euler_orders`.
-"""
+"""R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made; equation (2) differs."""
 ANGLES = geometry.parse_orientation(f"euler-{ORDER}")
-GREEK = ("alpha", "beta", "gamma")
 
 STATED, PRESUMED = "stated", "presumed"
 """Noises of sizes.yaml: that of the paper, and that with which its Tables 5 and 6 agree, as the
@@ -152,12 +147,11 @@ class Setup:
         return cell
 
 
-def make_setup(case: StudyCase | None = None, seed: int = 0, leg_lengths: bool = True) -> Setup:
+def make_setup(case: StudyCase | None = None, seed: int = 0) -> Setup:
     """Return the hexapod of Tables 2 and 3 at the nominal poses of Table 4, or another robot with
     drawn errors at drawn poses.
 
-    The printed radians are whole degrees to their last digit. Without `leg_lengths` the errors of
-    the leg lengths are zero.
+    The printed radians are whole degrees to their last digit.
 
     Raises DataError: another robot reaches too few poses.
     """
@@ -166,12 +160,10 @@ def make_setup(case: StudyCase | None = None, seed: int = 0, leg_lengths: bool =
     epsilon = case.epsilon or PRINTED.number("threshold", "value")
     if robot is None:
         robot = lc.load_robot("hexapod-42")
-        errors = PRINTED.table("table_3").values * MM
-        errors[:, PARAMETERS.index("length")] *= leg_lengths
         coordinates = PRINTED.table("table_4", "PT").values / TO_PRINTED
         coordinates[:, 3:] = np.deg2rad(np.round(np.rad2deg(coordinates[:, 3:])))
         truth = robot.parameters.nominal.copy()
-        truth[find_places(robot)] += errors
+        truth[find_places(robot)] += PRINTED.table("table_3").values * MM
     else:
         robot, truth = robot.nominal, sample_truth(robot, 1, seed)[0]
         (level,) = study.poses.values()
@@ -467,142 +459,3 @@ def draw_poses(setup: Setup, place: str, n: int, seed: int) -> FloatArray:
     if place == WIDE:
         low, high = np.array(SIZES.find("wide")) * np.array([MM] * 3 + [np.pi / 180.0] * 3)
     return stream.uniform(low, high, (n, 6))
-
-
-def recover_noise(setup: Setup) -> FloatArray:
-    """Return the noise (n, 6) [m, rad] that Tables 5 and 6 together imply.
-
-    residual = noise + D (true - corrected parameters), with D the change of the coordinates.
-    """
-    D = linearize_truth(setup).D
-    rates = ANGLES.rates_inverse(setup.actual[:, 3:])
-    by_coordinates = np.concatenate([D[:, 3:], rates @ D[:, :3]], axis=1)
-    errors = np.zeros(len(setup.robot.parameters))
-    errors[find_places(setup.robot)] = PRINTED.table("table_5", "after").values * 1e-3 * MM
-    return PRINTED.table("table_6", "after").values / TO_PRINTED - by_coordinates @ errors
-
-
-def linearize_truth(setup: Setup) -> LegForm:
-    """Return the matrices at the machine with errors."""
-    return LegForm.at(setup.truth, forward(setup.truth, setup.commanded.q, setup.commanded))
-
-
-def write_rotation(order: str, angles: tuple[int, ...] = (0, 1, 2)) -> str:
-    """Return the product R of an Euler order whose angles are those of GREEK at these places.
-
-    Examples
-    --------
-    >>> write_rotation("ZYX")
-    'Rz(alpha) Ry(beta) Rx(gamma)'
-    >>> write_rotation("xyz")
-    'Rz(gamma) Ry(beta) Rx(alpha)'
-    """
-    turns = [f"R{axis.lower()}({GREEK[place]})" for axis, place in zip(order, angles, strict=True)]
-    return " ".join(reversed(turns) if order.islower() else turns)
-
-
-def rank_euler_orders(
-    setup: Setup, nominal: FloatArray, measured: FloatArray, sd: FloatArray
-) -> list[Row]:
-    """Return the rms differences [mm, rad] of all products, the best first: 12 sequences of axes,
-    angles in any order.
-
-    setup : machines of Tables 2 and 3. nominal, measured : (n, 6) poses of Table 4 [m, rad]. sd :
-    (n, 6) of their rounding; "rounding" is the rms of position differences over it.
-    """
-    orders = []
-    for order in (name for name in geometry.EULER_ORDERS if name.islower()):
-        for angles in permutations(range(3)):
-            wanted, printed = (
-                geometry.make_pose(
-                    geometry.euler_to_matrix(poses[:, 3:][:, angles], order), poses[:, :3]
-                )
-                for poses in (nominal, measured)
-            )
-            commanded = inverse(setup.robot, wanted)
-            reached = forward(setup.truth, commanded.q, commanded).T
-            change = geometry.pose_difference(reached, printed)
-            orders.append(
-                {"formula": write_rotation(order, angles),
-                 "position": compute_rms(change[:, 3:] / MM),
-                 "rotation": compute_rms(change[:, :3]),
-                 "rounding": compute_rms(change[:, 3:] / sd[:, :3])}
-            )  # fmt: skip
-    return sorted(orders, key=lambda order: order["position"])
-
-
-class Outliers(NamedTuple):
-    """Labels of outliers in the order of their removal, and the fits without each pose before the
-    first removal and after the last.
-    """
-
-    labels: list[str]
-    first: list[Row]
-    last: list[Row]
-
-
-def find_rounding(printed: Printed) -> FloatArray:
-    """Return the standard deviations (n, 6) [m, rad] of the rounding of printed poses."""
-    return printed.unit * TO_SI / np.sqrt(12.0)
-
-
-def search_outliers(setup: Setup, printed: Printed) -> Outliers:
-    """Name measured poses of Table 4 that the others contradict, without the errors of Table 3.
-
-    Removing a pose lowers the chi-square of a least-squares fit (all legs, weighted by the rounding
-    of each printed number) by a chi-square of its 6 equations if it belongs to the same machine.
-    The pose with the largest drop is removed while that drop is too large.
-    """
-    data = to_measurements(setup, printed.values / TO_PRINTED, find_rounding(printed))
-    method, keep = lc.LeastSquares(), np.arange(len(printed.rows))
-    labels, rounds = [], []
-    while True:
-        whole = lc.identify(setup.robot, data.take(keep), method).chi_square
-        fits = []
-        for pose in keep:
-            test = lc.identify(setup.robot, data.take(keep[keep != pose]), method).residual_test
-            fits.append(
-                {"label": data.labels[pose], "chi_square": test.chi_square, "degrees": test.degrees,
-                 "p_value": test.p_value, "drop": whole - test.chi_square}
-            )  # fmt: skip
-        rounds.append(fits)
-        worst = max(range(len(keep)), key=lambda i: fits[i]["drop"])
-        level = SIZES.find("outlier_level") / len(keep)
-        largest = float(compute_chi_square_quantile(6, level))
-        if fits[worst]["drop"] <= largest or fits[worst]["degrees"] < 6:
-            return Outliers(labels, rounds[0], rounds[-1])
-        labels.append(fits[worst]["label"])
-        keep = np.delete(keep, worst)
-
-
-def calibrate_from_print(setup: Setup, printed: Printed) -> list[Row]:
-    """Return number of poses and rms parameter error [mm] of calibrations from Table 4 itself: as
-    printed, with row A2 corrected, without it, unrounded, and with all legs weighted.
-    """
-    actual, odd = setup.actual, printed.labels.index(ODD_POSE)
-    measured, unit = printed.values / TO_PRINTED, printed.unit[odd - 1] * TO_SI
-    repaired = measured.copy()
-    repaired[odd] = np.round(actual[odd] / unit) * unit
-    keep = np.arange(len(measured)) != odd
-    nine = replace(setup, coordinates=setup.coordinates[keep])
-    made: list[tuple[str, int | None, FloatArray]] = [("not calibrated", None, setup.robot.values)]
-    for name, other, poses in (
-        ("Table 4 as printed", setup, measured),
-        ("row A2 computed, rounded as row A1", setup, repaired),
-        ("without row A2", nine, measured[keep]),
-        ("computed poses in full", setup, actual),
-    ):
-        made.append((name, len(poses), iterate(other, poses).values[-1]))
-    data = to_measurements(nine, measured[keep], find_rounding(printed)[keep])
-    for name, method in (
-        ("least squares", lc.LeastSquares()),
-        ("tolerances as prior (MAP)", lc.MAP()),
-    ):
-        title = f"without row A2, all legs weighted by the rounding, {name}"
-        made.append(
-            (title, len(nine.coordinates), lc.identify(setup.robot, data, method).robot.values)
-        )
-    return [
-        {"name": name, "number": n, "error": compute_rms(v - setup.truth.values) / MM}
-        for name, n, v in made
-    ]

@@ -350,18 +350,6 @@ class LegForm:
             change[members] = np.linalg.lstsq(self.G[:, leg, members], lengths[:, leg])[0]
         return change
 
-    def explain(self, twists: FloatArray) -> FloatArray:
-        """Return the share (6,) of each leg's length changes that parameters could explain.
-
-        It is the ratio of norms, and 0 for residuals of least squares.
-        """
-        lengths, shares = self.compute_lengths(twists), []
-        for leg, members in enumerate(self.members):
-            q, _ = np.linalg.qr(self.G[:, leg, members])
-            explained = np.linalg.norm(q.T @ lengths[:, leg])
-            shares.append(float(explained / np.linalg.norm(lengths[:, leg])))
-        return np.array(shares)
-
     def count_legs(self) -> IntArray:
         """Return the number (p,) of legs that each free parameter moves."""
         return np.bincount(np.concatenate(self.members), minlength=self.G.shape[2])
