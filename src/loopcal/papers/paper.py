@@ -12,7 +12,6 @@ replaces) yield what a page shows.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -35,9 +34,6 @@ if TYPE_CHECKING:
 
 TRIALS = 50
 """Drawings of noise behind each statistical number, unless more are asked for."""
-
-ANY_ERRORS = "errors: [1]  # normal errors, in tolerances of the robot file"
-"""In place of errors that are those of one robot."""
 
 
 @dataclass(frozen=True)
@@ -302,79 +298,64 @@ class PaperStudyFile:
 
 
 def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> PaperStudyFile:
-    """Return the study file of a paper, for its robot or for another one.
-
-    Another robot gets as many poses of its own workspace in place of a file of poses (three more
-    than its parameters need by the count of equations, at least), and of rings that it does not
-    reach, errors by its tolerances in place of the errors of one machine, as many
-    directions of truncated SVD as it has parameters, and no angles that it does not have.
-    """
-    from loopcal.io.core.yaml_file import quote_scalar
-    from loopcal.studies.files.study_file import quote_robot
+    """Return the study file of a paper, for its robot or for another one, see `adapt_content`."""
+    from loopcal.io.core.yaml_file import format_yaml, parse_yaml, quote_scalar
+    from loopcal.studies.files.study_file import name_robot
 
     first = next(iter(paper.studies))
     wanted = first if robot is None else robot
     text = paper.read_file(paper.studies.get(wanted, paper.studies[first]))
-    file = re.search(r"^  .*\{file: ([\w.]+)\}$", text, re.MULTILINE)
-    poses = "" if file is None else paper.read_file(file[1])
+    content = parse_yaml(text, path, "study file").content
+    (poses,) = content["poses"].values()
+    file = poses.get("file", "")
+    table = paper.read_file(file) if file else ""
     if wanted in paper.studies:
-        if file is None:
+        if not file:
             return PaperStudyFile({path: text}, wanted)
         beside = path.with_name(f"{path.stem}-poses.csv")
-        text = text.replace(f"{{file: {file[1]}}}", f"{{file: {quote_scalar(beside.name)}}}")
-        return PaperStudyFile({path: text, beside: poses}, wanted)
-    changes, loaded = {"robots": f"robots: [{quote_robot(path, wanted)}]"}, load_robot(wanted)
-    if file is not None:
-        count = max(len(poses.splitlines()) - 1, -(-int(loaded.parameters.free.sum()) // 6) + 3)
-        changes["poses"] = f"poses: [{count}]  # drawn from the workspace"
-    if re.search(r"^ +deviations:", text, re.MULTILINE):
-        changes["errors"] = ANY_ERRORS
-    if (rings := re.search(r"count: (\d+), choice: tilts", text)) is not None:
-        try:
-            list_tilt_rings(loaded.nominal, int(rings[1]))
-        except MechanismError:
-            changes["poses"] = f"poses: [{rings[1]}]  # drawn from the workspace"
-    if "unused: [psi]" in text and not loaded.can_rotate:
-        changes["instruments"] = _keep_position(text)
-    for key, content in changes.items():
-        text = _replace_key(text, key, content)
-    text = _list_directions(text, len(select_free_parameters(loaded)))
-    title = quote_scalar(f"{paper.name} with {loaded.name}")
-    text = re.sub(r"^title: .*$", lambda _: f"title: {title}", text, flags=re.MULTILINE)
-    # a factor of tolerances is no size of the paper
-    text = re.sub(
-        r"^  [^:\n]+: (\{tolerance_factor: ([\d.]+)\})$",
-        lambda found: f"  {found[2]} tolerance{'s' * (found[2] != '1')}: {found[1]}",
-        text,
-        flags=re.MULTILINE,
-    )
-    return PaperStudyFile({path: text}, wanted)
+        text = text.replace(f"{{file: {file}}}", f"{{file: {quote_scalar(beside.name)}}}")
+        return PaperStudyFile({path: text, beside: table}, wanted)
+    other = load_robot(wanted)
+    content |= {"title": f"{paper.name} with {other.name}", "robots": [name_robot(path, wanted)]}
+    content |= adapt_content(content, other, max(len(table.splitlines()) - 1, 0))
+    head = text[: text.index("format:")]
+    return PaperStudyFile({path: head + format_yaml(content)}, wanted)
 
 
-def _keep_position(text: str) -> str:
-    """Return the instruments of a study file without angles, for a platform that cannot rotate."""
-    found = re.search(r"(distribution: \w+, sigma_position: [^,}\n]+)", text)
-    assert found is not None
-    return f"instruments:\n  3-DOF: {{kinds: [component], components: [x, y, z], {found[1]}}}"
+def adapt_content(content: Mapping[str, Any], robot: Mechanism, listed: int) -> dict[str, Any]:
+    """Return the keys of a study file of a paper that differ for another robot.
 
-
-def _list_directions(text: str, parameters: int) -> str:
-    """Return the text of a study file in which truncated SVD keeps each number of directions from
-    one fewer than the parameters to 1, if it lists such numbers.
+    It gets as many poses of its own workspace in place of those `listed` in a file (three more than
+    its parameters need by the count of equations, at least), and of rings that it does not reach,
+    errors by its tolerances in place of the errors of one machine, as many directions of
+    truncated SVD as it has parameters, and no angles that it does not have.
     """
-    listed = re.compile(r"(?:^  [^:\n]*\d+: \{[^\n]*keep: \d+\}\n)+", re.MULTILINE)
-
-    def list_all(found: re.Match[str]) -> str:
-        line = found[0].splitlines(keepends=True)[0]
-        numbers = range(parameters - 1, 0, -1)
-        return "".join(re.sub(r"\d+(?=: \{|\})", str(number), line) for number in numbers)
-
-    return listed.sub(list_all, text)
-
-
-def _replace_key(text: str, key: str, content: str) -> str:
-    """Return the text of a study file in which one key, with the comment above it, is replaced."""
-    pattern = rf"(?:^#[^\n]*\n)*^{key}:[^\n]*\n(?:^[ ][^\n]*\n)*"
-    changed, count = re.subn(pattern, lambda _: f"{content}\n", text, flags=re.MULTILINE)
-    assert count == 1, key
+    changed = dict[str, Any]()
+    (poses,) = content["poses"].values()
+    if listed:
+        changed["poses"] = [max(listed, -(-int(robot.parameters.free.sum()) // 6) + 3)]
+    elif poses["choice"] == "tilts":
+        try:
+            list_tilt_rings(robot.nominal, poses["count"])
+        except MechanismError:
+            changed["poses"] = [poses["count"]]
+    errors: Mapping[str, Mapping[str, Any]] = content["errors"]
+    if any("deviations" in level for level in errors.values()):
+        changed["errors"] = [1]
+    elif all("tolerance_factor" in level for level in errors.values()):  # is no size of the paper
+        sizes = [level["tolerance_factor"] for level in errors.values()]
+        changed["errors"] = {
+            f"{x} tolerance{'s' * (x != 1)}": {"tolerance_factor": x} for x in sizes
+        }
+    (level, *others) = content["instruments"].values()
+    if any("unused" in other for other in others) and not robot.can_rotate:
+        position = {key: level[key] for key in ("kinds", "distribution", "sigma_position")}
+        changed["instruments"] = {"3-DOF": position | {"components": ["x", "y", "z"]}}
+    methods: Mapping[str, Mapping[str, Any]] = content["methods"]
+    kept = {name: level for name, level in methods.items() if "keep" in level}
+    if kept:
+        (name, level), count = next(iter(kept.items())), len(select_free_parameters(robot))
+        every = {name.replace(str(level["keep"]), str(k)): {**level, "keep": k}
+                 for k in range(count - 1, 0, -1)}  # fmt: skip
+        changed["methods"] = {n: m for n, m in methods.items() if n not in kept} | every
     return changed

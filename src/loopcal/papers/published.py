@@ -160,19 +160,10 @@ class Comparison:
     @cached_property
     def within(self) -> BoolArray:
         """(r, c) which numbers agree."""
-        return self.agrees_with(self.computed)
-
-    def agrees_with(self, numbers: FloatArray) -> BoolArray:
-        """Return which of other computed numbers (r, c) agree with the published ones."""
-        return np.abs(numbers - self.published.values) <= self.step * (1.0 + ROUNDING)
-
-    @property
-    def largest(self) -> float:
-        """Largest difference, in the units of the table (which must have one)."""
-        return float(np.abs(self.difference).max())
+        return np.abs(self.difference) <= self.step * (1.0 + ROUNDING)
 
     def table(self) -> Table:
-        """One row for each number."""
+        """One row for each number, of which a page shows those that differ by more than a unit."""
         numbers = (self.computed, self.difference, self.step, self.within)
         rows = [
             (label, column, printed, *(array[i, j].item() for array in numbers))
@@ -182,24 +173,8 @@ class Comparison:
         columns = ("row", "column", "published", "computed", "difference",
                    "unit of the last digit", "within one unit")  # fmt: skip
         formats = ("", "", "", ".9g", ".2g", ".0e", "")
-        return Table(self.name, self.title, columns, tuple(rows), formats, self.note)
-
-    def side_by_side(self) -> Table:
-        """The layout of the paper, three lines a row: published, computed, and the difference, in
-        bold if it is too large.
-        """
-        lines: list[tuple[Cell, ...]] = []
-        for i, (label, texts) in enumerate(self.published.rows.items()):
-            computed = []  # as the printed ones are written, with one digit more
-            for value, text in zip(self.computed[i], texts, strict=True):
-                digits = max(1 - round(float(np.log10(last_digit(text)))), 1)
-                computed.append(f"{value:.3e}" if "E" in text.upper() else f"{value:.{digits}f}")
-            shown = (f"{d:.1e}" if d else "0" for d in self.difference[i])
-            marked = (d if ok else f"**{d}**" for d, ok in zip(shown, self.within[i], strict=True))
-            lines += [(label, "published", *texts), ("", "computed", *computed)]
-            lines.append(("", "difference", *marked))
-        columns = ("", "", *self.columns)
-        return Table(self.name, self.title, columns, tuple(lines), ("",) * len(columns), self.note)
+        shown = tuple(np.flatnonzero(~self.within).tolist())
+        return Table(self.name, self.title, columns, tuple(rows), formats, self.note, shown)
 
 
 @dataclass(frozen=True)

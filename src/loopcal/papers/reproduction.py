@@ -34,6 +34,10 @@ FOLDER = FolderKind(
 )
 
 
+APART = 0.04
+"""Least distance of the markers of a line, as a share of the diagonal of the axes."""
+
+
 class Content(NamedTuple):
     """What a study shows: published beside computed numbers, one comparison for each table of the
     paper; further tables; the judged claims; figures.
@@ -162,9 +166,10 @@ def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
         if series.label.startswith("_"):
             axes.plot(series.x, series.y, color=style.PALE, lw=style.THIN)
             continue
+        is_line = figure.joined and series.joined
         handles += axes.plot(
-            series.x, series.y, label=series.label, ms=style.DOT,
-            lw=style.LINE * (figure.joined and series.joined),
+            series.x, series.y, label=series.label, ms=style.DOT, lw=style.LINE * is_line,
+            markevery=APART if is_line else None,
             fillstyle="full" if figure.joined else "none",  # points on points stay visible
             **styles[series.label],
         )  # fmt: skip

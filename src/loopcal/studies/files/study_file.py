@@ -306,10 +306,10 @@ def write_template(path: Path, robot: str) -> None:
     """
     load_robot(robot)
     text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
-    write_text(path, text.replace("[ROBOT]", f"[{quote_robot(path, robot)}]"))
+    write_text(path, text.replace("[ROBOT]", f"[{quote_scalar(name_robot(path, robot))}]"))
 
 
-def quote_robot(path: Path, robot: str) -> str:
+def name_robot(path: Path, robot: str) -> str:
     """Return how a study file names a robot: a shipped one by its name, another one by its file,
     relative to the study file where it is in the same folder or below.
     """
@@ -317,4 +317,4 @@ def quote_robot(path: Path, robot: str) -> str:
         return robot
     file, folder = find_robot_file(robot).resolve(), path.parent.resolve()
     named = file.relative_to(folder) if file.is_relative_to(folder) else file
-    return quote_scalar(named.as_posix())
+    return named.as_posix()
