@@ -96,6 +96,27 @@ def test_poses_are_covered_where_the_instrument_drifts():
     assert np.mean(adjusted) > max(np.mean(inside), 0.93)
 
 
+@pytest.mark.parametrize("label", ["session", "block"])
+def test_poses_are_covered_where_sessions_have_offsets_whose_mean_no_residual_shows(label):
+    robot, covered, pinned, group = ROBOTS["linear-delta"], [], [], np.arange(24) // 6
+    for seed in range(6):
+        offsets = np.random.default_rng([seed, 7]).normal(0.0, 2.0, (4, 3))
+        errors = draw_errors(24, 3, seed) + offsets[group]
+        session = np.array([f"s{i}" for i in group]) if label == "session" else None
+        truth, data = measure("linear-delta", "component", errors, seed, session)
+        if label == "block":
+            data = replace(data, block=group)
+        fit = identify(robot, data)
+        adjusted = adjust_uncertainty(fit, data)
+        (found,) = (f for f in adjusted.findings if f.code == "residuals.sessions-differ")
+        assert found.data["unit"] == label
+        covered += list(cover_positions(robot, adjusted, truth).ravel())
+        pinned += list(cover_positions(robot, fit, truth).ravel())
+    # 144 intervals of 6 machines; those of one machine err together
+    assert np.mean(covered) > 0.93
+    assert np.mean(pinned) < 0.85
+
+
 def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
     errors = draw_errors(14, 3, 3, 0.7)
     _, data = measure("linear-delta", "component", errors, 3)

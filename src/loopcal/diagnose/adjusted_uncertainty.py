@@ -23,6 +23,7 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import add_slow_errors, find_slow_errors
 from loopcal.diagnose.residual_patterns import (
+    BLOCK,
     ORDER,
     READING,
     SESSION,
@@ -52,6 +53,7 @@ CODES = {
     ORDER: "residuals.trend",
     TIME: "residuals.drift",
     SESSION: "residuals.sessions-differ",
+    BLOCK: "residuals.sessions-differ",
     TEMPERATURE: "residuals.depend-on-temperature",
     READING: "residuals.depend-on-reading",
 }
@@ -98,13 +100,12 @@ def _add_patterns(
     effects_of = [D[:, rows].reshape(-1, D.shape[-1]) for rows in (slice(0, 3), slice(3, 6))]
     tool = [(E, float(((E @ posterior.root) ** 2).sum())) for E in effects_of]
     for effect in effects:
-        root = (
-            rows.root
-            @ (rows.gain.T @ effect.effect.columns)
-            @ take_root(effect.moments, np.diag(effect.moments))
-        )
+        whole = effect.effect.whole
+        columns = effect.effect.columns if whole is None else whole
+        moments = take_root(effect.moments, np.diag(effect.moments))
+        root = rows.root @ (rows.gain.T @ columns) @ moments
         finding = _report_effect(effect, _measure_growth(tool, root))
-        fit = add_covariance(fit, root, np.inf, finding)
+        fit = add_covariance(fit, root, effect.degrees, finding)
     if patterns.is_correlated:
         fit = _add_correlation(fit, patterns, tool)
     return _without_doubt_of_sigma(fit)
@@ -163,10 +164,11 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
         Quantity(float(values[most]) / unit.factor_to_si, unit.symbol)
         for values in (effect.sizes, effect.errors)
     )
-    name = effect.effect.name
+    source, name = effect.effect.source, effect.effect.name
     return report_finding(
-        CODES[effect.effect.source],
+        CODES[source],
         **({"name": name} if name else {}),
+        **({"unit": source} if source in (SESSION, BLOCK) else {}),
         component=component,
         size=size,
         error=error,

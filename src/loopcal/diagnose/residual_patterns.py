@@ -28,7 +28,12 @@ from loopcal.measure.kinds.kind import list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.statistics import compute_any_probability, compute_f_tail, find_distinct
+from loopcal.numerics.statistics import (
+    compute_any_probability,
+    compute_f_tail,
+    estimate_variance_component,
+    find_distinct,
+)
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -169,7 +174,8 @@ def order_by_time(time: FloatArray | None, count: int) -> IntArray:
 
 
 # What residuals may depend on.
-ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
+ORDER, TIME, TEMPERATURE, READING = "order", "time", "temperature", "reading"
+SESSION, BLOCK = "session", "block"
 
 
 class Effect(NamedTuple):
@@ -177,15 +183,18 @@ class Effect(NamedTuple):
 
     source: str  # what it depends on, such as "time"
     name: str  # of the temperature or actuator, else empty
-    columns: FloatArray  # (R, c) whitened rows by the sizes
+    columns: FloatArray  # (R, c) whitened rows by the sizes, less their means
     labels: tuple[tuple[str, Dimension], ...]  # component and dimension of each of the c columns
+    # (R, c) the same with their means, where the sizes are drawn and their mean is an error, too
+    whole: FloatArray | None = None
 
 
 def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
     """Return the effects that measurements without excluded poses can have.
 
     Linear in time, or in the order of measurement where the rows state no time, linear in each
-    temperature, a difference between sessions, and quadratic in each actuator reading.
+    temperature, and quadratic in each actuator reading; an error of each session, and of each block
+    where blocks are large.
     """
     observations = [o for o in data.observations if len(o)]
     kinds = []  # of each kind: places among all rows, its rows, and what a unit of a component adds
@@ -200,17 +209,21 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
         """Return an effect from functions (r,) of the rows of each kind, less their means: an
         offset of all rows is no such effect.
         """
-        columns, labels = [np.zeros((len(rows.residual), 0))], []
+        columns, whole, labels = [np.zeros((len(rows.residual), 0))], [], []
         for (places, row, shifts), of_kind in zip(kinds, functions, strict=True):
-            centered = [(function - function.mean())[row] for function in of_kind]
             for label, shift in shifts:
-                for function in centered:
-                    column = np.zeros(len(rows.residual))
-                    column[places] = -shift * function
+                for function in of_kind:
+                    column, mean = np.zeros((2, len(rows.residual), 1))
+                    column[places, 0] = -shift * (function - function.mean())[row]
+                    mean[places, 0] = -shift * function.mean()
                     if column.any():
-                        columns.append(column[:, None])
+                        columns.append(column)
+                        whole.append(column + mean)
                         labels.append(label)
-        return Effect(source, name, np.concatenate(columns, axis=1), tuple(labels))
+        centered, drawn = np.concatenate(columns, axis=1), None
+        if whole and source in (SESSION, BLOCK):
+            drawn = np.concatenate(whole, axis=1)
+        return Effect(source, name, centered, tuple(labels), drawn)
 
     has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
     place = [o.context[TIME] if has_time else order_rows(o).astype(float) for o in observations]
@@ -220,11 +233,13 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
             [scale_to_range(o.context[name])] if name in o.context else [] for o in observations
         ]
         effects.append(build(functions, TEMPERATURE, name))
-    functions = [
-        [(o.session == name).astype(float) for name in find_distinct(o.session)]
-        for o in observations
-    ]
-    effects.append(build(functions, SESSION))
+    blocks = [data.block[o.rows.reshape(len(o), -1)[:, 0]] for o in observations]
+    has_blocks = 2 * len(find_distinct(data.block)) <= data.n_poses
+    sessions = [o.session for o in observations]
+    for source, groups in ((SESSION, sessions), (BLOCK, blocks if has_blocks else [])):
+        functions = [[(g == name).astype(float) for name in find_distinct(g)] for g in groups]
+        if functions:
+            effects.append(build(functions, source))
     for i, actuator in enumerate(robot.actuators):
         readings = (data.readings[o.rows.reshape(len(o), -1)[:, 0], i] for o in observations)
         functions = [[x, 4.0 * x**2] for x in map(scale_to_range, readings)]
@@ -260,6 +275,7 @@ class EffectSizes(NamedTuple):
     sizes: FloatArray
     errors: FloatArray
     moments: FloatArray  # (c, c) [SI] expected products of the sizes
+    degrees: float = np.inf  # degrees of freedom of their size
 
 
 class ResidualPatterns(NamedTuple):
@@ -334,13 +350,29 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
     kept = axes[size > 1e-10 * size.max(initial=0.0)]
     spread = (kept.T @ kept) @ (vt.T * np.sqrt(variance))
     back = 1.0 / length
-    return EffectSizes(
-        effect,
-        p_value,
-        back * mean,
-        back * np.linalg.norm(spread, axis=1),
-        back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back,
-    )
+    sizes, errors = back * mean, back * np.linalg.norm(spread, axis=1)
+    if effect.whole is not None:  # the mean of all sizes moves the estimate, and no residual
+        own = np.linalg.norm(effect.whole, axis=0)
+        w, y, rest = find_spectrum(rows, effect.whole / own)
+        component = estimate_variance_component(w, y, rest=rest)
+        moments = np.diag(component.variance / own**2)
+        return EffectSizes(effect, p_value, sizes, errors, moments, component.degrees)
+    moments = back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back
+    return EffectSizes(effect, p_value, sizes, errors, moments)
+
+
+def find_spectrum(
+    rows: ResidualRows, columns: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
+    """Return the weights (k,) and the elements (k,) of the residuals that errors of unit variance
+    with these columns (R, c) change, and sum of squares and number of all other elements.
+    """
+    left = rows.project(columns)
+    w, vectors = np.linalg.eigh(left.T @ left)
+    kept = w > EXPLAINED * w.max(initial=0.0)
+    w, y = w[kept], (rows.residual @ left) @ vectors[:, kept] / np.sqrt(w[kept])
+    square = max(rows.square - float(y @ y), 0.0)
+    return w, y, (square, float(rows.degrees - len(y)))
 
 
 def test_correlation(rows: ResidualRows) -> tuple[float, float]:

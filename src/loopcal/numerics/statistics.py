@@ -119,6 +119,9 @@ def compute_single_level(level: float, tests: int) -> float:
 STEPS, NEWTON = 400, 100
 """Values of tau that are compared, and most steps to the saddlepoint."""
 
+MOST_KNOWN = 1e6
+"""Degrees of freedom of a sigma that is exact."""
+
 SMALLEST, LARGEST = 1e-3, 1e4
 """Ends of the values of tau: the strongest element gains this share of sigma, and this many."""
 
@@ -137,31 +140,37 @@ class VarianceComponent(NamedTuple):
     ratio: float
 
 
-def compute_component_tail(weights: FloatArray, y: FloatArray) -> float:
+def compute_component_tail(
+    weights: FloatArray, y: FloatArray, rest: tuple[float, float] = (0.0, 0.0)
+) -> float:
     """Return the probability of a larger Q without the component; 1 where there is no test.
 
     Parameters
     ----------
-    weights, y : (k,) elements.
+    weights, y : (k,) elements. rest : sum of squares and number of elements of weight 0; those of a
+        stated sigma of `known` degrees of freedom are `known` and `known`.
     """
-    total, largest = float((y**2).sum()), float(weights.max(initial=0.0))
+    total, largest = float((y**2).sum()) + rest[0], float(weights.max(initial=0.0))
     if not (total > 0.0 and largest > 0.0):
         return 1.0
-    return _tail(weights / largest - float(weights @ y**2) / (largest * total))
+    mean = float(weights @ y**2) / (largest * total)
+    count = min(rest[1], MOST_KNOWN)
+    return _tail(np.r_[weights / largest - mean, -mean], np.r_[np.ones(len(weights)), count])
 
 
 def estimate_variance_component(
-    weights: FloatArray, y: FloatArray, known: float = 0.0
+    weights: FloatArray, y: FloatArray, known: float = 0.0, rest: tuple[float, float] = (0.0, 0.0)
 ) -> VarianceComponent:
     """Return the size of a component; arguments as of `compute_component_tail`.
 
-    `known` degrees of freedom say that sigma is 1; infinite ones, that it is exactly 1.
+    `known` degrees of freedom say that sigma is 1; infinite ones, that it is exactly 1. `rest` :
+    sum of squares and number of elements of weight 0.
     """
     largest = float(weights.max())
     tau = np.geomspace(SMALLEST, LARGEST, STEPS) / np.sqrt(largest)
     ratio = tau**2
     scale = 1.0 + ratio[:, None] * weights
-    square, count = (y**2 / scale).sum(axis=1), len(y) + known
+    square, count = (y**2 / scale).sum(axis=1) + rest[0], len(y) + rest[1] + known
     if np.isinf(known):
         by_size, variance = -0.5 * square, np.ones(STEPS)
     else:
@@ -178,20 +187,21 @@ def estimate_variance_component(
     return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]))
 
 
-def _tail(values: FloatArray) -> float:
-    """Return P(sum of values_i times chi-square of one degree > 0), saddlepoint t:
+def _tail(values: FloatArray, counts: FloatArray) -> float:
+    """Return P(sum of values_i times chi-square of counts_i degrees > 0), saddlepoint t:
 
-    K(t) = -1/2 sum log(1 - 2 t values), K'(t) = 0, w = sign(t) sqrt(-2 K(t)),
+    K(t) = -1/2 sum counts log(1 - 2 t values), K'(t) = 0, w = sign(t) sqrt(-2 K(t)),
     v = t sqrt(K''(t)), tail = 1 - Phi(w + log(v / w) / w).
     """
     from scipy.special import ndtr
 
+    values, counts = values[counts > 0.0], counts[counts > 0.0]
     if not (values.max() > 0.0 > values.min()):
         return 1.0 if values.min() >= 0.0 else 0.0
     low, high = 0.5 / values.min(), 0.5 / values.max()
 
     def slope(t: float) -> float:
-        return float((values / (1.0 - 2.0 * t * values)).sum())
+        return float((counts * values / (1.0 - 2.0 * t * values)).sum())
 
     t = 0.0
     for _ in range(NEWTON):  # K' grows: bisection cannot fail
@@ -199,11 +209,11 @@ def _tail(values: FloatArray) -> float:
         before, t = t, 0.5 * (low + high)
         if t == before:
             break
-    K = -0.5 * float(np.log1p(-2.0 * t * values).sum())
-    curvature = 2.0 * float(((values / (1.0 - 2.0 * t * values)) ** 2).sum())
+    K = -0.5 * float((counts * np.log1p(-2.0 * t * values)).sum())
+    curvature = 2.0 * float((counts * (values / (1.0 - 2.0 * t * values)) ** 2).sum())
     w, v = np.sign(t) * np.sqrt(max(-2.0 * K, 0.0)), t * np.sqrt(curvature)
     if abs(w) < 1e-4:  # the limit at the mean
-        third = 8.0 * float(((values / (1.0 - 2.0 * t * values)) ** 3).sum())
+        third = 8.0 * float((counts * (values / (1.0 - 2.0 * t * values)) ** 3).sum())
         return float(0.5 - third / (6.0 * np.sqrt(2.0 * np.pi) * curvature**1.5))
     return float(ndtr(-(w + np.log(v / w) / w)))
 
