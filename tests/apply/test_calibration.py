@@ -241,7 +241,12 @@ UNDETERMINED = report_finding(
     where="the workspace",
 )
 NOISE = report_finding(
-    "noise.residuals-too-large", Severity.FAILURE, ratio=3.9, degrees=81.0, p_value=1e-9
+    "noise.residuals-too-large",
+    Severity.FAILURE,
+    ratio=3.9,
+    degrees=81.0,
+    p_value=1e-9,
+    uncertainty=0.25,
 )
 SESSIONS = report_finding(
     "residuals.sessions-differ", component="x", size=SMALL, error=SMALL, ratio=1.8, p_value=0.01

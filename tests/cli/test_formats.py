@@ -217,13 +217,13 @@ def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
     """The weights are those of the firmware. Two of its arms are not optimal (cost 0.6477)."""
     record = read_records(data_folder)[WITH_DISTANCES]
     (folder / "printer.cfg").write_text(format_printer_cfg(record))
-    sigma = 0.1 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))
-    words = f"{ONE_COMMAND} --sigma-height {sigma}mm --sigma-distance 0.1mm --json"
+    sigma = 0.01 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))
+    words = f"{ONE_COMMAND} --sigma-height {sigma}mm --sigma-distance 0.01mm --json"
     loopcal(words, code=2)
     assert not (folder / "corrected.cfg").exists()
     document = loopcal(f"{words} --force", code=2).json
     assert document["fit"]["rank"] == 9
-    assert document["fit"]["chi_square"] * 0.1**2 == pytest.approx(0.6160, abs=1e-4)  # [mm^2]
+    assert document["fit"]["chi_square"] * 0.01**2 == pytest.approx(0.6160, abs=1e-4)  # [mm^2]
     found = {row["name"]: row["estimate"] for row in document["fit"]["parameters"]}
     best = {
         "arm1.length": 217.4260,

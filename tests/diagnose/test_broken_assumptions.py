@@ -110,12 +110,12 @@ def test_study_sees_an_alarm_where_it_is_due_and_none_where_it_is_not():
     cases = {case.name: case for case in list_cases()}
     loud = evaluate_case(setup, cases["noise 2.0 times sigma"], 2)
     assert loud["explained"] == 1.0
-    assert loud["codes"]["noise.residuals-too-large"] == 1.0
-    assert loud["groups"]["noise.residuals-too-large"] == 1.0
+    assert loud["codes"]["noise.doubtful"] == 1.0
+    assert loud["groups"]["noise.doubtful"] == 1.0
     # a code that is common in clean data explains nothing
-    common = frozenset({"noise.residuals-too-large"})
+    common = frozenset({"noise.doubtful"})
     assert evaluate_case(setup, cases["noise 2.0 times sigma"], 2, common)["explained"] == 0.0
-    assert "noise.residuals-too-large" not in evaluate_case(setup, cases["clean"], 2)["alarms"]
+    assert "noise.doubtful" not in evaluate_case(setup, cases["clean"], 2)["alarms"]
 
 
 def test_codes_of_one_level_form_one_group():

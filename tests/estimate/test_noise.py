@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 from scipy.stats import t as student
 
 import loopcal as lc
@@ -50,7 +51,7 @@ def test_a_wrong_sigma_is_reported_with_every_method():
     for method in (LeastSquares(), MAP(), Ridge(3.0), TruncatedSVD(30)):
         codes = [
             identify(hexapod(), scale_sigma(hexapod_data(15), factor), method).residual_test.finding
-            for factor in (0.5, 2.0)
+            for factor in (0.25, 2.0)
         ]
         assert [f.code for f in codes] == ["noise.residuals-too-large", "noise.residuals-too-small"]
         assert all(f.severity.value == "warning" for f in codes)
@@ -197,3 +198,26 @@ def test_wrong_sigma_uncertainties_are_refused():
     for wrong in (-0.1, 1.5):
         with pytest.raises(EstimationError, match="sigma_uncertainty is"):
             FitOptions(sigma_uncertainty=wrong)
+
+
+@pytest.mark.parametrize(
+    ("times", "u", "failed", "code"),
+    [
+        (1.25, 0.0, True, "noise.residuals-too-large"),
+        (1.25, 0.25, False, "noise.consistent"),
+        (2.0, 0.25, False, "noise.doubtful"),
+        (2.0, 0.05, True, "noise.residuals-too-large"),
+        (4.0, 0.25, True, "noise.residuals-too-large"),
+        (0.9, 0.25, False, "noise.consistent"),
+        (0.4, 0.25, False, "noise.residuals-too-small"),
+    ],
+)
+def test_the_gate_of_residuals_allows_for_the_stated_uncertainty_of_sigma(times, u, failed, code):
+    """Residuals per degree of freedom have the distribution F(m - rank, 1 / (2 u^2))."""
+    data = scale_sigma(hexapod_data(40), 1.0 / times)
+    test = identify(hexapod(), data, options=FitOptions(sigma_uncertainty=u)).residual_test
+    assert (test.failed, test.finding.code) == (failed, code)
+    if u:
+        expected = f_distribution.sf(test.chi_square / test.degrees, test.degrees, 0.5 / u**2)
+        assert test.p_value == pytest.approx(expected, rel=1e-9)
+    assert test.exact_p_value == pytest.approx(chi2.sf(test.chi_square, test.degrees))

@@ -72,8 +72,8 @@ def assert_explained(fit, true: Mapping[str, float]):
 
 
 def assert_contradicted(fit):
-    """Assert that the residuals reject what was stated."""
-    assert fit.residual_test.p_value < REJECTED_P_VALUE
+    """Assert that the residuals reject what was stated with exact sigmas."""
+    assert fit.residual_test.exact_p_value < REJECTED_P_VALUE
     assert fit.residual_test.finding in fit.findings
     assert not fit.residual_test.intervals or fit.residual_test.sigma_scale > 1.0
 

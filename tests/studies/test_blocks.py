@@ -353,7 +353,7 @@ def test_adjusted_intervals_cover_the_truth_where_the_noise_is_larger_than_state
 
 def test_verdicts_are_those_of_calibrations():
     scores = Scores(held_out=6, verdict=True, limit_position=1e-3)
-    effects = {"none": EffectsLevel(), "noise": EffectsLevel(noise=4.0)}
+    effects = {"none": EffectsLevel(), "noise": EffectsLevel(noise=9.0)}
     study = make_study(scores=scores, effects=effects, replicates=2, block=2)
     good, bad = compute_cells(study)
     assert set(good["verdict"]) <= {0.0, 1.0}

@@ -127,7 +127,7 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
     if columns is None:
         return None
     unit = list_units(linear)
-    level = DOUBTED if test.failed else compute_single_level(LEVEL, 2)
+    level = DOUBTED if test.exceeds_sigma else compute_single_level(LEVEL, 2)
     rows, backlash, findings = _find_backlash(linear, rows, columns, unit, level)
     known = count_sigma_degrees(test.noise, fit.options.sigma_uncertainty)
     scaled = ReadingColumns(columns.values * unit, columns.poses, columns.count)

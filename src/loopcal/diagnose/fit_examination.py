@@ -32,7 +32,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import transmit_readings
-from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail, find_distinct
+from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import Progress, report_no_progress
@@ -376,11 +376,10 @@ def check_start_values(fit: Identification) -> StartCheck:
     test = fit.residual_test
     # the stated noise explains the residuals of the fit, or none are left
     is_consistent = test.noise == "given" and not test.failed
-    p_value = float("nan")  # of a larger gain by this noise, else by that of the residuals
-    if is_consistent:
-        p_value = float(compute_chi_square_tail(fit.rank, gain))
-    elif test.dof >= 1.0 and last > 0.0:
-        p_value = float(compute_f_tail(fit.rank, test.dof, gain / fit.rank / (last / test.dof)))
+    p_value = float("nan")  # of a larger gain by the noise that the fit states; without any, none
+    if test.sigma_scale > 0.0:
+        each = gain / fit.rank / test.sigma_scale**2
+        p_value = float(compute_f_tail(fit.rank, test.noise_degrees, each))
     ratio = float(before / after) if after > 0.0 else None
     if p_value < SIGNIFICANCE:
         return judged(StartVerdict.NOT_CALIBRATED, p_value, "not-calibrated", ratio=ratio)

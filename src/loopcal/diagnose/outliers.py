@@ -36,7 +36,7 @@ from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.penalties import decompose_for
 from loopcal.estimate.problem import Problem, problem_of
-from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
+from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE, count_sigma_degrees
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
@@ -44,7 +44,6 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import (
     choose_evenly,
     compute_chi_square_quantile,
-    compute_chi_square_tail,
     compute_f_tail,
     compute_single_level,
     find_distinct,
@@ -522,7 +521,9 @@ def find_outliers(
     problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
     member = np.unique(linked_blocks(data), return_inverse=True)[1]
     labels = list_block_labels(data.labels, member)
-    reference = _refit_robustly(fit, data, member, progress) if fit.residual_test.failed else fit
+    reference = (
+        _refit_robustly(fit, data, member, progress) if fit.residual_test.exceeds_sigma else fit
+    )
     z = fit.free_parameters.deviation(reference.robot.values[None])
     start = problem.linearize(z, problem.start(z)).next_start
     low_weight = np.zeros(len(labels), dtype=bool)
@@ -553,7 +554,8 @@ def find_outliers(
     is_converged, suspected = search.is_converged, int(ambiguous.sum())
     summary = _summarize(fit, len(outliers), suspected, level, shared, is_converged=is_converged)
     # whether the fitted blocks exceed the stated noise beyond doubt
-    tail = compute_chi_square_tail(end.left, end.left * end.scale**2)
+    stated = count_sigma_degrees(noise, fit.options.sigma_uncertainty)
+    tail = compute_f_tail(end.left, stated, end.scale**2)
     if noise == "given" and outliers and end.left > 0.0 and tail < SIGNIFICANCE:
         summary = (report_finding("outliers.larger-noise", times=end.scale, **shared), *summary)
     return OutlierCheck(

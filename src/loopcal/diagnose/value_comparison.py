@@ -394,7 +394,7 @@ def _compare(fit: Identification, indices: IntArray, given: FloatArray) -> Value
         p_value=p_value,
         second_order=second_order,
         is_linear=len({bound >= SIGNIFICANCE for bound in bounds}) == 1 and p_value >= 0.0,
-        noise="widened" if fit.residual_test.failed else fit.residual_test.noise,
+        noise="widened" if fit.residual_test.exceeds_sigma else fit.residual_test.noise,
         sigma=sigma,
         direction=direction,
     )

@@ -9,10 +9,14 @@ nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, G.4.2), to which the residuals a
 
     s^2 = (nu0 + unexplained) / (nu0 + degrees)        with nu0 + degrees degrees of freedom
 
-u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. Residuals that are larger or
-smaller than the stated noise explains contradict the stated sigma beyond doubt: then s is that of
-the residuals alone. An exact sigma is replaced by a larger one only, and none by residuals without
-noise, such as those of computed values. See docs/theory/uncertainty.md.
+u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. The test allows for the same u:
+unexplained / degrees is distributed like F(degrees, nu0) where the stated sigma is right within its
+uncertainty. Only what this rejects contradicts the stated noise.
+
+Residuals that are larger or smaller than an exact sigma explains show the noise better than the
+statement does: then s is that of the residuals alone. An exact sigma is replaced by a larger one
+only, and none by residuals without noise, such as those of computed values. See
+docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ import numpy as np
 
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail
 from loopcal.typing import FloatArray
 
 FEWEST_DEGREES = 5
@@ -42,6 +46,11 @@ that do not agree with the data.
 
 DOUBT = 1e-2
 """Probability below which a test does not accept either."""
+
+NOTABLE = 0.05
+"""Probability below which residuals that an exact sigma does not explain are notable, although the
+uncertainty of sigma allows them.
+"""
 
 NO_NOISE = 1e-3
 """Share of the stated noise up to which residuals (rms) are no noise, but computed values."""
@@ -65,12 +74,14 @@ class ResidualTest:
         other numbers NaN where the iteration did not converge, because it then belongs to no fit.
         Where a loss chose the weights: of all weighted residuals.
     degrees : its degrees of freedom, equations minus rank.
-    p_value : probability of a larger chi_square; NaN where nothing can be tested.
+    p_value : probability of a larger chi_square, sigmas being as uncertain as stated; NaN where
+        nothing can be tested.
     dof : equations minus the number of parameters that the method effectively uses.
     noise : "given", "estimated", or "assumed" where nobody stated it.
     sigma_scale : factor s on the stated sigmas; 1 where they are exact and not contradicted.
     noise_degrees : degrees of freedom of s; infinite where the stated sigmas are exact.
     intervals : whether intervals are given at all.
+    stated_degrees : nu0 of the stated sigmas: infinite if they are exact, 0 if noise is estimated.
     converged, weighted : whether the iteration converged, and whether a loss chose the weights.
     """
 
@@ -81,21 +92,38 @@ class ResidualTest:
     noise: str
     sigma_scale: float
     noise_degrees: float
+    stated_degrees: float
     intervals: bool
     converged: bool = True
     weighted: bool = False
 
     @property
+    def exact_p_value(self) -> float:
+        """Probability of a larger chi_square if the stated sigmas were exact; NaN as `p_value`."""
+        tested = np.isfinite(self.p_value)
+        return float(compute_chi_square_tail(self.degrees, self.chi_square)) if tested else np.nan
+
+    @property
     def failed(self) -> bool:
-        """Whether the residuals exceed the stated noise beyond doubt."""
+        """Whether the residuals exceed the stated noise beyond its uncertainty."""
         return self.noise == "given" and self.p_value < SIGNIFICANCE
+
+    @property
+    def exceeds_sigma(self) -> bool:
+        """Whether the residuals exceed the stated noise, were it exact."""
+        return self.noise == "given" and self.exact_p_value < SIGNIFICANCE
+
+    @property
+    def is_notable(self) -> bool:
+        """Whether an exact sigma does not explain the residuals, and an uncertain one hardly."""
+        return self.exact_p_value < DOUBT and self.p_value < NOTABLE
 
     @property
     def is_doubtful(self) -> bool:
         """Whether the residuals exceed the stated noise, and have too few degrees of freedom to
         find out whether noise or the model is the cause.
         """
-        return self.degrees < FEWEST_DEGREES and self.p_value < DOUBT
+        return self.degrees < FEWEST_DEGREES and self.is_notable
 
     @property
     def sigma_degrees(self) -> float:
@@ -118,9 +146,9 @@ class ResidualTest:
         code = "noise.consistent"
         if self.p_value < SIGNIFICANCE:
             code = "noise.residuals-too-large"
-        elif self.p_value < DOUBT:
+        elif self.is_notable:
             code = "noise.doubtful"
-        elif self.p_value > 1.0 - SIGNIFICANCE:
+        elif self.exact_p_value > 1.0 - SIGNIFICANCE and self.p_value > 1.0 - NOTABLE:
             code = "noise.residuals-too-small"
         ratio = float(np.sqrt(self.chi_square / self.degrees))
         return report_finding(
@@ -130,6 +158,7 @@ class ResidualTest:
             p_value=self.p_value,
             scale=self.sigma_scale,
             noise_degrees=self.noise_degrees,
+            uncertainty=float(np.sqrt(0.5 / self.stated_degrees)),
         )
 
     @property
@@ -167,32 +196,33 @@ def run_residual_test(
     """
     if not converged:
         nan = np.nan
-        return ResidualTest(nan, nan, nan, nan, noise, 1.0, nan, False, False, weighted)
+        return ResidualTest(nan, nan, nan, nan, noise, 1.0, nan, nan, False, False, weighted)
     left = float(decomposition.unexplained[0])
     m, degrees = float(decomposition.rows[0]), float((decomposition.rows - decomposition.rank)[0])
     dof = m - float(decomposition.filter_factors(penalty).sum())
-    square, p_value = left, np.nan
+    square, exact, p_value = left, np.nan, np.nan
+    stated = count_sigma_degrees(noise, sigma_uncertainty)
     if weighted:
         square = float(decomposition.remaining(penalty)[0])
     elif noise != "estimated" and degrees > 0:
-        p_value = float(compute_chi_square_tail(degrees, left))
-    scale, nu = _estimate_scale(left, degrees, p_value, noise, sigma_uncertainty, weighted)
-    return ResidualTest(square, degrees, p_value, dof, noise, scale, nu, nu > 0.0, True, weighted)
+        exact = float(compute_chi_square_tail(degrees, left))
+        p_value = float(compute_f_tail(degrees, stated, left / degrees))
+    scale, nu = _estimate_scale(left, degrees, exact, stated, weighted)
+    return ResidualTest(
+        square, degrees, p_value, dof, noise, scale, nu, stated, nu > 0.0, True, weighted
+    )
 
 
 def _estimate_scale(
-    unexplained: float,
-    degrees: float,
-    p_value: float,
-    noise: str,
-    uncertainty: float,
-    weighted: bool,
+    unexplained: float, degrees: float, p_value: float, stated: float, weighted: bool
 ) -> tuple[float, float]:
-    """Return the factor on the stated sigmas, and its degrees of freedom; see the module."""
-    stated = count_sigma_degrees(noise, uncertainty)
+    """Return the factor on the stated sigmas, and its degrees of freedom; see the module.
+
+    p_value : of a larger `unexplained`, if the stated sigmas were exact. stated : nu0.
+    """
     is_noise = degrees > 0 and unexplained > NO_NOISE**2 * degrees
     is_too_large = p_value > 1.0 - SIGNIFICANCE and np.isfinite(stated) and is_noise
-    if noise == "estimated" or p_value < SIGNIFICANCE or is_too_large:
+    if stated == 0.0 or p_value < SIGNIFICANCE or is_too_large:
         return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
     if weighted or degrees <= 0 or np.isinf(stated):
         return 1.0, stated
