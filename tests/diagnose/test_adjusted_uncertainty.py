@@ -227,7 +227,7 @@ def test_data_of_another_fit_are_refused():
         adjust_uncertainty(fit, other)
 
 
-@pytest.mark.parametrize(("drift", "severity"), [(2, Severity.INFO), (4.0, Severity.WARNING)])
+@pytest.mark.parametrize(("drift", "severity"), [(2.4, Severity.INFO), (4.0, Severity.WARNING)])
 def test_only_what_independent_errors_hardly_ever_show_is_a_warning(drift, severity):
     """A drift of z over the series, in sigmas: a weak one is allowed for, but raises no doubt."""
     errors = draw_errors(40, 3, 5)

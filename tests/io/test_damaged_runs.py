@@ -199,7 +199,7 @@ def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
     errors = describe_smooth_errors(np.tile(np.eye(4), (3, 1, 1)), np.zeros(3), 1.0)
     own = store_arrays(errors, DISCREPANCY_PREFIX)
     m, p = 6 * len(own["discrepancy_centers"]), len(arrays["estimate"])
-    own |= {"discrepancy_root": np.zeros((p, m)), "discrepancy_degrees": np.ones(2)}
+    own |= {"discrepancy_root": np.zeros((p, m)), "discrepancy_degrees": np.ones(6)}
     own |= {"discrepancy_directions": np.eye(p), "discrepancy_variance": np.ones(p)}
     arrays |= own
     heights = HeightErrors(

@@ -226,7 +226,7 @@ def _compute_covariance(
     """
     errors, squares = linearize_tool_errors(posterior, solution, frame, H), []
     if (slow := posterior.discrepancy) is not None:
-        squares += slow.split_squares(errors.by_discrepancy[..., :-6])
+        squares += slow.split_squares(errors.by_discrepancy[..., : -len(slow.degrees)])
         posterior = posterior.without_discrepancy
     D, others = errors.by_parameters, (errors.by_frame, errors.by_discrepancy, errors.by_readings)
     covariance = combine_errors(

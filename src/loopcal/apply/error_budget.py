@@ -137,8 +137,9 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
     for part in (part for part in fit.posterior.parts if part.is_added):
         name, slow = "", fit.posterior.discrepancy
         if part.source == DISCREPANCY and slow is not None:
-            of_position = slow.root[:, slow.root.shape[1] // 2 :]
-            name = "position" if np.array_equal(part.root, of_position) else "orientation"
+            is_place, _, root = slow.parts[-1]
+            is_place = is_place and np.array_equal(part.root, root)
+            name = "position" if is_place else "orientation"
         key = Source(part.source, name, "A", part.degrees)
         merged.setdefault(key, []).append(part.root / fit.tolerance[:, None])
     roots = tuple(fit.tolerance[:, None] * np.concatenate(each, axis=1) for each in merged.values())
@@ -444,12 +445,12 @@ def _list_sources(
     lines = []
     for source, root in zip(split.sources, split.roots, strict=True):
         twists = D @ root
-        if source.kind == DISCREPANCY:
-            # columns are those of rotations and of places, then of what each pose has of its own
-            twists, part = effects.by_discrepancy, 1 if source.name == "position" else 0
-            shared_and_own = np.split(twists, [twists.shape[2] - 6], axis=2)
-            halves = [np.split(each, 2, axis=2)[part] for each in shared_and_own]
-            twists = np.concatenate(halves, axis=2)
+        if source.kind == DISCREPANCY and (slow := fit.posterior.discrepancy) is not None:
+            # columns of the directions, then of what each pose has of its own
+            is_own = next(own for of, own, _ in slow.parts if of == (source.name == "position"))
+            centers = len(slow.errors.centers)
+            chosen = np.concatenate([np.repeat(is_own, centers), is_own])
+            twists = effects.by_discrepancy[..., chosen]
         if source.kind == SETUP and not is_relative:
             twists = np.concatenate([twists, effects.by_frame], axis=2)
         variances = np.where(split.undetermined, np.nan, (root**2).sum(axis=1))

@@ -7,7 +7,9 @@ of the poses (`SmoothErrors`), the elimination of the parameters leaves (y, S) o
 Phi. If the model is right, y has the variance sigma^2; with errors of amplitude tau it has
 sigma^2 + tau^2 S S'. The test compares residuals by their weights alone: it needs no sigma, and
 does not depend on the order of the poses. Displacements and rotations of the tool are tested one
-after the other, the more significant first. See docs/theory/uncertainty.md.
+after the other, the more significant first. Only directions that the rows sense have errors, each
+as large as its own residuals show. The likelihood chooses over which length the errors vary. See
+docs/theory/uncertainty.md.
 
 The lack of fit is tested against the pure error of repeated poses, which have equal predictions:
 SS_pure = sum over groups min over mu of |W (r - mu)|^2, SS_lack = RSS - SS_pure, and SS_lack /
@@ -17,7 +19,7 @@ sigma is. Source: Draper and Smith, Applied Regression Analysis.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -26,7 +28,7 @@ import numpy as np
 from loopcal.diagnose.residual_patterns import LEVEL
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.identification import prepare_fitted_data
-from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy
+from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy, combine_degrees
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.residual_test import (
     FEWEST_DEGREES,
@@ -35,11 +37,12 @@ from loopcal.estimate.residual_test import (
     count_sigma_degrees,
 )
 from loopcal.estimate.result import Identification, add_covariance
-from loopcal.estimate.smooth_errors import SmoothErrors, describe_smooth_errors
+from loopcal.estimate.smooth_errors import CENTERS, SmoothErrors, describe_smooth_errors
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.statistics import (
     VarianceComponent,
+    compute_any_probability,
     compute_chi_square_tail,
     compute_component_tail,
     compute_f_tail,
@@ -56,12 +59,20 @@ FEWEST_POSES = 5  # different poses below which nothing can be said of how error
 UNSEEN = 1e-8
 NEGLIGIBLE = 1e-12  # share of the largest variance by slow errors below which one is rounding
 # Lengths over which slow errors vary, in halves of the range of a coordinate, and whether they
-# vary with the rotation of the platform: a wave over the workspace, and slower ones.
-KERNELS = ((0.6, False), (1.7, True))
+# vary with the rotation of the platform: a wave over the workspace, and slower ones. They find slow
+# errors. The likelihood chooses among them and, where poses are dense, a short one; with more
+# centers.
+KERNELS, SHORT_KERNELS = ((0.6, False), (1.7, True)), ((0.3, False),)
+FINE_CENTERS = 150
+# Share of the information on the direction that the rows sense best, below which they do not
+# measure a direction: errors of it are seen a tenth as well.
+UNMEASURED_SHARE = 0.01
 # Length, in halves of the range, over which errors vary that no two poses share, and most poses
 # for these.
 ROUGH, MOST_ROUGH = 1e-3, 150
-ROTATION, PLACE = 0, 1  # number of the errors of rotation and of place
+# Probability without errors in a direction below which it has some, once its machine shows any.
+DIRECTION_LEVEL = 0.3
+NAMED = 0.5  # share of the largest component of errors from which an axis is named
 
 
 class SlowErrorRows(NamedTuple):
@@ -73,12 +84,19 @@ class SlowErrorRows(NamedTuple):
     residuals: FloatArray  # (m,) y
 
 
+class SlowError(NamedTuple):
+    """Independent errors of equal size in some directions."""
+
+    directions: FloatArray  # (6, d) unit vectors of rotation and place
+    size: VarianceComponent
+    p_value: float  # without them
+
+
 class SlowErrors(NamedTuple):
     """Slow errors that residuals show."""
 
     rows: SlowErrorRows  # that show them
-    # PLACE or ROTATION -> size and probability of these errors
-    components: Mapping[int, tuple[VarianceComponent, float]]
+    errors: tuple[SlowError, ...]
     is_slow: bool = True  # whether neighboring poses share them; otherwise each pose has its own
 
 
@@ -90,19 +108,33 @@ def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | No
     # deviations from nominal show errors, too, but only as far as the tolerances are right
     if len(T) < FEWEST_POSES or fit.residual_test.degrees < FEWEST_DEGREES:
         return None
-    kernels = (
-        describe_smooth_errors(T, tool, fit.robot.size, length, by_rotation=by_rotation)
-        for length, by_rotation in KERNELS
-    )
-    projected = (project_slow_errors(linear, errors) for errors in kernels)
-    tested = [rows for rows in projected if rows is not None]
-    level = compute_single_level(LEVEL, len(tested))
+
+    def project(
+        kernels: Sequence[tuple[float, bool]], directions: FloatArray, most: int = CENTERS
+    ) -> list[SlowErrorRows]:
+        each = (
+            describe_smooth_errors(T, tool, fit.robot.size, length, most, by_rotation=by_rotation)
+            for length, by_rotation in kernels
+        )
+        scaled = (e.scaled(directions) for e in each if kernels is not SHORT_KERNELS or e.is_dense)
+        projected = (project_slow_errors(linear, errors) for errors in scaled)
+        return [rows for rows in projected if rows is not None]
+
+    tested = project(KERNELS, np.eye(6))
+    if not tested:
+        return None
+    groups = find_measured_directions(tested[0])
+    measured = np.hstack([np.zeros((6, 0)), *groups])
+    short = project(SHORT_KERNELS, measured, FINE_CENTERS) if measured.size else []
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
-    slow = [SlowErrors(rows, detect_slow_errors(rows, known, level)) for rows in tested]
-    slow = [each for each in slow if each.components]
-    if slow:
-        return min(slow, key=lambda each: min(p for _, p in each.components.values()))
-    return find_rough_errors(linear, T)
+    level = compute_single_level(LEVEL, len(tested) + len(short))
+    slow = [detect_slow_errors(rows, groups, known, level) for rows in (*tested, *short)]
+    if not any(slow):
+        return find_rough_errors(linear, T)
+    found = min((each for each in slow if each), key=lambda each: min(e.p_value for e in each))
+    fine = [*project(KERNELS, measured, FINE_CENTERS), *short]
+    divided = [SlowErrors(rows, divide_by_direction(rows, found, groups, known)) for rows in fine]
+    return max(divided, key=lambda each: sum(error.size.gain for error in each.errors))
 
 
 def find_rough_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | None:
@@ -119,16 +151,16 @@ def find_rough_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | N
     rows = project_slow_errors(linear, errors)
     if rows is None:
         return None
-    components = {}
-    for part in (part for part in (PLACE, ROTATION) if _is_seen(rows, part)):
-        u, w = _find_axes(rows.rows[:, _columns(rows.errors, part)])
+    rough = []
+    for directions in find_measured_directions(rows):
+        u, w = _find_axes(_columns(rows.rows, rows.errors, directions))
         y = (u.T @ rows.residuals) / lack.sigma_scale
         p_value = float(compute_f_tail(len(y), lack.pure_degrees, float(y @ y) / len(y)))
         if p_value < REPEATS_LEVEL:
             size = estimate_variance_component(w, y, lack.pure_degrees)
-            variance = size.variance * lack.sigma_scale**2
-            components[part] = (size._replace(variance=variance), p_value)
-    return SlowErrors(rows, components, is_slow=False) if components else None
+            size = size._replace(variance=size.variance * lack.sigma_scale**2)
+            rough.append(SlowError(directions, size, p_value))
+    return SlowErrors(rows, tuple(rough), is_slow=False) if rough else None
 
 
 def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
@@ -137,57 +169,99 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
     The parameters get what the errors do to them, and poses what is left of them. Estimates stay.
     """
     rows, first = slow.rows, fit.posterior
-    amplitude, degrees = np.zeros(6), np.full(2, np.inf)
-    for part, (component, _) in slow.components.items():
-        amplitude[3 * part : 3 * part + 3] = np.sqrt(component.variance)
-        degrees[part] = component.degrees
-    errors = rows.errors.scaled(amplitude)
-    root = rows.slope * np.repeat(amplitude, rows.errors.count // 6)
-    for part, (component, p_value) in slow.components.items():
-        dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
+    ordered = sorted(slow.errors, key=lambda error: _is_place(error.directions))
+    amplitude = np.hstack([e.directions * np.sqrt(e.size.variance) for e in ordered])
+    degrees = np.concatenate([np.full(e.directions.shape[1], e.size.degrees) for e in ordered])
+    root = _columns(rows.slope, rows.errors, amplitude)
+    discrepancy = ModelDiscrepancy(
+        rows.errors.scaled(amplitude), root, degrees, first.directions, first.variance
+    )
+    for is_place, own, of_part in discrepancy.parts:
+        squares = (amplitude[:, own] ** 2).sum(axis=0)
+        common = float(combine_degrees(squares.sum(), zip(squares, degrees[own], strict=True)))
+        p_value = min(e.p_value for e in ordered if _is_place(e.directions) == is_place)
+        dimension = Dimension.LENGTH if is_place else Dimension.ANGLE
+        axes = np.abs(amplitude[:, own]).max(axis=1).reshape(2, 3)[int(is_place)]
         finding = report_finding(
             DISCREPANCY,
-            quantity=("orientation", "position")[part],
-            amplitude=fit.robot.to_quantity(float(np.sqrt(component.variance)), dimension),
-            degrees=component.degrees,
+            quantity="position" if is_place else "orientation",
+            axes=tuple(a for a, size in zip("xyz", axes, strict=True) if size > NAMED * axes.max()),
+            amplitude=fit.robot.to_quantity(float(np.sqrt(squares.max())), dimension),
+            degrees=common,
             p_value=p_value,
             is_slow=slow.is_slow,
             level=LEVEL if slow.is_slow else REPEATS_LEVEL,
             severity=choose_severity(p_value),  # a warning where they are beyond doubt
         )
-        own = root[:, _columns(rows.errors, part)]
-        fit = add_covariance(fit, own, component.degrees, finding)
-    discrepancy = ModelDiscrepancy(errors, root, degrees, first.directions, first.variance)
+        fit = add_covariance(fit, of_part, common, finding)
     return replace(fit, posterior=replace(fit.posterior, discrepancy=discrepancy))
 
 
+def find_measured_directions(rows: SlowErrorRows) -> list[FloatArray]:
+    """Return the directions (6, d) of the errors of place, then of rotation, that rows measure;
+    they are base axes where the rows measure all three.
+    """
+    from scipy.linalg import qr
+
+    by_axis, listed = rows.rows.reshape(len(rows.rows), 6, -1), []
+    for first in (3, 0):
+        own = by_axis[:, first : first + 3]
+        if not np.linalg.norm(own) > UNSEEN * np.linalg.norm(by_axis):
+            continue
+        information, axes = np.linalg.eigh(np.einsum("rak,rbk->ab", own, own))
+        axes = axes[:, information > UNMEASURED_SHARE * information[-1]]
+        # the same space by base axes, as far as it contains them
+        Q = np.asarray(qr(axes @ axes.T, pivoting=True)[0])
+        directions = np.zeros((6, axes.shape[1]))
+        directions[first : first + 3] = Q[:, : axes.shape[1]]
+        listed.append(directions)
+    return listed
+
+
+def divide_by_direction(
+    rows: SlowErrorRows, found: Sequence[SlowError], groups: Sequence[FloatArray], known: float
+) -> tuple[SlowError, ...]:
+    """Return errors that were found in some of the groups of directions, with a size for each
+    direction whose own residuals show them; with a common size where none does by itself.
+    """
+    kinds = {_is_place(error.directions) for error in found}
+    together = [directions for directions in groups if _is_place(directions) in kinds]
+    single = [directions[:, [i]] for directions in together for i in range(directions.shape[1])]
+    level = compute_any_probability(DIRECTION_LEVEL, len(single))
+    shown = detect_slow_errors(rows, single, known, level)
+    kinds = {_is_place(error.directions) for error in shown}
+    rest = [directions for directions in together if _is_place(directions) not in kinds]
+    return (*shown, *detect_slow_errors(rows, rest, known, 1.0))
+
+
 def detect_slow_errors(
-    rows: SlowErrorRows, known: float, level: float = LEVEL
-) -> dict[int, tuple[VarianceComponent, float]]:
-    """Return the significant errors, the number of each -> its size and probability.
+    rows: SlowErrorRows, groups: Sequence[FloatArray], known: float, level: float = LEVEL
+) -> tuple[SlowError, ...]:
+    """Return the errors of groups of directions (6, d) that are significant, the most significant
+    first.
 
     `known` degrees of freedom say that the residuals have unit variance. `level` : probability of
     finding any without such errors.
     """
-    remaining = [part for part in (PLACE, ROTATION) if _is_seen(rows, part)]
+    remaining, found = list(range(len(groups))), []
     level = compute_single_level(level, len(remaining))
-    residuals, whitened, components = rows.residuals, rows.rows, {}
+    residuals, whitened = rows.residuals, rows.rows
     while remaining:
-        turned = {part: _find_axes(whitened[:, _columns(rows.errors, part)]) for part in remaining}
-        tests = {part: (w, u.T @ residuals) for part, (u, w) in turned.items()}
-        p_values = {part: compute_component_tail(*test) for part, test in tests.items()}
-        part = min(remaining, key=lambda each: p_values[each])
-        if p_values[part] >= level:
+        turned = {i: _find_axes(_columns(whitened, rows.errors, groups[i])) for i in remaining}
+        tests = {i: (w, u.T @ residuals) for i, (u, w) in turned.items()}
+        p_values = {i: compute_component_tail(*test) for i, test in tests.items()}
+        best = min(remaining, key=lambda each: p_values[each])
+        if not p_values[best] <= level:
             break
-        u, w = turned[part]
-        component = estimate_variance_component(*tests[part], known)
-        components[part] = (component, p_values[part])
+        u, w = turned[best]
+        size = estimate_variance_component(*tests[best], known)
+        found.append(SlowError(groups[best], size, p_values[best]))
         # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
-        shrink = 1.0 / np.sqrt(1.0 + component.ratio * w) - 1.0
+        shrink = 1.0 / np.sqrt(1.0 + size.ratio * w) - 1.0
         residuals = residuals + (u * shrink) @ (u.T @ residuals)
         whitened = whitened + (u * shrink) @ (u.T @ whitened)
-        remaining.remove(part)
-    return components
+        remaining.remove(best)
+    return tuple(found)
 
 
 def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowErrorRows | None:
@@ -220,10 +294,18 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     return SlowErrorRows(errors, slope, triangle, residuals)
 
 
-def _columns(errors: SmoothErrors, part: int) -> slice:
-    """Return the coefficients of the errors of rotation or of place."""
-    half = errors.count // 2
-    return slice(part * half, (part + 1) * half)
+def _columns(rows: FloatArray, errors: SmoothErrors, directions: FloatArray) -> FloatArray:
+    """Return the columns (r, d k) by errors in directions (6, d), from rows (r, m) by errors of
+    unit amplitude in orthogonal directions that contain these.
+    """
+    shares = errors.amplitude.T @ directions
+    by_direction = rows.reshape(len(rows), len(shares), -1)
+    return np.einsum("rak,ad->rdk", by_direction, shares).reshape(len(rows), -1)
+
+
+def _is_place(directions: FloatArray) -> bool:
+    """Return whether directions (6, d) are of place; otherwise of rotation."""
+    return bool(directions[3:].any())
 
 
 def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -240,12 +322,6 @@ def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     axes = np.zeros((len(rows), inner.shape[1]))
     axes[filled] = inner if basis is None else basis @ inner
     return axes, variances[kept]
-
-
-def _is_seen(rows: SlowErrorRows, part: int) -> bool:
-    """Return whether the residuals can show errors of rotation or of place."""
-    own = rows.rows[:, _columns(rows.errors, part)]
-    return bool(len(own)) and bool(np.linalg.norm(own) > UNSEEN * np.linalg.norm(rows.rows))
 
 
 # Singular values of the whiteners of repeats below this share of the largest belong to components

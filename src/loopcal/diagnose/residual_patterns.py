@@ -31,6 +31,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import (
     compute_any_probability,
     compute_f_tail,
+    compute_single_level,
     estimate_variance_component,
     find_distinct,
 )
@@ -256,11 +257,15 @@ def scale_to_range(values: FloatArray) -> FloatArray:
     return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
 
 
+# Probability that independent errors change the uncertainty of a fit: patterns or slow errors.
+FALSE_ALARMS = 0.05
 # Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the
 # same for slow errors of the poses (`model_discrepancy`).
-LEVEL = 0.05
-# Probability that independent errors change the uncertainty of a fit: patterns or slow errors.
-FALSE_ALARMS = compute_any_probability(LEVEL, 2)
+LEVEL = compute_single_level(FALSE_ALARMS, 2)
+# Share of an effect that the parameters must leave in the residuals: with less, an effect that they
+# show is more than ten times as large as they are. Of readings where a probe touched a bed, the
+# rest is the noise of the probe itself.
+LEFT = 0.1
 # Degrees of freedom of the residuals for each size of an effect that is tested, at least.
 FEWEST_LEFT = 3.0
 
@@ -415,7 +420,9 @@ def _list_testable(
     testable = []
     for effect in effects:
         if effect.columns.shape[1]:
-            basis = span_columns(rows.project(effect.columns))
+            scaled = effect.columns / np.linalg.norm(effect.columns, axis=0)
+            u, s, _ = np.linalg.svd(rows.project(scaled), full_matrices=False)
+            basis = u[:, s > LEFT]
             if basis.shape[1] > 0 and rows.degrees >= (1.0 + FEWEST_LEFT) * basis.shape[1]:
                 testable.append((effect, basis))
     return testable

@@ -24,6 +24,7 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import Field
 from loopcal.results.storage import restore_arrays, store_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -165,8 +166,7 @@ class ModelDiscrepancy:
     Attributes
     ----------
     errors : phi. root : (p, m) L [SI].
-    degrees : (2,) degrees of freedom of the amplitudes of rotation and place; infinite where the
-        amplitude is zero.
+    degrees : (d,) degrees of freedom of the amplitude of each direction.
     directions, variance : (p, p), (p,) of the posterior without the discrepancy.
     """
 
@@ -178,27 +178,41 @@ class ModelDiscrepancy:
 
     def __repr__(self) -> str:
         """Return the amplitudes."""
-        rotation, place = 1e3 * self.errors.amplitude[[0, 3]]
-        return (
-            f"<ModelDiscrepancy: {round_to_digits(place)} mm and {round_to_digits(rotation)} mrad>"
-        )
+        sizes = 1e3 * np.linalg.norm(self.errors.amplitude, axis=0)
+        stated = [
+            f"{round_to_digits(sizes[own].max())} {'mm' if is_place else 'mrad'}"
+            for is_place, own, _ in self.parts
+        ]
+        return f"<ModelDiscrepancy: {' and '.join(stated)}>"
+
+    @property
+    def parts(self) -> list[tuple[bool, BoolArray, FloatArray]]:
+        """Errors of rotation and of place, if any: whether of place, which directions (d,), and
+        their columns of `root`.
+        """
+        of_place = np.asarray(np.linalg.norm(self.errors.amplitude[3:], axis=0) > 0.0)
+        k = len(self.errors.centers)
+        return [
+            (bool(of), of_place == of, self.root[:, np.repeat(of_place == of, k)])
+            for of in find_distinct(of_place)
+        ]
 
     def twists(self, T: FloatArray, by_parameters: FloatArray) -> FloatArray:
         """Return twists (n, 6, m) of the platform at poses T (n, 4, 4) by independent errors of
-        variance 1: first those by the rotations, then those by the places of `errors`.
+        variance 1, those of each direction of `errors` in turn.
 
         `by_parameters` (n, 6, p) are the twists by the parameters [per SI].
         """
         return by_parameters @ self.root - self.errors.twists(T)
 
     def split_squares(self, twists: FloatArray) -> list[tuple[FloatArray, float]]:
-        """Return the variances (n, 6) that the errors of rotation and those of place cause, from
-        columns (n, 6, m) such as `twists`, and the degrees of freedom of each.
+        """Return the variances (n, 6) that the errors of each direction cause, from columns
+        (n, 6, m) such as `twists`, and the degrees of freedom of each.
         """
-        halves = np.split(twists, 2, axis=2)
+        each = np.split(twists, len(self.degrees), axis=2)
         return [
-            ((half**2).sum(axis=2), float(degrees))
-            for half, degrees in zip(halves, self.degrees, strict=True)
+            ((own**2).sum(axis=2), float(degrees))
+            for own, degrees in zip(each, self.degrees, strict=True)
         ]
 
 

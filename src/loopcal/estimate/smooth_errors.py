@@ -27,6 +27,9 @@ from loopcal.typing import FloatArray
 CENTERS = 40
 """Largest number of centers: more of them are closer to each other than the error varies."""
 
+DENSE = np.sqrt(0.5)
+"""Correlation of errors at neighboring centers from which these are dense."""
+
 STILL = 0.01
 """Half the range of a coordinate, as a share of the largest one (rotations times the robot's size),
 below which poses do not differ in it. Small differences, as of heights probed on a bed, are errors
@@ -52,7 +55,8 @@ class SmoothErrors:
     origin, length : (6,) of rotation vectors [rad] and places [m]; an infinite length leaves a
         coordinate out.
     centers : (k, 6) normalized coordinates. whitening : (k, k) L^-T.
-    amplitude : (6,) standard deviations of the rotation [rad] and of the tool's place [m].
+    amplitude : (6, d) rotation [rad] and displacement [m] of the tool by independent errors in d
+        directions, those of rotation first.
     """
 
     tool: FloatArray
@@ -65,28 +69,35 @@ class SmoothErrors:
 
     @property
     def count(self) -> int:
-        """Number of coefficients: those of rx, ry, rz, x, y and z in turn."""
-        return 6 * len(self.centers)
+        """Number of coefficients, those of each direction in turn."""
+        return self.amplitude.shape[1] * len(self.centers)
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether most centers share more than half of the variance of their errors with another
+        one; otherwise errors of this length look like noise.
+        """
+        shared = correlate(self.centers, self.centers) - np.eye(len(self.centers))
+        return bool(np.median(shared.max(axis=1)) > DENSE)
 
     def scaled(self, amplitude: FloatArray) -> SmoothErrors:
-        """Return the errors with other amplitudes (6,)."""
+        """Return the errors with other amplitudes (6, d)."""
         return replace(self, amplitude=amplitude)
 
     def twists(self, T: FloatArray) -> FloatArray:
-        """Return twists (.., 6, 6 k) of the platform's origin at poses T (.., 4, 4)."""
+        """Return twists (.., 6, d k) of the platform's origin at poses T (.., 4, 4)."""
         shares = self._correlate(T) @ self.whitening
-        k = len(self.centers)
-        own = np.zeros((*T.shape[:-2], 6, 6, k))
-        own[..., range(6), range(6), :] = shares[..., None, :] * self.amplitude[:, None]
-        return self._at_origin(T) @ own.reshape(*T.shape[:-2], 6, 6 * k)
+        directions = self._at_origin(T) @ self.amplitude
+        own = directions[..., None] * shares[..., None, None, :]
+        return np.asarray(own.reshape(*T.shape[:-2], 6, self.count))
 
     def rest(self, T: FloatArray) -> FloatArray:
-        """Return twists (.., 6, 6) by the errors that have nothing to do with those at the centers,
+        """Return twists (.., 6, d) by the errors that have nothing to do with those at the centers,
         independent at every pose.
         """
         known = ((self._correlate(T) @ self.whitening) ** 2).sum(axis=-1)
         left = np.sqrt(np.maximum(1.0 - known, 0.0))
-        return self._at_origin(T) * (left[..., None, None] * self.amplitude)
+        return self._at_origin(T) @ (left[..., None, None] * self.amplitude)
 
     def _correlate(self, T: FloatArray) -> FloatArray:
         """Return the correlations (.., k) of errors at poses with those at the centers."""
@@ -133,7 +144,7 @@ def describe_smooth_errors(
     centers = x[_spread(x, most)]
     triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
     whitening = np.asarray(np.linalg.inv(triangle).T, dtype=np.float64)
-    return SmoothErrors(tool, rotation, origin, scale, centers, whitening, np.ones(6))
+    return SmoothErrors(tool, rotation, origin, scale, centers, whitening, np.eye(6))
 
 
 def _spread(x: FloatArray, most: int) -> list[int]:

@@ -132,12 +132,14 @@ class VarianceComponent(NamedTuple):
     Attributes
     ----------
     variance : mean of sigma^2 tau^2. degrees : its degrees of freedom.
-    ratio : of variances, tau^2 at which the likelihood is largest.
+    ratio : of variances, tau^2 at which the likelihood is largest. gain : of the logarithm of this
+        likelihood over that without the component.
     """
 
     variance: float
     degrees: float
     ratio: float
+    gain: float
 
 
 def compute_component_tail(
@@ -184,7 +186,9 @@ def estimate_variance_component(
     own = 2.0 / max(count - 4.0, 1.0)
     spread = float(share @ ((values - mean) ** 2 + own * values**2))
     degrees = max(2.0 * mean**2 / spread, 1.0)
-    return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]))
+    # the first tau is as good as none
+    gain = float(density.max() - density[0])
+    return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]), gain)
 
 
 def _tail(values: FloatArray, counts: FloatArray) -> float:
