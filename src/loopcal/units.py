@@ -64,6 +64,8 @@ UNITS: Mapping[str, Unit] = {
         Unit("arcmin", Dimension.ANGLE, math.pi / 10800.0),
         Unit("arcsec", Dimension.ANGLE, math.pi / 648000.0),
         Unit("1", Dimension.RATIO, 1.0),
+        Unit("ppm", Dimension.RATIO, 1e-6),
+        Unit("um/m", Dimension.RATIO, 1e-6),
     )
 }
 

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -86,6 +87,19 @@ def with_stated_targets(data: Measurements, sd: float) -> Measurements:
     return replace(data, stated_values=tuple(StatedValue(n, sd) for n in names))
 
 
+def with_common_errors(data: Measurements, *items: str, sd: float = 25e-6) -> Measurements:
+    """Return measurements whose instruments have a scale, or a bias, of this standard deviation."""
+    rows = tuple(
+        replace(rows, kind=replace(cast(Any, rows.kind), unknown=(*rows.kind.unknown, *items)))
+        for rows in data.observations
+    )
+    data = replace(data, observations=rows)
+    common = {
+        rows.kind.nuisance_parameters[i].name for rows in rows for i in rows.kind.common_errors
+    }
+    return replace(data, stated_values=tuple(StatedValue(name, sd) for name in sorted(common)))
+
+
 def cases() -> dict[str, tuple[Mechanism, Measurements, FitOptions]]:
     """Return fits of every kind of source and method."""
     robot, poses = tripod(), Sensor(Pose(), noise(*[50 * URAD] * 3, *[10 * UM] * 3))
@@ -118,6 +132,12 @@ def cases() -> dict[str, tuple[Mechanism, Measurements, FitOptions]]:
             robot,
             replace(tracked, reading_sigma=np.full(tracked.readings.shape, 4 * UM)),
             FitOptions(),
+        ),
+        "scale": (robot, with_common_errors(plain, "scale"), FitOptions(method=MAP())),
+        "scale and bias of a tracker": (
+            robot,
+            with_common_errors(tracked, "scale", "bias"),
+            FitOptions(method=MAP()),
         ),
         "delta": (delta(), lines, FitOptions()),
         "excluded": (delta(), lines, FitOptions(excluded_poses=("2", "5"))),
@@ -223,6 +243,26 @@ def test_sessions_are_sources_of_their_own():
     assert sum(parts) == pytest.approx(find(whole, "instrument").position, rel=1e-9)
 
 
+def test_common_errors_have_lines_of_their_own_and_move_no_error_into_the_setup():
+    robot, data, options = CASES["scale and bias of a tracker"]
+    budget = budget_of(identify(robot, data, options=options), data)
+    named = [line for line in budget.lines if line.source.kind == "common"]
+    assert [line.source.name for line in named] == ["position.bias", "position.scale"]
+    assert [line.source.words for line in named][1] == "common error: position.scale"
+    assert all(line.source.evaluation == "B" for line in named)
+    assert budget.position.common == pytest.approx(sum(line.position for line in named))
+    wider = with_common_errors(data, sd=50e-6)
+    other = budget_of(identify(robot, wider, options=options), wider)
+    assert find(other, "common", "scale").position > 2.0 * find(budget, "common", "scale").position
+    assert find(other, "setup").position == pytest.approx(find(budget, "setup").position, rel=0.05)
+    plain, known, fit_options = CASES["MAP"]
+    none = budget_of(identify(plain, known, options=fit_options), known)
+    assert none.position.common == 0.0
+    alone = budget_of(identify(*CASES["scale"][:2], options=CASES["scale"][2]), CASES["scale"][1])
+    assert {line.source.kind for line in alone.lines} >= {"common", "instrument", "tolerances"}
+    assert "setup" not in {line.source.kind for line in alone.lines}
+
+
 @pytest.mark.parametrize("source", ["instrument", "readings", "setup"])
 def test_half_a_sigma_is_a_new_fit_with_half_the_sigma(source):
     """The same noise, half as large where it is that of the instrument, with the sigma stated."""
@@ -247,6 +287,17 @@ def test_half_a_sigma_is_a_new_fit_with_half_the_sigma(source):
     again = budget_of(identify(robot, other, options=exact), other)
     assert halved.position == pytest.approx(again.position.rms, rel=5e-3)
     assert halved.orientation == pytest.approx(again.orientation.rms, rel=5e-3)
+    assert np.allclose(halved.parameters, again.sd, rtol=5e-3)
+
+
+def test_half_the_sigma_of_a_common_error_is_a_new_fit_with_half_of_it():
+    robot, data, _ = CASES["scale"]
+    exact = FitOptions(method=MAP(), sigma_uncertainty=0.0)
+    halved = find(budget_of(identify(robot, data, options=exact), data), "common").halved
+    assert halved is not None
+    finer = with_common_errors(data, sd=12.5e-6)
+    again = budget_of(identify(robot, finer, options=exact), finer)
+    assert halved.position == pytest.approx(again.position.rms, rel=5e-3)
     assert np.allclose(halved.parameters, again.sd, rtol=5e-3)
 
 

@@ -23,6 +23,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import ParameterTable
 from tests.estimate.problems import UM, URAD, noise
@@ -110,6 +111,40 @@ def test_with_known_frames_and_accurate_data_the_instrument_is_the_only_source()
     for sources, true in zip((budget.position, budget.orientation), errors, strict=True):
         assert sources.rms == pytest.approx(true, rel=AGREEMENT)
         assert sources.instrument == pytest.approx(sum(sources), rel=1e-9)
+
+
+def test_a_stated_scale_of_the_instrument_is_as_large_as_the_true_errors_that_it_causes():
+    """A gantry takes all its lengths from the instrument: radii of belts and the gain of its lift
+    are unknown.
+    """
+    gantry = lc.load_robot("core-xy")
+    sensor = Sensor(Position(unknown=("scale",)), noise(*[1 * UM] * 3))
+    tracker = Instrument((sensor,), (lc.StatedValue("position.scale", 50e-6),))
+    truth = sample_truth(gantry, MACHINES, 5)
+    poses = sample_workspace(gantry, 30, 7).coordinates
+    trials = simulate_trials(gantry, truth, poses, tracker, 5)
+    fits = identify_trials(gantry, trials, MAP())
+    assert fits.converged.all()
+    data = trials.trial(0)
+    fit = identify(gantry, data, MAP())
+    budget = find_budget(fit, data)
+    solution = sample_workspace(gantry, 200, 0).solution
+    estimated, true = (
+        forward_trials(gantry, values, solution.q[None]).T[..., :3, 3]
+        for values in (fits.values, truth)
+    )
+    errors = np.linalg.norm(estimated - true, axis=2)
+    size = float(np.sqrt((errors**2).mean()))
+    # one error of each machine: three standard deviations of its rms over 240 machines
+    assert budget.position.rms == pytest.approx(size, rel=3.0 / np.sqrt(2.0 * MACHINES))
+    assert budget.position.common > 0.95 * sum(budget.position)
+    U = pose_uncertainty(fit, forward(fit.robot, solution.q)).expanded_position
+    assert (errors <= U).mean() >= 0.93
+    # without the statement nothing contains them
+    (rows,) = data.observations
+    unstated = replace(data, observations=(replace(rows, kind=rows.kind.without_shared_errors()),))
+    plain = identify(gantry, unstated, MAP())
+    assert find_budget(plain, unstated).position.rms < 0.1 * size
 
 
 def find_budget(fit: Identification, data: Measurements, frame: str = "fitted") -> ErrorBudget:

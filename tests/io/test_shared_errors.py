@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bias and a drift of each session, declared in one line of a measurement file."""
+"""A bias, a drift and a scale of an instrument, declared in one line of a measurement file."""
 
 from __future__ import annotations
 
@@ -196,3 +196,134 @@ def test_offset_and_bias_of_a_distance_are_one_unknown_under_old_names_too(tmp_p
     path.write_text(f"{head}\n{columns}\n{rows}\n")
     (value,) = load_measurements(path, DELTA).stated_values
     assert (value.name, value.sd) == ("wire.offset", 2e-4)
+
+
+WARM = "temperature: {value: 23 degC, sd: 1 K, expansion: 11.5 ppm/K"
+FACTORS = {
+    "scale: {sd: 25 ppm}": {"scale": (0.0, 25e-6)},
+    "scale: {sd: 6 um/m, mean: -2 ppm}": {"scale": (-2e-6, 6e-6)},
+    f"{WARM}}}": {"temperature": (34.5e-6, 11.5e-6)},
+    f"{WARM}, expansion_sd: 1 ppm/K}}": {
+        "temperature": (34.5e-6, 11.5e-6),
+        "expansion": (0.0, np.sqrt(10.0) * 1e-6),  # hypot(3 K, 1 K) times 1 ppm/K
+    },
+    f"{WARM}, reference: 296.15 K}}": {"temperature": (0.0, 11.5e-6)},
+    "temperature: {value: 77 degF, sd: 1.8 degF, expansion: 6 ppm/degF}": {
+        "temperature": (5 * 10.8e-6, 10.8e-6)
+    },
+    "mpe: {constant: 15 um, per_length: 6 um/m}": {"scale": (0.0, 6e-6 / np.sqrt(3.0))},
+    "mpe: {constant: 15 um}": {},
+}
+
+
+@pytest.mark.parametrize("line", FACTORS)
+def test_scales_are_declared_in_one_line_for_each_session_and_written_as_read(tmp_path, line):
+    _, data = measure_biased()
+    path = save_with(tmp_path / "a.csv", data, line)
+    if line.startswith("mpe"):
+        lines = path.read_text("utf-8").splitlines(keepends=True)
+        path.write_text("".join(x for x in lines if not x.startswith("# noise")), "utf-8")
+    loaded = load_measurements(path, DELTA)
+    table = loaded.nuisance_parameters.table
+    found = {e.name: (e.nominal, e.tolerance) for e in table.entries}
+    expected = {
+        f"{session}.component.{item}": pytest.approx(of, rel=1e-9, abs=1e-18)
+        for session in ("mon", "tue", "wed")
+        for item, of in FACTORS[line].items()
+    }
+    assert found == expected
+    (rows,) = loaded.observations
+    sigma = 15e-6 / np.sqrt(3.0) if line.startswith("mpe") else LENGTH
+    assert np.allclose(rows.covariance, sigma**2 * np.eye(3), rtol=1e-9, atol=0.0)
+    save_measurements(loaded, tmp_path / "b.csv", DELTA)
+    again = load_measurements(tmp_path / "b.csv", DELTA)
+    assert again.nuisance_parameters.table == table
+    assert again.observations[0].kind.unknown == rows.kind.unknown
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["scale: {sd: 2 ppm, scope: all}"],
+        ["unknown: [scale]", "unknowns: {component.scale: {sd: 2 ppm, scope: all}}"],
+    ],
+)
+def test_all_sessions_can_share_one_scale(tmp_path, lines):
+    _, data = measure_biased()
+    loaded = load_measurements(save_with(tmp_path / "a.csv", data, *lines), DELTA)
+    (entry,) = loaded.nuisance_parameters.table.entries
+    assert (entry.name, entry.tolerance) == ("component.scale", 2e-6)
+    assert not loaded.nuisance_parameters.indices[0].any()
+    save_measurements(loaded, tmp_path / "b.csv", DELTA)
+    again = load_measurements(tmp_path / "b.csv", DELTA)
+    assert again.nuisance_parameters.table.entries == (entry,)
+
+
+def test_noise_that_is_stated_counts_before_that_of_an_mpe(tmp_path):
+    _, data = measure_biased()
+    path = save_with(tmp_path / "a.csv", data, "mpe: {constant: 15 um}")
+    (rows,) = load_measurements(path, DELTA).observations
+    assert np.allclose(rows.covariance, LENGTH**2 * np.eye(3), rtol=1e-9, atol=0.0)
+
+
+def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
+    _, data = measure_biased()
+    (rows,) = data.observations
+    rows = replace(rows, kind=replace(rows.kind, unknown=("scale",)))
+    stated = (lc.StatedValue("component.scale", 2e-6),)
+    data = replace(data, observations=(rows,), stated_values=stated)
+    expected = {f"{session}.component.scale": 2e-6 for session in ("mon", "tue", "wed")}
+    save_measurements(data, tmp_path / "a.csv", DELTA)
+    for each in (data, load_measurements(tmp_path / "a.csv", DELTA)):
+        entries = each.nuisance_parameters.table.entries
+        assert {e.name: e.tolerance for e in entries} == expected
+    with pytest.raises(lc.DataError, match="the scope of 'a' is 'some'"):
+        lc.StatedValue("a", 1.0, scope="some")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("scale: 2 ppm", "write 'scale: {sd: 2 ppm}'"),
+        ("scale: {}", "write 'scale: {sd: 2 ppm}'"),
+        ("scale: {mean: 2 ppm}", "has no key 'sd'"),
+        ("scale: {sd: 2}", "write a number and one of 1, ppm, um/m"),
+        ("scale: {sd: 2 mm}", "write a number and one of 1, ppm, um/m"),
+        ("scale: {sd: nan ppm}", "write a number and one of"),
+        ("scale: {sd: -2 ppm}", "'sd' of 'scale' is -2 ppm; write a positive number"),
+        ("scale: {sd: 2 ppm, sigma: 3 ppm}", "sigma"),
+        ("scale: {sd: 2 ppm, scope: robot}", "the scope is 'robot'; write session, or all"),
+        ("temperature: {value: 23 mm, sd: 1 K, expansion: 11.5 ppm/K}", "degC, K, degF"),
+        ("temperature: {value: 23 degC, sd: 1 mm, expansion: 11.5 ppm/K}", "degC, K, degF"),
+        ("temperature: {value: 23 degC, sd: 1 K, expansion: 11.5 ppm}", "ppm/K"),
+        ("temperature: {value: 23 degC, sd: 1 K}", "has no key 'expansion'"),
+        ("temperature: {value: -5 K, sd: 1 K, expansion: 11.5 ppm/K}", "below absolute zero"),
+        ("mpe: {per_length: 6 um/m}", "has no key 'constant'"),
+        ("mpe: {constant: -6 um}", "positive number"),
+        ("mpe: {constant: 6 ppm}", "write a number and one of m, mm"),
+    ],
+)
+def test_wrong_scales_are_refused_at_their_place(tmp_path, line, words):
+    _, data = measure_biased()
+    with pytest.raises(FileError, match=words) as caught:
+        load_measurements(save_with(tmp_path / "a.csv", data, line), DELTA)
+    assert "a.csv:1" in str(caught.value)
+
+
+def test_contradictions_of_scales_are_refused(tmp_path):
+    _, data = measure_biased()
+    lines = ["mpe: {constant: 6 um, per_length: 2 ppm}", "scale: {sd: 2 ppm}"]
+    with pytest.raises(FileError, match="both state the scale of the instrument; remove one"):
+        load_measurements(save_with(tmp_path / "a.csv", data, *lines), DELTA)
+    lines = ["scale: {sd: 2 ppm, scope: all}", "unknowns: {mon.component.scale: {sd: 5 ppm}}"]
+    with pytest.raises(FileError, match="has the scope all in another line or file"):
+        load_measurements(save_with(tmp_path / "a.csv", data, *lines), DELTA)
+
+
+@pytest.mark.parametrize("key", ["scale", "temperature", "mpe"])
+def test_angles_have_no_scale(tmp_path, key):
+    text = f"# kind: inclination\n# noise: {{'*': 5 urad}}\n# {key}: {{sd: 2 ppm}}\n"
+    path = tmp_path / "a.csv"
+    path.write_text(text + "q1 [mm],q2 [mm],q3 [mm],tilt_x [mrad],tilt_y [mrad]\n200,200,200,1,2\n")
+    with pytest.raises(FileError, match=f"'inclination' measures no lengths; remove '{key}'"):
+        load_measurements(path, DELTA)

@@ -41,16 +41,17 @@ from loopcal.measure.observations import Observations
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import are_nonzero, substitute_backward
+from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import OTHER, Field, fields, label_axes
 from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 # Kinds of sources; others are the codes of the findings with which a covariance was added.
-INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
+INSTRUMENT, READINGS, SETUP, COMMON = "instrument", "readings", "setup", "common"
 EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
 # Kinds of sources whose errors the fit weighs against each other.
-OF_ROWS = (INSTRUMENT, READINGS, SETUP, TOLERANCES, EARLIER)
+OF_ROWS = (INSTRUMENT, READINGS, SETUP, COMMON, TOLERANCES, EARLIER)
 PRIOR = "prior."  # begins codes of findings on the tolerances, whose errors count as theirs
 POSES, SEED = 200, 0  # number and seed of the poses that are drawn from the workspace
 NEGLIGIBLE = 0.01  # share of an expected error below which the sentence leaves out a source
@@ -59,6 +60,7 @@ SOURCE_WORDS = {
     INSTRUMENT: "instrument: {name}",
     READINGS: "actuator readings",
     SETUP: "setup parameters",
+    COMMON: "common error: {name}",
     TOLERANCES: "tolerances",
     EARLIER: "earlier calibration",
     REPEATABILITY: "repeatability in use",
@@ -81,8 +83,8 @@ class Source(NamedTuple):
 
     # one of the kinds above, "residuals.model-discrepancy", or the code of another finding
     kind: str
-    # of the measurement with its session; "position" or "orientation" of a discrepancy; of other
-    # sources empty
+    # of the measurement with its session; of a common error of an instrument, such as
+    # `tracker.scale`; "position" or "orientation" of a discrepancy; of other sources empty
     name: str
     # "A" by statistics, "B" by other means (JCGM 100, 3.3), "A and B" where a stated value was
     # corrected by statistics
@@ -118,15 +120,18 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
     sources = [Source(kind, name, evaluation, of_noise) for kind, name in names]
     factors = list(fold_sources(linear.problem, linear.linearization, members, len(names)))
     U = factors[0].shape[1] - len(fit.names)
-    for kind, rows in _list_further_rows(linear, U):
-        sources.append(Source(kind, "", "B", np.inf))
+    common = list_common_errors(linear.problem)
+    for (kind, name), rows in _list_further_rows(linear, U, common):
+        sources.append(Source(kind, name, "B", np.inf))
         factors.append(rows)
     own, moved = _propagate(linear, factors, U)
     evaluation_of_size = "B (assumed)" if fit.free_parameters.assumed.any() else "B"
     evaluation_of_size = "A and B" if np.isfinite(of_size) else evaluation_of_size
     sources.append(Source(TOLERANCES, "", evaluation_of_size, of_size))
-    rest, of_setup = _separate_setup(own, moved, linear.linearization)
-    if len(fit.nuisance):  # rows of stated setup parameters act by these alone
+    is_common = np.array([source.kind == COMMON for source in sources])
+    is_setup = np.array([not name for name in common], dtype=bool)
+    rest, of_setup = _separate_setup(own, moved, linear.linearization, is_common, is_setup)
+    if is_setup.any():  # rows of stated setup parameters act by these alone
         sources.append(Source(SETUP, "", evaluation, of_noise))
         rest.append(of_setup)
     merged: dict[Source, list[FloatArray]] = {}
@@ -164,10 +169,10 @@ def _halve_sigma(
         factors = (np.where(rows, 2.0, 1.0)[:, None, None] for rows in chosen)
         pairs = zip(problem.rows, factors, strict=True)
         problem = problem.with_rows(replace(r, whitener=factor * r.whitener) for r, factor in pairs)
-    elif source.kind == SETUP and nuisance is not None and nuisance.has_prior.any():
+    elif source.kind in (SETUP, COMMON) and nuisance is not None and nuisance.has_prior.any():
         local = nuisance.local
-        for entry in local.table.entries:
-            if entry.free and entry.tolerance is not None:
+        for entry, name in zip(local.table.entries, list_common_errors(problem), strict=True):
+            if name == source.name and entry.free and entry.tolerance is not None:
                 local = local.with_prior(entry.name, 0.5 * entry.tolerance)
         poses = replace(problem.poses, nuisance=replace(nuisance, local=local))
         problem = replace(problem, poses=poses)
@@ -209,22 +214,45 @@ def _number_sources(linear: FitLinearization) -> tuple[list[tuple[str, str]], li
     return list(numbers), members
 
 
-def _list_further_rows(linear: FitLinearization, U: int) -> list[tuple[str, FloatArray]]:
-    """Return rows (m, U + p) of the stated setup parameters, and of an earlier calibration."""
+def list_common_errors(problem: Problem) -> list[str]:
+    """Return for each of U setup parameters the common error of an instrument that it is, such as
+    `tracker.bias` for a component in a session; empty for frames and others, or without a prior.
+    """
+    nuisance = problem.nuisance
+    if nuisance is None:
+        return []
+    names = [""] * len(nuisance)
+    for rows in problem.rows:
+        for i, name in rows.kind.common_errors.items():
+            for k in find_distinct(rows.nuisance[:, i]):
+                names[k] = name if nuisance.has_prior[k] else ""
+    return names
+
+
+def _list_further_rows(
+    linear: FitLinearization, U: int, common: list[str]
+) -> list[tuple[tuple[str, str], FloatArray]]:
+    """Return kind, name and rows (m, U + p) of stated setup parameters, of common errors, and of an
+    earlier calibration.
+    """
     rows, prior = [], linear.fit.options.prior
     problem, estimate = linear.problem, linear.linearization.nuisance
     if problem.nuisance is not None and estimate is not None and problem.nuisance.has_prior.any():
         stated = problem.nuisance.has_prior
         sd = problem.nuisance.local.table.tolerance[stated]
         done = estimate.elimination
-        both = np.concatenate([done.joint_root()[0], done.slope[0]], axis=1)[stated]
-        rows.append((SETUP, both / sd[:, None]))
+        both = np.concatenate([done.joint_root()[0], done.slope[0]], axis=1)[stated] / sd[:, None]
+        names = np.array(common)[stated]
+        rows += [
+            ((COMMON if name else SETUP, name), both[names == name])
+            for name in find_distinct(names).tolist()
+        ]
     if prior is not None:
         measured = problem.linearize(
             linear.linearization.deviation, linear.linearization.next_start
         )
         slope = prior.added(problem).list_slopes(measured)[0]
-        rows.append((EARLIER, np.concatenate([np.zeros((len(slope), U)), slope], axis=1)))
+        rows.append(((EARLIER, ""), np.concatenate([np.zeros((len(slope), U)), slope], axis=1)))
     return rows
 
 
@@ -251,30 +279,41 @@ def _propagate(
 
 
 def _separate_setup(
-    errors: list[FloatArray], moved: list[FloatArray], linearization: Linearization
+    errors: list[FloatArray],
+    moved: list[FloatArray],
+    linearization: Linearization,
+    is_common: BoolArray,
+    is_setup: BoolArray,
 ) -> tuple[list[FloatArray], FloatArray]:
     """Return the errors of the machine that are uncorrelated with those of the setup parameters, by
     source, and a root (p, k) of the others.
+
+    Sources that are common errors of an instrument stay whole: they also move frames, and would
+    seem to be errors of these. is_setup : (U,) parameters that are no such errors.
     """
     estimate = linearization.nuisance
     if estimate is None:
         return list(errors), np.zeros((len(errors[0]), 0))
-    done = estimate.elimination
-    e = np.concatenate(errors, axis=1)
-    setup = done.slope[0] @ e + done.joint_root()[0] @ np.concatenate(moved, axis=1)
+    done, kept = estimate.elimination, np.flatnonzero(~is_common)
+    e, motion = (np.concatenate([of[i] for i in kept], axis=1) for of in (errors, moved))
+    setup = done.slope[0][is_setup] @ e + done.joint_root()[0][is_setup] @ motion
     length = np.linalg.norm(setup, axis=1, keepdims=True)
     _, s, vt = np.linalg.svd(setup / np.where(length > 0.0, length, 1.0), full_matrices=False)
     basis = vt[are_nonzero(s)].T if s.size and s[0] > 0.0 else np.zeros((e.shape[1], 0))
     of_setup = e @ basis
     rest = e - of_setup @ basis.T
-    ends = np.cumsum([each.shape[1] for each in errors])[:-1]
-    return list(np.split(rest, ends, axis=1)), of_setup
+    ends = np.cumsum([errors[i].shape[1] for i in kept])[:-1]
+    separated = list(errors)
+    for i, part in zip(kept, np.split(rest, ends, axis=1), strict=True):
+        separated[i] = part
+    return separated, of_setup
 
 
 class ErrorSources(NamedTuple):
     """Variances [m^2 or rad^2] of the length of an error, mean over poses, by kind of source.
 
-    `other` are the covariances that findings added, such as for correlated errors.
+    `common` are those that all values of an instrument share, such as its scale; `other` the
+    covariances that findings added, such as for correlated errors.
     """
 
     instrument: float
@@ -285,6 +324,7 @@ class ErrorSources(NamedTuple):
     earlier: float = 0.0
     discrepancy: float = 0.0
     other: float = 0.0
+    common: float = 0.0
 
     @property
     def rms(self) -> float:

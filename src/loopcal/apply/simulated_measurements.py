@@ -15,8 +15,10 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.measure.data_checks import check_strokes, find_outside_strokes
 from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Noise, Sensor, Uniform
 from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.kind import name_shared_error
 from loopcal.measure.kinds.position import TargetKind
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import StatedValue
 from loopcal.measure.simulation import (
     replace_measured_values,
     sample_truth,
@@ -156,6 +158,8 @@ class InstrumentDescription:
     # sigma_position, sigma_angle: standard deviations of each length [m] and angle [rad]
     sigma_position: float = SIGMA[Dimension.LENGTH]
     sigma_angle: float = SIGMA[Dimension.ANGLE]
+    # standard deviation of a factor on all lengths that it measures, which is drawn; None for 1
+    sigma_scale: float | None = None
     # of "base" (the frame of the instrument in the base) and "tool"
     unknown_frames: Sequence[str] = ()
     # names of targets on the platform whose places are unknown; none leaves the tool
@@ -170,7 +174,7 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
     possible = {"components": tuple(description.components), "orientation": description.orientation}
     settings = {name: value for name, value in possible.items() if value}
     sigma = {Dimension.LENGTH: description.sigma_position, Dimension.ANGLE: description.sigma_angle}
-    sensors = []
+    sensors, stated = [], list[StatedValue]()
     for i, name in enumerate(description.kinds):
         if name not in KINDS:
             raise DataError(
@@ -195,7 +199,12 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
         if description.targets:
             unknown = tuple(dict.fromkeys((*kind.unknown, "targets")))
             kind = replace(kind, targets=tuple(description.targets), unknown=unknown)
-        noise = np.array([sigma[column.dimension] for column in kind.noise_columns])
+        columns = [column.dimension for column in kind.noise_columns]
+        if description.sigma_scale is not None and Dimension.LENGTH in columns:
+            kind = replace(kind, unknown=(*kind.unknown, "scale"))
+            owned = name_shared_error(kind, "scale", "")
+            stated.append(StatedValue(owned, description.sigma_scale))
+        noise = np.array([sigma[dimension] for dimension in columns])
         sensors.append(Sensor(kind, DISTRIBUTIONS[description.distribution](noise)))
     for setting in settings:
         if not any(setting in _setting_names(name) for name in description.kinds):
@@ -204,7 +213,9 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
                 f"the setting {setting!r} does not belong to the kind {kinds!r}; remove it, or "
                 "choose another kind"
             )
-    return Instrument(tuple(sensors))
+    if description.sigma_scale is not None and not stated:
+        raise DataError("the instrument measures angles, which have no scale; remove its sigma")
+    return Instrument(tuple(sensors), tuple(stated))
 
 
 def _setting_names(kind: str) -> set[str]:
@@ -248,4 +259,4 @@ def place_targets(instrument: Instrument, robot: Mechanism) -> Instrument:
             places = np.round(radius * circle, 1 if radius < 100.0 else 0) * unit
             kind = kind if kind.has_tool else replace(kind, places=places + robot.tool[:3, 3])
         sensors.append(replace(sensor, kind=kind))
-    return Instrument(tuple(sensors))
+    return replace(instrument, sensors=tuple(sensors))

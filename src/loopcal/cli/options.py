@@ -623,6 +623,11 @@ INSTRUMENT: Any = Group(
     sigma_angle=option(
         "Standard deviation of each measured angle.", of=_INSTRUMENT, type=POSITIVE_ANGLE
     ),
+    sigma_scale=option(
+        "Standard deviation of a common factor on all measured lengths, such as 2ppm.  "
+        "[default: none]",
+        type=_quantity(Dimension.RATIO, is_positive=True),
+    ),
 )
 """The kind of measurement and its noise, for `make_instrument`."""
 

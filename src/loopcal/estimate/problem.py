@@ -58,7 +58,7 @@ from loopcal.estimate.pose_coordinates import (
 from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows
-from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
+from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import compute_whitener
 from loopcal.measure.readings import list_sensed_joints, make_readings_kind, resolve_reading_sigma
 from loopcal.mechanism.model import Mechanism
@@ -524,7 +524,7 @@ def problem_of_trials(
 ) -> Problem:
     """Return the problem of t simulated machines; `nuisance`: other than those of the kinds."""
     sensors, first = trials.instrument.sensors, trials.trial(0)
-    local = nuisance or collect_nuisance_parameters(first.all_observations, first.labels)
+    local = nuisance or first.nuisance_parameters
     order = sorted(range(len(sensors)), key=lambda i: sensors[i].kind.is_of_base)  # stable
     rows = []
     for i, (number, o) in enumerate(zip(order, first.all_observations, strict=True)):

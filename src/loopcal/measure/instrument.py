@@ -17,6 +17,7 @@ from loopcal.measure.array_checks import (
     set_fields,
 )
 from loopcal.measure.kinds.kind import Kind, measure_progress
+from loopcal.measure.nuisance import StatedValue
 from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray, IntArray
@@ -118,7 +119,7 @@ def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Ge
     numbers only.
 
     purpose : separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3
-        effects, 4 errors of the readings of held-out poses.
+        effects, 4 errors of the readings of held-out poses, 5 setup parameters.
     """
     if isinstance(seed, BlockStream):
         counter = np.array([0, purpose, trial, seed.block], dtype=np.uint64)
@@ -210,12 +211,17 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Instrument:
-    """The sensors, at least one, that measure every pose."""
+    """The sensors, at least one, that measure every pose.
+
+    stated_values : priors of its setup parameters, such as a scale of 2 ppm:
+        `StatedValue("position.scale", sd=2e-6)`. A simulation draws the true values from them.
+    """
 
     sensors: tuple[Sensor, ...]
+    stated_values: tuple[StatedValue, ...] = ()
 
     def __post_init__(self) -> None:
-        set_fields(self, sensors=tuple(self.sensors))
+        set_fields(self, sensors=tuple(self.sensors), stated_values=tuple(self.stated_values))
         if not self.sensors:
             raise DataError("an instrument needs at least one sensor: a kind and its noise")
         for sensor in self.sensors:
@@ -228,6 +234,5 @@ class Instrument:
 
     def with_tool(self, robot: Mechanism) -> Self:
         """Return the instrument with the robot's tool, wherever a kind does not state one."""
-        return type(self)(
-            tuple(replace(s, kind=s.kind.with_tool(robot.tool)) for s in self.sensors)
-        )
+        sensors = (replace(s, kind=s.kind.with_tool(robot.tool)) for s in self.sensors)
+        return replace(self, sensors=tuple(sensors))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from loopcal.units import SD_RANGE, is_sd
 if TYPE_CHECKING:
     from loopcal.measure.instrument import Sensor
 
+ALL = "machine"  # scope of a parameter that all rows share
+
 
 @dataclass(frozen=True)
 class StatedValue:
@@ -32,22 +34,28 @@ class StatedValue:
 
     Parameters
     ----------
-    name : full name, such as `monday.tracker.x`.
+    name : full name, such as `monday.tracker.x`; without a session (`tracker.x`) that of the
+        parameter in every session.
     sd : standard deviation of a prior [SI]; 0 fixes the parameter.
     nominal : fixed value, or center of the prior [SI]; default: the nominal value of the kind.
     is_undetermined : whether it is fixed because no motion of the machine determines it.
+    scope : "all" where all sessions share one value of a parameter `tracker.x`; by default every
+        session has its own.
 
     Raises
     ------
-    DataError : the standard deviation is negative, or a number is not finite.
+    DataError : the standard deviation is negative, a number is not finite, or another scope.
     """
 
     name: str
     sd: float = 0.0
     nominal: float | None = None
     is_undetermined: bool = False
+    scope: Literal["session", "all"] = "session"
 
     def __post_init__(self) -> None:
+        if self.scope not in ("session", "all"):
+            raise DataError(f"the scope of {self.name!r} is {self.scope!r}; give session or all")
         if self.sd != 0.0 and not is_sd(self.sd):
             raise DataError(
                 f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, "
@@ -145,6 +153,9 @@ def collect_nuisance_parameters(
     """
     entries: dict[str, Parameter] = {}
     references: dict[str, FloatArray] = {}
+    in_sessions: dict[str, list[str]] = {}  # own name -> full names
+    stated_values = tuple(stated_values)
+    common = {value.name for value in stated_values if value.scope == "all"}
     indices, factors = [], []
     for rows in observations:
         kind = rows.kind
@@ -160,17 +171,22 @@ def collect_nuisance_parameters(
         keys = list(zip(*owners.values(), strict=True)) if owners else [()] * len(rows.session)
         names = {}
         for key in dict.fromkeys(keys):
-            owner = dict(zip(owners, key, strict=True))
-            names[key] = [
-                _enter(entries, p, owner[p.scope], kind) for p in kind.nuisance_parameters
+            owner = dict(zip(owners, key, strict=True)) | {ALL: ""}
+            own = [
+                replace(p, scope=ALL) if p.name in common else p for p in kind.nuisance_parameters
             ]
+            names[key] = [_enter(entries, p, owner[p.scope], kind) for p in own]
+            for parameter, name in zip(own, names[key], strict=True):
+                in_sessions.setdefault(parameter.name, []).append(name)
         order = {name: i for i, name in enumerate(entries)}
         used = [[order[name] for name in names[key]] for key in keys]
         shape = (len(keys), len(kind.nuisance_parameters))
         indices.append(np.array(used, dtype=np.intp).reshape(shape))
     for stated in stated_values:
-        if (entry := entries.get(stated.name)) is not None:
-            entries[stated.name] = replace(
+        names = [stated.name] if stated.name in entries else in_sessions.get(stated.name, [])
+        for name in names:
+            entry = entries[name]
+            entries[name] = replace(
                 entry,
                 nominal=entry.nominal if stated.nominal is None else stated.nominal,
                 tolerance=stated.sd or entry.tolerance,

@@ -56,7 +56,7 @@ class Disturbance:
 
 
 NO_DISTURBANCE = Disturbance()
-NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
+NOISE, TRUTH, READING, SETUP = 0, 1, 2, 5  # purposes of a trial's random streams
 STEPS = 20  # corrections of a commanded position; each leaves the share of the geometry's errors
 EXACT = 1e-6  # share of the noise to which a gap is reached
 # Parameters of a surface that move it along the residuals of its points, in their order.
@@ -123,7 +123,8 @@ class Trials:
     truth : (t, p) [SI], true parameter values of each trial.
     T : (t, n, 4, 4), true T_base_platform.
     reached : (t, n) bool, poses that the true machine reaches.
-    nuisance_parameters : of the kinds, with their true values as nominal ones.
+    nuisance_parameters : of the kinds, with their true values, or the means from which these are
+        drawn, as nominal ones.
     recorded : (t, n, a) [SI] readings with their noise; None where they are the controller's.
     reading_sigma : (n, a) [SI], as in `Measurements`.
     """
@@ -162,6 +163,7 @@ class Trials:
             self.readings if self.recorded is None else self.recorded[i],
             tuple(rows for rows in observations if not rows.kind.is_of_base),
             reading_sigma=self.reading_sigma,
+            stated_values=self.instrument.stated_values,
             base_observations=tuple(rows for rows in observations if rows.kind.is_of_base),
         )
 
@@ -227,7 +229,8 @@ def simulate_trials(
     poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI], as commanded.
     seed : trial i draws the same noise for any number of trials.
     controller : the geometry that turns poses into readings; default: the nominal robot.
-    nuisance_values : true values [SI] of setup parameters, such as `tracker.x`; default: nominal.
+    nuisance_values : true values [SI] of setup parameters, such as `tracker.x`; default: drawn
+        where the instrument states a prior, such as that of its scale, else nominal.
     reading_sigma : number, (a,) or (n, a) [SI], standard deviation of the recorded readings, which
         are the true ones plus normal noise; 0 is exact, infinity is missing. Default: as the robot
         states for its actuators.
@@ -251,10 +254,12 @@ def simulate_trials(
     readings, n = commanded.q, len(commanded.q)
     given = None if reading_sigma is None else broadcast_reading_sigma(reading_sigma, readings)
     check_closure(robot, kinds, given, n)
-    assigned = Instrument(tuple(s.assign_rows(n) for s in instrument.with_tool(robot).sensors))
+    mounted = instrument.with_tool(robot)
+    assigned = replace(mounted, sensors=tuple(s.assign_rows(n) for s in mounted.sensors))
     labels = tuple(str(i + 1) for i in range(n))
-    nuisance = collect_nuisance_parameters(assigned.sensors, labels)
+    nuisance = collect_nuisance_parameters(assigned.sensors, labels, instrument.stated_values)
     nuisance = nuisance.with_nominal(nuisance.values(nuisance_values))
+    true_setup = _draw_setup(nuisance, nuisance_values or {}, len(values), seed)
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
     true, state = _reach_poses(robot, values, readings, commanded.state, disturbance)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
@@ -270,7 +275,7 @@ def simulate_trials(
     for k, sensor in enumerate(assigned.sensors):
         kind, rows = sensor.kind, sensor.assigned_rows
         noise = np.stack([sensor.noise.draw(stream, len(rows)) for stream in streams])
-        setup = nuisance.select(k, nuisance.table.nominal[None])
+        setup = nuisance.select(k, true_setup)
         columns = kind.measure(seen[:, rows], noise, setup, kind.stack_joints(joints, rows))
         if not kind.is_of_base:
             complete = np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1)
@@ -280,6 +285,21 @@ def simulate_trials(
     recorded = _record_readings(robot, shown, reading_sigma, len(values), seed)
     columns = tuple(measured)
     return Trials(assigned, robot.name, readings, columns, values, T, reached, nuisance, *recorded)
+
+
+def _draw_setup(
+    nuisance: NuisanceParameters, stated: Mapping[str, float], trials: int, seed: Seed
+) -> FloatArray:
+    """Return true values (t | 1, U) of setup parameters, drawn from their priors where they have
+    one and no `stated` true value.
+    """
+    table = nuisance.table
+    is_drawn = table.free & ~np.isnan(table.tolerance) & ~np.isin(table.names, list(stated))
+    if not is_drawn.any():
+        return table.nominal[None]
+    streams = (make_random_stream(seed, trial, SETUP) for trial in range(trials))
+    draws = np.stack([stream.standard_normal(len(table)) for stream in streams])
+    return table.nominal + np.where(is_drawn, table.tolerance, 0.0) * draws
 
 
 def simulate(
@@ -333,7 +353,7 @@ def replace_measured_values(
         for sensor, rows in zip(instrument.sensors, data.all_observations, strict=True)
     )
     how = {"controller": robot.nominal, "reading_sigma": data.reading_sigma}
-    measured = simulate(robot, nominal.T, Instrument(sensors), seed, **how)
+    measured = simulate(robot, nominal.T, replace(instrument, sensors=sensors), seed, **how)
     filled = replace(
         data, observations=measured.observations, base_observations=measured.base_observations
     )

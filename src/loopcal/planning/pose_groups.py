@@ -217,7 +217,8 @@ def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters
     assigned = _assign_poses(mounted, members)
     of_poses = (replace(sensor, rows=rows).assign_rows(count) for sensor, rows in assigned)
     sensors = (*of_poses, *_list_base_sensors(mounted))
-    return collect_nuisance_parameters(sensors, tuple(str(i) for i in range(count)))
+    labels = tuple(str(i) for i in range(count))
+    return collect_nuisance_parameters(sensors, labels, mounted.stated_values)
 
 
 def _assign_poses(mounted: Instrument, members: IntArray) -> list[tuple[Sensor, IntArray]]:
@@ -275,7 +276,7 @@ def _linearize_block(
     if is_redundant:
         read = Sensor(make_readings_kind(robot), Gaussian(robot.stated_sigma))
         mounted, places = (
-            Instrument((*mounted.sensors, read)),
+            replace(mounted, sensors=(*mounted.sensors, read)),
             np.arange(members.size).reshape(members.shape),
         )
         observed = _observe_groups(free, readings[members.ravel()], joints, size)

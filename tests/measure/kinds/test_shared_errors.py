@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every kind can have a bias and a drift of each session."""
+"""Every kind can have a bias and a drift of each session; one that measures lengths, a scale."""
 
 import dataclasses
 
@@ -7,23 +7,36 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from loopcal.errors import DataError
 from loopcal.measure.instrument import Gaussian, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.distance import Distance, Separation
-from loopcal.measure.kinds.kind import measure_progress, update_setup_name
+from loopcal.measure.kinds.kind import SCALES, measure_progress, update_setup_name
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.position import Bearing
 from loopcal.measure.nuisance import collect_nuisance_parameters
 from loopcal.measure.observations import Observations
+from loopcal.units import Dimension
 from tests.measure.kinds.test_contract import (
     attach_frame_and_tool,
+    check_derivatives,
     draw_joint_values,
     platform_poses,
 )
 
+CONSTANTS = ("bias", "drift")
+
+
+def measures_lengths(kind):
+    return any(column.dimension is Dimension.LENGTH for column in kind.columns)
+
+
 KINDS_WITH_ERRORS = [
     pytest.param(
-        dataclasses.replace(kind, unknown=(*kind.unknown, "bias", "drift")), id=f"{name}-{i}"
+        dataclasses.replace(
+            kind, unknown=(*kind.unknown, *CONSTANTS, *(SCALES if measures_lengths(kind) else ()))
+        ),
+        id=f"{name}-{i}",
     )
     for name, cls in KINDS.items()
     for i, kind in enumerate(cls.examples()[:2])
@@ -41,7 +54,8 @@ def test_what_is_measured_with_a_bias_has_no_residual_and_right_derivatives(kind
     assert shared > 0
     # the bias of a length is its offset, which is no error that all kinds have
     own = 2 if kind.bias_item == "bias" else 1
-    assert kind.is_drift[-shared:].sum() * own == shared
+    scales = len(SCALES) if measures_lengths(kind) else 0
+    assert kind.is_drift[-shared:].sum() * own == shared - scales
     values = np.tile(kind.nominal_values, (1, 3, 1))
     values[..., -shared:] += 1e-5 * np.random.default_rng(1).standard_normal((1, 3, shared))
     measured = kind.measure(T, np.zeros((1, 3, len(kind.noise_columns))), values, joints)
@@ -54,6 +68,39 @@ def test_what_is_measured_with_a_bias_has_no_residual_and_right_derivatives(kind
         moved[..., i] += 1e-3
         change = kind.evaluate(T, measured, moved, joints).residual - evaluated.residual
         assert_allclose(evaluated.nuisance[..., i], change / 1e-3, atol=1e-9)
+
+
+SCALED = [
+    pytest.param(dataclasses.replace(kind, unknown=(*kind.unknown, "scale")), id=f"{name}-{i}")
+    for name, cls in KINDS.items()
+    for i, kind in enumerate(cls.examples())
+    if measures_lengths(kind)
+]
+
+
+@pytest.mark.parametrize("kind", SCALED)
+def test_derivatives_of_scaled_lengths_agree_with_finite_differences(kind):
+    check_derivatives(kind, 1e-4, with_jax=False)
+
+
+@pytest.mark.parametrize("kind", SCALED)
+def test_a_scale_multiplies_lengths_and_leaves_angles(kind):
+    kind = attach_frame_and_tool(kind)
+    T = platform_poses(kind, 2, 5)
+    noise = 1e-3 * np.random.default_rng(4).standard_normal((2, 5, len(kind.noise_columns)))
+    joints, values = draw_joint_values(kind, T), np.array(kind.nominal_values)
+    exact, plain = (kind.measure(T, n, values, joints) for n in (0.0 * noise, noise))
+    values[-1] = 0.5
+    is_length = np.array([column.dimension is Dimension.LENGTH for column in kind.columns])
+    assert_allclose(
+        kind.measure(T, noise, values, joints), plain + 0.5 * exact * is_length, atol=1e-14
+    )  # [m, rad] rounding
+
+
+@pytest.mark.parametrize("kind", [Bearing(), KINDS["direction"](), KINDS["inclination"]()])
+def test_what_measures_angles_has_no_scale(kind):
+    with pytest.raises(DataError, match="measures angles, which have no scale; remove 'scale'"):
+        dataclasses.replace(kind, unknown=("scale",))
 
 
 def test_progress_is_that_in_time_within_each_session():

@@ -114,6 +114,7 @@ SOURCES = {
     "instrument": "instrument",
     "readings": "actuator readings",
     "setup": "set-up",
+    "common": "common errors of the instrument",
     "tolerances": "undetermined tolerances",
     "earlier": "earlier calibration",
     "repeatability": "repeatability",

@@ -139,7 +139,8 @@ class _RecordReader:
 
     def _scale(self, node: Any, dimension: Dimension, at: Location) -> Any:
         """Return a number in SI; what is none as it is."""
-        if self.units is None and dimension is not Dimension.RATIO and node is not None:
+        is_plain = node is None or (dimension is Dimension.RATIO and not isinstance(node, str))
+        if self.units is None and not is_plain:
             return self.file.quantity(node, dimension, at)
         if not isinstance(node, int | float) or isinstance(node, bool):
             return node

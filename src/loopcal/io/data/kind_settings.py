@@ -22,10 +22,20 @@ import types
 import typing
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache, reduce
-from typing import TYPE_CHECKING, Annotated, Any, Union, cast, get_args, get_origin
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +48,12 @@ from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.data.columns import (
+    ABSOLUTE_ZERO,
+    ROUNDING,
     ROW_COLUMNS,
     SIGMA,
+    TEMPERATURE_UNITS,
+    Scales,
     find_column_fault,
     list_columns,
     name_covariance,
@@ -53,13 +67,17 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import (
     DISPLAY_UNITS,
     EXAMPLES,
+    NUMBER,
     SI_SYMBOLS,
     SMALLEST_SD,
+    UNITS,
     Angle,
     Dimension,
     Length,
     Ratio,
+    Unit,
     find_sd_fault,
+    list_symbols,
 )
 
 if TYPE_CHECKING:
@@ -204,13 +222,13 @@ def describe_kind(
     return {**settings, "noise_source": ASSUMED} if is_noise_assumed else settings
 
 
-def describe_quantity(value: float, dimension: Dimension) -> str | float:
+def describe_quantity(value: float, dimension: Dimension, unit: Unit | None = None) -> str | float:
     """Return a number with its unit, in SI where only that reads back as the same double; a ratio
-    without a unit.
+    for which none is given without a unit.
     """
-    if dimension is Dimension.RATIO:
+    if dimension is Dimension.RATIO and unit is None:
         return value
-    shown = DISPLAY_UNITS[dimension]
+    shown = unit or DISPLAY_UNITS[dimension]
     text = format_scaled(value, shown.factor_to_si)
     if float(text) * shown.factor_to_si == value:
         return f"{text} {shown.symbol}"
@@ -286,7 +304,12 @@ _NUMBERS: tuple[Any, ...] = (Length, Angle, Ratio)
 RECORDS = {
     dimension: make_dataclass(
         "KnownParameter",
-        [("start", number | None, None), ("sd", number | None, None), ("fixed", bool, False)],
+        [
+            ("start", number | None, None),
+            ("sd", number | None, None),
+            ("fixed", bool, False),
+            ("scope", Literal["session", "all"], "session"),
+        ],
         frozen=True,
     )
     for dimension, number in zip(
@@ -296,37 +319,24 @@ RECORDS = {
 """Dimension -> record of the knowledge of a parameter."""
 
 
+Stated = tuple["StatedValue", YamlFile, Location]  # what is known, and where it is stated
+
+
 def read_stated_values(
-    files: Sequence[tuple[YamlFile, Sequence[Observations], Mapping[str, float]]],
+    files: Sequence[tuple[YamlFile, Sequence[Observations], Sequence[StatedValue]]],
     labels: tuple[str, ...],
 ) -> tuple[StatedValue, ...]:
     """Return the knowledge that files state of the setup parameters of their own rows.
 
-    `files` : settings of each file, its rows, and the standard deviations of their biases and
-    drifts by name without the session, 0 where there is none. `labels` : names of the poses.
+    `files` : settings of each file, its rows, and the priors of the common errors of its
+    instruments, of `read_shared_errors`. `labels` : names of the poses.
 
     FileError : a name that is not a parameter of the file, a bad statement, contradicting files.
     DataError : two kinds of a file state one parameter differently.
     """
-    from loopcal.measure.nuisance import StatedValue, collect_nuisance_parameters
-
-    known: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
+    known: dict[str, Stated] = {}
     for file, observations, shared in files:
-        stated = file.content.get(KEY, {})
-        if not isinstance(stated, dict):
-            sentence = f"{KEY!r} must name parameters, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}"
-            raise file.error(sentence, (KEY,))
-        of_file: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
-        entries: tuple[Parameter, ...] = ()
-        if stated or shared:
-            entries = collect_nuisance_parameters(observations, labels).table.entries
-        for name, sd in shared.items():
-            of_sessions = [e.name for e in entries if e.name == name or e.name.endswith(f".{name}")]
-            of_file |= {n: (StatedValue(n, sd), file, (KEY,)) for n in of_sessions}
-        for pattern, node in stated.items():
-            place = (KEY, pattern)
-            matching = _match(file, entries, pattern)
-            of_file |= {k.name: (k, file, place) for k in _read_one(file, node, matching, place)}
+        of_file = _read_values_of_file(file, observations, shared, labels)
         for name, (value, _, place) in of_file.items():
             if name in known and known[name][0] != value:
                 _, other, other_place = known[name]
@@ -334,7 +344,54 @@ def read_stated_values(
                 sentence = f"parameter {name!r} is stated differently in {line}; state it once"
                 raise file.error(sentence, place)
         known = of_file | known
+    common = [name for name, (value, _, _) in known.items() if value.scope == "all"]
+    for name, (_, file, place) in known.items():
+        if any(name != other and _is_parameter(name, other) for other in common):
+            sentence = f"parameter {name!r} has the scope all in another line or file"
+            raise file.error(f"{sentence}; state its scope once", place)
     return tuple(value for value, _, _ in known.values())
+
+
+def _read_values_of_file(
+    file: YamlFile,
+    observations: Sequence[Observations],
+    shared: Sequence[StatedValue],
+    labels: tuple[str, ...],
+) -> dict[str, Stated]:
+    """Return name -> what one file states of a parameter."""
+    from loopcal.measure.nuisance import collect_nuisance_parameters
+
+    stated = file.content.get(KEY, {})
+    if not isinstance(stated, dict):
+        sentence = f"{KEY!r} must name parameters, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}"
+        raise file.error(sentence, (KEY,))
+    if not (stated or shared):
+        return {}
+    entries = collect_nuisance_parameters(observations, labels).table.entries
+    values: dict[str, Stated] = {}
+    for value in shared:
+        names = [value.name]
+        if value.scope == "session":
+            names = [e.name for e in entries if _is_parameter(e.name, value.name)]
+        for name in names:
+            prior = replace(value, name=name)
+            if values.setdefault(name, (prior, file, ()))[0] != prior:
+                sentence = f"two kinds of this file state {value.name!r} differently"
+                raise file.error(f"{sentence}; state it alike, or give their frames two names")
+    own_names = {p.name for rows in observations for p in rows.kind.nuisance_parameters}
+    for pattern, node in stated.items():
+        place = (KEY, pattern)
+        for value in _read_one(file, node, _match(file, entries, pattern), place):
+            name = value.name
+            if value.scope == "all":
+                name = next(own for own in own_names if _is_parameter(name, own))
+            values[name] = (replace(value, name=name), file, place)
+    return values
+
+
+def _is_parameter(name: str, own_name: str) -> bool:
+    """Return whether a name is that of a parameter, with or without a session in front."""
+    return name == own_name or name.endswith(f".{own_name}")
 
 
 def describe_stated_values(
@@ -344,14 +401,18 @@ def describe_stated_values(
     dimensions = {entry.name: entry.dimension for entry in entries}
     content: dict[str, Any] = {}
     for value in known:
-        if value.name not in dimensions:
+        names = (name for name in dimensions if _is_parameter(name, value.name))
+        if (name := next(names, None)) is None:
             continue
-        dimension, stated = dimensions[value.name], dict[str, Any]()
+        dimension, stated = dimensions[name], dict[str, Any]()
         for key, number in (("start", value.nominal), ("sd", value.sd or None)):
             if number is not None:
-                stated[key] = describe_quantity(number, dimension)
+                unit = UNITS["ppm"] if dimension is Dimension.RATIO else None
+                stated[key] = describe_quantity(number, dimension, unit)
         if stated and not value.sd:
             stated[FIXED] = True
+        if stated and value.scope == "all":
+            stated["scope"] = "all"
         content[value.name] = stated or FIXED
     return content
 
@@ -395,7 +456,7 @@ def _read_one(
         sentence = f"the standard deviation is {node['sd']}; {fault}, or {FIXED}"
         raise file.error(sentence, (*place, "sd"))
     sd = 0.0 if stated.fixed else stated.sd or 0.0
-    return [StatedValue(entry.name, sd, stated.start) for entry in matching]
+    return [StatedValue(e.name, sd, stated.start, scope=stated.scope) for e in matching]
 
 
 def read_instrument(
@@ -427,49 +488,177 @@ def describe_instrument(record: InstrumentRecord) -> str | dict[str, str]:
     return record.name if list(stated) == ["name"] else stated
 
 
-# Errors that the rows of a session share, in the settings of a kind.
+# Common errors of an instrument, which its rows share, in the settings of a kind.
 
-UNKNOWN = "unknown"
+UNKNOWN, MPE = "unknown", "mpe"
 SHARED_ERRORS: Mapping[str, str] = {
     "session_bias": "`unknown`, or component -> standard deviation or `unknown`: an offset that "
     "all rows of a session share",
     "session_drift": "the same for a change from the first to the last row of a session, linear "
     "in time or, without the column `time`, in the order of the rows",
+    "scale": "a factor on all measured lengths: `sd` of its deviation from 1, and, unless 0, its "
+    "`mean`; with `scope: all` one factor holds in all sessions",
+    "temperature": "of the machine or part: `value`, `sd`, its `expansion` minus that of the "
+    "instrument's scale, and, unless 0, `expansion_sd`. Measured lengths are longer by `expansion "
+    "* (value - reference)`; `reference` is 20 degC, `scope` as of `scale`",
+    MPE: "maximum permissible error of the certificate, `constant` and `per_length`, in place of "
+    "the noise of lengths and of the scale; `scope` as of `scale`",
 }
+
+
+class ScaleRule(NamedTuple):
+    """What a setting states that scales lengths."""
+
+    units: Mapping[str, Scales]  # key -> units of its number
+    required: tuple[str, ...]  # keys
+    example: str
+
+
+LENGTH_UNITS, RATIO_UNITS = (
+    {symbol: (UNITS[symbol].factor_to_si, 0.0) for symbol in list_symbols(dimension)}
+    for dimension in (Dimension.LENGTH, Dimension.RATIO)
+)
+DIFFERENCE_UNITS = {symbol: (factor, 0.0) for symbol, (factor, _) in TEMPERATURE_UNITS.items()}
+EXPANSION_UNITS = {
+    f"{ratio}/{degree}": (of_ratio / of_degree, 0.0)
+    for ratio, (of_ratio, _) in RATIO_UNITS.items()
+    for degree, (of_degree, _) in DIFFERENCE_UNITS.items()
+}
+SCALED: Mapping[str, ScaleRule] = {
+    "scale": ScaleRule({"sd": RATIO_UNITS, "mean": RATIO_UNITS}, ("sd",), "sd: 2 ppm"),
+    "temperature": ScaleRule(
+        {
+            "value": TEMPERATURE_UNITS,
+            "sd": DIFFERENCE_UNITS,
+            "expansion": EXPANSION_UNITS,
+            "expansion_sd": EXPANSION_UNITS,
+            "reference": TEMPERATURE_UNITS,
+        },
+        ("value", "sd", "expansion"),
+        "value: 23 degC, sd: 1 K, expansion: 11.5 ppm/K",
+    ),
+    MPE: ScaleRule(
+        {"constant": LENGTH_UNITS, "per_length": RATIO_UNITS},
+        ("constant",),
+        "constant: 15 um, per_length: 6 um/m",
+    ),
+}
+NOT_NEGATIVE = ("sd", "expansion_sd", "constant", "per_length")
+REFERENCE = 20.0  # [degC], of ISO 1
 ITEMS: Mapping[str, str] = {"session_bias": "bias", "session_drift": "drift"}
 
 
 def read_shared_errors(
     file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Location
-) -> tuple[Kind, dict[str, float]]:
-    """Return a kind with its shared errors as unknowns, and parameter -> standard deviation [SI]
-    of those with a prior; 0 where a component has no such error. FileError : an unknown component,
-    or no number.
+) -> tuple[Kind, dict[str, float], list[StatedValue]]:
+    """Return a kind with the common errors of its instrument as unknowns, the noise [SI] of columns
+    that an MPE states, and the priors, of 0 where a component has no such error. FileError : an
+    unknown component or key, or no number.
     """
     from loopcal.measure.kinds.kind import list_components, name_shared_error
+    from loopcal.measure.nuisance import StatedValue
 
-    priors: dict[str, float] = {}
-    for key, item in ITEMS.items():
-        if key not in node:
-            continue
+    noise: dict[str, float] = {}
+    priors: dict[str, StatedValue] = {}
+    for key in (key for key in SHARED_ERRORS if key in node):
         place, stated = (*location, key), node[key]
         components = dict(list_components(kind).keys())
+        measured = set(components.values())
+        if not measured or (key in SCALED and Dimension.LENGTH not in measured):
+            what = "lengths" if key in SCALED else "values"
+            raise file.error(f"the kind {kind.name!r} measures no {what}; remove {key!r}", place)
+        if key in SCALED:
+            lengths, factors, scope = _read_scales(file, key, stated, place)
+            columns = [c.name for c in kind.noise_columns if c.dimension is Dimension.LENGTH]
+            noise |= dict.fromkeys(columns, lengths) if lengths else {}
+            if key == MPE and "scale" in node:
+                sentence = f"{MPE!r} and 'scale' both state the scale of the instrument"
+                raise file.error(f"{sentence}; remove one of them", place)
+            kind = _add_unknown(kind, tuple(factors))
+            for item, (mean, sd) in factors.items():
+                name = name_shared_error(kind, item, "")
+                priors[name] = StatedValue(name, sd, mean or None, scope=scope)
+            continue
         if stated != UNKNOWN and not (isinstance(stated, dict) and stated):
             example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in components.items())
             sentence = f"{key!r} is {stated!r}; write '{key}: {UNKNOWN}', or standard deviations"
             raise file.error(f"{sentence}, as '{key}: {{{example}}}'", place)
-        kind = replace(cast(Any, kind), unknown=tuple(dict.fromkeys((*kind.unknown, item))))
+        item = ITEMS[key]
+        kind = _add_unknown(kind, (item,))
         if stated == UNKNOWN:
             continue
-        priors |= {name_shared_error(kind, item, name): 0.0 for name in components}
-        for text, names, at in match_names(file, stated, list(components), place):
-            for name in names:
+        names = [name_shared_error(kind, item, name) for name in components]
+        priors |= {name: StatedValue(name) for name in names}
+        for text, chosen, at in match_names(file, stated, list(components), place):
+            for name in chosen:
                 parameter = name_shared_error(kind, item, name)
                 priors.pop(parameter, None)
                 if text != UNKNOWN:
                     what, act = "the standard deviation", f", or {UNKNOWN}"
-                    priors[parameter] = _read_sd(file, text, components[name], at, what, act)
-    return kind, priors
+                    sd = _read_sd(file, text, components[name], at, what, act)
+                    priors[parameter] = StatedValue(parameter, sd)
+    return kind, noise, list(priors.values())
+
+
+def _add_unknown(kind: Kind, items: tuple[str, ...]) -> Kind:
+    """Return a kind with more unknown setup items."""
+    return replace(cast(Any, kind), unknown=tuple(dict.fromkeys((*kind.unknown, *items))))
+
+
+def _read_scales(
+    file: YamlFile, key: str, node: Any, place: Location
+) -> tuple[float, dict[str, tuple[float, float]], Literal["session", "all"]]:
+    """Return what one of the settings `SCALED` states: the standard deviation [m] of each length, 0
+    where it states none; setup item -> mean and standard deviation of a factor minus 1; and whether
+    one value holds for a session or for all.
+    """
+    rule = SCALED[key]
+    if not isinstance(node, dict) or not node:
+        raise file.error(f"{key!r} is {node!r}; write '{key}: {{{rule.example}}}'", place)
+    refuse_unknown_keys(file, list(node), [*rule.units, "scope"], place)
+    if missing := [name for name in rule.required if name not in node]:
+        sentence = f"{key!r} has no key {missing[0]!r}; add it"
+        raise file.error(f"{sentence}, as in '{key}: {{{rule.example}}}'", place)
+    stated = {
+        name: _read_in_units(file, node[name], units, (*place, name))
+        for name, units in rule.units.items()
+        if name in node
+    }
+    scope = node.get("scope", "session")
+    if scope not in ("session", "all"):
+        sentence = f"the scope is {scope!r}; write session, or all for one value in all sessions"
+        raise file.error(sentence, (*place, "scope"))
+    for name in (n for n in stated if n in NOT_NEGATIVE and stated[n] != 0.0):
+        if fault := find_sd_fault(stated[name]):
+            raise file.error(f"{name!r} of {key!r} is {node[name]}; {fault}", (*place, name))
+    if key == MPE:  # its values are uniform within it
+        of_length, per_length = (
+            stated.get(name, 0.0) / np.sqrt(3.0) for name in ("constant", "per_length")
+        )
+        return float(of_length), {"scale": (0.0, float(per_length))} if per_length else {}, scope
+    if key == "scale":
+        return 0.0, {"scale": (stated.get("mean", 0.0), stated["sd"])}, scope
+    rise = stated["value"] - stated.get("reference", REFERENCE)
+    factors = {
+        "temperature": (rise * stated["expansion"], abs(stated["expansion"]) * stated["sd"]),
+        "expansion": (0.0, stated.get("expansion_sd", 0.0) * float(np.hypot(rise, stated["sd"]))),
+    }
+    return 0.0, {item: of for item, of in factors.items() if any(of)}, scope
+
+
+def _read_in_units(file: YamlFile, node: Any, units: Scales, place: Location) -> float:
+    """Return a number with one of these units, scaled."""
+    match = NUMBER.match(text := str(node).strip())
+    number = float(match[0]) if match else np.nan
+    symbol = text[match.end() :].strip() if match else ""
+    if not np.isfinite(number) or symbol not in units:
+        allowed = ", ".join(units)
+        sentence = f"{place[-1]!r} of {place[-2]!r} is {node!r}; write a number and one of"
+        raise file.error(f"{sentence} {allowed}", place)
+    factor, offset = units[symbol]
+    if units is TEMPERATURE_UNITS and factor * number + offset < ABSOLUTE_ZERO - ROUNDING:
+        raise file.error(f"{place[-1]!r} is {node}, below absolute zero; correct it", place)
+    return factor * number + offset
 
 
 # The rows of each kind: measured values and their noise.
@@ -507,7 +696,8 @@ POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
 class KindRows:
     """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
 
-    `is_noise_assumed` where nobody stated the noise; `shared_errors` as of `read_shared_errors`.
+    `is_noise_assumed` where nobody stated the noise; `shared_errors` are the priors of
+    `read_shared_errors`.
     """
 
     kind: Kind
@@ -515,7 +705,7 @@ class KindRows:
     rows: IntArray
     location: Location
     is_noise_assumed: bool = False
-    shared_errors: Mapping[str, float] = field(default_factory=dict)
+    shared_errors: Sequence[StatedValue] = ()
     instrument: InstrumentRecord | None = None
 
 
@@ -611,12 +801,12 @@ def _read_entry(
     kind = _read_robot_kind(file, node, robot, place)
     allowed = ["kind", *KIND_SETTINGS] if place else SETTINGS
     refuse_unknown_keys(file, list(node), [*allowed, *list_kind_settings(type(kind))], place)
-    noise = read_noise(file, node, kind, place)
+    kind, of_mpe, shared = read_shared_errors(file, node, kind, place)
+    noise = of_mpe | read_noise(file, node, kind, place)
     source = node.get("noise_source", "stated")
     if source not in (ASSUMED, "stated"):
         sentence = f"noise_source is {source!r}; write {ASSUMED} where nobody stated the noise"
         raise file.error(f"{sentence}, or stated", (*place, "noise_source"))
-    kind, shared = read_shared_errors(file, node, kind, place)
     instrument = read_instrument(file, node, place)
     if instrument is None and place:
         instrument = read_instrument(file, file.content, ())

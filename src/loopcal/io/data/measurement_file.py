@@ -522,7 +522,7 @@ def join_tables(
         (
             file.table.settings,
             [rows for rows, _ in of_file],
-            {name: sd for entry in file.kinds for name, sd in entry.shared_errors.items()},
+            [value for entry in file.kinds for value in entry.shared_errors],
         )
         for file, of_file in zip(files, read, strict=True)
         if of_file
@@ -682,4 +682,5 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
                 raise table.settings.error(sentence, (*entry.location, "noise"))
         sigma = np.array([entry.noise[column.name] for column in entry.kind.noise_columns])
         sensors.append(Sensor(entry.kind, Gaussian(sigma)))
-    return Instrument(tuple(sensors))
+    stated = tuple(value for entry in kinds for value in entry.shared_errors)
+    return Instrument(tuple(sensors), stated)

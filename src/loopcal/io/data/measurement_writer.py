@@ -180,6 +180,9 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
     ]
     contents = (describe_kind(kind, of, robot.tool) for kind, of in zip(kinds, noise, strict=True))
     settings = _format_settings(robot, list(zip(labels, contents, strict=True)), "")
+    entries = [parameter for kind in kinds for parameter in kind.nuisance_parameters]
+    if knowledge := describe_stated_values(instrument.stated_values, entries):
+        settings.append(f"# unknowns: {format_flow(knowledge)}")
     unknown = [(kind, getattr(kind, "unknown", ())) for kind in kinds]
     frames = [getattr(kind, "frame", "") for kind, names in unknown if "frame" in names]
     remarks = [UNKNOWN_FRAME.format(quote_scalar(name)) for name in dict.fromkeys(frames)]
@@ -219,6 +222,7 @@ def format_data_sheet(
         np.asarray(readings),
         tuple(of_sensor for of_sensor in rows if not of_sensor.kind.is_of_base),
         labels=tuple(labels),
+        stated_values=instrument.stated_values,
         is_held_out=np.array([] if is_held_out is None else is_held_out, dtype=bool),
         base_observations=tuple(of_sensor for of_sensor in rows if of_sensor.kind.is_of_base),
     )

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self, cast
@@ -41,9 +41,12 @@ from loopcal.units import Dimension
 
 # Index of each invalid row, and the end of a sentence that says why.
 InvalidRows = tuple[tuple[int, str], ...]
-# Errors that all rows of a session share, a constant and a linear drift: setup items that any kind
-# may list as unknown.
-BIAS, DRIFT = SHARED_ERRORS = ("bias", "drift")
+# Common errors of an instrument, which its rows share: setup items that any kind may list as
+# unknown. A constant and a linear drift of each component; factors on the measured lengths: of the
+# instrument's scale, and by the temperature and the coefficient of expansion of what it measures.
+BIAS, DRIFT = "bias", "drift"
+SCALES = ("scale", "temperature", "expansion")
+SHARED_ERRORS = (BIAS, DRIFT, *SCALES)
 BASE = "base"  # name of the base among the bodies that a kind may be `of`; no stage has it
 
 
@@ -156,16 +159,18 @@ def list_components(kind: Kind) -> dict[tuple[str, Dimension], list[int]]:
 
 def name_shared_error(kind: Kind, item: str, component: str) -> str:
     """Return the name of the bias or drift of a component, such as `tracker.bias.x`: with the name
-    of the fixed point or frame where the settings state one, else that of the kind.
+    of the fixed point or frame where the settings state one, else that of the kind. That of a
+    scale has no component, and rather that of the frame, which instruments have in common.
     """
     owner = kind.name
-    for setting in ("frame", "anchor_name"):
+    settings = ("frame", "anchor_name")
+    for setting in reversed(settings) if item in SCALES else settings:
         value = getattr(kind, setting, "")
         if value and value != getattr(type(kind), setting):
             owner = value
     if item == BIAS and kind.bias_item != BIAS:
         return f"{owner}.{kind.bias_item}"
-    return f"{owner}.{item}.{component}"
+    return f"{owner}.{item}" if item in SCALES else f"{owner}.{item}.{component}"
 
 
 def update_setup_name(name: str) -> str:
@@ -231,7 +236,7 @@ class Kind(ABC):
     def __post_init__(self) -> None:
         stated = (self.unknown,) if isinstance(self.unknown, str) else self.unknown
         names = tuple(dict.fromkeys(self.bias_item if n == BIAS else n for n in stated))
-        allowed = tuple(dict.fromkeys((*self.allowed_unknown, self.bias_item, DRIFT)))
+        allowed = tuple(dict.fromkeys((*self.allowed_unknown, self.bias_item, DRIFT, *SCALES)))
         for name in (name for name in names if name not in allowed):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
@@ -250,6 +255,12 @@ class Kind(ABC):
                 f"the kind {self.name!r} measures a moving body, but `of: {BASE}` is for targets "
                 "that are fixed to the base; leave it out, or use the kind position, bearing or "
                 "distance"
+            )
+        scales = [name for name in names if name in SCALES]
+        if scales and not self._length_places[0]:
+            raise DataError(
+                f"the kind {self.name!r} measures angles, which have no {scales[0]}; remove "
+                f"{scales[0]!r}"
             )
 
     def __repr__(self) -> str:
@@ -333,7 +344,7 @@ class Kind(ABC):
 
     @property
     def shared_errors(self) -> tuple[str, ...]:
-        """Which of "bias" and "drift" are unknown."""
+        """Which of the common errors of an instrument are unknown."""
         return tuple(name for name in SHARED_ERRORS if name in self.unknown)
 
     @cached_property
@@ -341,10 +352,23 @@ class Kind(ABC):
         """The unknown setup items in order, shared errors last: a parameter for each component."""
         items = dict(self.own_items)
         for item in self.shared_errors:
-            named = [(name_shared_error(self, item, name), d) for name, d in list_components(self)]
+            components = list_components(self)
+            of_item = [("", Dimension.RATIO)] if item in SCALES else list(components)
+            named = [(name_shared_error(self, item, name), d) for name, d in of_item]
             shared = (Parameter(name, d, 0.0, scope="session") for name, d in named)
             items[item] = SetupItem(tuple(shared))
         return items
+
+    @cached_property
+    def common_errors(self) -> Mapping[int, str]:
+        """Place among the u parameters -> common error of the instrument, such as `tracker.bias`
+        for each of its components.
+        """
+        return {
+            i: name_shared_error(self, item, "").rstrip(".")
+            for item in self.shared_errors
+            for i in range(*self._slices[item].indices(len(self.nuisance_parameters)))
+        }
 
     @cached_property
     def is_drift(self) -> BoolArray:
@@ -358,7 +382,7 @@ class Kind(ABC):
         return tuple(p for item in self.setup_items.values() for p in item.parameters)
 
     def without_shared_errors(self) -> Self:
-        """Return the kind without a bias or drift."""
+        """Return the kind without common errors of the instrument."""
         return replace(cast(Any, self), unknown=tuple(self.own_items))
 
     @cached_property
@@ -370,10 +394,51 @@ class Kind(ABC):
             matrix[columns, i] = 1.0
         return matrix
 
-    def _sum_shared_errors(self, values: FloatArray) -> FloatArray:
-        """Return bias plus drift (.., b) of the components; of a drift, the parts of the rows."""
-        items = [self.item_values(values, name) for name in self.shared_errors]
-        return np.asarray(sum(item for item in items if item is not None))
+    @cached_property
+    def _length_places(self) -> tuple[list[int], list[int]]:
+        """The indices of the lengths among the columns, and among the residuals."""
+        of_columns, of_residuals = (
+            [i for i, column in enumerate(columns) if column.dimension is Dimension.LENGTH]
+            for columns in (self.columns, self.noise_columns)
+        )
+        return of_columns, of_residuals
+
+    def _list_unknown(self, names: Sequence[str]) -> list[str]:
+        """Return those of some common errors that are unknown."""
+        return [name for name in names if name in self._slices]
+
+    def _sum_items(self, values: FloatArray, names: Sequence[str]) -> FloatArray:
+        """Return the sum (.., w) of the values of some setup items; of a drift, the parts of the
+        rows.
+        """
+        return np.asarray(sum(values[..., self._slices[name]] for name in names))
+
+    def _add_shared_errors(
+        self, result: Evaluation, columns: FloatArray, values: FloatArray
+    ) -> Evaluation:
+        """Return an evaluation with the common errors: a predicted length l is `(1 + sum of the
+        scales) l`, and bias and drift are added.
+        """
+        residual, jacobian, by_setup, joints = result
+        blocks = [] if by_setup is None else [by_setup]
+        constants, scales = (self._list_unknown(names) for names in ((BIAS, DRIFT), SCALES))
+        length = np.zeros_like(residual)
+        if scales:
+            of_columns, places = self._length_places
+            length[..., places] = residual[..., places] + columns[..., of_columns]
+            scale = self._sum_items(values, scales)
+            factor = (1.0 + scale * np.isin(np.arange(length.shape[-1]), places))[..., None]
+            residual = residual + scale * length
+            jacobian = jacobian * (factor[..., None, :, :] if self.poses_per_row > 1 else factor)
+            blocks = [block * factor for block in blocks]
+            joints = None if joints is None else joints * factor
+        if constants:
+            slope = self.linearize_noise(columns) @ self._spread
+            residual = residual + (slope @ self._sum_items(values, constants)[..., None])[..., 0]
+            blocks += [slope] * len(constants)
+        blocks += [length[..., None]] * len(scales)
+        blocks = [np.broadcast_to(b, (*residual.shape, b.shape[-1])) for b in blocks]
+        return Evaluation(residual, jacobian, np.concatenate(blocks, axis=-1), joints)
 
     @property
     def references(self) -> Mapping[str, FloatArray]:
@@ -493,13 +558,7 @@ class Kind(ABC):
             )
             result = result._replace(jacobian=np.zeros_like(result.jacobian), joints=by_entries)
         if self.shared_errors:
-            slope = self.linearize_noise(measured.columns) @ self._spread
-            error = slope @ self._sum_shared_errors(values)[..., None]
-            residual = result.residual + error[..., 0]
-            blocks = [] if result.nuisance is None else [result.nuisance]
-            blocks += [slope] * len(self.shared_errors)
-            columns = [np.broadcast_to(b, (*residual.shape, b.shape[-1])) for b in blocks]
-            result = result._replace(residual=residual, nuisance=np.concatenate(columns, axis=-1))
+            result = self._add_shared_errors(result, measured.columns, values)
         if measured.is_complete:
             return result
         present = measured.present[..., None]
@@ -544,9 +603,14 @@ class Kind(ABC):
         """
         values = self.nominal_values[None, None] if nuisance is None else nuisance
         joints = np.zeros_like(noise) if joints is None else joints
-        if self.shared_errors:
-            noise = noise + self._sum_shared_errors(values) @ self._spread.T
-        return self._measure(self._find_platform(T, joints), noise, values, joints)
+        if constants := self._list_unknown((BIAS, DRIFT)):
+            noise = noise + self._sum_items(values, constants) @ self._spread.T
+        columns = self._measure(self._find_platform(T, joints), noise, values, joints)
+        if scales := self._list_unknown(SCALES):
+            (of_columns, places), columns = self._length_places, np.array(columns)
+            length = columns[..., of_columns] - noise[..., places]
+            columns[..., of_columns] += self._sum_items(values, scales) * length
+        return columns
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
         """Return the derivative (..., m, m) of the residuals by errors of the noise columns, up to

@@ -374,7 +374,7 @@ def alter_noise(instrument: Instrument, effects: EffectsLevel) -> Instrument:
     sensors = tuple(
         replace(sensor, noise=AlteredNoise(sensor.noise, effects)) for sensor in instrument.sensors
     )
-    return Instrument(sensors)
+    return replace(instrument, sensors=sensors)
 
 
 def make_disturbance(

@@ -50,7 +50,7 @@ from loopcal.estimate.penalties import LeastSquares, Method
 from loopcal.estimate.problem import Problem, problem_of_trials
 from loopcal.findings import report_finding
 from loopcal.findings.wording import name_count
-from loopcal.measure.instrument import Gaussian, Instrument, make_random_stream
+from loopcal.measure.instrument import Gaussian, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.simulation import Trials
@@ -200,7 +200,8 @@ def make_raw_problem(robot: Mechanism, trials: Trials, method: Method | None = N
         replace(s, noise=Gaussian(list_raw_units([c.dimension for c in s.kind.noise_columns])))
         for s in trials.instrument.sensors
     )
-    problem = problem_of_trials(free, replace(trials, instrument=Instrument(sensors)))
+    instrument = replace(trials.instrument, sensors=sensors)
+    problem = problem_of_trials(free, replace(trials, instrument=instrument))
     z = np.repeat(free.deviation(robot.values[None]), len(trials), axis=0)
     start = problem.linearize(z, problem.start(z)).next_start
     return RawProblem(problem, replace(start, is_near=False), method or LeastSquares())
