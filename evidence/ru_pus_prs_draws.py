@@ -22,5 +22,5 @@ def check(tables: dict[str, Any]) -> None:
 
 
 def collect() -> dict[str, Any]:
-    """Collect medians with bootstrap intervals, ratios, and curves over lambda and k."""
+    """Collect medians with the middle half of the machines, and curves over lambda and k."""
     return to_document(simulate_machines(load_design("RU-PUS-PRS"), SEED, DRAWS), SEED)

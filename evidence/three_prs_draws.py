@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 from loopcal.papers.tsvd_2016 import steps
-from loopcal.papers.tsvd_2016.results import make_median_curves, make_medians, make_ratios
-from loopcal.papers.tsvd_2016.steps import RE, SIZES, TSVD, Draws, load_design, simulate_machines
+from loopcal.papers.tsvd_2016.results import Draws, make_curves, make_medians
+from loopcal.papers.tsvd_2016.steps import RE, SIZES, TSVD, load_design, simulate_machines
 
 DRAWS, SEED = 100, 0
 
@@ -19,16 +19,10 @@ QUICK = {"DRAWS": 3}
 
 def to_document(draws: Draws, seed: int) -> dict[str, Any]:
     """Return the draws for evidence: tables by name, and which curves have an interior minimum."""
-    curves = map(make_median_curves, draws.sweeps)
-    tables = dict(
-        zip(
-            ("medians", "ratios", "curves", "curves_5"),
-            (make_medians(draws), make_ratios(draws), *curves),
-            strict=True,
-        )
-    )
+    made = (make_medians(draws), *map(make_curves, draws))
+    tables = dict(zip(("medians", "curves", "curves_5"), made, strict=True))
     gain, inside = SIZES.find("gain"), {}
-    for sweep in draws.sweeps:
+    for sweep in draws:
         of_sweep = inside[str(sweep.study.freedoms)] = {RE: {}, TSVD: {}}
         for algorithm, measures in of_sweep.items():
             for i, name in enumerate(steps.MEASURES[:2]):
@@ -36,9 +30,9 @@ def to_document(draws: Draws, seed: int) -> dict[str, Any]:
                 machines = int((sweep.compute_rises(algorithm, i) > gain).sum())
                 measures[name] = {"median": median, "machines": machines}
     return {
-        "robot": draws.name,
+        "robot": draws[0].study.name,
         "seed": seed,
-        "draws": len(draws),
+        "draws": len(draws[0]),
         "minimum_inside": inside,
         "tables": {
             name: {"columns": list(table.columns), "formats": list(table.formats),
@@ -54,5 +48,5 @@ def check(tables: dict[str, Any]) -> None:
 
 
 def collect() -> dict[str, Any]:
-    """Collect medians with bootstrap intervals, ratios, and curves over lambda and k."""
+    """Collect medians with the middle half of the machines, and curves over lambda and k."""
     return to_document(simulate_machines(load_design("3-PRS"), SEED, DRAWS), SEED)

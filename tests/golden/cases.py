@@ -438,15 +438,14 @@ def run_tsvd_2016(name: str, five: bool) -> Report:
     """Run truncated SVD and the library's methods on one machine with the printed noise."""
     from loopcal.papers.tsvd_2016 import steps
 
-    measured = steps.measure_case(steps.load_design(name), 0)
-    measured = measured.five if five else measured
-    library = steps.run_library(measured)
-    return {
-        "singular_values": steps.linearize(measured).singular_values[0],
-        "library": {
-            name: {"values": a.values[0], "errors": a.errors[0, :4]} for name, a in library.items()
-        },
-    }
+    design = steps.load_design(name)
+    measured = steps.measure_machines(design, design.draw_true_values(1, 0))
+    measured, library = measured.five if five else measured, dict[str, Any]()
+    for method, how in steps.LIBRARY.items():
+        values = lc.identify_trials(measured.robot, measured.trials, how).values
+        errors = measured.compute_output_errors(values)
+        library[method] = {"values": values[0], "errors": errors[0, :4]}
+    return {"singular_values": steps.linearize(measured).singular_values[0], "library": library}
 
 
 add("papers/tsvd-2016/RU-PUS-PRS", run_tsvd_2016, "RU-PUS-PRS", five=True)
@@ -460,7 +459,8 @@ def run_cmm_constraint_2011() -> Report:
     grid = steps.load_grid(steps.CASE, 0, 3)
     (level,) = grid.poses.values()
     study = steps.plan_points(grid, replace(level, count=64, groups=8, sweeps=1))
-    cell = steps.calibrate_figure_5(study)
+    errors, noise = ({text: float(text)} for text in steps.find_figure_5())
+    (cell,) = steps.calibrate(study, steps.change_sizes(study.grid, errors, noise)).values()
     return {
         "design": study.optimized.design,
         "value": study.optimized.history[-1],

@@ -184,7 +184,7 @@ def test_the_study_of_a_paper_is_written_with_its_poses_and_read(tmp_path, paper
     path = tmp_path / "my study.yaml"
     assert main(["study", "new", str(path), "--paper", paper]) == 0
     study = load_study(path)
-    assert [robot.source for robot in study.robots.values()] == [next(iter(PAPERS[paper].studies))]
+    assert [robot.source for robot in study.robots.values()] == [PAPERS[paper].robots[0]]
     assert main(["study", "new", str(path), "--paper", paper]) == 1  # not without --force
     assert main(["study", "new", str(path), "--paper", paper, "--force"]) == 0
 

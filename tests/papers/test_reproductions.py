@@ -101,7 +101,7 @@ def test_sizes_that_another_robot_replaces_are_stated(paper, tmp_path) -> None:
     sentences = case.list_replaced()
     assert sentences[0].startswith("The robot is ")
     assert any("standard deviations" in sentence for sentence in sentences)
-    *_, own = PAPERS[paper].studies
+    *_, own = PAPERS[paper].robots
     stated = (f"{own} is a robot of the paper: the study runs for all, 3-prs and {own}.",)
     assert PAPERS[paper].make_case(own).list_replaced() == stated * (paper == "tsvd-2016")
     assert PAPERS[paper].make_case().list_replaced() == ()

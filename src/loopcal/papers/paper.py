@@ -32,20 +32,22 @@ if TYPE_CHECKING:
     from loopcal.studies.specification.levels import ErrorsLevel
     from loopcal.studies.specification.study import Study
 
+STUDY = "study.yaml"
+"""File of the study of a paper."""
 TRIALS = 50
 """Drawings of noise behind each statistical number, unless more are asked for."""
 
 
 @dataclass(frozen=True)
 class Paper:
-    """A published study that can be repeated; name : on the command line. studies : robot -> its
-    study file in the folder; that of the first is adapted to other robots.
+    """A published study that can be repeated; name : on the command line. robots : of the paper,
+    the study file of the first is adapted to others.
     """
 
     name: str
     title: str
     source: str
-    studies: Mapping[str, str]
+    robots: tuple[str, ...]
     # whether it identifies leg by leg, in steps that end where max dQint is at most epsilon
     is_per_leg: bool = False
 
@@ -94,7 +96,7 @@ class Paper:
                 f"epsilon is {epsilon:g} for {self.name}; give a finite number above 0, for {able} "
                 "only"
             )
-        if robot is None or str(robot) in self.studies:
+        if robot is None or str(robot) in self.robots:
             return StudyCase(self, str(robot or ""), epsilon=epsilon)
         other = load_robot(robot)
         if self.is_per_leg:
@@ -133,11 +135,15 @@ class Paper:
         )
 
     def load_study(self, robot: str = "") -> Study:
-        """Return the study of a robot of the paper; default: of the first."""
-        from loopcal.studies.files.study_file import load_study
+        """Return the study of a robot, or its file; default: of the first one of the paper."""
+        from loopcal.io.core.yaml_file import parse_yaml
+        from loopcal.studies.files.study_file import load_study, parse_study
 
-        name = self.studies[robot or next(iter(self.studies))]
-        return load_study(Path(str(files(self.package) / name)))
+        if robot in ("", self.robots[0]):
+            return load_study(Path(str(files(self.package) / STUDY)))
+        path = find_robot_file(robot).parent / STUDY  # is not written
+        made = make_paper_study(self, path, robot)
+        return parse_study(parse_yaml(made.files[path], path, "study file"))
 
     def read_file(self, name: str) -> str:
         """Return the text of a file of the paper."""
@@ -157,23 +163,16 @@ class StudyCase:
     robot: Mechanism | None = None
     epsilon: float | None = None
 
-    def load_study(self, name: str = "") -> Study:
-        """Return the study of the robot; name : which robot of the paper, by default the first."""
-        from loopcal.io.core.yaml_file import parse_yaml
-        from loopcal.studies.files.study_file import parse_study
-
-        if self.robot is None:
-            return self.paper.load_study(name)
-        path = find_robot_file(self.source).parent / "study.yaml"  # is not written
-        made = make_paper_study(self.paper, path, self.source)
-        return parse_study(parse_yaml(made.files[path], path, "study file"))
+    def load_study(self) -> Study:
+        """Return the study of the robot, by default of the first one of the paper."""
+        return self.paper.load_study(self.source if self.robot else "")
 
     def list_replaced(self) -> tuple[str, ...]:
         """Return sentences that state which sizes of the study the other robot replaces."""
         if self.robot is None:
-            if len(robots := self.paper.studies) == 1 or not self.source:
+            if len(robots := self.paper.robots) == 1 or not self.source:
                 return ()
-            names = list_names(tuple(robots))
+            names = list_names(robots)
             return (f"{self.source} is a robot of the paper: the study runs for all, {names}.",)
         first, other = self.paper.load_study(), self.load_study()
         (of_paper,) = first.robots.values()
@@ -241,7 +240,7 @@ PAPERS: Mapping[str, Paper] = {
             "squares leg by leg",
             "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no "
             "DOI known to us",
-            {"hexapod-42": "study.yaml"},
+            ("hexapod-42",),
             is_per_leg=True,
         ),
         Paper(
@@ -249,14 +248,14 @@ PAPERS: Mapping[str, Paper] = {
             "Least squares, ridge estimation and truncated SVD compared on a 3-PRS and an "
             "RU-PUS-PRS manipulator",
             "Advances in Mechanical Engineering 2016, doi:10.1177/1687814016667908",
-            {"3-prs": "study_3_prs.yaml", "ru-pus-prs": "study_ru_pus_prs.yaml"},
+            ("3-prs", "ru-pus-prs"),
         ),
         Paper(
             "cmm-constraint-2011",
             "A hexapod calibrated from points on planes and perpendicular lines, held by a "
             "coordinate measuring machine",
             "International Journal of Advanced Robotic Systems 2011, doi:10.5772/45684",
-            {"hexapod-nategh-agheli": "study.yaml"},
+            ("hexapod-nategh-agheli",),
         ),
     )
 }
@@ -302,14 +301,12 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
     from loopcal.io.core.yaml_file import format_yaml, parse_yaml, quote_scalar
     from loopcal.studies.files.study_file import name_robot
 
-    first = next(iter(paper.studies))
-    wanted = first if robot is None else robot
-    text = paper.read_file(paper.studies.get(wanted, paper.studies[first]))
+    wanted, text = robot or paper.robots[0], paper.read_file(STUDY)
     content = parse_yaml(text, path, "study file").content
     (poses,) = content["poses"].values()
     file = poses.get("file", "")
     table = paper.read_file(file) if file else ""
-    if wanted in paper.studies:
+    if wanted == paper.robots[0]:
         if not file:
             return PaperStudyFile({path: text}, wanted)
         beside = path.with_name(f"{path.stem}-poses.csv")

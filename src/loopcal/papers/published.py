@@ -278,6 +278,11 @@ def decide_share(draws: Sequence[bool | None]) -> bool | None:
     return decide(share.low > 0.5, share.high < 0.5)
 
 
+def decide_each(holds: BoolArray, usable: BoolArray) -> list[bool | None]:
+    """Return of each machine (t,) whether a statement holds; None where it is not usable."""
+    return [*map(decide, holds & usable, ~holds & usable)]
+
+
 def decide(agrees: Decision, disagrees: Decision) -> bool | None:
     """Return whether numbers support a claim; None if they neither do nor contradict it."""
     return True if agrees else False if disagrees else None

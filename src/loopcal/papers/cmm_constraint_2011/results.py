@@ -24,20 +24,16 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     PRINTED,
     PRIOR,
     SIZES,
-    Candidate,
     Cell,
     Draw,
     Key,
-    Quotient,
     name_measure,
 )
 from loopcal.papers.paper import StudyCase
-from loopcal.papers.published import Row, decide, decide_share
+from loopcal.papers.published import Row, decide, decide_each, decide_share
 from loopcal.typing import FloatArray
 
 TEXT = published.PaperText(__file__)
-WEIGHTS = {"printed": "as printed: weight one", "distance": "divided by |d_1|",
-           "single": "divided by the sd of each", "full": "full covariance"}  # fmt: skip
 POSITION = name_measure("position", ALIGNED)
 
 
@@ -48,15 +44,10 @@ class Results:
     case: StudyCase
     study: steps.Study  # the ten groups
     draws: tuple[Draw, ...]  # tables and figures show the first
-    arrangements: list[Row]  # of 100 points: the ten groups, one group, groups of any axis
-    one_plane: Cell  # figure 5 from points on one plane and line
-    candidates: list[Candidate]  # interpretations, the nearest first
     ranks: list[Row]  # of random groups
     pair: tuple[int, int]  # points of a group and rank of the equations of all its pairs
     frame_effect: float  # of a motion of the measuring machine on the equations
     undetermined: list[tuple[str, float]]  # directions, and their effect on the rows
-    table_4: Mapping[str, Quotient]  # as printed
-    conclusion: Mapping[str, Quotient]  # of root mean squares, as printed
 
     @property
     def cells(self) -> Mapping[Key, Cell]:
@@ -66,7 +57,7 @@ class Results:
     @property
     def figure_5(self) -> Cell:
         """Its cell of the first draw."""
-        return self.draws[0].weights["full"]
+        return self.cells[steps.find_figure_5()]
 
     @property
     def trials(self) -> int:
@@ -80,13 +71,16 @@ class Results:
 
     def reduce(self, measure: str) -> FloatArray:
         """Return the reductions of an error [%] by least squares, figure 5, all machines."""
-        cells = [draw.weights["full"] for draw in self.draws]
+        cells = [draw.cells[steps.find_figure_5()] for draw in self.draws]
         return 100.0 * (1.0 - np.concatenate([c.compute_left(LS, measure) for c in cells]))
 
+    def reduce_median(self, measure: str) -> float:
+        """Return the median reduction of an error [%] on the machines of the tables."""
+        return steps.take_median(100.0 * (1.0 - self.figure_5.compute_left(LS, measure)))
+
     def word_reduction(self, measure: str) -> str:
-        """Return the median reduction of an error on the machines of the tables in words."""
-        left = self.figure_5.compute_left(LS, measure)
-        return word_change(steps.take_median(100.0 * (1.0 - left)))
+        """Return it in words."""
+        return word_change(self.reduce_median(measure))
 
     def pool(self, judge: Callable[[Draw], Sequence[bool | None]]) -> list[bool | None]:
         """Return the decisions on the machines of all draws."""
@@ -95,20 +89,19 @@ class Results:
 
 def compute(
     seed: int, trials: int, progress: Callable[[str], None], case: StudyCase = steps.CASE,
-    draws: int = 0, sweeps: tuple[int | None, int] = (None, 1),
+    draws: int = 0, sweeps: int | None = None,
 ) -> Results:  # fmt: skip
     """Compute everything.
 
     draws : of points, machines and noise, by default those of sizes.yaml. sweeps : of the
-    coordinate exchange, on the planes of study.yaml and for the other arrangements.
+    coordinate exchange, by default those of study.yaml.
 
     Raises EstimationError: a robot whose end point cannot be held on planes and lines.
     """
     draws, drawn = draws or SIZES.find("draws"), list[Draw]()
     grid = steps.load_grid(case, seed, trials)
     (level,) = grid.poses.values()
-    level = level if sweeps[0] is None else replace(level, sweeps=sweeps[0])
-    other = replace(level, sweeps=sweeps[1])
+    level = level if sweeps is None else replace(level, sweeps=sweeps)
     progress("coordinate exchange")
     study = steps.plan_points(grid, level)
     for i in range(draws):
@@ -120,28 +113,14 @@ def compute(
                 lambda step, label=label: progress(f"{label}: {step}"),
             )
         )
-    progress("one plane and one line, and planes of any axis")
-    one = steps.plan_points(grid, replace(other, groups=1))
-    free = steps.plan_points(grid, other, ("x", "y", "z"))
-    first, on_one, on_free = drawn[0], *map(steps.calibrate_figure_5, (one, free))
-    arrangements = [first.points, steps.describe_points(one, on_one)]
-    arrangements.append(steps.describe_points(free, on_free, " of any axis"))
-    progress("interpretations of figure 5")
-    candidates = steps.compare_interpretations(study, first.weights["full"])
-    candidates += steps.compare_interpretations(one, on_one)
     return Results(
         case=case,
         study=study,
         draws=tuple(drawn),
-        arrangements=arrangements,
-        one_plane=on_one,
-        candidates=sorted(candidates, key=lambda candidate: candidate.distance),
         ranks=steps.compute_ranks(study),
         pair=steps.compute_pair_rank(study),
         frame_effect=steps.compute_frame_effect(study),
         undetermined=steps.list_undetermined(study),
-        table_4=steps.list_factors(),
-        conclusion=steps.list_conclusion(),
     )
 
 
@@ -162,8 +141,8 @@ def list_replaced(results: Results) -> tuple[str, ...]:
 
 
 def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
-    """Return the stated counts beside the computed ones, and figure 5 beside the nearest
-    interpretation; nothing for another robot.
+    """Return the stated counts and reductions of figure 5 beside the computed ones; nothing for
+    another robot.
     """
     if results.case.robot is not None:
         return ()
@@ -173,62 +152,49 @@ def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
     })  # fmt: skip
     rank = max(row["rank"] for row in results.ranks)
     iterations = max(int(cell.iterations.max()) for cell in results.draws[0].fifties.values())
-    figure, nearest = PRINTED.find("figure_5"), results.candidates[0]
-    stated = published.Printed.parse({name: given["stated"] for name, given in figure.items()})
-    reductions = np.array([[nearest.medians[name]] for name in figure])
+    figure, measures = PRINTED.find("figure_5"), list_printed_measures(results.study)
+    stated = published.Printed.parse({name: figure[name]["stated"] for name in measures})
+    falls = np.array([[results.reduce_median(measure)] for measure in measures.values()])
     return (
         TEXT.compare("counts", counts, np.array([[float(rank)], [float(iterations)]])),
-        TEXT.compare("figure_5", stated, reductions, nearest=nearest),
+        TEXT.compare("figure_5", stated, falls),
     )
 
 
 def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return all tables of the reproduction."""
     study, first, trials = results.study, results.draws[0], results.trials
-    parts, names = study.parts, list_printed_names(study)
-    printed = steps.list_printed()
-    readings: list[tuple[Any, ...]] = []
-    readings.append(("as printed", "", "", "", *(printed[name] for name in names), None))
-    for of in results.candidates:
-        place = (of.points, of.reading, of.truth, of.frame)
-        readings.append((*place, *(of.medians[name] for name in names), of.distance))
-    weights = [(WEIGHTS[w], *row) for w, cell in first.weights.items()
-               for row in list_methods(cell, (POSITION, DETERMINED), METHODS)]  # fmt: skip
+    parts = study.parts
     fifty = [
         (steps.name_planes(groups), frame, *row)
         for groups, cell in first.fifties.items() for frame in steps.FRAMES
         for row in list_methods(cell, list_statistics(study, frame))
     ]  # fmt: skip
-    figure_5, experiment = (
-        {"errors": study.describe_errors(cell.size), "noise": cell.noise}
-        for cell in (results.figure_5, next(iter(first.fifties.values())))
-    )
-    more = [(f"{name} [%]", ".0f") for name in names] + [("largest difference [%]", ".0f")]
+    cell = next(iter(first.fifties.values()))
+    experiment = {"errors": study.describe_errors(cell.size), "noise": cell.noise}
     statistics = [(study.label(name_measure(what, "", s)).replace(", ,", ","), ".3g")
                   for what in parts for s in steps.STATISTICS[1:]]  # fmt: skip
     aligned = tuple(name_measure(what, ALIGNED) for what in parts)
     absolute = tuple(name_measure(what, ABSOLUTE) for what in parts)
     at_nominal = name_measure("position", AT_NOMINAL)
-    tables = (
+    return (
         _list_given(study),
         TEXT.table("ranks", [tuple(row.values()) for row in results.ranks],
                    parameters=len(study.planned.free)),
         TEXT.table("gauge", results.undetermined, count=len(results.undetermined)),
         _list_table_3(results, "table_3", (*aligned, DETERMINED)),
         _list_table_3(results, "table_3_absolute", (*absolute, at_nominal, PARAMETERS)),
-        TEXT.table("figure_5_readings", readings, "", more),
-        TEXT.table("arrangements", results.arrangements, trials=trials, unit=study.unit[1],
-                   **figure_5),
-        TEXT.table("weights", weights, "",
-                   [(study.label(name), ".3g") for name in (POSITION, DETERMINED)], **figure_5),
         TEXT.table("table_4", fifty, "", statistics, trials=trials, **experiment),
     )  # fmt: skip
-    return (*tables, _list_arithmetic(results)) if results.case.robot is None else tables
 
 
-def list_printed_names(study: steps.Study) -> list[str]:
-    """Return which errors of figure 5 the robot has."""
-    return [name for name in steps.list_printed() if name in (PARAMETERS, *study.parts)]
+def list_printed_measures(study: steps.Study) -> dict[str, str]:
+    """Return which errors of figure 5 the robot has, and their measures in the absolute frame."""
+    return {
+        name: PARAMETERS if name == PARAMETERS else name_measure(name, ABSOLUTE)
+        for name in PRINTED.find("figure_5")
+        if name in (PARAMETERS, *study.parts)
+    }
 
 
 def list_statistics(study: steps.Study, frame: str) -> list[str]:
@@ -284,22 +250,6 @@ def _list_table_3(results: Results, name: str, measures: tuple[str, ...]) -> pub
                       poses=study.grid.scores.held_out)  # fmt: skip
 
 
-def _list_arithmetic(results: Results) -> published.Table:
-    rows: list[tuple[Any, ...]] = []
-    word = {True: "yes", False: "no", None: "if rounded so"}
-    for name, given in results.table_4.items():
-        numbers = (*given.before, *given.after, given.stated, given.factor)
-        possible = "{:.2f} to {:.2f}".format(*given.possible)
-        rows.append((f"Table 4, {name}", *numbers, possible, word[given.follows]))
-    for name, reduction in steps.list_printed().items():
-        given = PRINTED.find("figure_5", name)
-        if "before" in given:
-            follows = abs(reduction - float(given["stated"])) <= 0.5
-            numbers = (given["before"], given["after"], given["stated"], reduction)
-            rows.append((f"Figure 5, {name} [%]", *numbers, None, word[follows]))
-    return TEXT.table("arithmetic", rows)
-
-
 def make_figures(results: Results) -> tuple[published.Figure, ...]:
     """Return all figures."""
     return _draw_figure_4(results), _draw_figure_5(results), _draw_table_3(results)
@@ -351,11 +301,8 @@ def _draw_table_3(results: Results) -> published.Figure:
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
-    """Return a verdict for each claim; without those on printed numbers alone for another robot."""
-    groups = [_judge_equations, _judge_table_3, _judge_figure_5, _judge_experiment,
-              _judge_points, _judge_methods]  # fmt: skip
-    if results.case.robot is None:
-        groups.append(_judge_arithmetic)
+    """Return a verdict for each claim."""
+    groups = [_judge_equations, _judge_table_3, _judge_experiment, _judge_methods]
     return tuple(verdict for judge in groups for verdict in judge(results))
 
 
@@ -386,7 +333,7 @@ def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
     study, cells, cell, judge = results.study, results.cells, results.figure_5, TEXT.judge
     p, left = len(study.planned.free), len(study.planned.free) - len(study.observable)
     stated, falls = PRINTED.number("figure_5", PARAMETERS, "stated"), results.reduce(PARAMETERS)
-    reached = steps.decide_each(falls >= stated - 0.5, np.isfinite(falls))
+    reached = decide_each(falls >= stated - 0.5, np.isfinite(falls))
     best = chance = 1.0
     if left:  # distribution of the share of undetermined directions in the squared norm
         share = beta(left / 2, (p - left) / 2)
@@ -402,11 +349,18 @@ def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
         {m: steps.rank_correlations(d.cells.values(), m) for m in METHODS} for d in results.draws
     ]  # fmt: skip
     of_ls = np.concatenate([of[LS] for of in ranks])
-    correlated = steps.decide_each(of_ls > good, np.isfinite(of_ls))
+    correlated = decide_each(of_ls > good, np.isfinite(of_ls))
     ratio = np.median([c.compute_median(LS, POSITION) / c.noise for c in cells.values()])
     change, elsewhere = results.word_reduction(PARAMETERS), results.is_elsewhere
     sizes = {"errors": study.describe_errors(cell.size), "noise": cell.noise,
              "trials": results.trials}  # fmt: skip
+    figure, gains = PRINTED.find("figure_5"), [draw.gain for draw in results.draws]
+    each = np.min([results.reduce(name_measure(what, ABSOLUTE)) - float(figure[what]["stated"])
+                   for what in study.parts], axis=0)  # fmt: skip
+
+    def word_poses(numbers: Mapping[str, float]) -> list[str]:
+        return [f"{what} {numbers[what]:.3g} {steps.PARTS[what][2]}" for what in study.parts]
+
     return (
         judge("three_quarters", reached, elsewhere=elsewhere, stated=stated, parameters=p,
               left=left, best=100.0 * best, chance=100.0 * chance, change=change, **sizes),
@@ -414,49 +368,21 @@ def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
               elsewhere=elsewhere,
               better=sum(d is True for d in better.values()), count=len(cells),
               worse=worse or ["none"], parts=study.parts, ratio=ratio),
+        judge("figure_5", decide_each(each >= -0.5, np.isfinite(each)), elsewhere=elsewhere,
+              trials=results.trials,
+              stated=[f"{what} {figure[what]['stated']} %" for what in study.parts],
+              reductions=[f"{what} {results.word_reduction(name_measure(what, ABSOLUTE))}"
+                          for what in study.parts],
+              before=word_poses({what: cell.compute_median(BEFORE, name_measure(what, ABSOLUTE))
+                                 for what in study.parts}),
+              printed=word_poses({what: float(figure[what]["before"]) for what in study.parts})),
+        judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains),
+              unit=study.unit[1], drawn=study.spreads[0], optimized=study.spreads[1]),
         judge("correlation", correlated, elsewhere=elsewhere, good=good, count=len(cells),
               ratios=len({c.ratio for c in cells.values()}),
               ranks={m: steps.take_median(r) for m, r in ranks[0].items()}, parameters=change,
               position=results.word_reduction(name_measure("position", ABSOLUTE)),
               aligned=results.word_reduction(POSITION), **sizes),
-    )  # fmt: skip
-
-
-def _judge_figure_5(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge the printed reductions, and their interpretations."""
-    printed, study, elsewhere = steps.list_printed(), results.study, results.is_elsewhere
-    on_planes = [c for c in results.candidates if c.points == results.arrangements[0]["name"]]
-    deviation, variance = ([c for c in on_planes if c.reading == reading]
-                           for reading in (steps.SD, steps.VARIANCE))  # fmt: skip
-    stated = PRINTED.find("figure_5")
-    falls = {what: results.reduce(name_measure(what, ABSOLUTE)) for what in study.parts}
-    each = np.min([x - float(stated[what]["stated"]) for what, x in falls.items()], axis=0)
-    nearest = [np.min([c.distances for c in kind], axis=0) for kind in (deviation, variance)]
-    names, cell = list_printed_names(study), results.figure_5
-
-    def word(numbers: Mapping[str, float]) -> list[str]:
-        return [f"{name} {word_change(numbers[name])}" for name in names]
-
-    def word_poses(numbers: Mapping[str, float]) -> list[str]:
-        return [f"{what} {numbers[what]:.3g} {steps.PARTS[what][2]}" for what in study.parts]
-
-    before = {w: cell.compute_median(BEFORE, name_measure(w, ABSOLUTE)) for w in study.parts}
-    noise, nearest_one = float(steps.find_figure_5()[1]), results.candidates[0]
-    return (
-        TEXT.judge("figure_5", steps.decide_each(each >= -0.5, np.isfinite(each)),
-                   elsewhere=elsewhere, trials=results.trials,
-                   stated=[f"{what} {stated[what]['stated']} %" for what in study.parts],
-                   reductions=[f"{what} {results.word_reduction(name_measure(what, ABSOLUTE))}"
-                               for what in study.parts],
-                   before=word_poses(before),
-                   printed=word_poses({w: float(stated[w]["before"]) for w in study.parts}),
-                   nearest=nearest_one, nearest_medians=word(nearest_one.medians)),
-        TEXT.judge("variances", steps.decide_each(
-                       nearest[1] < nearest[0], np.isfinite(nearest[0] + nearest[1])),
-                   elsewhere=elsewhere,
-                   printed=word(printed), deviation=deviation[0], variance=variance[0],
-                   deviations=word(deviation[0].medians), variances=word(variance[0].medians),
-                   given=noise, root=np.sqrt(noise)),
     )  # fmt: skip
 
 
@@ -500,43 +426,14 @@ def _judge_experiment(results: Results) -> tuple[published.Verdict, ...]:
     )  # fmt: skip
 
 
-def _judge_points(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge the exchange and the number of planes."""
-    ten, one, free = results.arrangements
-    gains, unit = [draw.points["gain"] for draw in results.draws], results.study.unit[1]
-    on_one, on_ten = results.one_plane, results.figure_5
-    close = on_one.errors[LS][POSITION] < 1.5 * on_ten.errors[LS][POSITION]
-    close = steps.decide_each(close, on_one.converged[LS] & on_ten.converged[LS])
-    sizes = {"noise": results.figure_5.noise, "unit": unit}
-    return (
-        TEXT.judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains),
-                   ten=ten, one=one, unit=unit),
-        TEXT.judge("one_plane", close, one=one, ten=ten, free=free, cost_one=one[LS],
-                   cost_ten=ten[LS], **sizes),
-    )  # fmt: skip
-
-
-def _judge_arithmetic(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge the factors of Table 4, and those of root mean squares: rms^2 = mean^2 + sd^2."""
-    follows = [of.follows for of in results.conclusion.values()]
-    units = {name: given["unit"] for name, given in PRINTED.find("table_4").items()}
-    return (
-        *(TEXT.judge("factor", given.follows, name=name, given=given, unit=units[name],
-                     before=given.before[0], after=given.after[0])
-          for name, given in results.table_4.items()),
-        TEXT.judge("conclusion", decide(all(follows), False in follows), of=results.conclusion),
-    )  # fmt: skip
-
-
-def _judge_methods(results: Results) -> tuple[published.Verdict, published.Verdict]:
-    """Judge the prior, and the weights of the rows."""
+def _judge_methods(results: Results) -> tuple[published.Verdict]:
+    """Judge the prior."""
     sure, cells, study = SIZES.find("sure"), results.cells, results.study
 
     def judge_prior(cell: Cell) -> list[bool | None]:
         before, ls, prior = (cell.errors[m][POSITION] for m in (BEFORE, LS, PRIOR))
         good = (prior <= (1.0 + sure) * ls) & (prior <= before)
-        usable = cell.converged[LS] & cell.converged[PRIOR]
-        return steps.decide_each(good, usable)
+        return decide_each(good, cell.converged[LS] & cell.converged[PRIOR])
 
     priors = {
         key: decide_share(results.pool(lambda draw, k=key: judge_prior(draw.cells[k])))
@@ -547,27 +444,10 @@ def _judge_methods(results: Results) -> tuple[published.Verdict, published.Verdi
     worse = published.estimate_share(results.pool(
         lambda draw: [x > 1.0 for x in draw.cells[key].compute_left(PRIOR, POSITION)]))  # fmt: skip
 
-    def judge_weights(draw: Draw) -> list[bool | None]:
-        alike, full = (draw.weights[w].errors[LS][POSITION] for w in ("printed", "full"))
-        usable = draw.weights["printed"].converged[LS] & draw.weights["full"].converged[LS]
-        return steps.decide_each(alike < (1.0 + sure) * full, usable)
-
-    position, parameters = (
-        {w: cell.compute_median(m, x) for w, cell in results.draws[0].weights.items()}
-        for m, x in ((LS, POSITION), (PRIOR, DETERMINED))
-    )
-    pairs = {"full": ("full", "printed"), "single": ("full", "single"),
-             "distance": ("distance", "printed")}  # fmt: skip
-    change = {name: word_change(100.0 * (1.0 - position[a] / position[b]))
-              for name, (a, b) in pairs.items()}  # fmt: skip
-    cell = results.figure_5
-    given = {"errors": study.describe_errors(cell.size), "noise": cell.noise}
     return (
         TEXT.judge("prior", decide(all(d is True for d in priors.values()), False in
                                    priors.values()), sure=100 * sure, count=len(cells),
                    better=sum(d is True for d in priors.values()),
                    worse=sum(d is False for d in priors.values()), share=100.0 * worse.value,
                    errors=study.describe_errors(key[0]), noise=key[1], left=left),
-        TEXT.judge("weights", results.pool(judge_weights), sure=100 * sure, position=position,
-                   parameters=parameters, unit=study.unit[1], change=change, **given),
     )  # fmt: skip

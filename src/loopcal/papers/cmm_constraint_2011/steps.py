@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the paper does: points on planes and perpendicular lines, drawn machines, calibrations by LS
-and MAP, and errors at held-out poses; and the questions that it leaves open.
+and MAP, and errors at held-out poses.
 
 Robot and workspace are those of a robot file, by default of hexapod-nategh-agheli: the paper's
 Tables 1 and 2 are not in our text. A set of 1 mm is one tolerance of the robot file. Machines are
@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
-from math import hypot
 from time import process_time
 
 import numpy as np
@@ -32,7 +31,7 @@ from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.papers.paper import PAPERS, StudyCase
-from loopcal.papers.published import PaperFile, Row, decide, last_digit
+from loopcal.papers.published import PaperFile, Row, decide_each
 from loopcal.planning.design_space import ObservableSpace, PriorInformation, find_observable_space
 from loopcal.planning.exchange import MovedDesign
 from loopcal.planning.plane_line_planning import (
@@ -43,12 +42,7 @@ from loopcal.planning.plane_line_planning import (
 )
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, set_size
 from loopcal.studies.simulation.machines import build_robot_of, measure_held_points
-from loopcal.studies.simulation.published_steps import (
-    WEIGHTS,
-    Layout,
-    linearize_products,
-    map_displacements,
-)
+from loopcal.studies.simulation.published_steps import Layout, linearize_products, map_displacements
 from loopcal.studies.specification.levels import FEWEST_POINTS, PosesLevel
 from loopcal.studies.specification.study import Study as GridStudy
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -71,10 +65,6 @@ STATISTICS = ("", ", mean", ", standard deviation")
 """Of the errors over poses: the root mean square, the mean, the standard deviation."""
 PARAMETERS, DETERMINED = "parameters", "determined parameters"
 """Norm of the errors of the parameters, and of their part that plane and line can determine."""
-SD, VARIANCE = "standard deviation", "variance"
-"""Interpretations of a printed "variance of 0.01mm"."""
-ANY_TRUTH, OBSERVABLE = "all parameters", "gauge-free"
-"""True errors: of all parameters, or without their part that plane and line cannot determine."""
 SQUARED_ROUNDING = 1e-7
 """Singular values, relative to the largest, whose squares are rounding: log det cannot use them."""
 MORE_GROUPS = 3
@@ -92,11 +82,6 @@ def take_median(numbers: FloatArray) -> float:
     """Return the median of the finite numbers; NaN without any."""
     kept = numbers[np.isfinite(numbers)]
     return float(np.median(kept)) if len(kept) else np.nan
-
-
-def decide_each(holds: BoolArray, usable: BoolArray) -> list[bool | None]:
-    """Return of each machine (t,) whether a statement holds; None where it is not usable."""
-    return [bool(h) if u else None for h, u in zip(holds, usable, strict=True)]
 
 
 def name_measure(what: str, frame: str, statistic: str = "") -> str:
@@ -249,19 +234,16 @@ class Study:
         return errors
 
 
-def plan_points(
-    grid: GridStudy, level: PosesLevel | None = None, axes: tuple[str, ...] = ("z",)
-) -> Study:
+def plan_points(grid: GridStudy, level: PosesLevel | None = None) -> Study:
     """Draw groups at random and improve log det of their information by coordinate exchange.
 
     grid : study of a robot; what returns measures the planned points. level : number of points,
-    planes with a line each, and sweeps (0: as drawn); by default that of the grid. axes : of the
-    lines; z means planes of equal z.
+    planes with a line each, and sweeps (0: as drawn); by default that of the grid.
     """
     ((name, given),), (robot,) = grid.poses.items(), grid.robots.values()
     level = level or given
     points = level.count // level.groups
-    planned = PlaneLineGroups(build_robot_of(robot.text).nominal, points, MM, axes)
+    planned = PlaneLineGroups(build_robot_of(robot.text).nominal, points, MM, ("z",))
     first = planned.draw(level.groups, grid.seed)
     more = planned.draw(level.groups + MORE_GROUPS, grid.seed)
     known, possible = (
@@ -374,16 +356,13 @@ class Cell:
         return decide_each(left.max(axis=0) < 1.0, self.converged[method])
 
 
-def calibrate(study: Study, grid: GridStudy | None = None, rows: str = "") -> dict[Key, Cell]:
+def calibrate(study: Study, grid: GridStudy | None = None) -> dict[Key, Cell]:
     """Draw machines, hold their coordinates with noise, calibrate, compare at held-out poses.
 
-    grid : cells to compute, by default those of the study. rows : weights of the rows, by default
-    their full covariance. Returns the cells by the names of errors and noise.
+    grid : cells to compute, by default those of the study. Returns the cells by the names of errors
+    and noise.
     """
     grid, cells = grid or study.grid, dict[Key, Cell]()
-    if rows:
-        levels = {name: replace(level, rows=rows) for name, level in grid.methods.items()}
-        grid = replace(grid, methods=levels)
 
     def get_key(cell: CalibratedCell) -> Key:
         return cell.levels["errors"], cell.levels["instrument"]
@@ -403,17 +382,6 @@ def calibrate(study: Study, grid: GridStudy | None = None, rows: str = "") -> di
             values,
         )
     return cells
-
-
-def remove_gauge(study: Study, cell: Cell) -> Cell:
-    """Return a cell whose true errors are without their part that plane and line do not determine.
-
-    To first order it changes neither the readings nor the estimates, which are those of the cell.
-    """
-    nominal = study.robot.values
-    truth = nominal + study.remove_unobservable(cell.truth - nominal)
-    errors = {name: study.compute_errors(v, truth) for name, v in cell.values.items()}
-    return replace(cell, truth=truth, errors=errors)
 
 
 def rank_correlations(cells: Iterable[Cell], method: str) -> FloatArray:
@@ -441,162 +409,29 @@ def place_fifty(grid: GridStudy, groups: int) -> GridStudy:
     return replace(grid, poses={"measured": PosesLevel(count, "plane-line", groups, sweeps=0)})
 
 
-def calibrate_figure_5(study: Study, rows: str = "", reading: str = SD) -> Cell:
-    """Calibrate machines with the errors and the noise of figure 5, read as SD or VARIANCE."""
-    sizes = (
-        {text: float(text) if reading == SD else float(np.sqrt(float(text)))}
-        for text in find_figure_5()
-    )
-    (cell,) = calibrate(study, change_sizes(study.grid, *sizes), rows).values()
-    return cell
-
-
-def describe_points(study: Study, cell: Cell, axes: str = "") -> Row:
-    """Return the accuracy of one way to place 100 points; cell : of figure 5."""
-    drawn, optimized = study.spreads
-    medians = {m: cell.compute_median(m, name_measure("position", ALIGNED)) for m in METHODS}
-    row = {"name": name_planes(study.layout.groups) + axes, "rows": study.layout.equations}
-    row |= {"rank": len(study.observable)}
-    row |= {"drawn": drawn, "optimized": optimized, "gain": drawn / optimized, **medians}
-    return row | {"lost": sum(int((~c).sum()) for c in cell.converged.values())}
-
-
 @dataclass(frozen=True, eq=False)
 class Draw:
     """One draw of points, machines and noise."""
 
     cells: Mapping[Key, Cell]  # Table 3, by set and noise as printed
-    weights: Mapping[str, Cell]  # the cell of figure 5 by weights of the rows
     fifties: Mapping[int, Cell]  # from the points of the experiment, by their planes
     seconds: tuple[float, ...]  # of a processor for a calibration of these, simulation included
-    points: Row  # see `describe_points`
+    gain: float  # of coordinate exchange, see `Study.spreads`
 
 
 def compute_draw(study: Study, progress: Callable[[str], None]) -> Draw:
     """Calibrate the machines of one seed from the points of a study."""
     progress("Table 3")
     cells = calibrate(study)
-    progress("weights of the rows, and the points of the experiment")
+    progress("the points of the experiment")
     fifties, seconds = {}, []
     for groups in SIZES.find("fifty", "planes"):
         began = process_time()
         (fifties[groups],) = calibrate(study, place_fifty(study.grid, groups)).values()
         calibrations = study.grid.replicates * len(METHODS)
         seconds.append((process_time() - began) / calibrations)
-    full = cells[find_figure_5()]
-    weights = {w: calibrate_figure_5(study, f"products-{w}") for w in WEIGHTS if w != "full"}
-    points = describe_points(study, full)
-    return Draw(cells, weights | {"full": full}, fifties, tuple(seconds), points)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """Figure 5 under one interpretation of the paper, by least squares."""
-
-    points: str
-    reading: str
-    truth: str
-    frame: str
-    reductions: Mapping[str, FloatArray]  # by "parameters", "position" and "orientation", (t,) [%]
-
-    @property
-    def medians(self) -> dict[str, float]:
-        """Median reductions [%]; NaN if no machine converged."""
-        return {name: take_median(x) for name, x in self.reductions.items()}
-
-    @property
-    def distances(self) -> FloatArray:
-        """Largest difference (t,) of the reductions of each machine from the printed ones [%]."""
-        printed = list_printed()
-        return np.max([np.abs(x - printed[name]) for name, x in self.reductions.items()], axis=0)
-
-    @property
-    def distance(self) -> float:
-        """Largest difference of the median reductions from the printed ones [%]."""
-        printed = list_printed()
-        return max(abs(x - printed[name]) for name, x in self.medians.items())
-
-
-def list_printed() -> dict[str, float]:
-    """Return the printed reductions of parameters, position and orientation [%]; those of poses
-    from the errors before and after.
-    """
-    return {
-        name: 100.0 * (1.0 - float(given["after"]) / float(given["before"]))
-        if "before" in given
-        else float(given["stated"])
-        for name, given in PRINTED.find("figure_5").items()
-    }
-
-
-def compare_interpretations(study: Study, of_sd: Cell) -> list[Candidate]:
-    """Return figure 5 under the interpretations of the paper; of_sd : its cell, read as SD."""
-    candidates = []
-    for reading in (SD, VARIANCE):
-        cell = of_sd if reading == SD else calibrate_figure_5(study, reading=reading)
-        for truth, of in {ANY_TRUTH: cell, OBSERVABLE: remove_gauge(study, cell)}.items():
-            for frame, parameters in {ABSOLUTE: PARAMETERS, ALIGNED: DETERMINED}.items():
-                measures = {PARAMETERS: parameters}
-                measures |= {what: name_measure(what, frame) for what in study.parts}
-                reductions = {
-                    what: 100.0 * (1.0 - of.compute_left(LS, measure))
-                    for what, measure in measures.items()
-                }
-                place = name_planes(study.layout.groups)
-                candidates.append(Candidate(place, reading, truth, frame, reductions))
-    return candidates
-
-
-@dataclass(frozen=True)
-class Quotient:
-    """A stated quotient of roots of sums of squares of rounded numbers."""
-
-    before: tuple[str, ...]
-    after: tuple[str, ...]
-    stated: str
-
-    @property
-    def factor(self) -> float:
-        """The quotient of the printed numbers."""
-        return hypot(*map(float, self.before)) / hypot(*map(float, self.after))
-
-    @property
-    def possible(self) -> tuple[float, float]:
-        """Least and largest quotient of numbers that round to the printed ones."""
-        (least, most), (last, first) = (
-            [
-                hypot(*(float(text) + sign * 0.5 * last_digit(text) for text in rounded))
-                for sign in (-1, 1)
-            ]
-            for rounded in (self.before, self.after)
-        )
-        return least / first, most / last
-
-    @property
-    def follows(self) -> bool | None:
-        """Whether the printed numbers give the stated one to one unit of its last digit; None if
-        only other numbers that round to them do.
-        """
-        unit, (low, high) = last_digit(self.stated), self.possible
-        off = max(low - float(self.stated), float(self.stated) - high)
-        return decide(abs(self.factor - float(self.stated)) <= unit, off > 0.5 * unit)
-
-
-def list_factors() -> dict[str, Quotient]:
-    """Return the factors of Table 4 as printed."""
-    return {
-        name: Quotient((given["before"],), (given["after"],), given["stated"])
-        for name, given in PRINTED.find("table_4").items()
-    }
-
-
-def list_conclusion() -> dict[str, Quotient]:
-    """Return the factors of the conclusion, of root mean squares: rms^2 = mean^2 + sd^2."""
-    table, factors = list_factors(), {}
-    for name, stated in PRINTED.find("conclusion").items():
-        mean, sd = (table[f"{name}{statistic}"] for statistic in STATISTICS[1:])
-        factors[name] = Quotient(mean.before + sd.before, mean.after + sd.after, stated)
-    return factors
+    drawn, optimized = study.spreads
+    return Draw(cells, fifties, tuple(seconds), drawn / optimized)
 
 
 def list_undetermined(study: Study) -> list[tuple[str, float]]:

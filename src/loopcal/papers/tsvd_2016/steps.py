@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nine steps of the paper (docs/papers/tsvd-2016.md), for t machines or t settings of lambda
-and k at once; one machine with the printed noise, and many drawn machines.
+and k at once. The first of the drawn machines is measured with the printed noise.
 
 Raw numbers as in the paper: millimeters and radians, every equation and every parameter of weight
 one, and the filter acts on the step (`loopcal.studies.simulation.published_steps`). As in the paper
@@ -30,7 +30,7 @@ from loopcal.estimate.penalties import Method
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import SMALL_TILT, Component
 from loopcal.measure.simulation import Trials, simulate_trials
-from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.mechanism.workspace import list_tilt_rings
@@ -73,7 +73,8 @@ MEASURES = (
     "parameters farther from the truth than nominal [share]",
 )
 """Root mean squares over the output range and over the parameters, and a share."""
-ERRORS, RESAMPLING = 3, 4  # purposes of random streams
+ERRORS = 3
+"""Purpose of a random stream."""
 
 SHORT, FINE = SIZES.find("short"), 0.05
 """Iterations of the paper, and leaps of iterations that are drawn, see `StepRule.ahead`."""
@@ -86,23 +87,7 @@ LIBRARY: Mapping[str, Method] = {
 }  # fmt: skip
 """Methods of the library: rows whitened, columns scaled by tolerance."""
 
-BEFORE, TRUE = "before calibration", "true parameters known"
-RAW_LS, RAW_EARLY, RAW_RE, RAW_TSVD, RAW_FIVE, EARLY_FIVE, RE_FIVE, TSVD_FIVE = (
-    "raw LS", f"raw {EARLY}, at its best", f"raw {RE}, at its best", "raw TSVD at its best",
-    f"raw {RANKED}, 5-DOF", f"raw {EARLY}, at its best, 5-DOF", f"raw {RE}, at its best, 5-DOF",
-    "raw TSVD at its best, 5-DOF",
-)  # fmt: skip
-RAW = {
-    RAW_LS: (0, LS), RAW_EARLY: (0, EARLY), RAW_RE: (0, RE), RAW_TSVD: (0, TSVD),
-    RAW_FIVE: (1, RANKED), EARLY_FIVE: (1, EARLY), RE_FIVE: (1, RE), TSVD_FIVE: (1, TSVD),
-}  # fmt: skip
-"""Methods of the paper: 0 with 6-DOF and 1 with 5-DOF measurement, and the algorithm."""
-HINDSIGHT = "whitened ridge, best lambda in hindsight"
-NARROW, WIDE = "MAP, tolerances a third of the spread", "MAP, tolerances three times the spread"
-WHITENED_FIVE, PRIOR_FIVE = "whitened LS, 5-DOF", "MAP, 5-DOF"
-METHODS = (
-    BEFORE, *RAW, WHITENED, CROSS, PRIOR, NARROW, WIDE, HINDSIGHT, WHITENED_FIVE, PRIOR_FIVE, TRUE,
-)  # fmt: skip
+BEFORE = "before calibration"
 
 
 def list_limits() -> FloatArray:
@@ -119,7 +104,7 @@ def list_limits() -> FloatArray:
 
 
 def list_lambdas(key: str = "exponents") -> FloatArray:
-    """Return the lambdas of RE on drawn machines, see `widen`."""
+    """Return the lambdas of RE: powers of ten, see `widen`; "fine" ones between them."""
     return np.logspace(*SIZES.find(key))
 
 
@@ -253,6 +238,11 @@ class Study:
         trials = replace(self.trials, instrument=instrument, measured=(measured,))
         return replace(self, trials=trials, freedoms=5)
 
+    @cached_property
+    def known(self) -> Identifiability:
+        """What the measurements of the first machine identify."""
+        return lc.identifiability(self.robot.nominal, self.trials.trial(0))
+
     def with_noise(self, noise: FloatArray) -> Study:
         """Return the same poses measured with a noise (36, c or more) [m, rad]."""
         T, noise = self.trials.T, noise[..., : self.freedoms]
@@ -273,6 +263,12 @@ class Study:
     def true_outputs(self) -> FloatArray:
         """(t, 96, 4, 4) poses of the true machines, commanded to the output range."""
         return self._compute_outputs(self.trials.truth)
+
+    @cached_property
+    def before(self) -> FloatArray:
+        """(t, 5) errors of the machine as designed, see `compute_output_errors`."""
+        nominal = self.robot.parameters.nominal[None]
+        return self.compute_output_errors(np.repeat(nominal, len(self.trials), axis=0))
 
     def _compute_outputs(self, values: FloatArray) -> FloatArray:
         return forward_trials(self.robot, values, self.grid.q[None], self.grid.state).T
@@ -297,24 +293,6 @@ class Study:
         errors = np.column_stack([_compare_poses(T, self.true_outputs[machine]), *sizes])
         return np.where(is_finite, errors, np.nan)
 
-    def compute_commanded_errors(
-        self, values: FloatArray, machine: IntArray | None = None
-    ) -> FloatArray:
-        """Return the first two errors (a, 2) of the true machines, relative to the pose of the
-        machine as designed, at the readings with which the identified machine would reach it;
-        parameters as for `compute_output_errors`.
-
-        Coordinates without an actuator keep their errors, even with the true values.
-        """
-        is_finite = np.isfinite(values).all(axis=1, keepdims=True)
-        machine = np.arange(len(values)) if machine is None else machine
-        known = np.where(is_finite, values, self.robot.values)
-        target = self.design.output_range[None]
-        state = inverse_trials(self.robot, known, target, self.grid.state)
-        q = compute_readings(self.robot, known, state)
-        T = forward_trials(self.robot, self.trials.truth[machine], q, self.grid.state).T
-        return np.where(is_finite, _compare_poses(T, self.grid.T[None])[:, :2], np.nan)
-
 
 def _compare_poses(T: FloatArray, reference: FloatArray) -> FloatArray:
     """Return rms differences (a, 3) of poses (a, n, 4, 4): the first three MEASURES. Where the
@@ -329,17 +307,17 @@ def _compare_poses(T: FloatArray, reference: FloatArray) -> FloatArray:
 
 
 def measure_machines(design: Design, truth: FloatArray, seed: int = 0) -> Study:
-    """Measure the poses of true machines (t, p) [SI] with drawn noise: steps 3 and 4."""
+    """Measure the poses of true machines (t, p) [SI]: steps 3 and 4. The first has the noise of
+    Appendix 1, the others have drawn noise.
+    """
     n = len(design.columns)
     kind = Component(design.columns, "tilt-torsion" if n > 3 else None)
     instrument = lc.Instrument((lc.Sensor(kind, lc.Uniform(list_limits()[:n])),))
     trials = simulate_trials(design.robot, truth, design.poses, instrument, seed)
-    return Study(design, trials, n)
-
-
-def measure_case(design: Design, seed: int) -> Study:
-    """Measure one machine with drawn errors and the noise of Appendix 1."""
-    return measure_machines(design, design.draw_true_values(1, seed)).with_noise(read_noise())
+    study = Study(design, trials, n)
+    printed = study.with_noise(read_noise()).trials.measured[0][:1]
+    measured = np.concatenate([printed, trials.measured[0][1:]])
+    return replace(study, trials=replace(trials, measured=(measured,)))
 
 
 def read_noise() -> FloatArray:
@@ -394,20 +372,14 @@ def linearize(study: Study) -> Decomposition:
     return first.linearize(study.robot.parameters.nominal[None])[0]
 
 
-def find_rank(decomposition: Decomposition) -> int:
+def find_rank(study: Study) -> int:
     """Return the rank of the first machine's H."""
-    return int(are_nonzero(decomposition.singular_values[0]).sum())
+    return int(are_nonzero(linearize(study).singular_values[0]).sum())
 
 
 def list_scales(robot: Mechanism) -> FloatArray:
     """Return the paper's units (p,) in SI: millimeters and radians."""
     return list_raw_units(robot.parameters.dimensions)
-
-
-def find_bottom(errors: FloatArray) -> int:
-    """Return the place of the smallest product of errors (s, ..), those of `Design.parts`."""
-    product = errors.prod(axis=1)
-    return int(np.argmin(np.where(np.isnan(product), np.inf, product)))
 
 
 def locate_bottoms(errors: FloatArray, parts: Sequence[int]) -> IntArray:
@@ -461,17 +433,15 @@ class Chosen:
     iterations: IntArray  # (t,)
     is_converged: BoolArray  # (t,)
     errors: FloatArray  # (t, 5), see MEASURES, infinite if diverged
-    commanded: FloatArray  # (t, 2), see `Study.compute_commanded_errors`, infinite if diverged
 
     @classmethod
-    def judge(
+    def of(
         cls, study: Study, settings: FloatArray, values: FloatArray, iterations: IntArray,
         is_converged: BoolArray,
     ) -> Chosen:  # fmt: skip
         """Return identified machines with their errors."""
         errors = mark_diverged(study.compute_output_errors(values))
-        commanded = mark_diverged(study.compute_commanded_errors(values))
-        return cls(settings, values, iterations, is_converged, errors, commanded)
+        return cls(settings, values, iterations, is_converged, errors)
 
 
 def mark_diverged(errors: FloatArray) -> FloatArray:
@@ -489,17 +459,13 @@ class Sweep:
     settings: Mapping[str, FloatArray]
     curves: Mapping[str, FloatArray]  # (t, s, 5) errors at them, see MEASURES, infinite if diverged
     counts: Mapping[str, IntArray]  # (t, s) iterations
-    # of LS and RANKED, and of the others at the bottom of their curves, without LS
+    # LS and RANKED, the others at the bottom of their curves, without LS, and those of LIBRARY
     chosen: Mapping[str, Chosen]
+    runs: RawSteps  # of PICTURED at their settings on the first machine, with FINE leaps
     exact: FloatArray  # (t, 5) errors of LS with rank detection, measured without noise
 
     def __len__(self) -> int:
         return len(self.exact)
-
-    @property
-    def short(self) -> FloatArray:
-        """(t, s - 1, 5) errors of EARLY, without LS."""
-        return self.curves[EARLY][:, 1:]
 
     def are_at_end(self, algorithm: str) -> BoolArray:
         """Return for which machines (t,) the bottom of a curve is no minimum: LS is as good, or the
@@ -508,6 +474,30 @@ class Sweep:
         curves = self.curves[algorithm]
         bottoms = locate_bottoms(curves, self.study.design.parts)[:, -1]
         return (bottoms == 0) | (bottoms == curves.shape[1] - 1)
+
+    @property
+    def singular_values(self) -> FloatArray:
+        """(p,) of the raw identification matrix of the first machine at nominal parameters."""
+        return linearize(self.study).singular_values[0]
+
+    def is_diverged(self, method: str) -> bool:
+        """Return whether a method has no answer for the first machine."""
+        return not np.isfinite(self.chosen[method].values[0]).all()
+
+    def describe_setting(self, method: str) -> str:
+        """Return lambda or k of a method for the first machine."""
+        form = {
+            RANKED: f"rank {find_rank(self.study)}",
+            EARLY: "lambda = {:.2g}",
+            RE: "lambda = {:.2g}",
+            TSVD: "k = {:.0f}",
+            CROSS: "lambda = {:.2g}, chosen",
+            PRIOR: "lambda = 1, by definition",
+        }.get(method, "-")
+        text = form.format(self.chosen[method].settings[0])
+        if method in self.curves and self.are_at_end(method)[0]:
+            return f"{text}, at the end of the range"
+        return text
 
     def compute_median(self, algorithm: str) -> FloatArray:
         """Return the median curve (s, 5)."""
@@ -526,21 +516,20 @@ class Sweep:
         parts = self.study.design.parts
         curves, ratios = self.curves[algorithm][:, 1:, parts], np.empty((len(self), len(parts)))
         for half in (0, 1):
-            best = find_bottom(np.median(curves[1 - half :: 2], axis=0))
+            median = np.median(curves[1 - half :: 2], axis=0, keepdims=True)
+            best = locate_bottoms(median, range(len(parts)))[0, -1]
             errors, reference = curves[half::2, best], self.chosen[LS].errors[half::2, parts]
             with np.errstate(invalid="ignore"):
                 ratios[half::2] = np.where(np.isfinite(errors), errors / reference, np.inf)
         return ratios
 
 
-def run_settings(
-    study: Study, lambdas: FloatArray, progress: Callable[[str], None] = lambda _: None
-) -> Sweep:
-    """Run the paper's methods on all machines: RE with these lambdas and as many more as `widen`
-    needs, after all steps and after the first ones, and TSVD with every k.
+def run_settings(study: Study, progress: Callable[[str], None] = lambda _: None) -> Sweep:
+    """Run the paper's methods on all machines: RE with as many lambdas as `widen` needs, after all
+    steps and after the first ones, and TSVD with every k; and the methods of the library.
     """
     p, t, judged = len(study.design.free), len(study.trials), study.design.parts
-    null, machines = p - find_rank(linearize(study)), np.arange(t)
+    null, machines = p - find_rank(study), np.arange(t)
     ks, together = np.arange(p, 0, -1), SIZES.find("together")
 
     def run(penalty: FloatArray) -> list[np.ndarray]:
@@ -564,7 +553,7 @@ def run_settings(
 
     truncated = run(penalize_truncated(ks, p))
     lambdas, ridge = widen(
-        lambda more: run(penalize_ridge(more, p)), np.array([0.0, *lambdas]), judged, 2
+        lambda more: run(penalize_ridge(more, p)), np.array([0.0, *list_lambdas()]), judged, 2
     )
     settings = {EARLY: lambdas, RE: lambdas, TSVD: ks.astype(np.float64)}
     found = {EARLY: ridge[1::2], RE: ridge[::2], TSVD: truncated[::2]}
@@ -572,8 +561,21 @@ def run_settings(
 
     def choose(algorithm: str, place: IntArray) -> Chosen:
         values, count, is_converged = (x[machines, place] for x in found[algorithm][1:])
-        return Chosen.judge(study, settings[algorithm][place], values, count, is_converged)
+        return Chosen.of(study, settings[algorithm][place], values, count, is_converged)
 
+    progress(f"{study.label}, methods of loopcal")
+    fits = {name: lc.identify_trials(study.robot, study.trials, how)
+            for name, how in LIBRARY.items()}  # fmt: skip
+    chosen = {
+        LS: choose(TSVD, np.zeros(t, np.int64)),
+        RANKED: choose(TSVD, np.full(t, null)),
+        **{algorithm: choose(algorithm, place) for algorithm, place in places.items()},
+        **{name: Chosen.of(study, fit.penalty[:, 0], fit.values, fit.iterations, fit.converged)
+           for name, fit in fits.items()},
+    }  # fmt: skip
+    pictured = [penalize_truncated(np.array([p]), p),
+                *(penalize_ridge(chosen[a].settings[:1], p) for a in (EARLY, RE)),
+                penalize_truncated(chosen[TSVD].settings[:1].astype(np.int64), p)]  # fmt: skip
     exact = study.with_noise(np.zeros(study.freedoms))
     free = iterate(exact, penalize_truncated(np.array([p - null]), p), machines)
     return Sweep(
@@ -581,236 +583,41 @@ def run_settings(
         settings=settings,
         curves={a: of[0] for a, of in found.items()},
         counts={a: of[2] for a, of in found.items()},
-        chosen={
-            LS: choose(TSVD, np.zeros(t, np.int64)),
-            RANKED: choose(TSVD, np.full(t, null)),
-            **{algorithm: choose(algorithm, place) for algorithm, place in places.items()},
-        },
+        chosen=chosen,
+        runs=iterate(study, np.concatenate(pictured), ahead=FINE),
         exact=mark_diverged(exact.compute_output_errors(free.values)),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Case:
-    """One machine with the printed noise and one number of measured coordinates."""
-
-    sweep: Sweep
-    singular_values: FloatArray  # (p,) of the raw identification matrix at nominal parameters
-    rank: int  # of them
-    known: Identifiability  # identifiability of the same measurements
-    spacing: tuple[str, ...]  # of each lambda
-    runs: RawSteps  # of PICTURED at their settings, with FINE leaps
-    answers: Mapping[str, Chosen]  # by method of the paper and of LIBRARY
-    bracket: tuple[float, float]  # smallest and largest lambda of those tried that does not diverge
-    # largest component [mm, rad] of the first step if (H'H)^-1 H'D is computed as printed
-    normal_equations: float
-
-    @property
-    def study(self) -> Study:
-        """The measurements."""
-        return self.sweep.study
-
-    def is_diverged(self, method: str) -> bool:
-        """Return whether a method has no answer."""
-        return not np.isfinite(self.answers[method].values).all()
-
-    def describe_setting(self, method: str) -> str:
-        """Return lambda or k of a method."""
-        form = {
-            RANKED: f"rank {self.rank}",
-            EARLY: "lambda = {:.2g}",
-            RE: "lambda = {:.2g}",
-            TSVD: "k = {:.0f}",
-            CROSS: "lambda = {:.2g}, chosen",
-            PRIOR: "lambda = 1, by definition",
-        }.get(method, "-")
-        text = form.format(self.answers[method].settings[0])
-        if method in self.sweep.curves and self.sweep.are_at_end(method)[0]:
-            return f"{text}, at the end of the range"
-        return text
-
-
-def solve_case(study: Study, progress: Callable[[str], None]) -> Case:
-    """Run all methods on one machine's measurements."""
-    progress(f"{study.label} measurement")
-    p, known = len(study.design.free), linearize(study)
-    s, rank, tried = known.singular_values[0], find_rank(known), np.array(SIZES.find("tried"))
-    lambdas, is_equal = space_lambdas(s[rank - 1])
-    wide = list_lambdas()
-    sweep = run_settings(study, np.array([*lambdas, *wide[wide > lambdas[-1]]]))
-    words = dict(zip(lambdas, np.where(is_equal, "equal intervals", "equal ratios"), strict=True))
-    k = {LS: p, TSVD: sweep.chosen[TSVD].settings[0]}
-    pictured = [
-        penalize_truncated(np.array([k[a]]), p) if a in k
-        else penalize_ridge(sweep.chosen[a].settings, p)
-        for a in PICTURED
-    ]  # fmt: skip
-    safe = tried[~iterate(study, penalize_ridge(tried, p), limit=3).is_diverged]
-    return Case(
-        sweep=sweep,
-        singular_values=s,
-        rank=rank,
-        known=lc.identifiability(study.robot.nominal, study.trials.trial(0)),
-        spacing=tuple(str(words.get(lam, "more decades")) for lam in sweep.settings[RE][1:]),
-        runs=iterate(study, np.concatenate(pictured), ahead=FINE),
-        answers={**sweep.chosen, **run_library(study)},
-        bracket=(float(safe.min()), float(safe.max())),
-        normal_equations=solve_normal_equations(study),
-    )
-
-
-def space_lambdas(smallest: float) -> tuple[FloatArray, BoolArray]:
-    """Return lambdas (s,) from the smallest singular value to 1, and which are equidistant."""
-    intervals = np.linspace(smallest, 1.0, SIZES.find("equal_intervals"))
-    ratios = np.geomspace(smallest, 1.0, SIZES.find("equal_ratios"))
-    lambdas = np.unique(np.concatenate([intervals, ratios[1:-1]]))
-    return lambdas, np.isin(lambdas, intervals)
-
-
-def solve_normal_equations(study: Study) -> float:
-    """Return the first step of LS as printed, with the inverse of H'H: only here it is formed.
-
-    With a null direction H'H is singular up to rounding, and so its inverse is rounding.
+def follow_ridge(sweep: Sweep) -> list[tuple[int | str, float, bool, FloatArray]]:
+    """Return the best lambda for the first machine, whether it is at an end of the range, and its
+    errors (5,) after each number of RE iterations, and after all.
     """
-    d = linearize(study)
-    H = d.singular_values[0][:, None] * d.directions[0].T
-    try:
-        step = np.linalg.inv(H.T @ H) @ (H.T @ d.projections[0])
-    except np.linalg.LinAlgError:
-        return float("inf")
-    return float(np.abs(step).max())
-
-
-def run_library(study: Study, methods: Mapping[str, Method] = LIBRARY) -> dict[str, Chosen]:
-    """Return the results of methods of the library."""
-    answers = {}
-    for name, method in methods.items():
-        fit = lc.identify_trials(study.robot, study.trials, method)
-        answers[name] = Chosen.judge(
-            study, fit.penalty[:, 0], fit.values, fit.iterations, fit.converged
-        )
-    return answers
-
-
-def follow_ridge(case: Case) -> list[tuple[int | str, float, bool, FloatArray]]:
-    """Return the best lambda, whether it is at an end of the range, and its errors (5,) after each
-    number of RE iterations, and after all.
-    """
-    study, sweep, counts = case.study, case.sweep, SIZES.find("ridge_steps")
-    lambdas = sweep.settings[RE]
+    study, counts, lambdas = sweep.study, SIZES.find("ridge_steps"), list_lambdas("fine")
     penalty = penalize_ridge(lambdas, len(study.design.free))
     history = iterate(study, penalty, limit=max(counts), ahead=0.0).history
-    machine, rows = np.zeros(len(lambdas), dtype=np.int64), []
-    for count in (*counts, "all"):
-        errors = sweep.curves[RE][0]
-        if count != "all":
-            values = history[min(count, len(history) - 1)]
-            errors = mark_diverged(study.compute_output_errors(values, machine))
+    machine, curves = np.zeros(len(lambdas), dtype=np.int64), dict[int | str, FloatArray]()
+    for count in counts:
+        values = history[min(count, len(history) - 1)]
+        curves[count] = mark_diverged(study.compute_output_errors(values, machine))
+    found = {count: (lambdas, curve) for count, curve in curves.items()}
+    found["all"] = sweep.settings[RE], sweep.curves[RE][0]
+    rows = []
+    for count, (settings, errors) in found.items():
         best = int(locate_bottoms(errors[None], study.design.parts)[0, -1])
-        rows.append((count, float(lambdas[best]), best in (0, len(lambdas) - 1), errors[best]))
+        is_at_end = best in (0, len(settings) - 1)
+        rows.append((count, float(settings[best]), is_at_end, errors[best]))
     return rows
-
-
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """Results of t drawn machines of a structure.
-
-    The paper's methods take the setting that is best for the true machine. The library's methods
-    choose theirs from the data; MAP is given the true spread of the errors as its tolerances.
-    """
-
-    sweeps: tuple[Sweep, ...]  # the paper's methods with 6- and 5-DOF measurement
-    errors: Mapping[str, FloatArray]  # method -> (t, 5), see MEASURES, infinite if diverged
-    # method -> (t, 2), see `Chosen`; without HINDSIGHT, which takes another lambda for each measure
-    commanded: Mapping[str, FloatArray]
-    # method with a setting -> (t,) whether its curve has no minimum, see `Sweep.are_at_end`
-    at_end: Mapping[str, BoolArray]
-
-    def __len__(self) -> int:
-        return len(self.sweeps[0])
-
-    @property
-    def design(self) -> Design:
-        """The structure."""
-        return self.sweeps[0].study.design
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.design.name
-
-    def compute_median(self, method: str) -> FloatArray:
-        """Return medians (5,) over the machines."""
-        return np.median(self.errors[method], axis=0)
-
-    def compute_interval(self, method: str) -> FloatArray:
-        """Return the bootstrap interval (2, 5) of the medians, 95 %."""
-        return _find_interval(_resample_medians(self.errors[method]))
-
-    def compute_ratio(self, method: str, other: str) -> FloatArray:
-        """Return the ratio (5,) of medians, method over other."""
-        with np.errstate(divide="ignore", invalid="ignore"):  # of diverged fits
-            return self.compute_median(method) / self.compute_median(other)
-
-    def compute_ratio_interval(self, method: str, other: str) -> FloatArray:
-        """Return the bootstrap interval (2, parts) of the ratio of medians, the machines drawn in
-        pairs, 95 %.
-        """
-        parts = self.design.parts
-        first, second = (_resample_medians(self.errors[m][:, parts]) for m in (method, other))
-        return _find_interval(first / second)
-
-
-def _resample_medians(values: FloatArray) -> FloatArray:
-    """Return medians (r, ..) of machines drawn with replacement, always the same ones."""
-    t, count = len(values), SIZES.find("resamples")
-    drawn = make_random_stream(0, 0, RESAMPLING).integers(0, t, (count, t))
-    return np.median(values[drawn], axis=1)
-
-
-def _find_interval(medians: FloatArray) -> FloatArray:
-    return np.quantile(medians, [0.025, 0.975], axis=0, method="nearest")  # some may be infinite
 
 
 def simulate_machines(
     design: Design, seed: int, trials: int, progress: Callable[[str], None] = lambda _: None
-) -> Draws:
-    """Draw machines, measure and identify them by all methods."""
-    truth = design.draw_true_values(trials, seed)
-    whole = measure_machines(design, truth, seed)
-    sweeps = tuple(run_settings(study, list_lambdas(), progress) for study in whole.both)
-    progress(f"{design.name}, methods of loopcal")
-    factor = SIZES.find("factor")
-    scaled = {NARROW: lc.Ridge(factor**2), WIDE: lc.Ridge(factor**-2)}
-    without = {WHITENED_FIVE: lc.LeastSquares(), PRIOR_FIVE: lc.MAP()}
-    values = {BEFORE: np.repeat(whole.robot.parameters.nominal[None], trials, axis=0), TRUE: truth}
-    for study, methods in zip(whole.both, ({**LIBRARY, **scaled}, without), strict=False):
-        for method, how in methods.items():
-            values[method] = lc.identify_trials(study.robot, study.trials, how).values
-    errors = {m: whole.compute_output_errors(v) for m, v in values.items()}
-    commanded = {m: whole.compute_commanded_errors(v) for m, v in values.items()}
+) -> tuple[Sweep, ...]:
+    """Draw machines, measure and identify them by all methods: with all coordinates and, where psi
+    is one of them, without it.
 
-    def run(lambdas: FloatArray) -> list[np.ndarray]:
-        start, tried = None, []
-        for lam in lambdas:
-            options = lc.FitOptions(start=start)
-            fit = lc.identify_trials(whole.robot, whole.trials, lc.Ridge(lam), options=options)
-            start = fit.values
-            tried.append(mark_diverged(whole.compute_output_errors(fit.values)))
-        return [np.stack(tried, axis=1)]
-
-    parts, lambdas = design.parts, list_lambdas("hindsight_exponents")
-    lambdas, (tried,) = widen(run, lambdas, parts, 1)  # each machine and measure has its best one
-    bottoms, errors[HINDSIGHT] = locate_bottoms(tried, parts), tried.min(axis=1)
-    at_end = {HINDSIGHT: ((bottoms == 0) | (bottoms == len(lambdas) - 1)).any(axis=1)}
-    for method, (place, algorithm) in RAW.items():
-        if place == len(sweeps):  # without psi, which is not measured
-            continue
-        chosen = sweeps[place].chosen[algorithm]
-        errors[method], commanded[method] = chosen.errors, chosen.commanded
-        if algorithm in sweeps[place].curves:
-            at_end[method] = sweeps[place].are_at_end(algorithm)
-    errors, commanded = (
-        {m: mark_diverged(of[m]) for m in METHODS if m in of} for of in (errors, commanded)
-    )
-    return Draws(sweeps, errors, commanded, at_end)
+    The paper's methods take the setting that is best for the true machine. The library's methods
+    choose theirs from the data; MAP is given the true spread of the errors as its tolerances.
+    """
+    whole = measure_machines(design, design.draw_true_values(trials, seed), seed)
+    return tuple(run_settings(study, progress) for study in whole.both)
