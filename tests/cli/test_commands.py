@@ -345,6 +345,37 @@ def test_simulate_draws_uniform_noise_with_the_stated_sigma(loopcal, tmp_path) -
     )
 
 
+def test_simulate_draws_a_scale_and_states_it_in_files_that_it_fills_in_too(
+    loopcal, tmp_path
+) -> None:
+    words = "simulate core-xy --draw 30 --kind position --sigma-position 1nm --seed 4"
+    loopcal(f"{words} -o exact.csv")
+    loopcal(f"{words} --sigma-scale 100ppm -o scaled.csv")
+    loopcal("simulate core-xy --fill scaled.csv --seed 9 -o filled.csv")
+    robot = lc.load_robot("core-xy")
+    exact, scaled, filled = (
+        lc.load_measurements(tmp_path / f"{name}.csv", robot)
+        for name in ("exact", "scaled", "filled")
+    )
+    lengths = exact.observations[0].measured
+    drawn = []
+    for data in (scaled, filled):
+        measured = data.observations[0].measured
+        factor = float((measured * lengths).sum() / (lengths**2).sum())
+        assert measured == pytest.approx(factor * lengths, abs=1e-8)  # [m], noise of 1 nm twice
+        drawn.append(factor - 1.0)
+        assert 1e-6 < abs(drawn[-1]) < 4e-4
+    assert abs(drawn[0] - drawn[1]) > 1e-6
+    for data in (scaled, filled):
+        (stated,) = data.stated_values
+        assert (stated.name, stated.sd) == ("position.scale", 100 * 1e-6)
+    loopcal(
+        "simulate core-xy --kind inclination --sigma-scale 2ppm -o x.csv",
+        "measures angles, which have no scale",
+        code=1,
+    )
+
+
 def test_simulate_adds_the_requested_noise_to_readings_and_states_it(loopcal, tmp_path) -> None:
     words = "simulate linear-delta --draw 30 --kind position --seed 4"
     loopcal(f"{words} -o exact.csv")

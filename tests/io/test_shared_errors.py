@@ -12,8 +12,10 @@ import loopcal as lc
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.errors import FileError
 from loopcal.estimate.identification import identify
-from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_file import load_instrument, load_measurements
 from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.workspace import sample_workspace
 from tests.diagnose.correlated_data import LENGTH, ROBOTS, draw_errors, measure
 
 DELTA = ROBOTS["linear-delta"]
@@ -327,3 +329,47 @@ def test_angles_have_no_scale(tmp_path, key):
     path.write_text(text + "q1 [mm],q2 [mm],q3 [mm],tilt_x [mrad],tilt_y [mrad]\n200,200,200,1,2\n")
     with pytest.raises(FileError, match=f"'inclination' measures no lengths; remove '{key}'"):
         load_measurements(path, DELTA)
+
+
+def test_a_warm_machine_is_corrected_to_the_reference_temperature(tmp_path):
+    """Lengths measured at 23 degC are 34.5 ppm longer than those of the robot file."""
+    gantry = lc.load_robot("core-xy")
+    truth = gantry.with_values(sample_truth(gantry, 1, 2)[0])
+    poses = sample_workspace(gantry, 30, 2).coordinates
+    sensor = lc.Sensor(lc.Position(), lc.Gaussian([1e-6] * 3))
+    cold = lc.simulate(truth, poses, lc.Instrument((sensor,)), 2)
+    (rows,) = cold.observations
+    warm = replace(cold, observations=(replace(rows, measured=rows.measured * (1.0 + 34.5e-6)),))
+    save_measurements(warm, tmp_path / "warm.csv", gantry)
+    text = (tmp_path / "warm.csv").read_text("utf-8")
+    line = "temperature: {value: 23 degC, sd: 0.001 K, expansion: 11.5 ppm/K}"
+    (tmp_path / "warm.csv").write_text(f"# {line}\n{text}", "utf-8")
+    gains = [
+        dict(zip(fit.robot.parameters.names, fit.robot.values, strict=True))["z.gain"]
+        for fit in (
+            identify(gantry, cold),
+            identify(gantry, warm),
+            identify(gantry, load_measurements(tmp_path / "warm.csv", gantry)),
+        )
+    ]
+    assert gains[1] - gains[0] == pytest.approx(34.5e-6, rel=0.05)
+    assert gains[2] - gains[0] == pytest.approx(0.0, abs=0.1e-6)
+
+
+def test_a_simulation_draws_the_scale_of_each_machine_from_the_prior_of_the_file(tmp_path):
+    path = tmp_path / "like.csv"
+    settings = ["kind: position", "noise: {'*': 1 nm}", "mpe: {constant: 1 um, per_length: 90 ppm}"]
+    path.write_text("".join(f"# {line}\n" for line in settings) + "q1 [mm]\n1\n", "utf-8")
+    instrument = load_instrument(path, DELTA)
+    poses, sd = sample_workspace(DELTA, 2, 1).coordinates, 90e-6 / np.sqrt(3.0)
+    truth = np.repeat(DELTA.values[None], 2000, axis=0)
+    trials = simulate_trials(DELTA, truth, poses, instrument, 1)
+    scale = (trials.measured[0] / trials.T[..., :3, 3])[:, 0, 2] - 1.0
+    assert abs(scale.mean()) < 4.0 * sd / np.sqrt(2000)
+    assert scale.std() == pytest.approx(sd, rel=4.0 / np.sqrt(4000))
+    assert trials.trial(7).nuisance_parameters.table.tolerance == pytest.approx([sd])
+    known = simulate_trials(
+        DELTA, truth[:2], poses, instrument, 1, nuisance_values={"position.scale": 1e-3}
+    )
+    expected = 1.001 * known.T[..., :3, 3]
+    assert known.measured[0] == pytest.approx(expected, abs=6e-9)  # [m], six sigma

@@ -47,6 +47,7 @@ from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.findings.wording import list_names, name_count, round_to_digits
 from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.fitted_rows import FittedRows
+from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_quantile, find_distinct
@@ -480,8 +481,11 @@ def _check_limits(errors: Validation, limits: Mapping[str, float | None]) -> lis
 
 
 def owner_of(name: str) -> str:
-    """Return the frame, target or surface of a setup parameter: `tracker` of `tracker.x`."""
-    return name.rsplit(".", 1)[0]
+    """Return the frame, target or surface of a setup parameter: `tracker` of `tracker.x`; the scale
+    of an instrument is no coordinate of its frame, and belongs to itself.
+    """
+    owner, _, axis = name.rpartition(".")
+    return name if axis in SCALES else owner
 
 
 def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:

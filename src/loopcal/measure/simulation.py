@@ -353,7 +353,8 @@ def replace_measured_values(
         for sensor, rows in zip(instrument.sensors, data.all_observations, strict=True)
     )
     how = {"controller": robot.nominal, "reading_sigma": data.reading_sigma}
-    measured = simulate(robot, nominal.T, replace(instrument, sensors=sensors), seed, **how)
+    measuring = Instrument(sensors, data.stated_values)
+    measured = simulate(robot, nominal.T, measuring, seed, **how)
     filled = replace(
         data, observations=measured.observations, base_observations=measured.base_observations
     )

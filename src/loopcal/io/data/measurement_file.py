@@ -44,6 +44,7 @@ from loopcal.io.data.kind_settings import (
     KindRows,
     has_measured_values,
     match_names,
+    read_common_errors,
     read_kinds,
     read_observations,
     read_stated_values,
@@ -682,5 +683,4 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
                 raise table.settings.error(sentence, (*entry.location, "noise"))
         sigma = np.array([entry.noise[column.name] for column in entry.kind.noise_columns])
         sensors.append(Sensor(entry.kind, Gaussian(sigma)))
-    stated = tuple(value for entry in kinds for value in entry.shared_errors)
-    return Instrument(tuple(sensors), stated)
+    return Instrument(tuple(sensors), read_common_errors(table.settings, kinds))
