@@ -261,7 +261,9 @@ def test_probabilities_agree_with_all_eigenvectors_of_the_variances():
     rows = np.triu(rng.standard_normal((2 * half, 2 * half)))
     y = 5.0 * rng.standard_normal(2 * half)
     groups = list(np.split(np.eye(6), 2, axis=1))
-    found = detect_slow_errors(SlowErrorRows(errors, rows, rows, y), groups, known=0.0, level=1.0)
+    found = detect_slow_errors(
+        SlowErrorRows(errors, rows, rows, y, np.ones(6)), groups, known=0.0, level=1.0
+    )
     variance = np.eye(2 * half)
     for error in found:
         part = int(error.directions[3:].any())

@@ -32,6 +32,7 @@ from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
+from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
@@ -152,16 +153,35 @@ def calibrate(
     fit, choice, change = _fit(robot, split.fitted, options, count, held_out)
     count.begin("testing the residuals for patterns and slow errors")
     linear = linearize_fit(fit, split.fitted) if fit.converged else None
-    drives = None if linear is None else find_drive_errors(linear)
     plain, fit = fit, adjust_uncertainty(fit, split.fitted, linear)
+    again = replace(options, choose_model=False)
+    by_region = _fit_by_region(fit, kept, again, count) if split.share else None
+    if by_region is not None:
+        split, plain, change = by_region
+        linear = linearize_fit(plain, split.fitted) if plain.converged else None
+        fit = adjust_uncertainty(plain, split.fitted, linear)
+    drives = None if linear is None else find_drive_errors(linear)
     is_of_drives = drives is not None and drives.explain_better(fit)
     if drives is not None and is_of_drives and not are_outliers(plain, split.fitted):
-        split, again = split.with_reading_sigma(drives.sigma), replace(options, choose_model=False)
+        split = split.with_reading_sigma(drives.sigma)
         refit, _, change = _fit(fit.initial, split.fitted, again, count, held_out)
         if refit.converged:
             fit = adjust_uncertainty(drives.add_to(refit), split.fitted)
     outliers = _search_before_split(fit, split, kept, options)
     return _report(fit, choice, change, split, conventions, options, count, outliers)
+
+
+def _fit_by_region(
+    fit: Identification, data: Measurements, options: CalibrationOptions, count: StepCounter
+) -> tuple[DataSplit, Identification, Change | None] | None:
+    """Hold out regions of poses whose slow errors are alike, and fit again; None without any."""
+    regions = find_dense_regions(fit, data)
+    if regions is None:
+        return None
+    split = split_data(data, options.hold_out, options.seed, regions=regions)
+    again, _, change = _fit(fit.initial, split.fitted, options, count)
+    finding = report_finding("workflow.regions-held-out", count=int(regions.max()) + 1)
+    return split, replace(again, findings=(*again.findings, finding)), change
 
 
 def _fit(

@@ -18,7 +18,7 @@ from loopcal.measure.array_checks import check_seed, check_type
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 
 def describe_wrong_share(share: float) -> str:
@@ -48,7 +48,8 @@ class CalibrationOptions:
     ----------
     fit : how parameters are estimated, and which poses are excluded.
     hold_out : share of the poses to keep out of the fit for validation, from 0 to below 1. The
-        sets are those of `data.split(hold_out=hold_out, seed=seed)`.
+        sets are those of `data.split(hold_out=hold_out, seed=seed)`; of a
+        dense map whose residuals vary slowly, they are whole regions.
     held_out : labels of the poses to keep out, instead of a share. Neither is allowed where the
         data state their held-out poses (`Measurements.is_held_out`).
     seed : of the random choice of held-out poses.
@@ -157,7 +158,11 @@ class DataSplit:
 
 
 def split_data(
-    data: Measurements, hold_out: float = 0.0, seed: int = 1, held_out: Sequence[str] = ()
+    data: Measurements,
+    hold_out: float = 0.0,
+    seed: int = 1,
+    held_out: Sequence[str] = (),
+    regions: IntArray | None = None,
 ) -> DataSplit:
     """Divide measurements into a set to fit and a set for validation.
 
@@ -165,7 +170,7 @@ def split_data(
 
     hold_out : share of the poses to hold out, drawn by whole blocks, and with all repeats of a
         pose, as `data.split` does. 0 holds nothing out.
-    held_out : labels of the poses to hold out, instead of a share.
+    held_out : labels of the poses to hold out, instead of a share. regions : see `data.split`.
     """
     stated = tuple(label for label, out in zip(data.labels, data.is_held_out, strict=True) if out)
     if stated and (hold_out or (held_out and set(held_out) != set(stated))):
@@ -187,4 +192,4 @@ def split_data(
         return DataSplit(data.take(~is_held_out), data.take(is_held_out), 0.0, seed, repeats)
     if not hold_out:
         return DataSplit(data, None, 0.0, seed)
-    return DataSplit(*data.split(hold_out=hold_out, seed=seed), hold_out, seed)
+    return DataSplit(*data.split(hold_out=hold_out, seed=seed, regions=regions), hold_out, seed)

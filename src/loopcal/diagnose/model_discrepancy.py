@@ -40,6 +40,7 @@ from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.smooth_errors import CENTERS, SmoothErrors, describe_smooth_errors
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import (
     VarianceComponent,
     compute_any_probability,
@@ -60,9 +61,10 @@ UNSEEN = 1e-8
 NEGLIGIBLE = 1e-12  # share of the largest variance by slow errors below which one is rounding
 # Lengths over which slow errors vary, in halves of the range of a coordinate, and whether they
 # vary with the rotation of the platform: a wave over the workspace, and slower ones. They find slow
-# errors. The likelihood chooses among them and, where poses are dense, a short one; with more
-# centers.
-KERNELS, SHORT_KERNELS = ((0.6, False), (1.7, True)), ((0.3, False),)
+# errors; where poses are dense, the shortest of the short ones does so, too. The likelihood chooses
+# among all, with more centers.
+KERNELS = ((0.6, False), (1.7, True))
+SHORT_KERNELS = ((0.3, False), (0.35, False), (0.42, False), (0.5, False))
 FINE_CENTERS = 150
 # Share of the information on the direction that the rows sense best, below which they do not
 # measure a direction: errors of it are seen a tenth as well.
@@ -72,6 +74,7 @@ UNMEASURED_SHARE = 0.01
 ROUGH, MOST_ROUGH = 1e-3, 150
 # Probability without errors in a direction below which it has some, once its machine shows any.
 DIRECTION_LEVEL = 0.3
+FEWEST_REGIONS = 8  # with fewer, a quarter is not a share of the regions
 NAMED = 0.5  # share of the largest component of errors from which an axis is named
 
 
@@ -82,6 +85,7 @@ class SlowErrorRows(NamedTuple):
     slope: FloatArray  # (p, m) change of the estimates [SI] with the coefficients
     rows: FloatArray  # (m, m) S
     residuals: FloatArray  # (m,) y
+    sizes: FloatArray  # (d,) whitened size of the errors of each direction before the elimination
 
 
 class SlowError(NamedTuple):
@@ -116,7 +120,7 @@ def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | No
             describe_smooth_errors(T, tool, fit.robot.size, length, most, by_rotation=by_rotation)
             for length, by_rotation in kernels
         )
-        scaled = (e.scaled(directions) for e in each if kernels is not SHORT_KERNELS or e.is_dense)
+        scaled = (e.scaled(directions) for e in each if kernels is KERNELS or e.is_dense)
         projected = (project_slow_errors(linear, errors) for errors in scaled)
         return [rows for rows in projected if rows is not None]
 
@@ -125,7 +129,7 @@ def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | No
         return None
     groups = find_measured_directions(tested[0])
     measured = np.hstack([np.zeros((6, 0)), *groups])
-    short = project(SHORT_KERNELS, measured, FINE_CENTERS) if measured.size else []
+    short = project(SHORT_KERNELS[:1], measured, FINE_CENTERS) if measured.size else []
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     level = compute_single_level(LEVEL, len(tested) + len(short))
     slow = [detect_slow_errors(rows, groups, known, level) for rows in (*tested, *short)]
@@ -133,8 +137,22 @@ def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | No
         return find_rough_errors(linear, T)
     found = min((each for each in slow if each), key=lambda each: min(e.p_value for e in each))
     fine = [*project(KERNELS, measured, FINE_CENTERS), *short]
+    fine += project(SHORT_KERNELS[1:], measured, FINE_CENTERS)
     divided = [SlowErrors(rows, divide_by_direction(rows, found, groups, known)) for rows in fine]
-    return max(divided, key=lambda each: sum(error.size.gain for error in each.errors))
+    return max(divided, key=_score)
+
+
+def _score(slow: SlowErrors) -> float:
+    """Return the logarithm of the probability of the length of errors, up to a constant: that of
+    the residuals, and a half-Cauchy prior of the amplitude, in units of that of independent errors
+    as large as the residuals. Larger errors would hide in the parameters.
+    """
+    rows, score = slow.rows, 0.0
+    for error in slow.errors:
+        sizes = (rows.errors.amplitude.T @ error.directions).T * rows.sizes
+        square = error.size.variance * float((sizes**2).sum())
+        score += error.size.gain - np.log1p(square / float(rows.residuals @ rows.residuals))
+    return score
 
 
 def find_rough_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | None:
@@ -197,6 +215,21 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
     return replace(fit, posterior=replace(fit.posterior, discrepancy=discrepancy))
 
 
+def find_dense_regions(fit: Identification, data: Measurements) -> IntArray | None:
+    """Return the numbers (n,) of the regions of measured poses within which slow errors of a fit
+    are alike, so that a pose beside fitted ones tests nothing; None where poses are farther apart
+    than these errors, or share all of them.
+    """
+    own = fit.posterior.discrepancy
+    if own is None or not own.errors.is_dense or not np.isfinite(data.readings).all():
+        return None
+    solution = forward(fit.robot, data.readings)
+    if not solution.converged.all():
+        return None
+    regions = own.errors.group_regions(solution.T)
+    return regions if len(find_distinct(regions)) >= FEWEST_REGIONS else None
+
+
 def find_measured_directions(rows: SlowErrorRows) -> list[FloatArray]:
     """Return the directions (6, d) of the errors of place, then of rotation, that rows measure;
     they are base axes where the rows measure all three.
@@ -254,7 +287,11 @@ def detect_slow_errors(
         if not p_values[best] <= level:
             break
         u, w = turned[best]
-        size = estimate_variance_component(*tests[best], known)
+        # residuals that the errors cannot change say how large the noise is
+        rest, (weights, y) = len(residuals) - len(w), tests[best]
+        square = max(float(residuals @ residuals - y @ y), 0.0)
+        y = np.concatenate([y, np.full(rest, np.sqrt(square / max(rest, 1)))])
+        size = estimate_variance_component(np.pad(weights, (0, rest)), y, known)
         found.append(SlowError(groups[best], size, p_values[best]))
         # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
         shrink = 1.0 / np.sqrt(1.0 + size.ratio * w) - 1.0
@@ -287,11 +324,13 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     if degrees < FEWEST_DEGREES:
         return None
     slope = linear.fit.tolerance[:, None] * (to_z @ np.linalg.solve(R[:k, :k], R[:k, k : k + m]))
-    triangle, residuals = R[k : k + m, k : k + m], R[k : k + m, k + m]
-    size = np.linalg.norm(factor[:, p : p + m])
-    if not np.linalg.norm(triangle) > UNSEEN * size:
+    last = k + min(m, degrees)  # further rows are rounding
+    triangle, residuals = R[k:last, k : k + m], R[k:last, k + m]
+    by_direction = factor[:, p : p + m].reshape(len(factor), -1, len(errors.centers))
+    sizes = np.linalg.norm(by_direction, axis=(0, 2))
+    if not np.linalg.norm(triangle) > UNSEEN * np.linalg.norm(sizes):
         return None
-    return SlowErrorRows(errors, slope, triangle, residuals)
+    return SlowErrorRows(errors, slope, triangle, residuals, sizes)
 
 
 def _columns(rows: FloatArray, errors: SmoothErrors, directions: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal import geometry
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 CENTERS = 40
 """Largest number of centers: more of them are closer to each other than the error varies."""
@@ -80,6 +80,14 @@ class SmoothErrors:
         shared = correlate(self.centers, self.centers) - np.eye(len(self.centers))
         return bool(np.median(shared.max(axis=1)) > DENSE)
 
+    def group_regions(self, T: FloatArray) -> IntArray:
+        """Return the numbers (n,) of regions of poses T (n, 4, 4): each pose belongs to the nearest
+        of some that are more than a length apart, over which errors are hardly correlated.
+        """
+        x = self._normalize(T)
+        centers = x[_spread(x, len(x), 1.0)]
+        return np.argmin(((x[:, None] - centers) ** 2).sum(axis=2), axis=1)
+
     def scaled(self, amplitude: FloatArray) -> SmoothErrors:
         """Return the errors with other amplitudes (6, d)."""
         return replace(self, amplitude=amplitude)
@@ -101,8 +109,11 @@ class SmoothErrors:
 
     def _correlate(self, T: FloatArray) -> FloatArray:
         """Return the correlations (.., k) of errors at poses with those at the centers."""
-        x = (_coordinates(T, self.tool, self.rotation) - self.origin) / self.length
-        return correlate(x, self.centers)
+        return correlate(self._normalize(T), self.centers)
+
+    def _normalize(self, T: FloatArray) -> FloatArray:
+        """Return normalized coordinates (.., 6) of poses."""
+        return (_coordinates(T, self.tool, self.rotation) - self.origin) / self.length
 
     def _at_origin(self, T: FloatArray) -> FloatArray:
         """Return (.., 6, 6) from twists of the tool point to those of the platform's origin."""
@@ -147,13 +158,13 @@ def describe_smooth_errors(
     return SmoothErrors(tool, rotation, origin, scale, centers, whitening, np.eye(6))
 
 
-def _spread(x: FloatArray, most: int) -> list[int]:
+def _spread(x: FloatArray, most: int, apart: float = SAME) -> list[int]:
     """Return the outermost of coordinates (n, 6), then always the one farthest from all chosen
-    ones, up to `most` different ones.
+    ones, up to `most` that are this far apart.
     """
     chosen = [int(np.argmax((x**2).sum(axis=1)))]
     distance = ((x - x[chosen[0]]) ** 2).sum(axis=1)
-    while len(chosen) < most and distance.max() > SAME**2:
+    while len(chosen) < most and distance.max() > apart**2:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, ((x - x[chosen[-1]]) ** 2).sum(axis=1))
     return chosen

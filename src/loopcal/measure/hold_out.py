@@ -52,14 +52,19 @@ class _SetupValues(NamedTuple):
         return np.isin(rank, place[is_needed]), is_whole[self.owner]
 
 
-def choose_fitted(data: Measurements, hold_out: float, seed: int) -> BoolArray:
-    """Return which poses (n,) are fitted where a share is held out, by whole `data.undivided`.
+def choose_fitted(
+    data: Measurements, hold_out: float, seed: int, regions: IntArray | None = None
+) -> BoolArray:
+    """Return which poses (n,) are fitted where a share is held out, by whole `data.undivided` and
+    whole regions (n,), if they are given.
 
     Where the setup leaves less than half of the poses to hold out, sessions that need all of theirs
     are held out as a whole; where it leaves none then, it does not count. DataError where the poses
     cannot be divided.
     """
     unit, setup = np.unique(data.undivided, return_inverse=True)[1], _count_values(data)
+    if regions is not None:
+        unit = _join(np.column_stack([unit, unit.max() + 1 + regions]), unit)
     if unit.max() == 0:
         raise DataError(
             "cannot split measurements of a single block; measure more poses, or state smaller "
@@ -73,8 +78,7 @@ def choose_fitted(data: Measurements, hold_out: float, seed: int) -> BoolArray:
     is_needed, is_whole = setup.find_needed(unit, np.argsort(order))
     if np.bincount(unit)[~is_needed].sum() < ENOUGH * hold_out * data.n_poses:
         links = np.column_stack([unit[setup.pose], unit.max() + 1 + setup.owner])[is_whole]
-        joined = find_connected_groups(links, len(order) + len(setup.needed))[unit]
-        joined = np.unique(joined, return_inverse=True)[1]
+        joined = _join(links, unit)
         order = permute(joined)
         is_needed = setup.find_needed(joined, np.argsort(order))[0]
         if is_needed.all() or len(order) < 2:
@@ -86,6 +90,14 @@ def choose_fitted(data: Measurements, hold_out: float, seed: int) -> BoolArray:
     error = np.abs(np.cumsum(np.bincount(unit)[order])[:-1] - (1.0 - hold_out) * data.n_poses)
     error[: max(int(is_needed.sum()) - 1, 0)] = np.inf
     return np.isin(unit, order[: int(np.argmin(error)) + 1])
+
+
+def _join(links: IntArray, unit: IntArray) -> IntArray:
+    """Return the number (n,) of the group of units to which each pose belongs; links (k, 2) join
+    units (n,) and what has the numbers above them.
+    """
+    groups = find_connected_groups(links, int(max(links.max(initial=0), unit.max())) + 1)
+    return np.unique(groups[unit], return_inverse=True)[1]
 
 
 def _count_values(data: Measurements) -> _SetupValues:

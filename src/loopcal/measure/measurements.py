@@ -307,7 +307,9 @@ class Measurements(TableResult):
         labels = tuple(self.labels[i] for i in chosen)
         return replace(self, observations=tuple(observations), labels=labels, **of_poses)
 
-    def split(self, *, hold_out: float, seed: int) -> tuple[Self, Self]:
+    def split(
+        self, *, hold_out: float, seed: int, regions: IntArray | None = None
+    ) -> tuple[Self, Self]:
         """Split the poses at random into a set to fit and a held-out set.
 
         Blocks and repeats of a pose are not split (`undivided`), and the poses to fit determine
@@ -319,7 +321,8 @@ class Measurements(TableResult):
         hold_out : share of the poses that is not fitted (0.25 fits three poses of four), as nearly
             as whole blocks allow; both sets get at least one block. DataError unless it is between
             0 and 1, or where all poses are in one block.
-        seed : the same seed gives the same sets.
+        seed : the same seed gives the same sets. regions : (n,) numbers of sets of poses that are
+            not split either.
         """
         check_seed(seed)
         if not 0.0 < hold_out < 1.0:
@@ -327,7 +330,7 @@ class Measurements(TableResult):
                 f"cannot hold out a share of {hold_out}; give the share of the poses that is not "
                 "fitted, above 0 and below 1, such as 0.25"
             )
-        fitted = choose_fitted(self, hold_out, seed)
+        fitted = choose_fitted(self, hold_out, seed, regions)
         return self.take(fitted), self.take(~fitted)
 
     def with_weights(self, weight: ArrayLike) -> Self:
