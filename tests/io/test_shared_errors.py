@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -373,3 +374,40 @@ def test_a_simulation_draws_the_scale_of_each_machine_from_the_prior_of_the_file
     )
     expected = 1.001 * known.T[..., :3, 3]
     assert known.measured[0] == pytest.approx(expected, abs=6e-9)  # [m], six sigma
+
+
+def test_all_sessions_can_share_the_offset_of_a_bar_but_no_frame(tmp_path):
+    rows = lc.Observations.from_sigma(
+        lc.Separation(unknown=("offset",)).with_tool(DELTA.tool),
+        np.array([[0, 1], [1, 2]]),
+        np.full((2, 1), 0.1),
+        1e-6,
+        np.array(["mon", "tue"]),
+    )
+    stated = (lc.StatedValue("separation.offset", np.inf, scope="all"),)
+    data = measure_biased()[1].take(np.arange(3))
+    data = replace(data, observations=(rows,), stated_values=stated)
+    save_measurements(data, tmp_path / "a.csv", DELTA)
+    for each in (data, load_measurements(tmp_path / "a.csv", DELTA)):
+        (entry,) = each.nuisance_parameters.table.entries
+        assert (entry.name, entry.tolerance) == ("separation.offset", None)
+    _, tracked = measure("hexapod-42", "tracker", draw_errors(5, 9, 2), 2)
+    path = tmp_path / "b.csv"
+    save_measurements(tracked, path, ROBOTS["hexapod-42"])
+    text = path.read_text("utf-8")
+    path.write_text("# unknowns: {frame.x: {scope: all}}\n" + text, "utf-8")
+    with pytest.raises(lc.LoopcalError, match=r"of 'frame\.x' is all, but only offsets"):
+        load_measurements(path, ROBOTS["hexapod-42"])
+
+
+def test_a_contradicted_scale_of_all_sessions_is_named_with_its_value():
+    session = np.repeat(["mon", "tue"], 20)
+    _, data = measure("linear-delta", "component", draw_errors(40, 3, 1), 1, session)
+    (rows,) = data.observations
+    kind = replace(rows.kind, unknown=("scale",))
+    rows = replace(rows, kind=kind, measured=1.003 * rows.measured)
+    stated = (lc.StatedValue("component.scale", 2e-6, scope="all"),)
+    data = replace(data, observations=(rows,), stated_values=stated)
+    text = str(lc.check_conventions(DELTA, data).finding)
+    assert re.search(r"put component.scale at (299|300)\d ppm", text)
+    assert "not at 0 ppm (sd 2 ppm)" in text

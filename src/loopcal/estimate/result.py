@@ -41,6 +41,7 @@ from loopcal.estimate.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.setup_parameters import ROTATION_AXES
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import choose_setup_unit
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, are_nonzero
 from loopcal.numerics.gauss_newton import DescentStatus
@@ -887,7 +888,7 @@ def estimate_nuisance(
     """
     table = nuisance.local.table
     begin = linearization.next_start.first_nuisance[0] if start is None else start
-    units = [robot.get_unit(entry.dimension) for entry in table.entries]
+    units = [choose_setup_unit(robot, entry) for entry in table.entries]
     shown = tuple((unit.factor_to_si, unit.symbol) for unit in units)
     U, p = len(table), decomposition.directions.shape[1]
     if linearization.nuisance is None or not np.isfinite(linearization.cost[0]):

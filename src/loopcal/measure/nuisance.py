@@ -8,7 +8,7 @@ Kinds that use the same name share the parameter.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Literal, Self
@@ -18,9 +18,10 @@ import numpy as np
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import SD_RANGE, is_sd
+from loopcal.units import SD_RANGE, UNITS, Dimension, Unit, is_sd
 
 if TYPE_CHECKING:
     from loopcal.measure.instrument import Sensor
@@ -36,11 +37,11 @@ class StatedValue:
     ----------
     name : full name, such as `monday.tracker.x`; without a session (`tracker.x`) that of the
         parameter in every session.
-    sd : standard deviation of a prior [SI]; 0 fixes the parameter.
+    sd : standard deviation of a prior [SI]; 0 fixes the parameter, infinity leaves it to the data.
     nominal : fixed value, or center of the prior [SI]; default: the nominal value of the kind.
     is_undetermined : whether it is fixed because no motion of the machine determines it.
-    scope : "all" where all sessions share one value of a parameter `tracker.x`; by default every
-        session has its own.
+    scope : "all" where all sessions share one value of an offset or another common error of an
+        instrument, such as `tracker.scale`; by default every session has its own.
 
     Raises
     ------
@@ -56,7 +57,7 @@ class StatedValue:
     def __post_init__(self) -> None:
         if self.scope not in ("session", "all"):
             raise DataError(f"the scope of {self.name!r} is {self.scope!r}; give session or all")
-        if self.sd != 0.0 and not is_sd(self.sd):
+        if self.sd not in (0.0, np.inf) and not is_sd(self.sd):
             raise DataError(
                 f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, "
                 f"{SD_RANGE}, or 0 to fix the parameter"
@@ -164,6 +165,7 @@ def collect_nuisance_parameters(
             np.where(kind.is_drift, rows.drift_part[:, None], 1.0) if takes_parts else None
         )
         _check_names(kind, references)
+        _check_common(kind, common)
         owners = {
             scope: _list_owners(rows, scope, labels)
             for scope in {p.scope for p in kind.nuisance_parameters}
@@ -189,11 +191,18 @@ def collect_nuisance_parameters(
             entries[name] = replace(
                 entry,
                 nominal=entry.nominal if stated.nominal is None else stated.nominal,
-                tolerance=stated.sd or entry.tolerance,
+                tolerance=stated.sd if 0.0 < stated.sd < np.inf else entry.tolerance,
                 free=entry.free and stated.sd > 0.0,
             )
     table = ParameterTable(tuple(entries.values()))
     return NuisanceParameters(table, tuple(indices), tuple(factors))
+
+
+def choose_setup_unit(robot: Mechanism, parameter: Parameter) -> Unit:
+    """Return the unit in which a setup parameter is shown: that of the robot, ppm for a scale."""
+    if parameter.dimension is Dimension.RATIO:
+        return UNITS["ppm"]
+    return robot.get_unit(parameter.dimension)
 
 
 def _list_owners(rows: Observations | Sensor, scope: str, labels: tuple[str, ...]) -> list[str]:
@@ -223,6 +232,17 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
             f"{existing.scope}); state it alike, or use another name"
         )
     return name
+
+
+def _check_common(kind: Kind, common: Collection[str]) -> None:
+    """Refuse names of frames, targets and surfaces that all sessions have in common."""
+    for item, of_item in kind.own_items.items():
+        for name in (p.name for p in of_item.parameters if item != kind.bias_item):
+            if name in common:
+                raise DataError(
+                    f"the scope of {name!r} is all, but only offsets and common errors of an "
+                    "instrument, such as its scale, can be shared by all sessions; leave it out"
+                )
 
 
 def _check_names(kind: Kind, references: dict[str, FloatArray]) -> None:

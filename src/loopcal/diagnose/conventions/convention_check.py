@@ -54,6 +54,7 @@ from loopcal.measure.data_checks import (
     has_static_targets,
 )
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import choose_setup_unit
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.over_constraint import fix_breaking_parameters
 from loopcal.mechanism.solutions import forward
@@ -230,7 +231,7 @@ def find_contradiction(stated: Comparison, misfit: float, better: float) -> Cont
     without which measurements fit better by this factor; None without any.
     """
     present = set(stated.data.nuisance_parameters.table.names)
-    values = (value for value in stated.data.stated_values if not value.is_undetermined)
+    values = (v for v in stated.data.stated_values if not v.is_undetermined and v.sd < np.inf)
     names = tuple(value.name for value in values if value.name in present)
     if not names:
         return None
@@ -275,15 +276,17 @@ def find_moved_setups(
 def _estimate_stated(stated: Comparison, names: tuple[str, ...]) -> Contradiction:
     """Compare the measurements with some stated parameters estimated."""
     free, data = stated.problem.free, stated.data
-    remaining = tuple(value for value in data.stated_values if value.name not in names)
-    freed = replace(data, stated_values=remaining)
+    stated_values = tuple(
+        replace(value, sd=np.inf) if value.name in names else value for value in data.stated_values
+    )
+    freed = replace(data, stated_values=stated_values)
     comparison = exclude_far_rows(compare_with_robot(free, freed))
     misfit, estimates = refine_misfit(comparison)
     before, after = data.nuisance_parameters.table, freed.nuisance_parameters.table
     values = []
     for name in names:
         entry, estimate = before.entries[before.index(name)], float(estimates[after.index(name)])
-        unit = free.robot.get_unit(entry.dimension)
+        unit = choose_setup_unit(free.robot, entry)
         symbol, factor = unit.symbol, unit.factor_to_si
         certainty = "fixed"
         if entry.free and entry.tolerance is not None:

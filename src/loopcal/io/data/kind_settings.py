@@ -296,7 +296,8 @@ def _describe_items(value: Any, dimension: Dimension | None) -> Any:
 
 KEY, FIXED = "unknowns", "fixed"
 EXAMPLE = (
-    f"write '{FIXED}', {{sd: 1 mm}}, {{start: 12 mm, sd: 1 mm}} or {{start: 12 mm, {FIXED}: true}}"
+    f"write '{FIXED}', {{sd: 1 mm}}, {{start: 12 mm, sd: 1 mm}}, {{start: 12 mm, {FIXED}: true}}, "
+    "or {scope: all} for one value in all sessions"
 )
 
 
@@ -417,16 +418,17 @@ def describe_stated_values(
     content: dict[str, Any] = {}
     for value in known:
         names = (name for name in dimensions if _is_parameter(name, value.name))
-        if (name := next(names, None)) is None:
+        name = next(names, None)
+        if name is None or (np.isinf(value.sd) and value.scope == "session"):
             continue
         dimension, stated = dimensions[name], dict[str, Any]()
         for key, number in (("start", value.nominal), ("sd", value.sd or None)):
-            if number is not None:
+            if number is not None and np.isfinite(number):
                 unit = UNITS["ppm"] if dimension is Dimension.RATIO else None
                 stated[key] = describe_quantity(number, dimension, unit)
-        if stated and not value.sd:
+        if not value.sd and (stated or value.scope == "all"):
             stated[FIXED] = True
-        if stated and value.scope == "all":
+        if value.scope == "all":
             stated["scope"] = "all"
         content[value.name] = stated or FIXED
     return content
@@ -465,12 +467,13 @@ def _read_one(
         sentence = "this pattern matches lengths and angles; state them in separate lines"
         raise file.error(sentence, place)
     stated = read_record(file, node, RECORDS[matching[0].dimension], None, place)
-    if stated.fixed == ("sd" in node):
+    is_only_shared = stated.scope == "all" and not stated.fixed and "sd" not in node
+    if stated.fixed == ("sd" in node) and not is_only_shared:
         raise file.error(f"state either 'sd' or '{FIXED}: true'; {EXAMPLE}", place)
-    if not stated.fixed and (fault := find_sd_fault(stated.sd or 0.0)):
+    if "sd" in node and (fault := find_sd_fault(stated.sd or 0.0)):
         sentence = f"the standard deviation is {node['sd']}; {fault}, or {FIXED}"
         raise file.error(sentence, (*place, "sd"))
-    sd = 0.0 if stated.fixed else stated.sd or 0.0
+    sd = np.inf if is_only_shared else stated.sd or 0.0
     return [StatedValue(e.name, sd, stated.start, scope=stated.scope) for e in matching]
 
 
