@@ -14,7 +14,10 @@ NOISE = ("noise.residuals-too-large", "noise.doubtful")
 PRIOR = ("prior.tolerances", "prior.components")
 TAILS = "residuals.heavy-tailed"
 OUTLIERS = ("outliers.some", "outliers.pose", "outliers.conflict", "outliers.ambiguous")
-TIME = ("residuals.drift", "residuals.trend", "residuals.sessions", "residuals.correlated")
+TIME = (
+    "residuals.drift", "residuals.trend", "residuals.sessions", "residuals.correlated",
+    "residuals.shared",
+)  # fmt: skip
 POSE = ("residuals.model-discrepancy", "residuals.depend-on-reading")
 """Beginnings of the codes of the findings that explain a case: they name what is wrong."""
 

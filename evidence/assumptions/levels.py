@@ -18,7 +18,7 @@ STATED_LEVELS = {
 }
 """Stated probabilities of alarms where every assumption holds, by group of codes."""
 
-PATTERNS = ("drift", "trend", "sessions-differ", "depend-on", "correlated")
+PATTERNS = ("drift", "trend", "sessions-differ", "depend-on", "correlated", "shared")
 """Beginnings of the codes of the residuals that share one level."""
 
 

@@ -249,7 +249,13 @@ NOISE = report_finding(
     uncertainty=0.25,
 )
 SESSIONS = report_finding(
-    "residuals.sessions-differ", component="x", size=SMALL, error=SMALL, ratio=1.8, p_value=0.01
+    "residuals.sessions-differ",
+    unit="session",
+    component="x",
+    size=SMALL,
+    error=SMALL,
+    ratio=1.8,
+    p_value=0.01,
 )
 MISSING = report_finding("gates.limit-not-measured", quantity="orientation")
 EXCEEDED = report_finding(

@@ -34,6 +34,7 @@ from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 PATTERNS = {
     "residuals.correlated",
     "residuals.drift",
+    "residuals.shared-errors",
     "residuals.trend",
     "residuals.sessions-differ",
     "residuals.depend-on-reading",

@@ -10,30 +10,23 @@ from scipy.stats import kstest
 import loopcal as lc
 from evidence.assumptions.hexapod import ROBOT, draw_repeatability, make_backlash, measure_hexapod
 from loopcal.apply.accuracy import pose_uncertainty
-from loopcal.diagnose.drive_errors import (
-    differentiate_by_readings,
-    estimate_size,
-    find_drive_errors,
-    list_units,
-    test_independent_errors,
-)
+from loopcal.diagnose.drive_errors import find_drive_errors, list_drive_effects, list_units
 from loopcal.diagnose.residual_patterns import collect_residual_rows
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.mechanism.solutions import forward
+from loopcal.numerics.statistics import EVIDENT
 
-test_independent_errors.__test__ = False  # type: ignore[attr-defined] - no test of pytest
 SIGMA = (5e-6, 25e-6)  # [m, rad] of the instrument
 REPEATABILITY, PLAY = draw_repeatability(6e-6), make_backlash(10e-6)
 
 
-def collect(linear):
-    """Return the residual rows of a fit, and their derivatives by the readings."""
+def find_spectrum(linear):
+    """Return the residual rows of a fit, and what errors of single readings change of them."""
     rows = collect_residual_rows(linear)
     assert rows is not None
-    columns = differentiate_by_readings(linear, rows)
-    assert columns is not None
-    return rows, columns
+    drives, *_ = list_drive_effects(linear, rows)
+    return rows, drives, rows.remainder.find_spectrum(drives.scaled)
 
 
 def linearize(data):
@@ -43,32 +36,34 @@ def linearize(data):
 def test_probability_is_uniform_without_errors_of_the_drives() -> None:
     p_values = []
     for seed in range(60):
-        rows, columns = collect(linearize(measure_hexapod(seed, SIGMA, 25).data))
-        p_values.append(test_independent_errors(rows, columns, np.inf))
+        *_, spectrum = find_spectrum(linearize(measure_hexapod(seed, SIGMA, 25).data))
+        p_values.append(spectrum.compute_tail(np.inf))
     assert kstest(p_values, "uniform").pvalue > 0.01
 
 
 @pytest.mark.parametrize("known", [0.0, 8.0, np.inf])
 def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: float) -> None:
-    rows, columns = collect(linearize(measure_hexapod(3, SIGMA, 12, error=REPEATABILITY).data))
-    n, a = columns.count, 6
-    Z = np.zeros((len(rows.residual), n * a))
-    for i, pose in enumerate(columns.poses):
-        Z[i, pose * a : pose * a + a] = columns.values[i]
+    data = measure_hexapod(3, SIGMA, 12, error=REPEATABILITY).data
+    rows, drives, spectrum = find_spectrum(linearize(data))
+    Z = drives.scaled
     noise = np.linalg.qr(np.c_[rows.basis, np.eye(len(Z))])[0][:, rows.basis.shape[1] : len(Z)]
     y, A = noise.T @ rows.residual, noise.T @ Z  # what nothing estimated explains
 
-    def compute_likelihood(tau: float) -> tuple[float, float]:
+    def compute_likelihood(tau: float) -> float:
         V = np.eye(len(y)) + tau**2 * A @ A.T
         square, count = y @ np.linalg.solve(V, y), len(y) + known
         scale = 1.0 if np.isinf(known) else (square + known) / count
         by_size = square if np.isinf(known) else count * np.log(scale)
-        return float(-0.5 * (np.linalg.slogdet(V)[1] + by_size)), float(tau * np.sqrt(scale))
+        return float(-0.5 * (np.linalg.slogdet(V)[1] + by_size))
 
-    sizes = np.geomspace(1e-7, 1e-4, 400)
-    likelihoods, scaled = np.array([compute_likelihood(tau) for tau in sizes]).T
-    expected = scaled[np.argmax(likelihoods)]
-    assert estimate_size(rows, columns, known) == pytest.approx(expected, rel=0.26)  # of the grid
+    sizes = np.geomspace(0.05, 40.0, 400)
+    logs = np.array([compute_likelihood(tau) for tau in sizes]) - compute_likelihood(0.0)
+    found = spectrum.estimate(known)
+    # steps of the two grids: 1.5 and 4 %
+    assert np.sqrt(found.ratio) == pytest.approx(sizes[np.argmax(logs)], rel=0.05)
+    grid = np.linspace(*np.log(EVIDENT), 400)
+    mean = np.exp(np.interp(grid, np.log(sizes), logs)).mean()
+    assert found.evidence == pytest.approx(np.log(mean), abs=0.05)
 
 
 def test_errors_of_the_drives_are_found_with_their_size() -> None:

@@ -15,10 +15,9 @@ from loopcal.diagnose.residual_patterns import (
     collect_residual_rows,
     find_patterns,
     list_effects,
-    span_columns,
 )
 from loopcal.diagnose.residual_patterns import test_correlation as compute_correlation
-from loopcal.diagnose.residual_patterns import test_effect as compute_basis_tail
+from loopcal.diagnose.residual_patterns import test_effect as compute_tail
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares, Ridge
@@ -33,10 +32,6 @@ def collect(robot, kind, errors, seed, method=None, **context):
     rows = collect_residual_rows(linearize_fit(fit, data))
     assert rows is not None
     return rows, data
-
-
-def compute_tail(rows, effect):
-    return compute_basis_tail(rows, span_columns(rows.project(effect.columns)))
 
 
 CLEAN = [

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,15 +26,17 @@ from loopcal.apply.verdict import (
     report_validation,
 )
 from loopcal.checks import check_choice
-from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
+from loopcal.diagnose.adjusted_uncertainty import SHARED, add_shared_errors, adjust_uncertainty
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.drive_errors import are_outliers, find_drive_errors
+from loopcal.diagnose.drive_errors import BACKLASH, DRIVES, find_drive_errors
+from loopcal.diagnose.error_causes import CAUSE
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
+from loopcal.diagnose.residual_patterns import POSE
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError
 from loopcal.estimate.determinable_setup import (
@@ -152,21 +155,16 @@ def calibrate(
     held_out = 0 if split.held_out is None else split.held_out.n_poses
     fit, choice, change = _fit(robot, split.fitted, options, count, held_out)
     count.begin("testing the residuals for patterns and slow errors")
-    linear = linearize_fit(fit, split.fitted) if fit.converged else None
-    plain, fit = fit, adjust_uncertainty(fit, split.fitted, linear)
-    again = replace(options, choose_model=False)
-    by_region = _fit_by_region(fit, kept, again, count) if split.share else None
+    fit, again, explain = _explain_residuals(fit, split)
+    fitting = replace(options, choose_model=False)
+    by_region = _fit_by_region(fit, kept, fitting, count) if split.share else None
     if by_region is not None:
         split, plain, change = by_region
-        linear = linearize_fit(plain, split.fitted) if plain.converged else None
-        fit = adjust_uncertainty(plain, split.fitted, linear)
-    drives = None if linear is None else find_drive_errors(linear)
-    is_of_drives = drives is not None and drives.explain_better(fit)
-    if drives is not None and is_of_drives and not are_outliers(plain, split.fitted):
-        split = split.with_reading_sigma(drives.sigma)
-        refit, _, change = _fit(fit.initial, split.fitted, again, count, held_out)
+        fit, again, explain = _explain_residuals(plain, split)
+    if again is not split:
+        refit, _, change = _fit(fit.initial, again.fitted, fitting, count, held_out)
         if refit.converged:
-            fit = adjust_uncertainty(drives.add_to(refit), split.fitted)
+            split, fit = again, adjust_uncertainty(explain(refit), again.fitted)
     outliers = _search_before_split(fit, split, kept, options)
     return _report(fit, choice, change, split, conventions, options, count, outliers)
 
@@ -182,6 +180,35 @@ def _fit_by_region(
     again, _, change = _fit(fit.initial, split.fitted, options, count)
     finding = report_finding("workflow.regions-held-out", count=int(regions.max()) + 1)
     return split, replace(again, findings=(*again.findings, finding)), change
+
+
+def _explain_residuals(
+    fit: Identification, split: DataSplit
+) -> tuple[Identification, DataSplit, Callable[[Identification], Identification]]:
+    """Return the fit with the uncertainty that its residuals show; the data with noise that
+    includes errors of drives or poses where these cause them, else as they are; and how a fit of
+    these data states the causes.
+    """
+    linear = linearize_fit(fit, split.fitted) if fit.converged else None
+    drives = None if linear is None else find_drive_errors(linear)
+    failed = fit.residual_test.exceeds_sigma
+    fit = adjust_uncertainty(fit, split.fitted, linear, is_doubted=drives is not None)
+    findings = [f for f in fit.findings if f.code == CAUSE]
+    named = {f.data["cause"] for f in findings}
+    for found in [f for f in fit.findings if f.code == SHARED and f.data["cause"] == POSE]:
+        findings.append(found)
+        split = split.change(partial(add_shared_errors, finding=found))
+    if not (named & {DRIVES, BACKLASH} or not (named or failed)):
+        drives = None
+    if drives is not None:
+        split = split.change(drives.add_to_readings)
+
+    def explain(refit: Identification) -> Identification:
+        """Return a fit of these data that states the causes."""
+        refit = replace(refit, findings=(*refit.findings, *findings))
+        return refit if drives is None else drives.add_to(refit)
+
+    return fit, split, explain
 
 
 def _fit(

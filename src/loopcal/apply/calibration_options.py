@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from loopcal.measure.array_checks import check_seed, check_type
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import IntArray
 
 
 def describe_wrong_share(share: float) -> str:
@@ -136,14 +136,10 @@ class DataSplit:
     seed: int  # of the random choice
     repeats: tuple[str, ...] = ()  # labels of held-out poses that repeat a fitted one
 
-    def with_reading_sigma(self, sigma: FloatArray) -> DataSplit:
-        """Return the sets with standard deviations (a,) [SI] of all readings."""
-        fitted, held_out = (
-            data and replace(data, reading_sigma=np.broadcast_to(sigma, data.readings.shape))
-            for data in (self.fitted, self.held_out)
-        )
-        assert fitted is not None
-        return replace(self, fitted=fitted, held_out=held_out)
+    def change(self, function: Callable[[Measurements], Measurements]) -> DataSplit:
+        """Return the sets as a function changes them."""
+        held_out = self.held_out and function(self.held_out)
+        return replace(self, fitted=function(self.fitted), held_out=held_out)
 
     def list_observations(self) -> tuple[Observations, ...]:
         """Return the observations of both sets, those of targets on the base once."""

@@ -69,6 +69,7 @@ SOURCE_WORDS = {
     "residuals.drift": "drift",
     "residuals.trend": "trend",
     "residuals.sessions-differ": "differences of sessions",
+    "residuals.shared-errors": "shared errors",
     "residuals.depend-on-temperature": "temperature",
     "residuals.depend-on-reading": "dependence on a reading",
     "prior.inflation": "factor on the tolerances",

@@ -57,6 +57,7 @@ DEPENDENT = {
     "residuals.drift",
     "residuals.trend",
     "residuals.sessions-differ",
+    "residuals.shared-errors",
     "residuals.depend-on-temperature",
     "residuals.depend-on-reading",
     "residuals.correlated",

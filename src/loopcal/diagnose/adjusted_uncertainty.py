@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.diagnose.error_causes import Cause, find_causes
 from loopcal.diagnose.error_frames import (
     FITTED,
     MOST_POSES,
@@ -25,27 +26,34 @@ from loopcal.diagnose.model_discrepancy import add_slow_errors, find_slow_errors
 from loopcal.diagnose.residual_patterns import (
     BLOCK,
     ORDER,
+    POSE,
     READING,
     SESSION,
+    TARGET,
     TEMPERATURE,
     TIME,
+    WALK,
     EffectSizes,
     ResidualPatterns,
     ResidualRows,
     collect_residual_rows,
     estimate_correlated_errors,
+    estimate_sizes,
     find_patterns,
 )
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.posterior import NOISE
+from loopcal.estimate.residual_test import DOUBT as DOUBTFUL
 from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.measure.kinds.kind import list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.statistics import choose_evenly, compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS
+from loopcal.units import DISPLAY_UNITS, find_unit
 
+SHARED = "residuals.shared-errors"  # code of the finding
 # Code of the finding that independent errors would mean that sigma is too large.
 TOO_SMALL = "noise.residuals-too-small"
 # Codes of the findings on what residuals depend on.
@@ -60,11 +68,16 @@ CODES = {
 
 
 def adjust_uncertainty(
-    fit: Identification, data: Measurements, linear: FitLinearization | None = None
+    fit: Identification,
+    data: Measurements,
+    linear: FitLinearization | None = None,
+    *,
+    is_doubted: bool = False,
 ) -> Identification:
     """Return a fit whose covariance allows for what the residuals of its data show, and says why.
     Estimates stay, and no variance becomes smaller. A fit that did not converge, has no intervals,
-    or has weights by a loss is returned as it is. `linear` : see `linearize_fit`.
+    or has weights by a loss is returned as it is. `linear` : see `linearize_fit`. `is_doubted` :
+    whether another test found that noise alone does not explain the residuals.
     """
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
         return fit
@@ -77,19 +90,40 @@ def adjust_uncertainty(
         T = poses.T[0, poses.is_reached[0]]
     slow = find_slow_errors(linear, T)
     if rows is not None:
-        fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
+        is_doubted |= fit.residual_test.exact_p_value < DOUBTFUL
+        fit = _add_patterns(fit, linear, rows, is_slow=slow is not None, is_doubted=is_doubted)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 
 def _add_patterns(
-    fit: Identification, data: Measurements, rows: ResidualRows, *, is_slow: bool
-) -> Identification:
-    """Return a fit whose covariance allows for the patterns of its residuals. A dependence on a
-    reading is a slow error of the poses, and counts once where such errors were found.
+    fit: Identification, linear: FitLinearization, rows: ResidualRows, *, is_slow: bool,
+    is_doubted: bool,
+) -> Identification:  # fmt: skip
+    """Return a fit whose covariance allows for the patterns of its residuals, or for their causes
+    where these are known. A dependence on a reading is a slow error of the poses, and counts once
+    where such errors were found.
     """
+    data = linear.data
     patterns = find_patterns(rows, data, fit.robot)
-    effects = [e for e in patterns.effects if not (is_slow and e.effect.source == READING)]
-    if not (effects or patterns.is_correlated):
+    if not (patterns.effects or patterns.is_correlated or is_doubted):
+        return fit
+    causes = find_causes(linear, rows)
+    if causes:
+        fit = replace(fit, findings=(*fit.findings, *(cause.finding for cause in causes)))
+    effects = [e for e in patterns.effects if e.effect.source in CODES]
+    if causes:
+        effects = [
+            estimate_sizes(rows, cause.effect, cause.p_value)
+            for cause in causes
+            if cause.effect is not None and cause.effect.source in CODES
+        ]
+    effects = [e for e in effects if not (is_slow and e.effect.source == READING)]
+    shared = [c for c in causes if c.source in (POSE, TARGET, WALK)]
+    # errors that groups of rows share make neighbors alike; a walk begins at zero, and correlated
+    # errors anywhere, so that what both add contains either
+    is_shared = {SESSION, BLOCK, POSE, TARGET} & {cause.source for cause in causes}
+    is_correlated = patterns.is_correlated and not is_shared
+    if not (effects or shared or is_correlated):
         return fit
     # orientation and position (3 n, p) of evenly chosen measured poses, frames fitted, by the
     # parameters [per SI], and the sum of the variances of each that the fit states
@@ -106,9 +140,46 @@ def _add_patterns(
         root = rows.root @ (rows.gain.T @ columns) @ moments
         finding = _report_effect(effect, _measure_growth(tool, root))
         fit = add_covariance(fit, root, effect.degrees, finding)
-    if patterns.is_correlated:
+    for cause in shared:
+        assert cause.effect is not None
+        assert cause.size is not None
+        root = rows.root @ (rows.gain.T @ cause.effect.scaled) * np.sqrt(cause.size.variance)
+        finding = _report_shared(cause, _measure_growth(tool, root))
+        fit = add_covariance(fit, root, cause.size.degrees, finding)
+    if is_correlated:
         fit = _add_correlation(fit, patterns, tool)
     return _without_doubt_of_sigma(fit)
+
+
+def _report_shared(cause: Cause, ratio: float) -> Finding:
+    """Return the sizes of errors that rows share, by component."""
+    assert cause.effect is not None
+    assert cause.size is not None
+    sizes = dict(zip(cause.effect.labels, cause.effect.unit.tolist(), strict=True))
+    shown = [(sd, DISPLAY_UNITS[dimension]) for (_, dimension), sd in sizes.items()]
+    sigma = float(np.sqrt(cause.size.variance))
+    return report_finding(
+        SHARED,
+        cause=cause.source,
+        components=tuple(component for component, _ in sizes),
+        sizes=tuple(Quantity(sigma * sd / u.factor_to_si, u.symbol) for sd, u in shown),
+        ratio=ratio,
+        p_value=cause.p_value,
+        severity=choose_severity(cause.p_value),
+    )
+
+
+def add_shared_errors(data: Measurements, finding: Finding) -> Measurements:
+    """Return measurements whose noise includes the errors that all targets of a pose share."""
+    stated = zip(finding.data["components"], finding.data["sizes"], strict=True)
+    sizes = {name: size.value * find_unit(size.unit).factor_to_si for name, size in stated}
+    rows = []
+    for o in data.observations:
+        covariance = o.covariance.copy()
+        for (name, _), columns in list_components(o.kind).items():
+            covariance[:, np.array(columns)[:, None], columns] += sizes.get(name, 0.0) ** 2
+        rows.append(replace(o, covariance=covariance))
+    return replace(data, observations=tuple(rows))
 
 
 def _add_correlation(

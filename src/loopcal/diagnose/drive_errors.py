@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors that the drives have at every pose by itself: repeatability, backlash, errors of gears.
 
-With whitened rows e of a fit, of which nothing estimated explains r = M e (nu degrees of freedom),
-an error of variance tau^2 of every reading at every pose adds tau^2 Z Z' to their covariance, Z the
-whitened derivatives by the readings, which are zero but for those of the pose of a row. The size of
-
-    q = r'Z Z'r / (r'r + nu0),    nu0 degrees of freedom of the stated sigmas
-
-is compared with its mean and variance without such errors, which follow from the traces of
-K = M Z Z'M and K^2. tau maximizes the restricted likelihood of the rows. Backlash is an error
+An error of variance tau^2 of every reading at every pose is a component of the variance of the
+whitened rows, with their derivatives by the readings as columns, which are zero but for those of
+the pose of a row (`Remainder`). Backlash is an error
 of the sign of travel from the pose before: a linear effect, see `residual_patterns`.
 Sources: Patterson and Thompson, Recovery of inter-block information when block sizes are unequal,
 Biometrika 58 (1971); docs/theory/uncertainty.md.
@@ -20,9 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.diagnose.outliers import find_outliers
 from loopcal.diagnose.residual_patterns import (
-    FEWEST_LEFT,
+    READING,
+    Effect,
     ResidualRows,
     collect_residual_rows,
     order_by_time,
@@ -30,16 +25,15 @@ from loopcal.diagnose.residual_patterns import (
     span_columns,
     test_effect,
 )
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import identify
+from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import evaluate_rows
 from loopcal.estimate.residual_test import choose_severity, count_sigma_degrees
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.numerics.statistics import compute_chi_square_tail, compute_single_level
-from loopcal.typing import FloatArray, IntArray
+from loopcal.numerics.statistics import choose_evenly, compute_single_level
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 LEVEL = 0.01
@@ -53,11 +47,9 @@ have errors, and their pattern decides.
 FEWEST_VALUES = 2
 """Measured values of a pose without which its errors have no pattern, such as single heights."""
 
-OUTLYING = 0.1
-"""Largest share of the poses that may be outliers in place of errors of the drives."""
+MOST_COLUMNS = 600  # of errors of single poses: of more poses an even choice shows them
 
-SIZES = np.geomspace(0.03, 300.0, 41)
-"""Sizes of the errors that are compared, in units in which they double the variance of the rows."""
+DRIVES, BACKLASH = "drives", "backlash"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,44 +63,14 @@ class DriveErrors:
     sigma: FloatArray
     findings: tuple[Finding, ...]
 
-    def explain_better(self, fit: Identification) -> bool:
-        """Return whether they are less likely to be chance than the patterns of residuals that a
-        fit, with its uncertainty adjusted, states.
-        """
-        patterns = (f for f in fit.findings if f.code.startswith("residuals."))
-        chance = min((f.data.get("p_value", 1.0) for f in patterns), default=1.0)
-        return any(f.data["p_value"] < chance for f in self.findings)
+    def add_to_readings(self, data: Measurements) -> Measurements:
+        """Return measurements with readings of these standard deviations."""
+        return replace(data, reading_sigma=np.broadcast_to(self.sigma, data.readings.shape))
 
     def add_to(self, fit: Identification) -> Identification:
         """Return a fit with readings of these standard deviations, which says so."""
         posterior = replace(fit.posterior, reading_sigma=self.sigma)
         return replace(fit, posterior=posterior, findings=(*fit.findings, *self.findings))
-
-
-@dataclass(frozen=True, eq=False)
-class ReadingColumns:
-    """Whitened derivatives of R rows by the a readings of their poses [1 / SI].
-
-    values : (R, a). poses : (R,) pose of each row. count : n of all poses.
-    """
-
-    values: FloatArray
-    poses: IntArray
-    count: int
-
-    def project(self, columns: FloatArray) -> FloatArray:
-        """Return Z' columns (n, a, c) of columns (R, c)."""
-        total = np.zeros((self.count, self.values.shape[1], columns.shape[1]))
-        np.add.at(total, self.poses, self.values[:, :, None] * columns[:, None, :])
-        return total
-
-    def expand(self, errors: FloatArray) -> FloatArray:
-        """Return Z errors (R, c) of errors (n, a, c) of the readings."""
-        return np.einsum("ra,rac->rc", self.values, errors[self.poses])
-
-    def square(self) -> FloatArray:
-        """Return the blocks (n, a, a) of Z'Z."""
-        return self.project(self.values)
 
 
 def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
@@ -123,17 +85,19 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
     rows = collect_residual_rows(linear)
     if rows is None or len(rows.residual) < FEWEST_VALUES * linear.data.n_poses:
         return None
-    columns = differentiate_by_readings(linear, rows)
-    if columns is None:
+    effects = list_drive_effects(linear, rows)
+    if not effects:
         return None
+    drives, travel, along = effects
     unit = list_units(linear)
     level = DOUBTED if test.exceeds_sigma else compute_single_level(LEVEL, 2)
-    rows, backlash, findings = _find_backlash(linear, rows, columns, unit, level)
+    rows, backlash, findings = _find_backlash(linear, rows, travel, along, level)
     known = count_sigma_degrees(test.noise, fit.options.sigma_uncertainty)
-    scaled = ReadingColumns(columns.values * unit, columns.poses, columns.count)
-    p_value, sigma = test_independent_errors(rows, scaled, known), np.zeros_like(unit)
+    spectrum, sigma = rows.remainder.find_spectrum(drives.scaled), np.zeros_like(unit)
+    p_value = spectrum.compute_tail(known)
     if p_value < level:
-        sigma = estimate_size(rows, scaled, known) * unit
+        component = spectrum.estimate(known)
+        sigma = np.sqrt(component.variance) * drives.unit[0] * unit
         largest = int(np.argmax(sigma))
         size = fit.robot.to_quantity(float(sigma[largest]), fit.robot.actuators[largest].dimension)
         severity = choose_severity(p_value)
@@ -142,18 +106,6 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
         )
         findings.append(found)
     return DriveErrors(np.hypot(sigma, backlash), tuple(findings)) if findings else None
-
-
-def are_outliers(fit: Identification, data: Measurements) -> bool:
-    """Return whether errors of the drives vanish without the poses that do not fit, of which there
-    are few: then these are wrong, and not the drives.
-    """
-    suspects = find_outliers(fit, data).suspects
-    if not 0 < len(suspects) <= max(OUTLYING * data.n_poses, 1.0):
-        return False
-    excluded = (*fit.options.excluded_poses, *suspects)
-    fewer = identify(fit.initial, data, options=replace(fit.options, excluded_poses=excluded))
-    return fewer.converged and find_drive_errors(linearize_fit(fewer, data)) is None
 
 
 def list_units(linear: FitLinearization) -> FloatArray:
@@ -165,18 +117,17 @@ def list_units(linear: FitLinearization) -> FloatArray:
     return np.where(is_angle, 1.0 / robot.size, 1.0)
 
 
-def differentiate_by_readings(
-    linear: FitLinearization, rows: ResidualRows
-) -> ReadingColumns | None:
-    """Return the derivatives of the rows by the readings of their poses; None where rows compare
-    poses, or sense joints, which follow the readings in another way.
+def list_drive_effects(linear: FitLinearization, rows: ResidualRows) -> list[Effect]:
+    """Return the effects of errors of each reading at each pose (of many poses an even choice), of
+    the direction in which it was approached, and cubic ones of its value, in the `list_units`; none
+    where rows compare poses, or sense joints, which follow the readings in another way.
     """
     poses, states, robot = linear.solution.linearized, linear.solution.states, linear.fit.robot
-    assert poses is not None
-    assert states is not None
     kinds = [r for r in linear.problem.rows if len(r.poses)]
     if any(r.kind.sensed_joints or r.kind.poses_per_row > 1 for r in kinds):
-        return None
+        return []
+    assert poses is not None
+    assert states is not None
     readings = linear.data.readings[None]
     S = differentiate_pose(robot, robot.values[None], readings, states.state).readings[0]
     values = np.zeros((len(rows.residual), S.shape[-1]))
@@ -187,40 +138,33 @@ def differentiate_by_readings(
         own = rows.kind == number
         values[own] = Z[rows.row[own], rows.column[own]]
         places[own] = r.poses[rows.row[own]]
-    return ReadingColumns(values, places, len(S))
+    values *= list_units(linear)
+    chosen = choose_evenly(len(S), max(MOST_COLUMNS // S.shape[-1], 1))
+    of_poses = (places[:, None] == chosen)[:, :, None] * values[:, None, :]
+    times = [o.context.get("time") for o in linear.data.observations if len(o)]
+    is_alike = len(times) == 1 and len(linear.data.observations[0]) == len(S)
+    order = order_by_time(times[0] if is_alike else None, len(S))
+    direction = np.zeros_like(linear.data.readings)
+    direction[order[1:]] = np.sign(np.diff(linear.data.readings[order], axis=0))
+    x = np.apply_along_axis(scale_to_range, 0, linear.data.readings)
+    along = np.concatenate([values * (x**k)[places] for k in (1, 2, 3)], axis=1)
+    listed = {DRIVES: of_poses.reshape(len(values), -1), BACKLASH: values * direction[places]}
+    label = (("reading", Dimension.LENGTH),)
+    return [Effect(k, "", c, label * c.shape[1]) for k, c in (*listed.items(), (READING, along))]
 
 
 def _find_backlash(
-    linear: FitLinearization, rows: ResidualRows, columns: ReadingColumns, unit: FloatArray,
-    level: float,
-) -> tuple[ResidualRows, FloatArray, list[Finding]]:  # fmt: skip
+    linear: FitLinearization, rows: ResidualRows, travel: Effect, along: Effect, level: float
+) -> tuple[ResidualRows, FloatArray, list[Finding]]:
     """Return rows as if the fit had also estimated the backlash that they show, half of it (a,)
-    [SI] for each actuator, and the finding. The order of the rows is that of travel.
+    [SI] for each actuator, and the finding. `travel`, `along` : effects of direction and reading.
     """
-    readings, robot = linear.data.readings, linear.fit.robot
-    nothing = np.zeros(len(unit))
-    times = [o.context.get("time") for o in linear.data.observations if len(o)]
-    time = (
-        times[0] if len(times) == 1 and len(linear.data.observations[0]) == len(readings) else None
-    )
-    order = order_by_time(time, len(readings))
-    direction = np.zeros_like(readings)
-    direction[order[1:]] = np.sign(np.diff(readings[order], axis=0))
-    x = np.apply_along_axis(scale_to_range, 0, readings)
-
-    def shift(errors: FloatArray) -> FloatArray:
-        return columns.values * errors[columns.poses] * unit
-
-    effect = shift(direction)
+    robot, unit, effect = linear.fit.robot, list_units(linear), travel.columns
     # the direction of travel goes with the reading: a pose at an end was reached towards it
-    known = rows.with_effects(np.concatenate([shift(x**k) for k in (1, 2, 3)], axis=1))
-    basis = span_columns(known.project(effect))
-    q = basis.shape[1]
-    if q < len(unit) or known.degrees < (1.0 + FEWEST_LEFT) * q:
-        return rows, nothing, []
-    p_value = test_effect(known, basis)
-    if not p_value < level:
-        return rows, nothing, []
+    known = rows.with_effects(along.columns)
+    p_value = test_effect(known, travel)
+    if not p_value < level or span_columns(known.project(effect)).shape[1] < len(unit):
+        return rows, np.zeros(len(unit)), []
     half, *_ = np.linalg.lstsq(known.project(effect), known.residual, rcond=None)
     largest = int(np.argmax(np.abs(half)))
     actuator = robot.actuators[largest]
@@ -230,54 +174,3 @@ def _find_backlash(
         severity=choose_severity(p_value),
     )  # fmt: skip
     return rows.with_effects(effect), np.abs(half) * unit, [finding]
-
-
-def test_independent_errors(rows: ResidualRows, columns: ReadingColumns, known: float) -> float:
-    """Return the probability of a larger q for independent errors of the instrument alone.
-
-    known : nu0, degrees of freedom of the stated sigmas; infinite where these are exact.
-    """
-    U, nu = rows.basis, rows.degrees
-    own = columns.project(U)  # Z'U
-    square = columns.project(rows.residual[:, None])
-    total, gram = float((columns.values**2).sum()), columns.square()
-    inner = np.einsum("nac,nad->cd", own, own)
-    spread = columns.expand(own)
-    first = total - float(np.trace(inner))
-    second = float((gram**2).sum()) - 2.0 * float((spread**2).sum()) + float((inner**2).sum())
-    if not first > 1e-9 * total:
-        return 1.0
-    if np.isinf(known):
-        ratio, mean, variance = float((square**2).sum()), first, 2.0 * second
-    else:
-        n = nu + known
-        ratio = float((square**2).sum()) / (rows.square + known) * n
-        mean, variance = first, 2.0 * (n * second - first**2) / (n + 2.0)
-    if not variance > 0.0:
-        return 1.0
-    degrees = 2.0 * mean**2 / variance
-    return float(compute_chi_square_tail(degrees, degrees * ratio / mean))
-
-
-def estimate_size(rows: ResidualRows, columns: ReadingColumns, known: float) -> float:
-    """Return the standard deviation tau [SI, scaled] of the errors of the readings at which the
-    restricted likelihood of the rows is largest, their noise at its best size.
-    """
-    both, q = np.column_stack([rows.basis, rows.residual]), rows.basis.shape[1]
-    B, (c, Q) = columns.project(both), np.linalg.eigh(columns.square())
-    B, c = Q.swapaxes(1, 2) @ B, np.maximum(c, 0.0)[..., None]
-    unit = float(np.sqrt(len(both) / (columns.values**2).sum()))
-    best, size = -np.inf, 0.0
-    for tau in SIZES * unit:
-        # (1 + tau^2 Z Z')^(-1/2) = 1 - Z Q diag(g) Q'Z', with g c = 1 - (1 + tau^2 c)^(-1/2)
-        root = np.sqrt(1.0 + tau**2 * c)
-        white = both - columns.expand(Q @ (tau**2 / (root * (1.0 + root)) * B))
-        diagonal = np.abs(np.diag(np.linalg.qr(white, mode="r")))
-        square, n, scale = float(diagonal[-1] ** 2), rows.degrees + known, 1.0
-        if np.isfinite(known):
-            scale = (square + known) / n
-            square = n * np.log(scale)
-        log_det = 2.0 * float(np.log(root).sum() + np.log(diagonal[:q]).sum())
-        if -0.5 * (log_det + square) > best:
-            best, size = -0.5 * (log_det + square), tau * np.sqrt(scale)
-    return float(size)

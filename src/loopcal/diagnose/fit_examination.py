@@ -13,6 +13,7 @@ import numpy as np
 
 from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
 from loopcal.diagnose.cluster_covariance import ClusterCheck, check_clusters
+from loopcal.diagnose.error_causes import CAUSE, OUTLIERS, find_causes
 from loopcal.diagnose.error_frames import (
     FITTED,
     compute_mean_squares,
@@ -21,6 +22,7 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
+from loopcal.diagnose.residual_patterns import collect_residual_rows
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
@@ -163,7 +165,8 @@ class FitExamination(Result):
     outliers : poses that do not fit the others. lack_of_fit : the test against repeated poses.
     clusters : the uncertainty that allows for common errors of a day, session or pose.
     correlated : groups of strongly correlated parameters. gain : expected errors before and after.
-    tails : the test of the other residuals for heavy tails.
+    tails : the test of the other residuals for heavy tails. causes : of the outliers, where the fit
+        names none.
     """
 
     outliers: OutlierCheck
@@ -172,6 +175,7 @@ class FitExamination(Result):
     correlated: tuple[CorrelatedGroup, ...]
     gain: CalibrationGain
     tails: HeavyTails
+    causes: tuple[Finding, ...] = ()
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields(
         *("outliers", "lack_of_fit", "clusters", "correlated"),
@@ -192,7 +196,7 @@ class FitExamination(Result):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All findings, the most important ones first."""
-        findings = [*self.outliers.findings, *self.tails.findings]
+        findings = [*self.outliers.findings, *self.causes, *self.tails.findings]
         if self.gain.is_worthwhile is not None:
             findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
         lack = self.lack_of_fit
@@ -216,18 +220,31 @@ def examine_fit(
         other tests begin.
     frame : in which expected errors are stated, see `choose_error_frame`.
     """
-    outliers = find_outliers(fit, data, progress=progress)
+    outliers, causes = find_outliers(fit, data, progress=progress), ()
     progress(0, 1, "testing for common errors and heavy tails")
     linear = None
     if fit.converged and fit.residual_test.intervals:
         linear = linearize_fit(fit, data)
+    known = [f for f in fit.findings if f.code == CAUSE]
+    if outliers.suspects and not known and linear is not None:
+        rows = collect_residual_rows(linear)
+        causes = () if rows is None else tuple(c.finding for c in find_causes(linear, rows))
+    found = [f.data["cause"] for f in (*known, *causes)]
+    shown = outliers
+    if outliers.suspects and found and OUTLIERS not in found:
+        name = next(f.data["name"] for f in (*known, *causes))
+        explained = report_finding(
+            "outliers.explained", poses=outliers.suspects, cause=found[0], name=name
+        )
+        shown = replace(outliers, outliers=(), ambiguous=(), summary=(explained,))
     return FitExamination(
-        outliers,
+        shown,
         check_lack_of_fit(fit, data),
         check_clusters(fit, data, frame, linear),
         find_correlated_groups(fit),
         estimate_calibration_gain(fit, data, frame),
         check_heavy_tails(fit, data, outliers.suspects, linear),
+        causes,
     )
 
 

@@ -16,20 +16,26 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal.estimate.fit_linearization import FitLinearization
-from loopcal.measure.kinds.kind import list_components
+from loopcal.estimate.smooth_errors import correlate
+from loopcal.measure.kinds.kind import Kind, list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import (
+    MOST_KNOWN,
+    VarianceComponent,
+    choose_evenly,
     compute_any_probability,
+    compute_component_tail,
     compute_f_tail,
     compute_single_level,
     estimate_variance_component,
@@ -61,6 +67,11 @@ class ResidualRows:
     def degrees(self) -> int:
         """Degrees of freedom of the residuals."""
         return self.basis.shape[0] - self.basis.shape[1]
+
+    @property
+    def remainder(self) -> Remainder:
+        """What independent errors of the rows leave."""
+        return Remainder(self.basis, self.residual, float(self.degrees))
 
     @cached_property
     def square(self) -> float:
@@ -176,10 +187,14 @@ def order_by_time(time: FloatArray | None, count: int) -> IntArray:
 
 # What residuals may depend on.
 ORDER, TIME, TEMPERATURE, READING = "order", "time", "temperature", "reading"
-SESSION, BLOCK = "session", "block"
+SESSION, BLOCK, POSE, TARGET, WALK = "session", "block", "pose", "target", "walk"
+SMOOTH = "smooth"
+RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH}  # whose sizes are drawn
+MOST_GROUPS, CENTERS = 80, 30  # of more poses an even choice shows an effect well enough
 
 
-class Effect(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Effect:
     """A dependence of the measured values on one quantity."""
 
     source: str  # what it depends on, such as "time"
@@ -189,63 +204,121 @@ class Effect(NamedTuple):
     # (R, c) the same with their means, where the sizes are drawn and their mean is an error, too
     whole: FloatArray | None = None
 
+    @cached_property
+    def unit(self) -> FloatArray:
+        """(c,) sizes [SI], equal for equal labels, that add the variance 1 to the rows that they
+        change.
+        """
+        columns = self.columns if self.whole is None else self.whole
+        unit = np.ones(columns.shape[1])
+        for label in set(self.labels):
+            own = np.array([each == label for each in self.labels])
+            square = (columns[:, own] ** 2).sum(axis=1)
+            if square.any():
+                unit[own] = 1.0 / np.sqrt(square[square > 0.0].mean())
+        return unit
+
+    @cached_property
+    def scaled(self) -> FloatArray:
+        """(R, c) the columns in these units: independent sizes of one variance are the effect."""
+        return (self.columns if self.whole is None else self.whole) * self.unit
+
 
 def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
     """Return the effects that measurements without excluded poses can have.
 
     Linear in time, or in the order of measurement where the rows state no time, linear in each
-    temperature, and quadratic in each actuator reading; an error of each session, and of each block
-    where blocks are large.
+    temperature, and quadratic in each actuator reading; an error of each session, of each block
+    where blocks are large, and of each pose where several targets share it.
     """
     observations = [o for o in data.observations if len(o)]
-    kinds = []  # of each kind: places among all rows, its rows, and what a unit of a component adds
-    for number, o in enumerate(observations):
-        chosen = np.flatnonzero(rows.kind == number)
-        whitener = o.whitener[rows.row[chosen], rows.column[chosen]]
-        members = list_components(o.kind).items()
-        shifts = [(each, whitener[:, columns].sum(axis=1)) for each, columns in members]
-        kinds.append((chosen, rows.row[chosen], shifts))
-
-    def build(functions: Sequence[Sequence[FloatArray]], source: str, name: str = "") -> Effect:
-        """Return an effect from functions (r,) of the rows of each kind, less their means: an
-        offset of all rows is no such effect.
-        """
-        columns, whole, labels = [np.zeros((len(rows.residual), 0))], [], []
-        for (places, row, shifts), of_kind in zip(kinds, functions, strict=True):
-            for label, shift in shifts:
-                for function in of_kind:
-                    column, mean = np.zeros((2, len(rows.residual), 1))
-                    column[places, 0] = -shift * (function - function.mean())[row]
-                    mean[places, 0] = -shift * function.mean()
-                    if column.any():
-                        columns.append(column)
-                        whole.append(column + mean)
-                        labels.append(label)
-        centered, drawn = np.concatenate(columns, axis=1), None
-        if whole and source in (SESSION, BLOCK):
-            drawn = np.concatenate(whole, axis=1)
-        return Effect(source, name, centered, tuple(labels), drawn)
-
+    place = [order_rows(o).astype(float) for o in observations]
     has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
-    place = [o.context[TIME] if has_time else order_rows(o).astype(float) for o in observations]
-    effects = [build([[scale_to_range(x)] for x in place], TIME if has_time else ORDER)]
+    along = [o.context[TIME] for o in observations] if has_time else place
+    listed = [(TIME if has_time else ORDER, "", [scale_to_range(x)[:, None] for x in along])]
     for name in dict.fromkeys(name for o in observations for name in o.context if name != TIME):
-        functions = [
-            [scale_to_range(o.context[name])] if name in o.context else [] for o in observations
-        ]
-        effects.append(build(functions, TEMPERATURE, name))
-    blocks = [data.block[o.rows.reshape(len(o), -1)[:, 0]] for o in observations]
-    has_blocks = 2 * len(find_distinct(data.block)) <= data.n_poses
-    sessions = [o.session for o in observations]
-    for source, groups in ((SESSION, sessions), (BLOCK, blocks if has_blocks else [])):
-        functions = [[(g == name).astype(float) for name in find_distinct(g)] for g in groups]
-        if functions:
-            effects.append(build(functions, source))
+        missing = [np.full(len(o), np.nan) for o in observations]
+        values = [o.context.get(name, x) for o, x in zip(observations, missing, strict=True)]
+        listed.append((TEMPERATURE, name, [scale_to_range(x)[:, None] for x in values]))
+    poses = [o.rows.reshape(len(o), -1)[:, 0] for o in observations]
+    listed.append((SESSION, "", [indicate_groups(o.session) for o in observations]))
+    blocks = len(find_distinct(data.block))
+    is_finer = blocks > len({session for o in observations for session in o.session.tolist()})
+    if is_finer and 2 * blocks <= data.n_poses:
+        listed.append((BLOCK, "", [indicate_groups(data.block[i]) for i in poses]))
+    members = [columns for o in observations for columns in list_components(o.kind).values()]
+    if max(map(len, members)) > 1:
+        chosen = choose_evenly(data.n_poses, MOST_GROUPS)
+        listed.append((POSE, "", [(i[:, None] == chosen).astype(float) for i in poses]))
     for i, actuator in enumerate(robot.actuators):
-        readings = (data.readings[o.rows.reshape(len(o), -1)[:, 0], i] for o in observations)
-        functions = [[x, 4.0 * x**2] for x in map(scale_to_range, readings)]
-        effects.append(build(functions, READING, actuator.name))
-    return tuple(effects)
+        readings = [scale_to_range(data.readings[of_kind, i]) for of_kind in poses]
+        functions = [np.column_stack([x, 4.0 * x**2]) for x in readings]
+        listed.append((READING, actuator.name, functions))
+    return tuple(build_effect(rows, observations, *each) for each in listed)
+
+
+def list_shared_errors(
+    rows: ResidualRows, data: Measurements, robot: Mechanism
+) -> tuple[Effect, ...]:
+    """Return effects whose sizes are drawn, beside those of `list_effects`: an error of each
+    target, steps of a walk in the order of the rows, and errors that change slowly with the
+    readings.
+    """
+    observations = [o for o in data.observations if len(o)]
+    poses = [o.rows.reshape(len(o), -1)[:, 0] for o in observations]
+    x = np.column_stack([2.0 * scale_to_range(column) for column in data.readings.T])
+    centers = x[choose_evenly(len(x), CENTERS)]
+    size, axes = np.linalg.eigh(correlate(centers, centers))
+    root = correlate(x, centers) @ (axes[:, size > EXPLAINED] / np.sqrt(size[size > EXPLAINED]))
+    steps = [choose_evenly(len(o), MOST_GROUPS)[1:] for o in observations]
+    listed = [
+        (SMOOTH, [root[i] for i in poses]),
+        (WALK, [order_rows(o)[:, None] >= i for o, i in zip(observations, steps, strict=True)]),
+    ]
+    effects = [build_effect(rows, observations, s, "", f) for s, f in listed]
+    of_targets, labels = [], [label for o in observations for label in _label_columns(o.kind)]
+    for number, o in enumerate(observations):
+        own = rows.kind == number
+        columns = np.zeros((len(own), o.present.shape[1]))
+        columns[own] = -o.whitener[rows.row[own], rows.column[own]]
+        of_targets.append(columns)
+    targets = np.concatenate(of_targets, axis=1)
+    return (*effects, Effect(TARGET, "", targets, tuple(labels), targets))
+
+
+def _label_columns(kind: Kind) -> list[tuple[str, Dimension]]:
+    """Return the component and dimension of each noise column of a kind."""
+    named = {i: label for label, columns in list_components(kind).items() for i in columns}
+    return [named[i] for i in sorted(named)]
+
+
+def build_effect(
+    rows: ResidualRows, observations: Sequence[Observations], source: str, name: str,
+    functions: Sequence[NDArray[Any]],
+) -> Effect:  # fmt: skip
+    """Return an effect from functions (r, f) of the rows of each kind, less their means: an offset
+    of all rows is no such effect.
+    """
+    columns, whole, labels = [np.zeros((len(rows.residual), 0))], [], []
+    for number, (o, of_kind) in enumerate(zip(observations, functions, strict=True)):
+        chosen = np.flatnonzero(rows.kind == number)
+        whitener, row = o.whitener[rows.row[chosen], rows.column[chosen]], rows.row[chosen]
+        for label, members in list_components(o.kind).items():
+            shift = -whitener[:, members].sum(axis=1)[:, None]
+            both = np.zeros((2, len(rows.residual), of_kind.shape[1]))
+            both[0, chosen] = shift * (of_kind - of_kind.mean(axis=0))[row]
+            both[1, chosen] = shift * of_kind[row]
+            both = both[:, :, both[0].any(axis=0)]
+            columns.append(both[0])
+            whole.append(both[1])
+            labels += [label] * both.shape[2]
+    drawn = np.concatenate(whole, axis=1) if source in RANDOM and whole else None
+    return Effect(source, name, np.concatenate(columns, axis=1), tuple(labels), drawn)
+
+
+def indicate_groups(names: NDArray[Any]) -> FloatArray:
+    """Return (r, g) 1 where a row belongs to a group, of names (r,), else 0."""
+    return (names[:, None] == find_distinct(names)).astype(float)
 
 
 def scale_to_range(values: FloatArray) -> FloatArray:
@@ -301,35 +374,43 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     """
     listed = list_effects(rows, data, robot)
     order = TIME if any(effect.source == TIME for effect in listed) else ORDER
-    effects = _list_testable(rows, listed)
+    effects = [effect for effect in listed if np.isfinite(test_effect(rows, effect))]
     p_value = test_correlation(rows)[1]
     tests = len(effects) + int(np.isfinite(p_value))
     significant: list[EffectSizes] = []
     while effects:
-        p_values = [test_effect(rows, basis) for _, basis in effects]
-        best = int(np.argmin(p_values))
+        p_values = [test_effect(rows, effect) for effect in effects]
+        if not np.isfinite(p_values).any():
+            break
+        best = int(np.nanargmin(p_values))
         p_any = compute_any_probability(p_values[best], tests)
         if not p_any < LEVEL:
             break
-        effect, _ = effects.pop(best)
+        effect = effects.pop(best)
         significant.append(estimate_sizes(rows, effect, p_any))
         rows = rows.with_effects(effect.columns)
-        effects = _list_testable(rows, [other for other, _ in effects])
     if significant:
         p_value = test_correlation(rows)[1]
     p_any = compute_any_probability(p_value, tests)
     return ResidualPatterns(tuple(significant), p_any, p_any < LEVEL, order, rows)
 
 
-def test_effect(rows: ResidualRows, basis: FloatArray) -> float:
-    """Return the probability of a larger F for independent errors.
-
-    basis : (R, q) orthonormal, of the part of an effect that nothing estimated explains.
+def test_effect(rows: ResidualRows, effect: Effect) -> float:
+    """Return the probability of a larger F, or of a larger component of the variance where sizes
+    are drawn, for independent errors; NaN where residuals cannot show it.
     """
+    if effect.whole is not None:
+        spectrum = rows.remainder.find_spectrum(effect.scaled)
+        is_open = spectrum.rest[1] >= FEWEST_LEFT and len(spectrum.y) > 0
+        return spectrum.compute_tail() if is_open else np.nan
+    length = np.linalg.norm(effect.columns, axis=0)
+    u, s, _ = np.linalg.svd(rows.project(effect.columns / length), full_matrices=False)
+    basis = u[:, s > LEFT]
     q, explained = basis.shape[1], float(((basis.T @ rows.residual) ** 2).sum())
     left = rows.degrees - q
-    statistic = explained / q / ((rows.square - explained) / left)
-    return float(compute_f_tail(q, left, statistic))
+    if q == 0 or left < FEWEST_LEFT * q:
+        return np.nan
+    return float(compute_f_tail(q, left, explained / q / ((rows.square - explained) / left)))
 
 
 def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> EffectSizes:
@@ -357,27 +438,66 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
     back = 1.0 / length
     sizes, errors = back * mean, back * np.linalg.norm(spread, axis=1)
     if effect.whole is not None:  # the mean of all sizes moves the estimate, and no residual
-        own = np.linalg.norm(effect.whole, axis=0)
-        w, y, rest = find_spectrum(rows, effect.whole / own)
-        component = estimate_variance_component(w, y, rest=rest)
-        moments = np.diag(component.variance / own**2)
+        component = rows.remainder.find_spectrum(effect.scaled).estimate()
+        moments = np.diag(component.variance * effect.unit**2)
         return EffectSizes(effect, p_value, sizes, errors, moments, component.degrees)
     moments = back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back
     return EffectSizes(effect, p_value, sizes, errors, moments)
 
 
-def find_spectrum(
-    rows: ResidualRows, columns: FloatArray
-) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
-    """Return the weights (k,) and the elements (k,) of the residuals that errors of unit variance
-    with these columns (R, c) change, and sum of squares and number of all other elements.
+class Remainder(NamedTuple):
+    """Residuals M r under the covariance 1 + sum of K_h of components that were found, with the
+    quadratic form v' (1 - P P') v of their inverse on what nothing estimated explains.
     """
-    left = rows.project(columns)
-    w, vectors = np.linalg.eigh(left.T @ left)
-    kept = w > EXPLAINED * w.max(initial=0.0)
-    w, y = w[kept], (rows.residual @ left) @ vectors[:, kept] / np.sqrt(w[kept])
-    square = max(rows.square - float(y @ y), 0.0)
-    return w, y, (square, float(rows.degrees - len(y)))
+
+    taken: FloatArray  # (R, e) P: the basis of what is estimated, and parts of components
+    residual: FloatArray  # (R,)
+    degrees: float
+
+    def weigh(self, columns: FloatArray) -> FloatArray:
+        """Return (1 - P P') columns (R, c)."""
+        return columns - self.taken @ (self.taken.T @ columns)
+
+    def find_spectrum(self, columns: FloatArray) -> Spectrum:
+        """Return the part of the residuals that independent errors of equal variance with these
+        columns (R, c) change.
+        """
+        weighed = self.weigh(columns)
+        w, vectors = np.linalg.eigh(columns.T @ weighed)
+        kept = w > EXPLAINED * float((columns**2).sum(axis=0).max(initial=0.0))
+        axes = weighed @ (vectors[:, kept] / np.sqrt(w[kept]))
+        y, square = self.residual @ axes, float(self.residual @ self.weigh(self.residual))
+        rest = (max(square - float(y @ y), 0.0), max(self.degrees - len(y), 0.0))
+        return Spectrum(axes, w[kept], y, rest)
+
+    def add(self, spectrum: Spectrum, ratio: float) -> Remainder:
+        """Return the remainder with a component of this ratio of variances; an infinite one takes
+        all that its errors change.
+        """
+        w, is_open = spectrum.weights, np.isinf(ratio)
+        share = np.ones(len(w)) if is_open else np.sqrt(ratio * w / (1.0 + ratio * w))
+        taken = np.concatenate([self.taken, spectrum.axes * share], axis=1)
+        return self._replace(taken=taken, degrees=self.degrees - (len(w) if is_open else 0))
+
+
+class Spectrum(NamedTuple):
+    """A component of the variance of residuals along its principal axes."""
+
+    axes: FloatArray  # (R, k)
+    weights: FloatArray  # (k,) variances of the elements by errors of unit variance
+    y: FloatArray  # (k,) elements of the residuals
+    rest: tuple[float, float]  # sum of squares and number of all other elements
+
+    def compute_tail(self, known: float = 0.0) -> float:
+        """Return the probability of such elements without the component, by sigmas that are stated
+        with so many `known` degrees of freedom.
+        """
+        rest = (self.rest[0] + min(known, MOST_KNOWN), self.rest[1] + known)
+        return compute_component_tail(self.weights, self.y, rest)
+
+    def estimate(self, known: float = 0.0) -> VarianceComponent:
+        """Return the size of the component."""
+        return estimate_variance_component(self.weights, self.y, known, self.rest)
 
 
 def test_correlation(rows: ResidualRows) -> tuple[float, float]:
@@ -411,21 +531,6 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
 
     place = float(np.clip(0.5 * (1.0 - observed), 0.0, 1.0))
     return observed - mean, float(betainc((1.0 - center) * total, center * total, place))
-
-
-def _list_testable(
-    rows: ResidualRows, effects: Iterable[Effect]
-) -> list[tuple[Effect, FloatArray]]:
-    """Return the effects that residuals can show, each with its basis, see `test_effect`."""
-    testable = []
-    for effect in effects:
-        if effect.columns.shape[1]:
-            scaled = effect.columns / np.linalg.norm(effect.columns, axis=0)
-            u, s, _ = np.linalg.svd(rows.project(scaled), full_matrices=False)
-            basis = u[:, s > LEFT]
-            if basis.shape[1] > 0 and rows.degrees >= (1.0 + FEWEST_LEFT) * basis.shape[1]:
-                testable.append((effect, basis))
-    return testable
 
 
 # The covariance of a fit whose errors are correlated in the order of measurement.

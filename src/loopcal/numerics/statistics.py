@@ -122,6 +122,9 @@ STEPS, NEWTON = 400, 100
 MOST_KNOWN = 1e6
 """Degrees of freedom of a sigma that is exact."""
 
+EVIDENT = (0.1, 30.0)
+"""Sizes of errors, in sigma, that are as probable as each other before the data."""
+
 SMALLEST, LARGEST = 1e-3, 1e4
 """Ends of the values of tau: the strongest element gains this share of sigma, and this many."""
 
@@ -134,12 +137,15 @@ class VarianceComponent(NamedTuple):
     variance : mean of sigma^2 tau^2. degrees : its degrees of freedom.
     ratio : of variances, tau^2 at which the likelihood is largest. gain : of the logarithm of this
         likelihood over that without the component.
+    evidence : logarithm of the likelihood over that without the component, averaged over the
+        logarithm of `EVIDENT` tau; for errors that alone have unit variance.
     """
 
     variance: float
     degrees: float
     ratio: float
     gain: float
+    evidence: float
 
 
 def compute_component_tail(
@@ -178,6 +184,9 @@ def estimate_variance_component(
     else:
         by_size, variance = -0.5 * count * np.log(square + known), (square + known) / count
     density = by_size - 0.5 * np.log(scale).sum(axis=1)
+    inside = density[(tau > EVIDENT[0]) & (tau < EVIDENT[1])] - density[0]
+    top = float(inside.max(initial=-np.inf))
+    evidence = top + float(np.log(np.exp(inside - top).mean())) if len(inside) else np.nan
     share = np.exp(density - density.max()) * np.gradient(tau)
     share /= share.sum()
     values = ratio * variance
@@ -188,7 +197,7 @@ def estimate_variance_component(
     degrees = max(2.0 * mean**2 / spread, 1.0)
     # the first tau is as good as none
     gain = float(density.max() - density[0])
-    return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]), gain)
+    return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]), gain, evidence)
 
 
 def _tail(values: FloatArray, counts: FloatArray) -> float:

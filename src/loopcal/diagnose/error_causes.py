@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare what may cause residuals that noise alone does not explain, wrong rows among it.
+
+Each cause h is a component of the variance of the whitened rows, K_h = Z Z' for independent errors
+with columns Z of unit variance. What nothing estimated explains of the residuals has the covariance
+sigma^2 (1 + tau^2 K_h); its likelihood over that of noise alone, averaged over log tau, is
+the evidence of h, and with equal probabilities before the data it gives those after them. Few wrong
+poses are errors of any size in the rows of k of n poses, for each choice of k of them. The most
+probable cause is taken into the covariance, and the others are compared again, until noise alone
+explains the rest. See docs/theory/residual-patterns.md.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.diagnose.drive_errors import list_drive_effects
+from loopcal.diagnose.residual_patterns import (
+    Effect,
+    Remainder,
+    ResidualRows,
+    list_effects,
+    list_shared_errors,
+)
+from loopcal.estimate.fit_linearization import FitLinearization
+from loopcal.estimate.residual_test import FEWEST_DEGREES, count_sigma_degrees
+from loopcal.findings import Finding, report_finding
+from loopcal.numerics.statistics import VarianceComponent, compute_f_tail
+from loopcal.typing import IntArray
+
+NOISE, OUTLIERS = "noise", "outliers"
+CAUSE = "residuals.cause"  # code of the finding
+EXCLUDED = 0.05  # probability of noise alone below which a cause is named
+OUTLYING = 0.1  # largest share of the poses that may be wrong
+MOST_CAUSES = 3
+
+
+class Cause(NamedTuple):
+    """What probably causes the residuals."""
+
+    source: str  # such as "pose", "session", "drives" or "outliers"
+    name: str  # of the actuator or temperature, else empty
+    probability: float
+    second: str  # the next probable source
+    second_probability: float
+    effect: Effect | None  # None for outliers
+    size: VarianceComponent | None  # of the effect, in columns of unit variance
+    p_value: float  # of such an effect by noise alone
+
+    @property
+    def finding(self) -> Finding:
+        """The comparison as a finding."""
+        names = ("name", "probability", "second", "second_probability")
+        data = {name: getattr(self, name) for name in names}
+        return report_finding(CAUSE, cause=self.source, **data)
+
+
+def find_causes(linear: FitLinearization, rows: ResidualRows) -> tuple[Cause, ...]:
+    """Return the causes of the residuals of a fit, the most probable first; none where noise alone
+    may explain them.
+    """
+    fit, data = linear.fit, linear.data
+    effects = [*list_effects(rows, data, fit.robot), *list_shared_errors(rows, data, fit.robot)]
+    effects += list_drive_effects(linear, rows)[:2]
+    observations = [o for o in data.observations if len(o)]
+    pose = np.zeros(len(rows.residual), dtype=np.int64)
+    for number, o in enumerate(observations):
+        own = rows.kind == number
+        pose[own] = o.rows.reshape(len(o), -1)[rows.row[own], 0]
+    known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
+    return compare_causes(rows.remainder, [e for e in effects if e.columns.any()], pose, known)
+
+
+def compare_causes(
+    remainder: Remainder, effects: Sequence[Effect], pose: IntArray, known: float
+) -> tuple[Cause, ...]:
+    """Return the causes among effects and wrong poses; `pose` (R,) of each row. `known` degrees of
+    freedom say that the noise has unit variance.
+    """
+    causes: list[Cause] = []
+    listed = list(effects)
+    alike = Counter(effect.source for effect in effects)
+    while len(causes) < MOST_CAUSES and remainder.degrees >= FEWEST_DEGREES:
+        spectra = [remainder.find_spectrum(effect.scaled) for effect in listed]
+        seen = [i for i, spectrum in enumerate(spectra) if len(spectrum.y)]
+        listed, spectra = [listed[i] for i in seen], [spectra[i] for i in seen]
+        sizes = [spectrum.estimate(known) for spectrum in spectra]
+        logs = [
+            size.evidence - np.log(alike[e.source]) for size, e in zip(sizes, listed, strict=True)
+        ]
+        wrong, without = -np.inf, remainder
+        if all(cause.source != OUTLIERS for cause in causes):
+            wrong, without = find_wrong_poses(remainder, pose, known)
+        share = np.array([0.0, wrong, *logs])
+        share = np.exp(share - share.max())
+        share /= share.sum()
+        if share[0] > EXCLUDED:
+            break
+        sources = [NOISE, OUTLIERS, *(effect.source for effect in listed)]
+        total = {name: float(share[[s == name for s in sources]].sum()) for name in sources}
+        first, second, *_ = sorted(total, key=lambda name: -total[name])
+        stated = (total[first], second, total[second])
+        best = int(np.argmax(np.where([s == first for s in sources], share, -1.0)))
+        if best == 1:
+            causes.append(Cause(first, "", *stated, None, None, np.nan))
+            remainder = without
+            continue
+        effect = listed.pop(best - 2)
+        spectrum, size = spectra[best - 2], sizes[best - 2]
+        p_value = spectrum.compute_tail(known)
+        causes.append(Cause(first, effect.name, *stated, effect, size, p_value))
+        remainder = remainder.add(spectrum, size.ratio)
+    return tuple(causes)
+
+
+def find_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> tuple[float, Remainder]:
+    """Return the evidence of few wrong poses, and what the most probable ones leave. The pose that
+    fits the others least is excluded, and so on.
+    """
+    order = np.argsort(pose, kind="stable")
+    names, count = np.unique(pose, return_counts=True)
+    member = np.full((len(names), int(count.max())), -1)  # rows of each pose
+    member[np.arange(member.shape[1]) < count[:, None]] = order
+    is_row = member >= 0
+    total, evidence, best, kept = 0.0, [-np.inf], -np.inf, remainder
+    for k in range(1, max(int(OUTLYING * len(names)), 1) + 1):
+        square = float(remainder.residual @ remainder.weigh(remainder.residual))
+        P = remainder.taken[member] * is_row[..., None]
+        w, vectors = np.linalg.eigh(np.eye(member.shape[1]) - P @ P.swapaxes(1, 2))
+        own = remainder.weigh(remainder.residual)[member] * is_row
+        y = np.matvec(vectors.swapaxes(1, 2), own)
+        is_open = (w > 1e-6) & (np.matvec(vectors.swapaxes(1, 2) ** 2, is_row.astype(float)) > 0.5)
+        distance = (np.where(is_open, y, 0.0) ** 2 / np.where(is_open, w, 1.0)).sum(axis=1)
+        degrees = is_open.sum(axis=1)
+        left = remainder.degrees + known - degrees
+        spread = np.ones(len(left)) if np.isinf(known) else (square + known - distance) / left
+        p_value = compute_f_tail(degrees, left, distance / np.maximum(degrees, 1) / spread)
+        worst = int(np.nanargmin(np.where(degrees > 0, p_value, 2.0)))
+        columns = np.zeros((len(pose), int(count[worst])))
+        columns[member[worst, : count[worst]], np.arange(count[worst])] = 1.0
+        spectrum = remainder.find_spectrum(columns)
+        if not len(spectrum.y) or remainder.degrees <= len(spectrum.y):
+            break
+        total += spectrum.estimate(known).evidence - np.log((len(names) - k + 1) / k)
+        remainder = remainder.add(spectrum, np.inf)
+        evidence.append(total - k * np.log(2.0))  # more wrong poses are less probable
+        if evidence[-1] > best:
+            best, kept = evidence[-1], remainder
+    top = max(evidence)
+    if np.isinf(top):
+        return top, kept
+    return top + float(np.log(np.exp(np.array(evidence) - top).sum())), kept
