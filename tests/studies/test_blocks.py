@@ -30,6 +30,7 @@ from loopcal.measure.simulation import Disturbance, sample_truth, simulate_trial
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
+from loopcal.studies.simulation import block, machines
 from loopcal.studies.simulation.block import compute_block, list_tasks, make_stream, replay_trial
 from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.machines import (
@@ -54,6 +55,23 @@ from loopcal.units import Dimension
 from tests.studies.studies import CAMERA, SIGMA, compute_cells, make_study
 
 ROTATION_FREE = ("orientation", "covered_orientation", "angles")
+
+
+def test_machines_and_measurements_are_made_once_for_all_methods_with_the_same_bits():
+    study = make_study(
+        poses={"8": PosesLevel(8), "12": PosesLevel(12)},
+        methods={"LS": MethodLevel("least-squares"), "MAP": MethodLevel("map"),
+                 "ridge": MethodLevel("ridge", lam=2.0)},
+    )  # fmt: skip
+    tasks = [*list_tasks(study)]
+    block._simulate.cache_clear()
+    together = [compute_block(task) for task in tasks]
+    assert block._simulate.cache_info().misses == 2  # one for each number of poses
+    assert len(together) == 6
+    for task, scores in zip(tasks, together, strict=True):
+        block._simulate.cache_clear()
+        machines._prepare.cache_clear()
+        assert_array_equal(compute_block(task), scores)
 
 
 def test_scores_equal_calibrations_made_by_hand():

@@ -7,6 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import groupby
 from typing import Any
 
@@ -42,6 +43,7 @@ from loopcal.studies.simulation.machines import (
     make_disturbance,
     measure_held_points,
     prepare_cell,
+    share_content,
 )
 from loopcal.studies.specification.study import (
     Study,
@@ -131,9 +133,12 @@ def list_tasks(
     """Yield the tasks of these blocks of these cells, of all by default. The poses of a cell are
     drawn or planned here; the driver of a study leaves them to workers.
     """
+    known = dict[str, CellPoses]()
     for number in range(len(study.cells)) if cells is None else cells:
         of_cell = describe_cell(study, study.cells[number])
-        poses = compute_poses(describe_poses(of_cell))
+        task = make_poses_task(of_cell)
+        poses = known.get(task.key) or compute_poses(json.loads(task.content))
+        known[task.key] = poses
         for block in range(study.blocks) if blocks is None else blocks:
             yield make_block_task(number, of_cell | {"block": block}, poses)
 
@@ -142,9 +147,18 @@ def calibrate_block(
     content: Mapping[str, Any], threads: int = 1
 ) -> tuple[PreparedCell, Trials, FittedTrials]:
     """Simulate and calibrate the machines of the content of a task, by so many threads."""
-    cell = prepare_cell(content)
-    trials = simulate_block(cell, make_stream(cell.content.seed, content["block"]))
+    cell, trials = prepare_cell(content), _simulate(format_json(share_content(content, "block")))
     return cell, trials, fit_trials(cell, trials, threads)
+
+
+@lru_cache(maxsize=2)
+def _simulate(text: str) -> Trials:
+    """Return the machines of a block and their measurements, which are those of all methods; text :
+    its `share_content`, as JSON.
+    """
+    content = json.loads(text)
+    cell = prepare_cell(content)
+    return simulate_block(cell, make_stream(cell.content.seed, content["block"]))
 
 
 def make_stream(seed: int, block: int) -> BlockStream:

@@ -455,13 +455,21 @@ class PreparedCell:
 
 
 def prepare_cell(content: Mapping[str, Any]) -> PreparedCell:
-    """Return the cell of the content of a task; the latest ones are kept."""
-    return _prepare(format_json({key: x for key, x in content.items() if key != "block"}))
+    """Return the cell of the content of a task; the latest ones are kept, and serve all methods."""
+    given, cell = convert(content, CellContent), _prepare(format_json(share_content(content)))
+    return replace(cell, content=given, fit_options=make_fit_options(given.method))
+
+
+def share_content(content: Mapping[str, Any], *more: str) -> dict[str, Any]:
+    """Return the part of the content of a task that cells with other methods have in common, and
+    its blocks; more : further keys to keep.
+    """
+    return {key: x for key, x in content.items() if key not in {"block", "method"} - {*more}}
 
 
 @lru_cache(maxsize=4)
 def _prepare(text: str) -> PreparedCell:
-    """Return the cell of the common content of its blocks, as JSON."""
+    """Return the cell of `share_content`, as JSON."""
     content = msgspec.json.decode(text, type=CellContent)
     robot = change_tolerances(build_robot_of(content.robot), content.errors).nominal
     measured, poses = np.array(content.measured), content.poses
