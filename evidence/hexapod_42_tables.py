@@ -14,7 +14,7 @@ import numpy as np
 import loopcal as lc
 from loopcal import geometry
 from loopcal.mechanism.solutions import forward, inverse
-from loopcal.numerics.statistics import compute_chi_square_quantile
+from loopcal.numerics.statistics import compute_chi_square_quantile, compute_f_tail
 from loopcal.papers.hexapod_42 import steps
 from loopcal.papers.hexapod_42.steps import (
     MM,
@@ -26,7 +26,7 @@ from loopcal.papers.hexapod_42.steps import (
     compute_rms,
     find_places,
 )
-from loopcal.studies.simulation.published_steps import LegForm
+from loopcal.studies.simulation.published_steps import LegForm, integrate_errors
 from loopcal.typing import FloatArray
 
 GREEK = ("alpha", "beta", "gamma")
@@ -34,7 +34,9 @@ OUTLIER_LEVEL = 0.01
 """Probability of calling any pose of good data an outlier."""
 SHOWN = 6
 """Products of three rotations in the table, of 72."""
-QUICK = {"SHOWN": 3}
+DRAWS = 50
+"""Of each level of noise."""
+QUICK = {"SHOWN": 3, "DRAWS": 10}
 
 MEASURED = PRINTED.table("table_4", "PP")
 POSES = MEASURED.values / TO_PRINTED  # (10, 6) [m, rad]
@@ -163,6 +165,36 @@ def explain(legs: LegForm, twists: FloatArray) -> FloatArray:
     return np.array(shares)
 
 
+def measure_printed() -> FloatArray:
+    """Return the sizes (4,) of Tables 5 and 6, see `steps.Level`."""
+    residual = PRINTED.table("table_6", "after").values / TO_PRINTED
+    parameters = PRINTED.table("table_5", "after").values * 1e-3
+    rms = [compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:], parameters)]
+    return np.array([*rms, integrate_errors(residual)])
+
+
+def compute_p_value(drawn: FloatArray, sizes: FloatArray) -> float:
+    """Return the p-value of sizes (4,) as one more of the drawn ones (t, 4): Student's t of their
+    logarithms, the smallest of the four probabilities times four.
+    """
+    logs = np.log(drawn)
+    spread = logs.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(logs))
+    t = (np.log(sizes) - logs.mean(axis=0)) / spread
+    return float(min(4.0 * compute_f_tail(1, len(logs) - 1, t**2).min(), 1.0))
+
+
+def compare_noises(setup: Setup) -> list[list[Any]]:
+    """Return the sizes of Tables 5 and 6, and those that each level of noise leaves, with the
+    p-value of the printed ones among them.
+    """
+    sizes = measure_printed()
+    rows: list[list[Any]] = [["published, Tables 5 and 6", None, None, *sizes.tolist(), None]]
+    for level in steps.sweep_noise(setup, 0, DRAWS).values():
+        p_value = compute_p_value(level.sizes, sizes)
+        rows.append(["computed, median", *level.limits, *level.median.tolist(), p_value])
+    return rows
+
+
 def examine_tables(setup: Setup) -> list[list[Any]]:
     """Return what else the tables say, a number each."""
     legs = LegForm.at(setup.truth, forward(setup.truth, setup.commanded.q, setup.commanded))
@@ -218,6 +250,11 @@ def check(tables: dict[str, Any]) -> None:
     assert second[3] > 50.0
     (printed,) = (row for row in tables["euler_orders"]["rows"] if row[-1] == "yes")
     np.testing.assert_allclose(printed[1:3], [2.8e-3, 7.1e-4], rtol=0.05)
+    published, *levels = tables["noise"]["rows"]
+    np.testing.assert_allclose(published[3:7], [3.04e-7, 9.1e-10, 2.39e-4, 7.2e-7], rtol=0.01)
+    for length, angle, *_, p_value in (row[1:] for row in levels):
+        assert p_value < 1e-3 or (length == 1e-6 and angle < 1e-6)
+    assert max(row[-1] for row in levels) > 0.05
     outliers = {row[0]: row for row in tables["outliers"]["rows"]}
     assert [name for name, row in outliers.items() if row[-1] == "yes"] == [ODD_POSE]
     assert 1e-3 < outliers[ODD_POSE][3] < 1.0 - 1e-3
@@ -238,7 +275,7 @@ def check(tables: dict[str, Any]) -> None:
 
 
 def collect() -> dict[str, Any]:
-    """Collect the tables of the forensics; nothing is drawn."""
+    """Collect what the printed tables say."""
     setup = steps.make_setup()
     orders = rank_euler_orders(setup)
     kept = [row for i, row in enumerate(orders) if i < SHOWN or row[-1] == "yes"]
@@ -260,6 +297,14 @@ def collect() -> dict[str, Any]:
                 "columns": ["measured poses", "number", "parameter error rms [mm]"],
                 "formats": ["", "d", ".2g"],
                 "rows": calibrate_from_print(setup),
+            },
+            "noise": {
+                "columns": ["", "noise +- [mm]", "noise +- [rad]",
+                            "residual of position coordinates, rms [mm]",
+                            "residual of angles, rms [rad]", "parameter error, rms [mm]",
+                            "max dQint [mm + rad]", "p-value of the published sizes"],
+                "formats": ["", ".0e", ".0e", ".2g", ".2g", ".2g", ".2g", ".1g"],
+                "rows": compare_noises(setup),
             },
             "sizes": {
                 "columns": ["", "number"],

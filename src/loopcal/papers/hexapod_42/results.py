@@ -26,8 +26,8 @@ from loopcal.papers.hexapod_42.steps import (
 )
 from loopcal.papers.paper import StudyCase
 from loopcal.papers.published import decide
-from loopcal.studies.simulation.published_steps import integrate_errors, list_raw_units
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.studies.simulation.published_steps import list_raw_units
+from loopcal.typing import BoolArray
 
 TEXT = published.PaperText(__file__)
 
@@ -42,8 +42,7 @@ RUNS = ("without noise", "without noise, one matrix throughout")
 
 # Limits of decisions; a number between the two of a pair decides nothing.
 UNITS = (1.0, 2.0)  # of the last digit: a second one can come from the rounding of other tables
-P_VALUES = (0.05, 0.001)
-OF_RULE = ("converges", "threshold_noise", "noise_size")
+OF_RULE = ("converges", "threshold_noise")
 """Claims on what the rule of the paper leaves."""
 AS_GOOD = 1.1  # ratio of errors
 EXACT = 1e-6  # [mm] parameter error that steps without noise leave
@@ -60,7 +59,6 @@ class Results:
     methods: Mapping[str, Draws]  # by key of METHODS
     poses: list[published.Row]
     comparisons: Mapping[str, published.Comparison]  # of Tables 3 to 6; none of another robot
-    printed: FloatArray | None  # (4,) sizes of Tables 5 and 6, see `Level`; None of another robot
 
 
 def compute(
@@ -84,21 +82,13 @@ def compute(
     progress("methods and numbers of poses")
     methods = steps.compare_methods(setup, seed, trials)
     poses = steps.compare_poses(setup, seed, trials)
-    of_paper = (compare_printed(setup, runs), measure_printed()) if setup.is_printed else ({}, None)
-    return Results(setup, runs, levels, methods, poses, *of_paper)
+    compared = compare_printed(setup, runs) if setup.is_printed else {}
+    return Results(setup, runs, levels, methods, poses, compared)
 
 
 def count_printed() -> int:
     """Return the iterations after which the paper's rule ends them."""
     return int(PRINTED.find("iterations", "value"))
-
-
-def measure_printed() -> FloatArray:
-    """Return the sizes (4,) of Tables 5 and 6, see `Level`."""
-    residual = PRINTED.table("table_6", "after").values / TO_PRINTED
-    parameters = PRINTED.table("table_5", "after").values * 1e-3
-    rms = [compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:], parameters)]
-    return np.array([*rms, integrate_errors(residual)])
 
 
 def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
@@ -158,21 +148,17 @@ def list_replaced(results: Results) -> tuple[str, ...]:
 
 def make_tables(results: Results) -> tuple[published.Table, ...]:
     """Return the tables beyond those of the paper."""
-    setup, printed, levels = results.setup, results.printed, results.levels
+    setup, levels = results.setup, results.levels
     runs, trials, count = results.runs.values(), len(levels[STATED].needed), len(setup.poses)
     rule = {"threshold": setup.epsilon, "limit": SIZES.find("iterations"), "count": count}
     states = zip(*(run.integrated for run in runs), strict=True)
     figure_4 = [(str(k), *sizes) for k, sizes in enumerate(states)]
     figure_4.append(("iterations needed", *(run.count_needed(setup.epsilon) for run in runs)))
     conditions = [(f"leg {i}", x) for i, x in enumerate(results.runs["exact"].conditions, 1)]
-    noise = []
-    for level in levels.values():
-        met = f"{np.isfinite(level.needed).sum()} of {len(level.needed)}"
-        p_value = () if printed is None else (level.test(printed),)
-        noise.append(("computed, median over draws", *level.limits, *level.median, met, *p_value))
-    if printed is not None:
-        noise.insert(0, ("published, Tables 5 and 6", None, None, *printed, None, None))
-    of_published = () if printed is None else (("p-value of the published sizes", ".2g"),)
+    noise = [
+        (*level.limits, *level.median, f"{np.isfinite(level.needed).sum()} of {len(level.needed)}")
+        for level in levels.values()
+    ]
     places = [
         (f"position error, rms over draws, poses {name} [mm]", ".2g")
         for name in steps.list_places(setup)
@@ -184,7 +170,7 @@ def make_tables(results: Results) -> tuple[published.Table, ...]:
                    stated=_describe_noise(STATED), **rule),
         TEXT.table("conditions", conditions, count=count),
         *(() if setup.is_printed else _make_own_tables(results)),
-        TEXT.table("noise", noise, "", of_published, **rule),
+        TEXT.table("noise", noise, **rule),
         TEXT.table("methods", methods, "", places, limits=levels[STATED].limits, trials=trials,
                    unmeasured=SIZES.find("unmeasured"), count=count),
         TEXT.table("poses", results.poses, trials=trials, before=before, wide=SIZES.find("wide"),
@@ -251,27 +237,22 @@ def _draw_noise(results: Results) -> published.Figure:
         if np.isclose(level.limits[1], 1e-3 * level.limits[0], atol=0.0)
     ]
     x = [level.limits[0] for level in levels]
-    places = {"parameter error": (2, 5), "position residual": (0, 6)}
+    places = {"parameter error": 2, "position residual": 0}
     lines = [
         published.Series.of(label, x, [level.median[i] for level in levels])
-        for label, (i, _) in places.items()
+        for label, i in places.items()
     ]
-    marks = {}
-    if (sizes := results.printed) is not None:
-        marks = {f"{k}, published in Table {n}": float(sizes[i]) for k, (i, n) in places.items()}
-    marks["parameter error before calibration"] = results.methods["before"].rms["parameters"]
+    marks = {"parameter error before calibration": results.methods["before"].rms["parameters"]}
     stated, trials = results.levels[STATED].limits[0], len(levels[0].needed)
-    return TEXT.figure("noise", lines, marks, trials=trials, noise=stated, tables=sizes is not None,
-                       presumed=results.levels[PRESUMED].limits[0])  # fmt: skip
+    return TEXT.figure("noise", lines, marks, trials=trials, noise=stated)
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim; those on the printed tables belong to their machine, and
     `OF_RULE` to the paper's rule.
     """
-    printed = results.printed
     verdicts = (
-        *(() if printed is None else (_judge_table_4(results), _judge_noise(results, printed))),
+        *((_judge_table_4(results),) if results.setup.is_printed else ()),
         *_judge_steps(results),
         *_judge_methods(results),
     )
@@ -317,17 +298,6 @@ def _judge_steps(results: Results) -> tuple[published.Verdict, ...]:
         judge("threshold_noise", stated.needed <= used, elsewhere=elsewhere, noise=noise,
               median=stated.median[3], angle=stated.limits[1]),
     )  # fmt: skip
-
-
-def _judge_noise(results: Results, printed: FloatArray) -> published.Verdict:
-    """Judge the noise of Tables 5 and 6 by their sizes (4,)."""
-    levels = results.levels
-    stated, p_values = levels[STATED], {k: level.test(printed) for k, level in levels.items()}
-    holding = [k for k, p in p_values.items() if p >= P_VALUES[0]]
-    agrees = decide(holding == [STATED], p_values[STATED] < P_VALUES[1])
-    names = ["+-{:g} mm with +-{:g} rad".format(*levels[k].limits) for k in holding]
-    return TEXT.judge("noise_size", agrees, printed=printed, holding=names, stated=stated.median,
-                      noise=PRINTED.number("noise", "value"))  # fmt: skip
 
 
 def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:

@@ -28,7 +28,6 @@ from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.numerics.statistics import compute_f_tail
 from loopcal.papers.paper import PAPERS, StudyCase
 from loopcal.papers.published import PaperFile, Row
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
@@ -328,17 +327,6 @@ class Level:
     def median(self) -> FloatArray:
         """(4,) medians of the sizes."""
         return np.median(self.sizes, axis=0)
-
-    def test(self, sizes: FloatArray) -> float:
-        """Return the p-value of sizes (4,) as one more draw: Student's t of their logarithms, the
-        smallest of the four probabilities times four.
-        """
-        logs = np.log(self.sizes[np.isfinite(self.sizes).all(axis=1)])
-        if len(logs) < 2:
-            return np.nan
-        spread = logs.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(logs))
-        t = (np.log(sizes) - logs.mean(axis=0)) / spread
-        return float(min(4.0 * compute_f_tail(1, len(logs) - 1, t**2).min(), 1.0))
 
 
 def sweep_noise(setup: Setup, seed: int, trials: int) -> dict[str, Level]:
