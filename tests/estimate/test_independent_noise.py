@@ -15,7 +15,7 @@ from loopcal.diagnose.bootstrap import bootstrap
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
-from loopcal.estimate.recalibration import recalibrate
+from loopcal.estimate.recalibration import compare_information, recalibrate
 from loopcal.mechanism.solutions import forward
 from tests.estimate.dense_delta import TOLERANCE, differentiate, fit_delta, locate_nozzle
 
@@ -139,7 +139,8 @@ def test_change_of_a_machine_is_tested_with_the_noise_of_both_calibrations():
         P = sum(s[:, None, None] * C for s, C in zip(shown, covariances, strict=True))
         solved = np.linalg.solve(P, moved[..., None])[..., 0]
         tail = float(((moved * solved).sum(axis=1) >= statistic).mean())
-        assert change.p_value == pytest.approx(tail, abs=0.03)
+        changes = compare_information(first.posterior, identify(ROBOT, again).posterior)
+        assert changes.compute_p_value(statistic, 9) == pytest.approx(tail, abs=0.03)
         assert change.moved == (change.p_value < 0.05)
 
 

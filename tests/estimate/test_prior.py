@@ -115,7 +115,7 @@ def test_moved_limb_is_detected_and_other_limbs_keep_their_prior():
     assert change.moved
     assert change.finding.code == "prior.machine-changed"
     assert change.finding.data["subject"] == "leg3"
-    assert change.finding.data["parameter"] == "leg3.length"
+    assert change.finding.data["names"] == ("leg3.length",)
     assert change.finding.data["change"].startswith("+0.0")
     assert change.finding in fit.findings
     pull = (fit.estimate - truth) / fit.standard_deviations

@@ -17,18 +17,16 @@ from loopcal.apply.validation import (
     validate,
 )
 from loopcal.diagnose.row_errors import PoseErrors, Statistics, join_errors
-from loopcal.diagnose.value_comparison import (
-    EQUAL,
+from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
+from loopcal.errors import DataError
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.recalibration import (
+    CHANGE_LEVEL,
     ChangeCause,
     ParameterChanges,
     compare_information,
-    estimate_cause,
-    explain_change,
-    refuse_other_dimensions,
+    judge_change,
 )
-from loopcal.errors import DataError
-from loopcal.estimate.posterior import Posterior
-from loopcal.estimate.recalibration import CHANGE_LEVEL, TOO_WELL
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
@@ -42,8 +40,6 @@ if TYPE_CHECKING:
     from loopcal.io.runs.run_folder import Run
 
 NEEDED = ("path", "result", "robot", "arrays", "load_posterior")  # attributes of a run
-CAUSE_LEVEL = 0.01  # probability of rejecting the true cause of a change
-COVERED = 1.96  # standard deviations of the half-width of a 95 % interval of a change
 
 
 @dataclass(frozen=True)
@@ -76,8 +72,8 @@ class PairComparison:
     # (p,) which shifts are larger than the noise explains, at the level for all parameters of all
     # runs together
     significant: BoolArray
-    # chi_square, degrees, p_value: of the change in all directions that both data sets determine;
-    # NaN and 0 where it is not tested
+    # chi_square, degrees: of the change in all directions that both data sets determine; p_value:
+    # of any change, see `ParameterChanges.compute_probability`; NaN and 0 where it is not tested
     chi_square: float = math.nan
     degrees: int = 0
     p_value: float = math.nan
@@ -483,45 +479,21 @@ def _test(
     tests: int,
 ) -> PairComparison:
     """Return a pair with the test of a change, and what explains it."""
-    level = compute_single_level(CHANGE_LEVEL, tests)
-    p_value = changes.compute_p_value(changes.chi_square, changes.degrees)
-    moved = bool(p_value < level)
-    cause, cause_shift, cause_sd = ChangeCause("none"), np.zeros(0), np.zeros(0)
-    judged: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
-    code = "runs.machine-changed" if moved else "runs.machine-unchanged"
-    if moved:
-        cause, change = explain_change(changes, CAUSE_LEVEL), ""
-        if cause.parameters:
-            cause_shift, cause_sd = estimate_cause(changes, cause)
-        if cause.kind == "parameter":
-            robot, name = earlier.robot, cause.names[0]
-            unit = robot.get_unit(robot.parameters.dimensions[robot.parameters.index(name)])
-            shift, half = (
-                float(x[0]) / unit.factor_to_si for x in (cause_shift, COVERED * cause_sd)
-            )
-            change = f"{shift:+.3g} {unit.symbol} +/- {half:.2g} {unit.symbol}"
-        alternatives = tuple(" and ".join(names) for names in cause.alternatives)
-        judged |= {"kind": cause.kind, "names": cause.names}
-        judged |= {"change": change, "alternatives": alternatives}
-    if not moved and p_value > 1.0 - TOO_WELL:
-        code = "runs.agree-too-well"
-        judged["probability"] = 1.0 - p_value
-    else:
-        judged |= {"p_value": p_value, "level": CHANGE_LEVEL}
+    judged = judge_change(changes, earlier.robot, tests)
     shifts, sd = changes.estimate_shifts()
     single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shifts).sum()))
     return replace(
         pair,
-        finding=report_finding(code, **words, **judged),
+        finding=report_finding(f"runs.{judged.code}", **words, **judged.data),
         names=changes.names,
         shift=shifts,
         shift_sd=sd,
         significant=np.nan_to_num(changes.test_shifts(), nan=1.0) < single,
         chi_square=changes.chi_square,
         degrees=changes.degrees,
-        p_value=p_value,
-        moved=moved,
-        cause=cause,
-        cause_shift=cause_shift,
-        cause_sd=cause_sd,
+        p_value=judged.p_value,
+        moved=judged.moved,
+        cause=judged.cause,
+        cause_shift=judged.shift,
+        cause_sd=judged.sd,
     )

@@ -20,7 +20,7 @@ import numpy as np
 from loopcal import engine
 from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.posterior import NOISE, CovariancePart, Posterior
+from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.problem import Problem
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
@@ -45,8 +45,6 @@ class Prior:
     unfixed : (12, k) motions of frames that the earlier measurements do not determine, see
         `FrameKnowledge`; None where it is not known.
     fitted_rows : the measured rows that it comes from; None where they are not known.
-    noise_share : (r,) share of the variance of each row that the noise of the measured rows causes;
-        the rest is known, such as tolerances. noise_degrees : degrees of freedom of that noise.
     """
 
     names: tuple[str, ...]
@@ -55,8 +53,6 @@ class Prior:
     rows: FloatArray
     unfixed: FloatArray | None = None
     fitted_rows: FittedRows | None = None
-    noise_share: FloatArray | None = None
-    noise_degrees: float = np.inf
 
     def __repr__(self) -> str:
         """Return the numbers of rows and parameters."""
@@ -71,22 +67,12 @@ class Prior:
 
     def without(self, names: Sequence[str]) -> Prior:
         """Return the marginal prior of the other parameters, without information on these."""
-        rows = self.split(names)[1].T @ self.rows
-        rows[:, np.isin(self.names, names)] = 0.0
-        return replace(self, rows=rows, noise_share=None)
-
-    def split(self, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Return orthonormal bases (r, k), (r, r - k) of the combinations of rows that depend on
-        these parameters, and of those that do not.
-        """
         freed = np.isin(self.names, names)
         u, s, _ = np.linalg.svd((self.rows * self.unit)[:, freed], full_matrices=True)
         rank = int((s > ELIMINATED * s[0]).sum()) if len(s) else 0
-        return u[:, :rank], u[:, rank:]
-
-    def scaled(self, sigma: float) -> Prior:
-        """Return this prior in units of a noise of this standard deviation: rows times sigma."""
-        return replace(self, rows=sigma * self.rows)
+        rows = u[:, rank:].T @ self.rows
+        rows[:, freed] = 0.0
+        return replace(self, rows=rows)
 
     def toleranced(self, names: Sequence[str], mean: FloatArray, tolerance: FloatArray) -> Prior:
         """Return this prior with independent rows (e - mean) / tolerance for some parameters of
@@ -192,45 +178,11 @@ def prior_from(earlier: Posterior) -> Prior:
     if np.isnan(earlier.variance).any():
         raise EstimationError(report_finding("prior.no-uncertainty"))
     known = np.isfinite(earlier.variance)
-    share, degrees = _find_noise_share(earlier)
     whitening = np.diag(1.0 / np.sqrt(np.where(known, earlier.variance, 1.0)))[known]
     rows = np.linalg.solve(earlier.directions.T, whitening.T).T / earlier.unit
     unfixed = None if earlier.frames is None else earlier.frames.unfixed
     estimate, fitted = np.array(earlier.estimate), earlier.fitted_rows
-    share = share[known]
-    return Prior(earlier.names, estimate, earlier.unit, rows, unfixed, fitted, share, degrees)
-
-
-def with_shown_noise(earlier: Posterior) -> Posterior:
-    """Return an earlier calibration whose covariance contains the noise that its residuals alone
-    show, in place of what the stated sigma makes of it. Where they do not show it, or a run of an
-    older version does not state it, the earlier calibration stays as it is.
-    """
-    shown = earlier.shown_noise
-    if shown is None or not shown.is_known:
-        return earlier
-    times = shown.variance / shown.used
-    share = _find_noise_share(earlier)[0]
-    variance = earlier.variance * (1.0 + (times - 1.0) * share)
-    root = np.sqrt(times)
-    parts = tuple(
-        CovariancePart(NOISE, root * part.root, shown.degrees) if part.source == NOISE else part
-        for part in earlier.parts
-    )
-    return replace(earlier, variance=variance, parts=parts)
-
-
-def _find_noise_share(earlier: Posterior) -> tuple[FloatArray, float]:
-    """Return the share (p,) of the variance of each direction that the noise of the measured rows
-    causes, and the degrees of freedom of that noise.
-    """
-    noise = [part for part in earlier.parts if part.source == NOISE]
-    share, degrees = np.zeros(len(earlier.variance)), np.inf
-    for part in noise:
-        coordinates = np.linalg.solve(earlier.directions, part.root / earlier.unit[:, None])
-        share += (coordinates**2).sum(axis=1) / earlier.variance
-        degrees = min(degrees, part.degrees)
-    return np.minimum(share, 1.0), degrees
+    return Prior(earlier.names, estimate, earlier.unit, rows, unfixed, fitted)
 
 
 def refuse_reused_rows(earlier: Prior | Posterior | None, data: Measurements) -> None:

@@ -101,7 +101,7 @@ outliers.all-poses outliers.some outliers.pose outliers.ambiguous outliers.searc
 outliers.conflict
 workflow.no-held-out-poses workflow.few-held-out-poses workflow.held-out-setup
 workflow.undetermined-combinations validation.setup-moved
-prior.machine-changed prior.agrees-too-well prior.tolerances-inflated
+prior.machine-changed prior.agree-too-well prior.tolerances-inflated
 prior.tolerances-too-narrow prior.components-inflated fit.beyond-tolerance
 model.no-expected-gain model.nothing-gained
 residuals.lack-of-fit residuals.repeatability-larger residuals.common-errors

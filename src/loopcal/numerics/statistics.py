@@ -44,11 +44,10 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
     degrees, left = np.asarray(degrees, dtype=float), np.asarray(left, dtype=float)
     tested = np.where(degrees > 0.0, degrees, 1.0)
     is_estimated = (left > 0.0) & np.isfinite(left)
-    tail = np.where(
-        is_estimated,
-        fdtrc(tested, np.where(is_estimated, left, 1.0), statistic),
-        compute_chi_square_tail(tested, tested * np.asarray(statistic, dtype=float)),
-    )
+    tail = fdtrc(tested, np.where(is_estimated, left, 1.0), statistic)
+    if not is_estimated.all():
+        known = compute_chi_square_tail(tested, tested * np.asarray(statistic, dtype=float))
+        tail = np.where(is_estimated, tail, known)
     return np.where(left > 0.0, np.where(degrees > 0.0, tail, 1.0), np.nan)
 
 

@@ -7,12 +7,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from loopcal.diagnose.value_comparison import (
-    ParameterChanges,
-    compare_information,
-    estimate_cause,
-    explain_change,
-)
 from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.penalties import MAP, LeastSquares, Ridge
 from loopcal.estimate.posterior import (
@@ -21,6 +15,12 @@ from loopcal.estimate.posterior import (
     compute_posterior,
     fold_information,
     posterior_from_arrays,
+)
+from loopcal.estimate.recalibration import (
+    ErrorPart,
+    ParameterChanges,
+    compare_information,
+    explain_change,
 )
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Instrument, Sensor
@@ -84,7 +84,7 @@ def judge_batch(robot: Mechanism, count: int, poses: int) -> np.ndarray:
     truths = sample_truth(robot, count, 1)
     pairs = zip(*(identify_batch(robot, truths, seed, poses) for seed in (2, 3)), strict=True)
     compared = [compare_information(*pair) for pair in pairs]
-    return np.array([c.compute_p_value(c.chi_square, c.degrees) for c in compared])
+    return np.array([c.compute_probability() for c in compared])
 
 
 def judge_unmoved(name: str, count: int, **options) -> np.ndarray:
@@ -94,7 +94,7 @@ def judge_unmoved(name: str, count: int, **options) -> np.ndarray:
     for seed in range(count):
         truth = draw_machine(robot, seed)
         changes = compare(robot, (truth, truth), (1000 + seed, 5000 + seed), **options)
-        p_values.append(changes.compute_p_value(changes.chi_square, changes.degrees))
+        p_values.append(changes.compute_probability())
     return np.array(p_values)
 
 
@@ -146,11 +146,12 @@ def test_the_moved_parameter_is_named_with_its_change() -> None:
         truth = draw_machine(robot, seed)
         moved = move(truth, tower2__stop=40 * UM)
         changes = compare(robot, (truth, moved), (seed, 100 + seed))
-        assert changes.compute_p_value(changes.chi_square, changes.degrees) < 1e-3
+        assert changes.compute_probability() < 1e-3
         cause = explain_change(changes, 0.01)
         named.append((cause.kind, cause.names))
         if named[-1] == ("parameter", ("tower2.stop",)):
-            shift, sd = estimate_cause(changes, cause)
+            places = [changes.names.index(name) for name in cause.parameters]
+            shift, sd = changes.select(places).estimate_shifts()
             assert abs(shift[0] - 40 * UM) < 4.0 * sd[0]
     assert named.count(("parameter", ("tower2.stop",))) >= 7
 
@@ -223,3 +224,46 @@ def test_added_errors_widen_the_comparison() -> None:
     assert alone == pytest.approx(2.0 * stats.t.sf(abs(shift) / sd, 5.0), rel=0.1)
     assert len(changes.sources) == 3
     assert sum(share for share, _ in changes.sources) == pytest.approx(changes.degrees)
+
+
+def make_changes(value: np.ndarray, degrees=(np.inf, np.inf), share=0.5) -> ParameterChanges:
+    """Changes of parameters of which each is one direction; the first part has this share."""
+    count = len(value)
+    roots = [np.sqrt(part) * np.eye(count) for part in (share, 1.0 - share)]
+    names = tuple(f"leg{i // 6}.p{i % 6}" for i in range(count))
+    errors = tuple(map(ErrorPart, roots, degrees))
+    return ParameterChanges(names, np.ones(count), np.eye(count), value, errors)
+
+
+def test_a_change_of_one_parameter_is_not_lost_among_30_directions() -> None:
+    value = np.tile([0.9, -0.9], 15)
+    value[7] = 4.2
+    changes = make_changes(value)
+    assert changes.compute_p_value(changes.chi_square, 30) > 0.05
+    assert changes.compute_probability() < 0.01
+    assert make_changes(10.0 * value).compute_probability() < 1e-12  # beyond the draws
+
+
+@pytest.mark.parametrize("degrees", [(np.inf, np.inf), (6.0, 12.0)])
+def test_probability_of_a_change_is_uniform_with_known_and_estimated_noise(degrees) -> None:
+    rng = np.random.default_rng(1)
+    p_values = []
+    for _ in range(40):
+        sizes = [1.0 if np.isinf(nu) else rng.chisquare(nu) / nu for nu in degrees]
+        value = rng.standard_normal(6) / np.sqrt(np.mean(sizes))
+        changes = make_changes(value, degrees, sizes[0] / sum(sizes))
+        p_values.append(changes.compute_probability())
+    assert_uniform(np.array(p_values))
+
+
+def test_the_pull_of_tolerances_is_no_error_of_what_data_say() -> None:
+    """The comparison contains no tolerance, so an inflated one must not widen it."""
+    robot = ROBOTS["linear-delta"]
+    truth = draw_machine(robot, 7)
+    fits = [identify(robot, measure(robot, truth, seed), LeastSquares()) for seed in (7, 107)]
+    plain = compare_information(*(fit.posterior for fit in fits))
+    root = 100 * UM * np.ones((len(fits[0].names), 1))
+    part = CovariancePart("prior.inflation", root, np.inf)
+    pulled = replace(fits[0].posterior, parts=(*fits[0].posterior.parts, part))
+    changes = compare_information(pulled, fits[1].posterior)
+    assert changes.chi_square == pytest.approx(plain.chi_square, rel=1e-12)
