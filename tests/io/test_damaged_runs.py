@@ -200,6 +200,8 @@ def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
     own = store_arrays(errors, DISCREPANCY_PREFIX)
     m, p = 6 * len(own["discrepancy_centers"]), len(arrays["estimate"])
     own |= {"discrepancy_root": np.zeros((p, m)), "discrepancy_degrees": np.ones(6)}
+    own |= {"discrepancy_test": np.ones(4), "discrepancy_mean": np.ones(m)}
+    own |= {"discrepancy_axes": np.eye(m), "discrepancy_left": np.ones(m)}
     own |= {"discrepancy_directions": np.eye(p), "discrepancy_variance": np.ones(p)}
     arrays |= own
     heights = HeightErrors(

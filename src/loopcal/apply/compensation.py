@@ -23,7 +23,7 @@ from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.checks import check_choice
 from loopcal.diagnose.error_frames import FITTED, fit_unfixed_frames
 from loopcal.diagnose.gauge_freedoms import twist_weights
-from loopcal.errors import DataError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -31,6 +31,7 @@ from loopcal.findings.wording import name_count
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions, read_coordinates
+from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import check_limits
@@ -41,6 +42,7 @@ from loopcal.units import Dimension
 
 Mode = Literal["readings", "commands"]
 
+MAP_STEPS = 3  # each makes the rest smaller by the slope of the map, which is far below 1
 SHOWN = 5  # targets out of reach that the text lists
 ROUNDING = 1e-9  # an error below this share of the robot's size (or this many radians) is rounding
 # Passes over all targets (the controller's answer, the best poses, the errors before, and the
@@ -96,6 +98,8 @@ class Compensation(TableResult):
         reachable pose before the first and after each fixed-point step; zeros (1, n) where readings
         are set.
     uncertainty : of the reached poses; None where only a robot was given.
+    residual_map : what the map of the residuals that corrects the poses gains at held-out regions;
+        None where it is not used. The robot is the identified geometry without this map.
     findings : (n,) one for each target: reached, or why not.
     """
 
@@ -114,6 +118,7 @@ class Compensation(TableResult):
     residual_orientation: FloatArray
     uncertainty: PoseUncertainty | None
     findings: tuple[Finding, ...]
+    residual_map: Finding | None = None
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(robot="robot.name", mode="", labels="", actuators="robot.actuators.name"),
@@ -131,6 +136,7 @@ class Compensation(TableResult):
         *fields("not_compensable", "residual_position", "residual_orientation"),
         *fields(uncertainty=lambda result: result.uncertainty and result.uncertainty.to_dict()),
         *fields(reach=lambda result: [reach.value for reach in result.reach]),
+        *fields(residual_map=lambda result: result.residual_map and str(result.residual_map)),
         *fields(sentences=lambda result: list(map(str, result.findings)), findings=""),
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(
@@ -162,6 +168,8 @@ class Compensation(TableResult):
         lines += [f"target {self.labels[i]!r} {self.findings[i]}" for i in missed[:SHOWN]]
         if len(missed) > SHOWN:
             lines.append(f"and {len(missed) - SHOWN} more")
+        if self.residual_map is not None:
+            lines.append(str(self.residual_map))
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -176,6 +184,7 @@ def compensate(
     labels: tuple[str, ...] = (),
     progress: Progress = report_no_progress,
     frame: str = FITTED,
+    residual_map: bool = False,
 ) -> Compensation:
     """Compute readings or shifted commands for targets.
 
@@ -188,6 +197,7 @@ def compensate(
     controller : that geometry; default: the nominal robot. steps : fixed-point steps of "commands".
     labels : of the targets; default "1", "2", ... progress : receives the passes that are done.
     frame : of the uncertainty, see `pose_uncertainty`; "relative": to the first target.
+    residual_map : whether a smooth map of the residuals of the fit corrects the poses as well.
 
     Returns
     -------
@@ -197,7 +207,8 @@ def compensate(
     ------
     DataError : unknown mode, no step, no target or targets of another shape, another number of
         labels.
-    EstimationError : no such frame.
+    EstimationError : no such frame; or a map that is not known, or lowers no errors at held-out
+        regions.
     """
     check_choice("mode", mode, get_args(Mode), DataError)
     if steps < 1:
@@ -205,6 +216,9 @@ def compensate(
     source = fit.posterior if isinstance(fit, Identification) else fit
     robot, posterior = (source, None) if isinstance(source, Mechanism) else (source.robot, source)
     old = controller or robot.nominal
+    gain = None
+    if residual_map:
+        gain, posterior = _use_map(posterior)
     count = StepCounter(progress, PASSES + (steps if mode == "commands" else 0))
     count.begin(TASK)
     uncorrected = inverse(old, targets)
@@ -217,15 +231,15 @@ def compensate(
             "least one target, and one label for each or none"
         )
     count.begin(TASK)
-    best = inverse(robot, targets)
+    best = _aim(posterior, robot, targets, wanted)
     count.begin(TASK)
     unchanged = forward(robot, uncorrected.q)
-    before = geometry.pose_difference(unchanged.T, wanted)
+    before = geometry.pose_difference(_predict(posterior, unchanged), wanted)
     final, commands, distances = best, None, np.zeros((1, len(wanted), 6))
     if mode == "commands":
         final, commands, distances = _shift_commands(robot, old, uncorrected, best, steps, count)
     count.begin(TASK)
-    not_compensable = geometry.pose_difference(best.T, wanted)
+    not_compensable = geometry.pose_difference(_predict(posterior, best), wanted)
     findings = _report_targets(robot, uncorrected, best, final, distances, not_compensable)
     # Elsewhere the iteration ends at some pose, but it is not the one nearest to the target.
     is_solved = uncorrected.converged & best.converged & final.converged
@@ -236,12 +250,13 @@ def compensate(
         q=np.where(is_solved[:, None], final.q, np.nan),
         T=np.where(is_solved[:, None, None], final.T, np.nan),
     )
+    reached = np.where(is_solved[:, None, None], _predict(posterior, final), np.nan)
     uncertainty = None
     if posterior is not None:
         before = _remove_unfixed_frames(posterior, old, wanted, before, frame)
         uncertainty = pose_uncertainty(posterior, solved, frame=frame, origin_name=names[0])
     is_answered = uncorrected.converged & unchanged.converged
-    remaining = geometry.pose_difference(final.T, wanted)
+    remaining = geometry.pose_difference(reached, wanted)
     return Compensation(
         mode=mode,
         labels=names,
@@ -250,15 +265,65 @@ def compensate(
         readings=solved.q,
         commands=None if commands is None else np.where(is_solved[:, None], commands, np.nan),
         wanted=wanted,
-        reached=solved.T,
+        reached=reached,
         before=np.where(is_answered[:, None], before, np.nan),
-        remaining=np.where(is_solved[:, None], remaining, np.nan),
+        remaining=remaining,
         not_compensable=np.where(is_solved[:, None], not_compensable, np.nan),
         residual_position=np.linalg.norm(distances[..., 3:], axis=2),
         residual_orientation=np.linalg.norm(distances[..., :3], axis=2),
         uncertainty=uncertainty,
         findings=findings,
+        residual_map=gain,
     )
+
+
+def _use_map(posterior: Posterior | None) -> tuple[Finding, Posterior]:
+    """Return what the map of the residuals gains, and the posterior of the poses that it corrects.
+
+    EstimationError: there is no map, or it is no proven gain.
+    """
+    if posterior is None:
+        raise EstimationError(report_finding("compensation.map-needs-run"))
+    own = posterior.discrepancy
+    if own is None:
+        raise EstimationError(report_finding("compensation.map-no-errors"))
+    before, after, lowest, regions = own.test.tolist()
+    values: dict[str, Any] = {"before": before, "after": after, "regions": int(regions)}
+    values["lowest"] = 100.0 * lowest
+    if np.isnan(lowest):
+        raise EstimationError(report_finding("compensation.map-not-tested"))
+    if not len(own.mean):
+        raise EstimationError(report_finding("compensation.map-no-gain", **values))
+    corrected = replace(posterior, discrepancy=replace(own, is_corrected=True))
+    return report_finding("compensation.map-gain", **values), corrected
+
+
+def _correct(posterior: Posterior | None, solution: Solution) -> FloatArray:
+    """Return the twists (n, 6) by which the map of the residuals corrects solved poses."""
+    if posterior is None or (own := posterior.discrepancy) is None or not own.is_corrected:
+        return np.zeros((len(solution.q), 6))
+    robot = posterior.robot
+    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
+    return own.correct(solution.T, S.parameters[0][..., posterior.places])
+
+
+def _predict(posterior: Posterior | None, solution: Solution) -> FloatArray:
+    """Return where the machine is at solved poses (n, 4, 4)."""
+    return geometry.apply_twist(solution.T, _correct(posterior, solution))
+
+
+def _aim(
+    posterior: Posterior | None, robot: Mechanism, targets: ArrayLike, wanted: FloatArray
+) -> Solution:
+    """Return the poses of the identified robot that the map of the residuals takes to targets."""
+    best = inverse(robot, targets)
+    if posterior is None or posterior.discrepancy is None or not posterior.discrepancy.is_corrected:
+        return best
+    for _ in range(MAP_STEPS):
+        aimed = geometry.apply_twist(wanted, -_correct(posterior, best))
+        is_pose = np.shape(targets)[-2:] == (4, 4)
+        best = inverse(robot, aimed if is_pose else read_coordinates(aimed, robot.controlled))
+    return best
 
 
 def _remove_unfixed_frames(

@@ -25,6 +25,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from loopcal.diagnose.residual_map import MapTest, check_map
 from loopcal.diagnose.residual_patterns import LEVEL
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.identification import prepare_fitted_data
@@ -102,6 +103,13 @@ class SlowErrors(NamedTuple):
     rows: SlowErrorRows  # that show them
     errors: tuple[SlowError, ...]
     is_slow: bool = True  # whether neighboring poses share them; otherwise each pose has its own
+    test: MapTest = MapTest(np.nan, np.nan, np.nan, 0)  # of a map that corrects them
+
+    @property
+    def amplitude(self) -> FloatArray:
+        """(6, d) amplitudes of the directions, those of rotation first."""
+        ordered = sorted(self.errors, key=lambda error: _is_place(error.directions))
+        return np.hstack([e.directions * np.sqrt(e.size.variance) for e in ordered])
 
 
 def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | None:
@@ -139,7 +147,9 @@ def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | No
     fine = [*project(KERNELS, measured, FINE_CENTERS), *short]
     fine += project(SHORT_KERNELS[1:], measured, FINE_CENTERS)
     divided = [SlowErrors(rows, divide_by_direction(rows, found, groups, known)) for rows in fine]
-    return max(divided, key=_score)
+    best = max(divided, key=_score)
+    errors = best.rows.errors.scaled(best.amplitude)
+    return best._replace(test=check_map(linear, errors, best.errors[-1].size.noise, T))
 
 
 def _score(slow: SlowErrors) -> float:
@@ -188,11 +198,24 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
     """
     rows, first = slow.rows, fit.posterior
     ordered = sorted(slow.errors, key=lambda error: _is_place(error.directions))
-    amplitude = np.hstack([e.directions * np.sqrt(e.size.variance) for e in ordered])
+    amplitude = slow.amplitude
     degrees = np.concatenate([np.full(e.directions.shape[1], e.size.degrees) for e in ordered])
     root = _columns(rows.slope, rows.errors, amplitude)
+    S, noise = _columns(rows.rows, rows.errors, amplitude), ordered[-1].size.noise
+    if not slow.test.is_gain:  # no map is kept
+        S = S[:, :0]
+    # the coefficients given -y = S c + noise: residuals are predicted less measured values
+    precision, axes = np.linalg.eigh(S.T @ S + noise * np.eye(S.shape[1]))
     discrepancy = ModelDiscrepancy(
-        rows.errors.scaled(amplitude), root, degrees, first.directions, first.variance
+        rows.errors.scaled(amplitude),
+        root,
+        degrees,
+        first.directions,
+        first.variance,
+        test=np.array(slow.test),
+        mean=-axes @ (axes.T @ (S.T @ rows.residuals) / precision),
+        axes=axes,
+        left=np.sqrt(noise / precision),
     )
     for is_place, own, of_part in discrepancy.parts:
         squares = (amplitude[:, own] ** 2).sum(axis=0)
@@ -307,7 +330,7 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     """
     if len(errors.centers) < FEWEST_POSES:
         return None
-    extended = linearize_smooth_errors(linear, errors)
+    extended = linearize_smooth_errors(linear, errors)[2]
     d, m, used = linear.decomposition, errors.count, linear.decomposition.used[0]
     k = int(used.sum())
     to_z = d.directions[0][:, used]

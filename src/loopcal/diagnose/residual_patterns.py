@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.estimate.fit_linearization import FitLinearization
+from loopcal.estimate.linearization import Linearization, PoseSolution
+from loopcal.estimate.problem import Problem
 from loopcal.estimate.smooth_errors import correlate
 from loopcal.measure.kinds.kind import Kind, list_components
 from loopcal.measure.measurements import Measurements
@@ -128,15 +130,23 @@ def span_columns(columns: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > EXPLAINED])
 
 
-def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
-    """Return the residuals of a fit with intervals in the order of measurement; None where rows
-    cannot be told apart, because their readings are uncertain, or where there are none.
-    """
-    if linear.problem.is_uncertain:
-        return None
-    observations = [rows for rows in linear.data.observations if len(rows)]
+class StackedRows(NamedTuple):
+    """R rows of a problem, those of one series (a kind and its column) in order."""
+
+    rows: FloatArray  # (R, w) by setup, parameters and residual
+    kind: IntArray
+    row: IntArray
+    column: IntArray
+    series: IntArray
+
+
+def collect_rows(
+    data: Measurements, problem: Problem, solution: PoseSolution, linearization: Linearization
+) -> StackedRows | None:
+    """Return the measured rows of a problem of exact readings; None without any."""
+    observations = [rows for rows in data.observations if len(rows)]
     groups: list[tuple[FloatArray, IntArray, IntArray, IntArray]] = []  # present rows
-    for node_rows in linear.problem.leverage_rows(linear.linearization, linear.solution):
+    for node_rows in problem.leverage_rows(linearization, solution):
         for part in node_rows:
             present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
             i, column = np.nonzero(present[part.numbers])
@@ -150,7 +160,19 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     place = np.concatenate([order_rows(o) for o in observations])
     start = np.cumsum([0, *(len(o) for o in observations)])
     order = np.lexsort((place[start[kind] + row], series))
-    rows, kind, row, column = rows[order], kind[order], row[order], column[order]
+    return StackedRows(*(array[order] for array in (rows, kind, row, column, series)))
+
+
+def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
+    """Return the residuals of a fit with intervals in the order of measurement; None where rows
+    cannot be told apart, because their readings are uncertain, or where there are none.
+    """
+    if linear.problem.is_uncertain:
+        return None
+    stacked = collect_rows(linear.data, linear.problem, linear.solution, linear.linearization)
+    if stacked is None:
+        return None
+    rows = stacked.rows
     d, p = linear.decomposition, len(linear.fit.names)
     used, determined = linear.is_estimated, d.used[0]
     by_direction = rows[:, -p - 1 : -1] @ d.directions[0]
@@ -162,10 +184,10 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
         residual=residual,
         gain=by_direction[:, used] / linear.information[used],
         root=linear.fit.tolerance[:, None] * d.directions[0][:, used],
-        kind=kind,
-        row=row,
-        column=column,
-        series=np.unique(series[order], return_inverse=True)[1],
+        kind=stacked.kind,
+        row=stacked.row,
+        column=stacked.column,
+        series=np.unique(stacked.series, return_inverse=True)[1],
     )
 
 

@@ -127,14 +127,16 @@ def linearize_fit(
     return FitLinearization(fit, data, problem, solution, linearization, d, penalty, sources)
 
 
-def linearize_smooth_errors(linear: FitLinearization, errors: SmoothErrors) -> Linearization:
+def linearize_smooth_errors(
+    linear: FitLinearization, errors: SmoothErrors
+) -> tuple[Problem, PoseSolution, Linearization]:
     """Linearize the rows of a fit also by the coefficients of errors of the poses, whose columns
     follow those of the parameters. Poses and nuisance parameters stay those of `linear`.
     """
     solution, free = linear.solution, replace(linear.fit.free_parameters, errors=errors)
     if solution.linearized is not None:
         solution = replace(solution, linearized=solution.linearized.with_errors(errors))
-    return linearize_at_estimate(linear.fit, linear.data, free, solution)[2]
+    return linearize_at_estimate(linear.fit, linear.data, free, solution)
 
 
 def linearize_at_estimate(

@@ -168,6 +168,10 @@ class ModelDiscrepancy:
     errors : phi. root : (p, m) L [SI].
     degrees : (d,) degrees of freedom of the amplitude of each direction.
     directions, variance : (p, p), (p,) of the posterior without the discrepancy.
+    test : (4,) of the map of the errors, see `loopcal.diagnose.residual_map.MapTest`.
+    mean, axes, left : (m,), (m, m), (m,) expected coefficients given the residuals, their principal
+        axes and standard deviations; without entries where the map is no proven gain.
+    is_corrected : whether the map corrects the poses.
     """
 
     errors: SmoothErrors
@@ -175,6 +179,11 @@ class ModelDiscrepancy:
     degrees: FloatArray
     directions: FloatArray
     variance: FloatArray
+    test: FloatArray
+    mean: FloatArray
+    axes: FloatArray
+    left: FloatArray
+    is_corrected: bool = False
 
     def __repr__(self) -> str:
         """Return the amplitudes."""
@@ -201,9 +210,24 @@ class ModelDiscrepancy:
         """Return twists (n, 6, m) of the platform at poses T (n, 4, 4) by independent errors of
         variance 1, those of each direction of `errors` in turn.
 
-        `by_parameters` (n, 6, p) are the twists by the parameters [per SI].
+        `by_parameters` (n, 6, p) are the twists by the parameters [per SI]. With the map, they are
+        what it leaves: of the variance 1 of a coefficient the share that the data leave, and the
+        whole where the map has faded.
         """
-        return by_parameters @ self.root - self.errors.twists(T)
+        twists = by_parameters @ self.root - self.errors.twists(T)
+        if not self.is_corrected:
+            return twists
+        faded = (1.0 - self.errors.share(T))[..., None, None] ** 2
+        left = np.sqrt(faded * (1.0 - self.left**2) + self.left**2)
+        return np.asarray((twists @ self.axes) * left)
+
+    def correct(self, T: FloatArray, by_parameters: FloatArray) -> FloatArray:
+        """Return the twists (n, 6) that the map adds to calibrated poses T (n, 4, 4), in base axes
+        at the platform's origin; `by_parameters` as of `twists`. It fades where errors have nothing
+        to do with those at measured poses.
+        """
+        expected = (self.errors.twists(T) - by_parameters @ self.root) @ self.mean
+        return np.asarray(self.errors.share(T)[..., None] * expected)
 
     def split_squares(self, twists: FloatArray) -> list[tuple[FloatArray, float]]:
         """Return the variances (n, 6) that the errors of each direction cause, from columns

@@ -80,12 +80,14 @@ class SmoothErrors:
         shared = correlate(self.centers, self.centers) - np.eye(len(self.centers))
         return bool(np.median(shared.max(axis=1)) > DENSE)
 
-    def group_regions(self, T: FloatArray) -> IntArray:
+    def group_regions(self, T: FloatArray, fewest: int = 1) -> IntArray:
         """Return the numbers (n,) of regions of poses T (n, 4, 4): each pose belongs to the nearest
-        of some that are more than a length apart, over which errors are hardly correlated.
+        of some that are more than a length apart, over which errors are hardly correlated, or of
+        the `fewest` that are farthest apart.
         """
         x = self._normalize(T)
-        centers = x[_spread(x, len(x), 1.0)]
+        apart = _spread(x, len(x), 1.0)
+        centers = x[apart if len(apart) >= fewest else _spread(x, fewest)]
         return np.argmin(((x[:, None] - centers) ** 2).sum(axis=2), axis=1)
 
     def scaled(self, amplitude: FloatArray) -> SmoothErrors:
@@ -103,9 +105,14 @@ class SmoothErrors:
         """Return twists (.., 6, d) by the errors that have nothing to do with those at the centers,
         independent at every pose.
         """
-        known = ((self._correlate(T) @ self.whitening) ** 2).sum(axis=-1)
-        left = np.sqrt(np.maximum(1.0 - known, 0.0))
+        left = np.sqrt(1.0 - self.share(T))
         return self._at_origin(T) @ (left[..., None, None] * self.amplitude)
+
+    def share(self, T: FloatArray) -> FloatArray:
+        """Return the share (..,) of the variance at poses that follows from errors at the
+        centers.
+        """
+        return np.minimum(((self._correlate(T) @ self.whitening) ** 2).sum(axis=-1), 1.0)
 
     def _correlate(self, T: FloatArray) -> FloatArray:
         """Return the correlations (.., k) of errors at poses with those at the centers."""

@@ -137,7 +137,8 @@ class VarianceComponent(NamedTuple):
     ratio : of variances, tau^2 at which the likelihood is largest. gain : of the logarithm of this
         likelihood over that without the component.
     evidence : logarithm of the likelihood over that without the component, averaged over the
-        logarithm of `EVIDENT` tau; for errors that alone have unit variance.
+        logarithm of `EVIDENT` tau; for errors that alone have unit variance. noise : sigma^2 at
+        `ratio`.
     """
 
     variance: float
@@ -145,6 +146,7 @@ class VarianceComponent(NamedTuple):
     ratio: float
     gain: float
     evidence: float
+    noise: float
 
 
 def compute_component_tail(
@@ -196,7 +198,8 @@ def estimate_variance_component(
     degrees = max(2.0 * mean**2 / spread, 1.0)
     # the first tau is as good as none
     gain = float(density.max() - density[0])
-    return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]), gain, evidence)
+    best, numbers = int(np.argmax(density)), (gain, evidence)
+    return VarianceComponent(mean, degrees, float(ratio[best]), *numbers, float(variance[best]))
 
 
 def _tail(values: FloatArray, counts: FloatArray) -> float:

@@ -402,6 +402,8 @@ def view_compensation(result: Compensation) -> list[Block]:
     caption = f"{robot.name}: {len(rows)} targets, {result.mode}"
     columns = ("target", "status", *(column for column, _ in values))
     blocks: list[Block] = [make_table(caption, columns, rows)]
+    if result.residual_map is not None:
+        blocks.append(str(result.residual_map))
     usable = result.usable
     if result.commands is not None and usable.any():
         for step in range(1, len(result.residual_position)):

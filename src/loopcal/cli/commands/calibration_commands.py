@@ -231,6 +231,9 @@ def compensate(
         type=opt.Count("STEPS", 1),
     ),
     frame: str = opt.frame("loopcal.apply.compensation:compensate"),
+    residual_map: bool = opt.flag(
+        "Correct also the smooth errors that the residuals show, if held-out regions prove a gain."
+    ),
     force: bool = opt.force("the output file", ", and compute also from a calibration that failed"),
 ) -> Output:
     """Compute readings or commands with which the machine of RUN reaches TARGETS, a CSV file of
@@ -263,7 +266,8 @@ def compensate(
     coordinates, labels = load_targets(targets, robot)
     old = None if controller is None else lc.load_robot(controller)
     with terminal.TerminalProgress() as progress:
-        result = lc.compensate(known, coordinates, mode, old, steps, labels, progress, frame=frame)
+        how = {"frame": frame, "residual_map": residual_map}
+        result = lc.compensate(known, coordinates, mode, old, steps, labels, progress, **how)
     if output is not None:
         write_text(output, format_compensation(result))
     missed = [
