@@ -11,9 +11,10 @@ import pytest
 import loopcal as lc
 from loopcal.diagnose.adjusted_uncertainty import SHARED, adjust_uncertainty
 from loopcal.diagnose.error_causes import CAUSE, NOISE, compare_causes, find_causes
-from loopcal.diagnose.residual_patterns import Effect, Remainder, collect_residual_rows
+from loopcal.diagnose.residual_patterns import Effect, collect_residual_rows
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
+from loopcal.numerics.statistics import Remainder
 from loopcal.units import Dimension
 from tests.diagnose.correlated_data import LENGTH, ROBOTS, draw_errors, measure
 
@@ -137,3 +138,14 @@ def test_few_rows_and_one_row_of_each_pose_name_no_cause_and_no_error():
     kept = collect_residual_rows(linear)
     assert kept is not None
     assert NOISE not in {cause.source for cause in find_causes(linear, kept)}
+
+
+def test_many_poses_are_compared_by_an_even_choice_and_widen_the_uncertainty_as_all():
+    _, data = measure("hexapod-42", "tracker", share(2, 130, 3.0), 2)
+    fit = adjust_uncertainty(identify(ROBOTS["hexapod-42"], data), data)
+    causes = [f.data["cause"] for f in fit.findings if f.code == CAUSE]
+    (found,) = (f for f in fit.findings if f.code == SHARED)
+    assert causes[0] == found.data["cause"] == "pose"
+    # chi-square has multiplied the variance by 1 + 9, and 9 for each of three targets are added;
+    # 130 poses know the size to 5 %, of which the frame and the drives take some
+    assert found.data["ratio"] == pytest.approx(np.sqrt(1.0 + 27.0 / 10.0), rel=0.15)

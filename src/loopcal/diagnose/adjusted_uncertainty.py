@@ -41,6 +41,7 @@ from loopcal.diagnose.residual_patterns import (
     estimate_sizes,
     find_patterns,
 )
+from loopcal.diagnose.residual_patterns import MOST_POSES as EVEN_CHOICE
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import DOUBT as DOUBTFUL
@@ -143,7 +144,10 @@ def _add_patterns(
     for cause in shared:
         assert cause.effect is not None
         assert cause.size is not None
-        root = rows.root @ (rows.gain.T @ cause.effect.scaled) * np.sqrt(cause.size.variance)
+        # of many poses only some have columns
+        times = max(data.n_poses / EVEN_CHOICE, 1.0) if cause.source == POSE else 1.0
+        size = np.sqrt(times * cause.size.variance)
+        root = rows.root @ (rows.gain.T @ cause.effect.scaled) * size
         finding = _report_shared(cause, _measure_growth(tool, root))
         fit = add_covariance(fit, root, cause.size.degrees, finding)
     if is_correlated:

@@ -3,7 +3,7 @@
 
 An error of variance tau^2 of every reading at every pose is a component of the variance of the
 whitened rows, with their derivatives by the readings as columns, which are zero but for those of
-the pose of a row (`Remainder`). Backlash is an error
+the pose of a row (`numerics.statistics.Remainder`). Backlash is an error
 of the sign of travel from the pose before: a linear effect, see `residual_patterns`.
 Sources: Patterson and Thompson, Recovery of inter-block information when block sizes are unequal,
 Biometrika 58 (1971); docs/theory/uncertainty.md.
@@ -32,7 +32,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.numerics.statistics import choose_evenly, compute_single_level
+from loopcal.numerics.statistics import compute_single_level, find_distinct
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -46,8 +46,6 @@ have errors, and their pattern decides.
 
 FEWEST_VALUES = 2
 """Measured values of a pose without which its errors have no pattern, such as single heights."""
-
-MOST_COLUMNS = 600  # of errors of single poses: of more poses an even choice shows them
 
 DRIVES, BACKLASH = "drives", "backlash"
 
@@ -85,6 +83,7 @@ def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
     rows = collect_residual_rows(linear)
     if rows is None or len(rows.residual) < FEWEST_VALUES * linear.data.n_poses:
         return None
+    rows = rows.take_poses(linear.data)
     effects = list_drive_effects(linear, rows)
     if not effects:
         return None
@@ -118,9 +117,9 @@ def list_units(linear: FitLinearization) -> FloatArray:
 
 
 def list_drive_effects(linear: FitLinearization, rows: ResidualRows) -> list[Effect]:
-    """Return the effects of errors of each reading at each pose (of many poses an even choice), of
-    the direction in which it was approached, and cubic ones of its value, in the `list_units`; none
-    where rows compare poses, or sense joints, which follow the readings in another way.
+    """Return the effects of errors of each reading at each pose of the rows, of the direction in
+    which it was approached, and cubic ones of its value, in the `list_units`; none where rows
+    compare poses, or sense joints, which follow the readings in another way.
     """
     poses, states, robot = linear.solution.linearized, linear.solution.states, linear.fit.robot
     kinds = [r for r in linear.problem.rows if len(r.poses)]
@@ -139,7 +138,7 @@ def list_drive_effects(linear: FitLinearization, rows: ResidualRows) -> list[Eff
         values[own] = Z[rows.row[own], rows.column[own]]
         places[own] = r.poses[rows.row[own]]
     values *= list_units(linear)
-    chosen = choose_evenly(len(S), max(MOST_COLUMNS // S.shape[-1], 1))
+    chosen = find_distinct(places)
     of_poses = (places[:, None] == chosen)[:, :, None] * values[:, None, :]
     times = [o.context.get("time") for o in linear.data.observations if len(o)]
     is_alike = len(times) == 1 and len(linear.data.observations[0]) == len(S)

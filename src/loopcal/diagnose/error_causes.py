@@ -21,7 +21,6 @@ import numpy as np
 from loopcal.diagnose.drive_errors import list_drive_effects
 from loopcal.diagnose.residual_patterns import (
     Effect,
-    Remainder,
     ResidualRows,
     list_effects,
     list_shared_errors,
@@ -29,14 +28,14 @@ from loopcal.diagnose.residual_patterns import (
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.residual_test import FEWEST_DEGREES, count_sigma_degrees
 from loopcal.findings import Finding, report_finding
-from loopcal.numerics.statistics import VarianceComponent, compute_f_tail
+from loopcal.numerics.statistics import UNSEEN, Remainder, VarianceComponent, compute_f_tail
 from loopcal.typing import IntArray
 
 NOISE, OUTLIERS = "noise", "outliers"
 CAUSE = "residuals.cause"  # code of the finding
 EXCLUDED = 0.05  # probability of noise alone below which a cause is named
 OUTLYING = 0.1  # largest share of the poses that may be wrong
-MOST_CAUSES = 3
+MOST_CAUSES, MOST_WRONG = 3, 30  # causes that are named, and wrong poses that are compared
 
 
 class Cause(NamedTuple):
@@ -64,15 +63,20 @@ def find_causes(linear: FitLinearization, rows: ResidualRows) -> tuple[Cause, ..
     may explain them.
     """
     fit, data = linear.fit, linear.data
-    effects = [*list_effects(rows, data, fit.robot), *list_shared_errors(rows, data, fit.robot)]
-    effects += list_drive_effects(linear, rows)[:2]
-    observations = [o for o in data.observations if len(o)]
-    pose = np.zeros(len(rows.residual), dtype=np.int64)
-    for number, o in enumerate(observations):
-        own = rows.kind == number
-        pose[own] = o.rows.reshape(len(o), -1)[rows.row[own], 0]
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
-    return compare_causes(rows.remainder, [e for e in effects if e.columns.any()], pose, known)
+
+    def list_all(rows: ResidualRows) -> list[Effect]:
+        """Return the effects of rows that these can show."""
+        effects = [*list_effects(rows, data, fit.robot), *list_shared_errors(rows, data, fit.robot)]
+        return [effect for effect in effects if effect.columns.any()]
+
+    few = rows.take_poses(data)
+    effects = list_all(few) + list_drive_effects(linear, few)[:2]
+    causes = compare_causes(few.remainder, effects, few.locate_poses(data), known)
+    if few is rows or not causes:
+        return causes
+    whole = {(effect.source, effect.name): effect for effect in list_all(rows)}
+    return tuple(c._replace(effect=whole.get((c.source, c.name), c.effect)) for c in causes)
 
 
 def compare_causes(
@@ -127,13 +131,15 @@ def find_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> tupl
     member[np.arange(member.shape[1]) < count[:, None]] = order
     is_row = member >= 0
     total, evidence, best, kept = 0.0, [-np.inf], -np.inf, remainder
-    for k in range(1, max(int(OUTLYING * len(names)), 1) + 1):
+    for k in range(1, min(max(int(OUTLYING * len(names)), 1), MOST_WRONG) + 1):
         square = float(remainder.residual @ remainder.weigh(remainder.residual))
         P = remainder.taken[member] * is_row[..., None]
-        w, vectors = np.linalg.eigh(np.eye(member.shape[1]) - P @ P.swapaxes(1, 2))
         own = remainder.weigh(remainder.residual)[member] * is_row
-        y = np.matvec(vectors.swapaxes(1, 2), own)
-        is_open = (w > 1e-6) & (np.matvec(vectors.swapaxes(1, 2) ** 2, is_row.astype(float)) > 0.5)
+        w, vectors = np.linalg.eigh(
+            is_row[:, None] * np.eye(member.shape[1]) - P @ P.swapaxes(1, 2)
+        )
+        y = (own[:, None] @ vectors)[:, 0]
+        is_open = w > UNSEEN
         distance = (np.where(is_open, y, 0.0) ** 2 / np.where(is_open, w, 1.0)).sum(axis=1)
         degrees = is_open.sum(axis=1)
         left = remainder.degrees + known - degrees

@@ -33,14 +33,11 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import (
-    MOST_KNOWN,
-    VarianceComponent,
+    Remainder,
     choose_evenly,
     compute_any_probability,
-    compute_component_tail,
     compute_f_tail,
     compute_single_level,
-    estimate_variance_component,
     find_distinct,
 )
 from loopcal.typing import FloatArray, IntArray
@@ -111,6 +108,22 @@ class ResidualRows:
             column=self.column[kept],
             series=self.series[kept],
         )
+
+    def take_poses(self, data: Measurements) -> ResidualRows:
+        """Return the rows as if the fit had only used an even choice of `MOST_POSES` poses."""
+        chosen = choose_evenly(data.n_poses, MOST_POSES)
+        if len(chosen) == data.n_poses:
+            return self
+        left = ~np.isin(self.locate_poses(data), chosen)
+        return self.without(np.flatnonzero(left))
+
+    def locate_poses(self, data: Measurements) -> IntArray:
+        """Return the first pose (R,) of each row."""
+        pose = np.zeros(len(self.residual), dtype=np.int64)
+        for number, o in enumerate(o for o in data.observations if len(o)):
+            own = self.kind == number
+            pose[own] = o.rows.reshape(len(o), -1)[self.row[own], 0]
+        return pose
 
 
 def span_columns(columns: FloatArray) -> FloatArray:
@@ -212,7 +225,8 @@ ORDER, TIME, TEMPERATURE, READING = "order", "time", "temperature", "reading"
 SESSION, BLOCK, POSE, TARGET, WALK = "session", "block", "pose", "target", "walk"
 SMOOTH = "smooth"
 RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH}  # whose sizes are drawn
-MOST_GROUPS, CENTERS = 80, 30  # of more poses an even choice shows an effect well enough
+# Poses that show an effect well enough, evenly chosen of more; centers of slow errors.
+MOST_POSES, CENTERS = 100, 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,12 +260,14 @@ class Effect:
         return (self.columns if self.whole is None else self.whole) * self.unit
 
 
-def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
+def list_effects(
+    rows: ResidualRows, data: Measurements, robot: Mechanism, *, with_poses: bool = True
+) -> tuple[Effect, ...]:
     """Return the effects that measurements without excluded poses can have.
 
     Linear in time, or in the order of measurement where the rows state no time, linear in each
     temperature, and quadratic in each actuator reading; an error of each session, of each block
-    where blocks are large, and of each pose where several targets share it.
+    where blocks are large, and, `with_poses`, of each pose where several targets share it.
     """
     observations = [o for o in data.observations if len(o)]
     place = [order_rows(o).astype(float) for o in observations]
@@ -269,8 +285,8 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
     if is_finer and 2 * blocks <= data.n_poses:
         listed.append((BLOCK, "", [indicate_groups(data.block[i]) for i in poses]))
     members = [columns for o in observations for columns in list_components(o.kind).values()]
-    if max(map(len, members)) > 1:
-        chosen = choose_evenly(data.n_poses, MOST_GROUPS)
+    if with_poses and max(map(len, members)) > 1:
+        chosen = choose_evenly(data.n_poses, MOST_POSES)
         listed.append((POSE, "", [(i[:, None] == chosen).astype(float) for i in poses]))
     for i, actuator in enumerate(robot.actuators):
         readings = [scale_to_range(data.readings[of_kind, i]) for of_kind in poses]
@@ -292,7 +308,7 @@ def list_shared_errors(
     centers = x[choose_evenly(len(x), CENTERS)]
     size, axes = np.linalg.eigh(correlate(centers, centers))
     root = correlate(x, centers) @ (axes[:, size > EXPLAINED] / np.sqrt(size[size > EXPLAINED]))
-    steps = [choose_evenly(len(o), MOST_GROUPS)[1:] for o in observations]
+    steps = [choose_evenly(len(o), MOST_POSES)[1:] for o in observations]
     listed = [
         (SMOOTH, [root[i] for i in poses]),
         (WALK, [order_rows(o)[:, None] >= i for o, i in zip(observations, steps, strict=True)]),
@@ -394,7 +410,7 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     The most significant effect is estimated, and the others are tested again without it, until none
     is significant.
     """
-    listed = list_effects(rows, data, robot)
+    listed = list_effects(rows, data, robot, with_poses=data.n_poses <= MOST_POSES)
     order = TIME if any(effect.source == TIME for effect in listed) else ORDER
     effects = [effect for effect in listed if np.isfinite(test_effect(rows, effect))]
     p_value = test_correlation(rows)[1]
@@ -465,61 +481,6 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
         return EffectSizes(effect, p_value, sizes, errors, moments, component.degrees)
     moments = back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back
     return EffectSizes(effect, p_value, sizes, errors, moments)
-
-
-class Remainder(NamedTuple):
-    """Residuals M r under the covariance 1 + sum of K_h of components that were found, with the
-    quadratic form v' (1 - P P') v of their inverse on what nothing estimated explains.
-    """
-
-    taken: FloatArray  # (R, e) P: the basis of what is estimated, and parts of components
-    residual: FloatArray  # (R,)
-    degrees: float
-
-    def weigh(self, columns: FloatArray) -> FloatArray:
-        """Return (1 - P P') columns (R, c)."""
-        return columns - self.taken @ (self.taken.T @ columns)
-
-    def find_spectrum(self, columns: FloatArray) -> Spectrum:
-        """Return the part of the residuals that independent errors of equal variance with these
-        columns (R, c) change.
-        """
-        weighed = self.weigh(columns)
-        w, vectors = np.linalg.eigh(columns.T @ weighed)
-        kept = w > EXPLAINED * float((columns**2).sum(axis=0).max(initial=0.0))
-        axes = weighed @ (vectors[:, kept] / np.sqrt(w[kept]))
-        y, square = self.residual @ axes, float(self.residual @ self.weigh(self.residual))
-        rest = (max(square - float(y @ y), 0.0), max(self.degrees - len(y), 0.0))
-        return Spectrum(axes, w[kept], y, rest)
-
-    def add(self, spectrum: Spectrum, ratio: float) -> Remainder:
-        """Return the remainder with a component of this ratio of variances; an infinite one takes
-        all that its errors change.
-        """
-        w, is_open = spectrum.weights, np.isinf(ratio)
-        share = np.ones(len(w)) if is_open else np.sqrt(ratio * w / (1.0 + ratio * w))
-        taken = np.concatenate([self.taken, spectrum.axes * share], axis=1)
-        return self._replace(taken=taken, degrees=self.degrees - (len(w) if is_open else 0))
-
-
-class Spectrum(NamedTuple):
-    """A component of the variance of residuals along its principal axes."""
-
-    axes: FloatArray  # (R, k)
-    weights: FloatArray  # (k,) variances of the elements by errors of unit variance
-    y: FloatArray  # (k,) elements of the residuals
-    rest: tuple[float, float]  # sum of squares and number of all other elements
-
-    def compute_tail(self, known: float = 0.0) -> float:
-        """Return the probability of such elements without the component, by sigmas that are stated
-        with so many `known` degrees of freedom.
-        """
-        rest = (self.rest[0] + min(known, MOST_KNOWN), self.rest[1] + known)
-        return compute_component_tail(self.weights, self.y, rest)
-
-    def estimate(self, known: float = 0.0) -> VarianceComponent:
-        """Return the size of the component."""
-        return estimate_variance_component(self.weights, self.y, known, self.rest)
 
 
 def test_correlation(rows: ResidualRows) -> tuple[float, float]:

@@ -121,6 +121,9 @@ STEPS, NEWTON = 400, 100
 MOST_KNOWN = 1e6
 """Degrees of freedom of a sigma that is exact."""
 
+UNSEEN = 1e-6
+"""Share of the variance by errors below which nothing of them is left."""
+
 EVIDENT = (0.1, 30.0)
 """Sizes of errors, in sigma, that are as probable as each other before the data."""
 
@@ -200,6 +203,65 @@ def estimate_variance_component(
     gain = float(density.max() - density[0])
     best, numbers = int(np.argmax(density)), (gain, evidence)
     return VarianceComponent(mean, degrees, float(ratio[best]), *numbers, float(variance[best]))
+
+
+class Spectrum(NamedTuple):
+    """A component of the variance of residuals along its principal axes."""
+
+    columns: FloatArray  # (R, c) of the errors
+    vectors: FloatArray  # (c, k) axes of unit length are what is left of the columns times these
+    weights: FloatArray  # (k,) variances of the elements by errors of unit variance
+    y: FloatArray  # (k,) elements of the residuals
+    rest: tuple[float, float]  # sum of squares and number of all other elements
+
+    def compute_tail(self, known: float = 0.0) -> float:
+        """Return the probability of such elements without the component, by sigmas that are stated
+        with so many `known` degrees of freedom.
+        """
+        rest = (self.rest[0] + min(known, MOST_KNOWN), self.rest[1] + known)
+        return compute_component_tail(self.weights, self.y, rest)
+
+    def estimate(self, known: float = 0.0) -> VarianceComponent:
+        """Return the size of the component."""
+        return estimate_variance_component(self.weights, self.y, known, self.rest)
+
+
+class Remainder(NamedTuple):
+    """Residuals M r under the covariance 1 + sum of K_h of components that were found, with the
+    quadratic form v' (1 - P P') v of their inverse on what nothing estimated explains.
+    """
+
+    taken: FloatArray  # (R, e) P: the basis of what is estimated, and parts of components
+    residual: FloatArray  # (R,)
+    degrees: float
+
+    def weigh(self, columns: FloatArray) -> FloatArray:
+        """Return (1 - P P') columns (R, c)."""
+        return columns - self.taken @ (self.taken.T @ columns)
+
+    def find_spectrum(self, columns: FloatArray) -> Spectrum:
+        """Return the part of the residuals that independent errors of equal variance with these
+        columns (R, c) change.
+        """
+        changed = np.flatnonzero(columns.any(axis=1))
+        own = columns[changed]
+        known, weighed = own.T @ self.taken[changed], self.weigh(self.residual)
+        w, vectors = np.linalg.eigh(own.T @ own - known @ known.T)
+        kept = w > UNSEEN * float((own**2).sum(axis=0).max(initial=0.0))
+        vectors = vectors[:, kept] / np.sqrt(w[kept])
+        y, square = (weighed[changed] @ own) @ vectors, float(self.residual @ weighed)
+        rest = (max(square - float(y @ y), 0.0), max(self.degrees - len(y), 0.0))
+        return Spectrum(columns, vectors, w[kept], y, rest)
+
+    def add(self, spectrum: Spectrum, ratio: float) -> Remainder:
+        """Return the remainder with a component of this ratio of variances; an infinite one takes
+        all that its errors change.
+        """
+        w, is_open = spectrum.weights, np.isinf(ratio)
+        share = np.ones(len(w)) if is_open else np.sqrt(ratio * w / (1.0 + ratio * w))
+        axes = self.weigh(spectrum.columns) @ (spectrum.vectors * share)
+        taken = np.concatenate([self.taken, axes], axis=1)
+        return self._replace(taken=taken, degrees=self.degrees - (len(w) if is_open else 0))
 
 
 def _tail(values: FloatArray, counts: FloatArray) -> float:
