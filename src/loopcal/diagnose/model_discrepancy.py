@@ -311,10 +311,9 @@ def detect_slow_errors(
             break
         u, w = turned[best]
         # residuals that the errors cannot change say how large the noise is
-        rest, (weights, y) = len(residuals) - len(w), tests[best]
-        square = max(float(residuals @ residuals - y @ y), 0.0)
-        y = np.concatenate([y, np.full(rest, np.sqrt(square / max(rest, 1)))])
-        size = estimate_variance_component(np.pad(weights, (0, rest)), y, known)
+        y = tests[best][1]
+        rest = (max(float(residuals @ residuals - y @ y), 0.0), len(residuals) - len(y))
+        size = estimate_variance_component(w, y, known, rest)
         found.append(SlowError(groups[best], size, p_values[best]))
         # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
         shrink = 1.0 / np.sqrt(1.0 + size.ratio * w) - 1.0
