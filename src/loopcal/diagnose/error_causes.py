@@ -28,7 +28,13 @@ from loopcal.diagnose.residual_patterns import (
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.residual_test import FEWEST_DEGREES, count_sigma_degrees
 from loopcal.findings import Finding, report_finding
-from loopcal.numerics.statistics import UNSEEN, Remainder, VarianceComponent, compute_f_tail
+from loopcal.numerics.statistics import (
+    UNSEEN,
+    Remainder,
+    VarianceComponent,
+    compute_any_probability,
+    compute_f_tail,
+)
 from loopcal.typing import IntArray
 
 NOISE, OUTLIERS = "noise", "outliers"
@@ -48,7 +54,7 @@ class Cause(NamedTuple):
     second_probability: float
     effect: Effect | None  # None for outliers
     size: VarianceComponent | None  # of the effect, in columns of unit variance
-    p_value: float  # of such an effect by noise alone
+    p_value: float  # (Sidak) of such an effect by noise alone, in any of those that are compared
 
     @property
     def finding(self) -> Finding:
@@ -115,7 +121,7 @@ def compare_causes(
             continue
         effect = listed.pop(best - 2)
         spectrum, size = spectra[best - 2], sizes[best - 2]
-        p_value = spectrum.compute_tail(known)
+        p_value = compute_any_probability(spectrum.compute_tail(known), len(effects))
         causes.append(Cause(first, effect.name, *stated, effect, size, p_value))
         remainder = remainder.add(spectrum, size.ratio)
     return tuple(causes)
