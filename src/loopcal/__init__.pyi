@@ -4,7 +4,9 @@
 from .apply.accuracy import AccuracyMap as AccuracyMap
 from .apply.accuracy import AccuracySimulation as AccuracySimulation
 from .apply.accuracy import PoseUncertainty as PoseUncertainty
+from .apply.accuracy import VolumeAccuracy as VolumeAccuracy
 from .apply.accuracy import accuracy_map as accuracy_map
+from .apply.accuracy import bound_errors as bound_errors
 from .apply.accuracy import pose_uncertainty as pose_uncertainty
 from .apply.accuracy import simulate_accuracy as simulate_accuracy
 from .apply.calibration import calibrate as calibrate

@@ -52,3 +52,15 @@ def test_a_run_of_an_earlier_version_is_refused_with_what_to_do(loopcal, run):
     del content["expected_error"]["sources"]
     path.write_text(json.dumps(content))
     loopcal(f"budget {run}", "contains no uncertainty budget", code=1)
+
+
+def test_the_largest_error_in_a_volume_is_stated_for_all_points_and_for_each(loopcal, run, capsys):
+    volume = "--volume x=-20mm..20mm --volume y=-20mm..20mm"
+    loopcal(f"accuracy {run} {volume}", "at all points", "at each single point")
+    stated = json.loads(loopcal(f"accuracy {run} {volume} --frame base --json").out)
+    assert stated["simultaneous"] >= stated["pointwise"] > 0.0
+    assert stated["refinement"] < 0.01
+    wrong = {"x=-2mm..9m": "reaches", "x=3mm": "no range", "x=3..4": "no unit", "w=1deg..2deg": "x"}
+    for text, words in wrong.items():
+        assert main(["accuracy", str(run), "--volume", text]) == 1
+        assert words in capsys.readouterr().err

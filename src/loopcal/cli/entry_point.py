@@ -52,6 +52,7 @@ SECTIONS = {
         "report": ("calibration", "Write the report of a calibration as HTML, JSON and PDF."),
         "validate": ("calibration", "Validate a calibration, or a robot file, with measurements."),
         "repeatability": ("calibration", "Compute pose accuracy and repeatability by ISO 9283."),
+        "accuracy": ("calibration", "State the largest position error in a volume."),
         "budget": ("calibration", "Show the uncertainty of a calibration by source."),
         "compare": (
             "calibration",

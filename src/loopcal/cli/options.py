@@ -336,6 +336,30 @@ def frame(of: str, names: str = "fitted, base, relative, or the frame of an inst
     return option(help_text, of=of, metavar="NAME")
 
 
+def _parse_range(text: str) -> tuple[str, tuple[float, float]]:
+    """Return a controlled coordinate and its range [SI] in a text such as x=-40mm..40mm."""
+    match = re.fullmatch(r"(\w+)=(.+)\.\.(.+)", text)
+    if match is None:
+        raise UnitError(f"{text!r} is no range; write a coordinate and its ends: x=-40mm..40mm")
+    name, *ends = match.groups()
+    dimension = Dimension.LENGTH if name in ("x", "y", "z") else Dimension.ANGLE
+    low, high = (parse_quantity(end, dimension) for end in ends)
+    if not low < high:
+        raise UnitError(f"{text!r} ends below its beginning; give the smaller value first")
+    return name, (low, high)
+
+
+VOLUME: Any = option(
+    "Range of a controlled coordinate, such as x=-40mm..40mm; others stay at home. Give it once "
+    "for each coordinate of the volume.",
+    type=Parsed("range", _parse_range),
+    multiple=True,
+    required=True,
+    metavar="NAME=LOW..HIGH",
+    callback=lambda _context, _option, ranges: dict(ranges),
+)
+
+
 def _limit(kind: Parsed, quantity: str, example: str) -> Any:
     text = f"Largest allowed {quantity} error on poses that were not fitted, such as {example}"
     return option(f"{text}; above it the exit code is 2.", type=kind)

@@ -162,7 +162,7 @@ def sample_workspace(
     kept = tried = 0
     while kept < n or not tried:
         coordinates = draw_coordinates(rng, robot.controlled, wanted, max(n, MIN_DRAWS // 8))
-        good = _find_reachable(robot, coordinates, rejected)
+        good = find_reachable(robot, coordinates, rejected)
         batches.append(coordinates[good])
         kept, tried = kept + int(good.sum()), tried + len(coordinates)
         if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
@@ -207,7 +207,7 @@ def list_tilt_rings(robot: Mechanism, n: int) -> FloatArray:
         given["z"] = np.linspace(*ranges["z"], 3)[(ring + i) % 3]
     coordinates = np.column_stack([given[name] for name in robot.controlled])
     rejected: Counter[str] = Counter()
-    if not _find_reachable(robot, coordinates, rejected).all():
+    if not find_reachable(robot, coordinates, rejected).all():
         reason, count = rejected.most_common(1)[0]
         raise MechanismError(
             f"{robot.name} does not reach {count} of {n} poses on rings of equal tilt ({reason}); "
@@ -255,7 +255,7 @@ def draw_coordinates(
     return np.stack(columns, axis=-1)
 
 
-def _find_reachable(robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]) -> BoolArray:
+def find_reachable(robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]) -> BoolArray:
     """Return which rows the machine reaches (n,); count the reasons of the others."""
     values, solution = robot.values[None], inverse(robot, coordinates)
     good = np.array(solution.closed)

@@ -147,6 +147,24 @@ def budget(run: Path = opt.RUN) -> Output:
 
 
 @opt.command()
+def accuracy(
+    run: Path = opt.RUN,
+    volume: dict[str, tuple[float, float]] = opt.VOLUME,
+    frame: str = opt.frame("loopcal.apply.accuracy:bound_errors"),
+) -> Output:
+    """State the largest position error of the tool in a volume, with a confidence of 95 %.
+
+    The errors of all points of the volume are at most the first number together; the second holds
+    for each single point. Scatter of the readings is not contained. RUN is a run folder.
+
+    Examples:
+      loopcal accuracy run --volume x=-40mm..40mm --volume y=-40mm..40mm
+    """
+    stated = lc.bound_errors(lc.load_run(run).load_posterior(), volume, frame)
+    return Output(stated, lambda: str(stated).splitlines())
+
+
+@opt.command()
 def validate(
     run: Path = opt.RUN,
     data: tuple[Path, ...] = opt.data(),
