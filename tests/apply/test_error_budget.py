@@ -140,8 +140,16 @@ def test_a_stated_scale_of_the_instrument_is_as_large_as_the_true_errors_that_it
     assert budget.position.common > 0.95 * sum(budget.position)
     U = pose_uncertainty(fit, forward(fit.robot, solution.q)).expanded_position
     assert (errors <= U).mean() >= 0.93
-    # without the statement nothing contains them
+    # a noise that is stated twice too large says nothing of the scale
     (rows,) = data.observations
+    coarse = replace(data, observations=(replace(rows, covariance=4.0 * rows.covariance),))
+    fit = identify(gantry, coarse, MAP())
+    assert fit.residual_test.sigma_scale < 0.7
+    U = pose_uncertainty(fit, forward(fit.robot, solution.q)).expanded_position
+    assert (errors <= U).mean() >= 0.93
+    wide = find_budget(fit, coarse).position.rms
+    assert wide == pytest.approx(size, rel=3.0 / np.sqrt(2.0 * MACHINES))
+    # without the statement nothing contains them
     unstated = replace(data, observations=(replace(rows, kind=rows.kind.without_shared_errors()),))
     plain = identify(gantry, unstated, MAP())
     assert find_budget(plain, unstated).position.rms < 0.1 * size

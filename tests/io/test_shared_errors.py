@@ -411,3 +411,33 @@ def test_a_contradicted_scale_of_all_sessions_is_named_with_its_value():
     text = str(lc.check_conventions(DELTA, data).finding)
     assert re.search(r"put component.scale at (299|300)\d ppm", text)
     assert "not at 0 ppm (sd 2 ppm)" in text
+
+
+def test_units_of_files_do_not_matter_to_a_scale(tmp_path):
+    gantry = lc.load_robot("core-xy")
+    sensor = lc.Sensor(lc.Position(), lc.Gaussian([1e-6] * 3))
+    poses = sample_workspace(gantry, 20, 2).coordinates
+    data = lc.simulate(gantry, poses, lc.Instrument((sensor,)), 2)
+    save_measurements(data, tmp_path / "mm.csv", gantry)
+    lines = (tmp_path / "mm.csv").read_text("utf-8").splitlines()
+    head = next(i for i, line in enumerate(lines) if line.startswith("pose,"))
+    columns = lines[head].split(",")
+    rows = [line.split(",") for line in lines[head + 1 :]]
+    for j, name in enumerate(columns):
+        if name.endswith("[mm]"):
+            columns[j] = name.replace("[mm]", "[m]")
+            for row in rows:
+                row[j] = repr(float(row[j]) / 1000.0)
+    meters = "\n".join([*lines[:head], *(",".join(r) for r in [columns, *rows])]) + "\n"
+    (tmp_path / "m.csv").write_text("# scale: {sd: 2.5e-5 1}\n" + meters, "utf-8")
+    (tmp_path / "mm.csv").write_text("# scale: {sd: 25 um/m}\n" + "\n".join(lines) + "\n", "utf-8")
+    fits = [
+        identify(gantry, load_measurements(tmp_path / f"{name}.csv", gantry))
+        for name in ("mm", "m")
+    ]
+    sd = fits[0].standard_deviations
+    assert np.allclose(fits[0].estimate, fits[1].estimate, rtol=0.0, atol=1e-5 * sd.min())
+    assert np.allclose(sd, fits[1].standard_deviations, rtol=1e-6)
+    # the gantry does not know its size, and residuals below the noise say nothing of it
+    assert fits[1].residual_test.sigma_scale < 0.97
+    assert fits[1].nuisance.sd[0] == pytest.approx(25e-6, rel=0.01)

@@ -73,6 +73,7 @@ SOURCE_WORDS = {
     "residuals.depend-on-temperature": "temperature",
     "residuals.depend-on-reading": "dependence on a reading",
     "prior.inflation": "factor on the tolerances",
+    "noise.setup-as-stated": "stated setup parameters and common errors",
 }
 
 

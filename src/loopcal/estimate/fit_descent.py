@@ -476,6 +476,25 @@ def add_loss_uncertainty(
     return add_covariance(result, root, left, finding)
 
 
+def add_setup_uncertainty(result: Identification, fit: Descent) -> Identification:
+    """Return a fit with the uncertainty that was stated of setup parameters, such as a scale.
+
+    Residuals below the stated noise scale the covariance of all rows, by s^2, and so that of these
+    statements, of which they show nothing: 1 - s^2 of their part is added.
+    """
+    setup, test = result.nuisance, result.residual_test
+    stated = setup.table.free & ~np.isnan(setup.table.tolerance)
+    if not (result.converged and test.intervals and stated.any() and test.sigma_scale < 1.0):
+        return result
+    V, information = fit.decomposition.directions[0], fit.decomposition.singular_values[0] ** 2
+    rows = (setup.slope[stated] / setup.table.tolerance[stated, None]) @ V
+    used = fit.decomposition.used[0]
+    change = np.divide(rows, information + fit.penalty[0], out=np.zeros_like(rows), where=used)
+    root = np.sqrt(1.0 - test.sigma_scale**2) * (V @ change.T)
+    finding = report_finding("noise.setup-as-stated", scale=test.sigma_scale)
+    return add_covariance(result, result.tolerance[:, None] * root, np.inf, finding)
+
+
 def compute_loss_variance(
     loss: Loss, distance: FloatArray, counts: FloatArray, rank: int, unit: float = 1.0
 ) -> tuple[float, float]:

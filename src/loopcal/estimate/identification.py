@@ -23,6 +23,7 @@ from loopcal.estimate.descent import Descent, LinearModel, descend
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.fit_descent import (
     add_loss_uncertainty,
+    add_setup_uncertainty,
     fit_rows,
     fit_with_tolerances,
     get_method,
@@ -363,7 +364,7 @@ def identify(
     if fit.status[0] != DescentStatus.CONVERGED.value and unclosed.are_most:
         raise EstimationError(unclosed.report("fit.poses-open"))
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
-    result = add_factor_uncertainty(result, fit)
+    result = add_setup_uncertainty(add_factor_uncertainty(result, fit), fit)
     if options.loss is not None:
         result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
     findings = list(result.findings)
