@@ -8,7 +8,13 @@ import pytest
 from scipy.stats import kstest
 
 import loopcal as lc
-from evidence.assumptions.hexapod import ROBOT, draw_repeatability, make_backlash, measure_hexapod
+from evidence.assumptions.machines import (
+    SETUPS,
+    Effects,
+    draw_repeatability,
+    make_backlash,
+    measure_machine,
+)
 from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.diagnose.drive_errors import find_drive_errors, list_drive_effects, list_units
 from loopcal.diagnose.residual_patterns import collect_residual_rows
@@ -18,7 +24,14 @@ from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import EVIDENT
 
 SIGMA = (5e-6, 25e-6)  # [m, rad] of the instrument
+ROBOT = lc.load_robot("hexapod-42")
 REPEATABILITY, PLAY = draw_repeatability(6e-6), make_backlash(10e-6)
+
+
+def measure_hexapod(seed, sigma, poses=60, noise=1.0, error=None):
+    """Return a measured hexapod of which the drives have errors."""
+    setup = replace(SETUPS["hexapod, pose probe"], sigma=sigma, poses=poses)
+    return measure_machine(setup, seed, Effects(noise=noise, drives=error))
 
 
 def find_spectrum(linear):
