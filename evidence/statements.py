@@ -137,7 +137,7 @@ def tabulate(outcomes: dict[tuple[str, str], list[Outcome]]) -> dict[str, Any]:
         covered = np.array([outcome.covered for outcome in of_case])
         good = np.array([outcome.verdict is lc.Verdict.CALIBRATED for outcome in of_case])
         named = [any(c.startswith(case.causes) for c in o.findings) for o in of_case]
-        U, gap = 1e6 * np.sqrt(np.mean([outcome.squares for outcome in of_case], axis=0))
+        U, gap = 1e6 * np.sqrt(np.median([outcome.squares for outcome in of_case], axis=0))
         of_good = float(covered[good].mean()) if good.any() else None
         share = float(np.mean(named)) if case.causes else None
         is_met = covered.mean() >= COVERED or (
@@ -153,7 +153,8 @@ def tabulate(outcomes: dict[tuple[str, str], list[Outcome]]) -> dict[str, Any]:
             codes = sorted({code for codes in warned for code in codes})
             listed = ", ".join(f"{c} {100 * np.mean([c in w for w in warned]):.1f}" for c in codes)
             alarms.append([setup, len(of_case), 100.0 * np.mean([bool(w) for w in warned]), listed])
-    columns = ["machine and instrument", "case", "poses within U", "U [um]", "true error [um]",
+    columns = ["machine and instrument", "case", "poses within U", "U [um], rms",
+               "true error [um], rms",
                "within U, verdict calibrated", "verdict calibrated", "cause named",
                "met"]  # fmt: skip
     return {

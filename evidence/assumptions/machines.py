@@ -76,7 +76,7 @@ SETUPS = {
             lc.Position(targets=("a", "b", "c"), places=TARGETS, unknown=("frame",), frame=FRAME),
             (1e-5, 0.0), 40, True,
         ),
-        Setup("delta, points", "linear-delta", lc.Component(("x", "y", "z")), (1e-5, 0.0)),
+        Setup("delta, points", "linear-delta", lc.Component(("x", "y", "z")), (5e-6, 0.0)),
         Setup("delta, heights", "linear-delta", lc.Component(("z",)), (1e-5, 0.0), 60),
         Setup(
             "five-bar, camera", "five-bar",
