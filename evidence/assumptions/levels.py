@@ -3,20 +3,22 @@
 
 from __future__ import annotations
 
+from loopcal.estimate.false_alarms import FALSE_ALARMS
+
 STATED_LEVELS = {
-    "noise.doubtful": 0.01,
-    "noise.residuals-too-large": 0.001,
-    "noise.residuals-too-small": 0.001,
-    "outliers": 0.05,
-    "prior.components-inflated": 0.03,
-    "prior.tolerances": 0.01,
-    "residuals.common-errors": 0.01,
-    "residuals.heavy-tailed": 0.001,
-    "residuals.model-discrepancy": 0.05,
-    "residuals.patterns": 0.05,
-    "residuals.perhaps-correlated": 0.001,  # of results that were made before it was removed
+    "noise.doubtful": FALSE_ALARMS["doubtful noise"],
+    "noise.residuals-too-large": 0.5 * FALSE_ALARMS["noise"],
+    "noise.residuals-too-small": 0.5 * FALSE_ALARMS["noise"],
+    "outliers": FALSE_ALARMS["outliers"],
+    "prior.components-inflated": FALSE_ALARMS["tolerance components"],
+    "prior.tolerances": FALSE_ALARMS["tolerances"],
+    "residuals.common-errors": FALSE_ALARMS["common errors"],
+    "residuals.drive-errors": FALSE_ALARMS["errors of drives"],
+    "residuals.heavy-tailed": FALSE_ALARMS["heavy tails"],
+    "residuals.model-discrepancy": FALSE_ALARMS["model discrepancy"],
+    "residuals.patterns": FALSE_ALARMS["residual patterns"],
 }
-"""Stated probabilities of alarms where every assumption holds, by group of codes."""
+"""Stated probabilities of alarms where every assumption holds, by group of codes; together 5 %."""
 
 PATTERNS = ("drift", "trend", "sessions-differ", "depend-on", "correlated", "shared")
 """Beginnings of the codes of the residuals that share one level."""

@@ -14,12 +14,12 @@ from scipy.stats import binom
 import loopcal as lc
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.residual_patterns import (
-    FALSE_ALARMS,
     RHO,
     SHARE,
     collect_residual_rows,
     estimate_correlated_errors,
 )
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
@@ -177,7 +177,7 @@ def test_clean_data_change_nothing(sets):
         _, fit, result = fit_and_adjust("linear-delta", "component", errors, seed)
         changed += len(result.posterior.parts) > len(fit.posterior.parts)
     # all tests together, slow errors of the poses among them
-    assert changed <= binom.isf(1e-3, sets, FALSE_ALARMS)
+    assert changed <= binom.isf(1e-3, sets, sum(FALSE_ALARMS.values()))
 
 
 def test_correlated_residuals_do_not_mean_that_sigma_is_too_large():

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The study of broken assumptions: what it simulates, how it judges, and that its results hold."""
 
-import inspect
 import json
 
 import numpy as np
@@ -13,9 +12,7 @@ from evidence.assumptions.evaluation import evaluate_case, is_met
 from evidence.assumptions.levels import STATED_LEVELS, name_group
 from evidence.assumptions.simulation import describe_noise, simulate_case
 from loopcal import load_robot
-from loopcal.diagnose import residual_patterns
-from loopcal.diagnose.outliers import find_outliers
-from loopcal.estimate import prior_inflation, residual_test
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.measure.instrument import Gaussian
 from loopcal.studies.simulation.machines import AlteredNoise
 
@@ -125,16 +122,9 @@ def test_codes_of_one_level_form_one_group():
     assert name_group("fit.beyond-tolerance") == "fit.beyond-tolerance"
 
 
-def test_levels_of_the_study_are_those_of_the_code():
-    default = inspect.signature(find_outliers).parameters["level"].default
-    assert STATED_LEVELS["outliers"] == default
-    assert STATED_LEVELS["noise.doubtful"] == residual_test.DOUBT
-    assert STATED_LEVELS["noise.residuals-too-large"] == residual_test.SIGNIFICANCE
-    assert STATED_LEVELS["noise.residuals-too-small"] == residual_test.SIGNIFICANCE
-    assert STATED_LEVELS["prior.tolerances"] == prior_inflation.LEVEL
-    assert STATED_LEVELS["residuals.heavy-tailed"] == residual_test.SIGNIFICANCE
-    assert STATED_LEVELS["residuals.model-discrepancy"] == residual_patterns.LEVEL
-    assert STATED_LEVELS["residuals.patterns"] == residual_patterns.LEVEL
+def test_false_alarms_of_all_tests_are_5_percent():
+    assert sum(FALSE_ALARMS.values()) == pytest.approx(0.05)
+    assert set(STATED_LEVELS.values()) <= set(FALSE_ALARMS.values()) | {0.5 * FALSE_ALARMS["noise"]}
 
 
 @pytest.fixture(params=SCRIPTS.values())

@@ -17,6 +17,7 @@ from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.prior_inflation import (
     LEVEL,
+    PRIOR_ODDS,
     VARIANCES,
     ComponentSearch,
     compute_evidence,
@@ -88,7 +89,7 @@ def test_evidence_equals_that_of_dense_normal_densities(component, factor):
     gain = np.array([log_density(v) for v in VARIANCES]) - log_density(0.0)
     expected = np.log(np.mean(np.exp(gain)))
     alone = compute_evidence(predict(d, np.array([factor])), [component])[0, 0]
-    odds = 0.0 if component.kind == "shift" else np.log(1.0 / 3.0)
+    odds = np.log(PRIOR_ODDS[component.kind])
     if np.isfinite(alone):
         assert alone == pytest.approx(expected + odds, abs=1e-9)
     else:

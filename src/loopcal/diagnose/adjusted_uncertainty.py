@@ -42,6 +42,7 @@ from loopcal.diagnose.residual_patterns import (
     find_patterns,
 )
 from loopcal.diagnose.residual_patterns import MOST_POSES as EVEN_CHOICE
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import DOUBT as DOUBTFUL
@@ -269,7 +270,7 @@ def _without_doubt_of_sigma(fit: Identification) -> Identification:
     return replace(fit, findings=findings)
 
 
-LEVEL = 0.01  # probability that normal noise is reported; below `SIGNIFICANCE` it is a warning
+LEVEL = FALSE_ALARMS["heavy tails"]
 DRAWS, BATCH = 10_000, 500  # draws of normal errors at most, and at once
 DOUBT = 0.05  # probability from which no more draws are needed
 FEWEST = 5.0  # degrees of freedom of the residuals from which the test is made

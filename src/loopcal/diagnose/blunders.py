@@ -32,6 +32,7 @@ from loopcal.diagnose.outliers import (
     search_blocks,
 )
 from loopcal.errors import LoopcalError
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_descent import estimate_scale_of
 from loopcal.estimate.fit_linearization import FitUncertainty
 from loopcal.estimate.free_parameters import FreeParameters
@@ -48,7 +49,7 @@ from loopcal.units import Dimension
 
 # Probability of naming any block where none is wrong. It is small, because a named block changes
 # the verdict.
-LEVEL = 1e-3
+LEVEL = FALSE_ALARMS["held-out rows"]
 FOLDED = 10_000  # rows that are factorized at once
 # Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians.
 ANYWHERE = 1e3

@@ -28,6 +28,7 @@ from loopcal.diagnose.error_frames import (
     locate_measured_poses,
 )
 from loopcal.diagnose.outliers import TESTABLE
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.observation_rows import linked_blocks
@@ -101,8 +102,8 @@ def _pose_sessions(data: Measurements) -> IntArray:
 
 LIMIT = 1.5  # ratio of standard uncertainties above which the stated ones are too small
 # Probability, for independent errors, of a ratio as large as that of position or orientation,
-# below which the ratio is reported: 1 % of data sets for the two together.
-SIGNIFICANCE = 0.005
+# below which the ratio is reported.
+SIGNIFICANCE = 0.5 * FALSE_ALARMS["common errors"]
 # Share of the variance of poses by noise that residuals must be able to judge. The rest lies in
 # directions that one cluster alone determines.
 JUDGED = 0.5

@@ -25,6 +25,7 @@ from loopcal.diagnose.residual_patterns import (
     span_columns,
     test_effect,
 )
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import evaluate_rows
 from loopcal.estimate.residual_test import choose_severity, count_sigma_degrees
@@ -36,7 +37,7 @@ from loopcal.numerics.statistics import compute_single_level, find_distinct
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-LEVEL = 0.01
+LEVEL = FALSE_ALARMS["errors of drives"]
 """Probability that independent errors of the instrument show errors of the drives."""
 
 DOUBTED = 0.1

@@ -22,6 +22,7 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.diagnose.residual_patterns import order_by_time
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
@@ -32,7 +33,7 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Unit, find_unit
 
 # Probability, for each of the two tests, of a report although no frame and no target moved.
-LEVEL = 0.01
+LEVEL = 0.5 * FALSE_ALARMS["motion of frames"]
 TINY = 1e-99  # smallest probability that is written; a smaller one is stated as below this
 # Standard deviation of stated places [m], negligible beside the noise of any instrument.
 EXACT = 1e-9

@@ -26,7 +26,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.diagnose.residual_map import MapTest, check_map
-from loopcal.diagnose.residual_patterns import LEVEL
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy, combine_degrees
@@ -73,6 +73,8 @@ UNMEASURED_SHARE = 0.01
 # Length, in halves of the range, over which errors vary that no two poses share, and most poses
 # for these.
 ROUGH, MOST_ROUGH = 1e-3, 150
+# Probability that independent errors look like slow errors of the poses, over all tests of a fit.
+LEVEL = FALSE_ALARMS["model discrepancy"]
 # Probability without errors in a direction below which it has some, once its machine shows any.
 DIRECTION_LEVEL = 0.3
 FEWEST_REGIONS = 8  # with fewer, a quarter is not a share of the regions

@@ -29,6 +29,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.errors import LoopcalError
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_descent import estimate_scale_of, measure_block_distances
 from loopcal.estimate.identification import identify, prepare_fitted_data
 from loopcal.estimate.linearization import LeverageRows, Linearization, PoseSolution, Start
@@ -506,7 +507,7 @@ class OutlierCheck(TableResult):
 def find_outliers(
     fit: Identification,
     data: Measurements,
-    level: float = 0.05,
+    level: float = FALSE_ALARMS["outliers"],
     progress: Progress = report_no_progress,
 ) -> OutlierCheck:
     """Find the observation blocks that do not fit what all others predict.

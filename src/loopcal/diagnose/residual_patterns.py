@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import Linearization, PoseSolution
 from loopcal.estimate.problem import Problem
@@ -37,7 +38,6 @@ from loopcal.numerics.statistics import (
     choose_evenly,
     compute_any_probability,
     compute_f_tail,
-    compute_single_level,
     find_distinct,
 )
 from loopcal.typing import FloatArray, IntArray
@@ -368,11 +368,8 @@ def scale_to_range(values: FloatArray) -> FloatArray:
     return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
 
 
-# Probability that independent errors change the uncertainty of a fit: patterns or slow errors.
-FALSE_ALARMS = 0.05
-# Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the
-# same for slow errors of the poses (`model_discrepancy`).
-LEVEL = compute_single_level(FALSE_ALARMS, 2)
+# Probability that independent errors show any pattern, over all tests of a fit (Sidak).
+LEVEL = FALSE_ALARMS["residual patterns"]
 # Share of an effect that the parameters must leave in the residuals: with less, an effect that they
 # show is more than ten times as large as they are. Of readings where a probe touched a bed, the
 # rest is the noise of the probe itself.

@@ -34,6 +34,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.estimate.descent import Descent
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.penalties import MAP, Method
 from loopcal.estimate.posterior import TOLERANCES, CovariancePart, find_variance_sources
@@ -63,9 +64,9 @@ from loopcal.numerics.statistics import (
 from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray
 
-PRIOR_ODDS: Mapping[Kind, float] = {"shift": 1.0, "group": 1.0 / 3.0, "single": 1.0 / 3.0}
+PRIOR_ODDS: Mapping[Kind, float] = {"shift": 0.3, "group": 0.1, "single": 0.1}
 """Odds of each kind of component against none, before the data: parts of one batch and common zeros
-are frequent, the others less so. With these odds and right tolerances about 4 % of data sets get a
+are frequent, the others less so. With these odds and right tolerances about 1 % of data sets get a
 component.
 """
 
@@ -482,7 +483,7 @@ def _divide(decomposition: Decomposition, method: MAP) -> Decomposition:
     return divided.divided(estimate_excess_noise(divided))
 
 
-LEVEL = 0.01
+LEVEL = FALSE_ALARMS["tolerances"]
 """Probability that any of the tests rejects tolerances that are right."""
 
 FAR = 2.0

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail
@@ -39,12 +40,12 @@ tolerances: with 4 its own standard deviation is 35 %. Intervals account for it 
 LEVEL = 0.95
 """Coverage of the intervals called +/-."""
 
-SIGNIFICANCE = 1e-3
+SIGNIFICANCE = 0.5 * FALSE_ALARMS["noise"]
 """Probability below which a test rejects: residuals that do not agree with the noise, tolerances
 that do not agree with the data.
 """
 
-DOUBT = 1e-2
+DOUBT = FALSE_ALARMS["doubtful noise"]
 """Probability below which a test does not accept either."""
 
 NOTABLE = 0.05
