@@ -140,6 +140,13 @@ def test_few_rows_and_one_row_of_each_pose_name_no_cause_and_no_error():
     assert NOISE not in {cause.source for cause in find_causes(linear, kept)}
 
 
+def test_blocks_that_cross_all_regions_are_held_out_alone():
+    _, data = measure("linear-delta", "component", draw_errors(12, 3, 1), 1)
+    blocks, regions = np.arange(12) // 3, np.arange(12) % 3
+    fitted, held_out = replace(data, block=blocks).split(hold_out=0.25, seed=0, regions=regions)
+    assert (fitted.n_poses, held_out.n_poses) == (9, 3)
+
+
 def test_many_poses_are_compared_by_an_even_choice_and_widen_the_uncertainty_as_all():
     _, data = measure("hexapod-42", "tracker", share(2, 130, 3.0), 2)
     fit = adjust_uncertainty(identify(ROBOTS["hexapod-42"], data), data)

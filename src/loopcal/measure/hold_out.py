@@ -56,7 +56,7 @@ def choose_fitted(
     data: Measurements, hold_out: float, seed: int, regions: IntArray | None = None
 ) -> BoolArray:
     """Return which poses (n,) are fitted where a share is held out, by whole `data.undivided` and
-    whole regions (n,), if they are given.
+    whole regions (n,), if they are given; not by regions that link all poses with each other.
 
     Where the setup leaves less than half of the poses to hold out, sessions that need all of theirs
     are held out as a whole; where it leaves none then, it does not count. DataError where the poses
@@ -64,7 +64,8 @@ def choose_fitted(
     """
     unit, setup = np.unique(data.undivided, return_inverse=True)[1], _count_values(data)
     if regions is not None:
-        unit = _join(np.column_stack([unit, unit.max() + 1 + regions]), unit)
+        joined = _join(np.column_stack([unit, unit.max() + 1 + regions]), unit)
+        unit = joined if joined.max() > 0 else unit
     if unit.max() == 0:
         raise DataError(
             "cannot split measurements of a single block; measure more poses, or state smaller "
