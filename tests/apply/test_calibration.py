@@ -15,6 +15,7 @@ import pytest
 import loopcal as lc
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions, split_data
+from loopcal.apply.conformity import STATED
 from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, EstimationError
@@ -145,12 +146,14 @@ def test_too_few_held_out_poses_give_an_undecided_verdict(robot, data):
     assert few.data == {"count": 3, "needed": 5}
 
 
-def test_exceeded_limit_gives_the_verdict_not_calibrated(robot, data):
+def test_missed_limit_is_a_statement_beside_the_verdict(robot, data):
     report = calibrate(robot, data, CalibrationOptions(hold_out=0.25, limit_position=1e-7))
-    assert report.verdict is Verdict.NOT_CALIBRATED
+    assert report.verdict is Verdict.RESERVATIONS
     assert report.exit_code == 2
-    assert [f.code for f in report.failures] == ["gates.limit-exceeded"]
-    assert report.next_step.code == "workflow.next-measure-more"
+    assert [f.code for f in report.failures] == ["conformity.fails"]
+    assert report.headline.endswith("The limit of position is not met.")
+    assert report.recommendation.code == "values.apply"
+    assert report.next_step.code == "workflow.next-improve-accuracy"
 
 
 def test_outlier_gives_the_verdict_not_calibrated_and_is_the_next_step(robot, data):
@@ -232,7 +235,6 @@ def test_wrong_or_contradictory_arguments_are_refused(expected):
 
 
 SMALL = Quantity(0.003, "mm")
-JUDGED = ("estimate", "expanded", "low", "high", "limit", "guard_band", "acceptance_limit")
 UNDETERMINED = report_finding(
     "workflow.undetermined-combinations",
     count=1,
@@ -261,9 +263,9 @@ MISSING = report_finding("gates.limit-not-measured", quantity="orientation")
 EXCEEDED = report_finding(
     "gates.limit-exceeded", quantity="position", pose="32", target="", error=SMALL, limit=SMALL
 )
-CONFORMS = report_finding(
-    "conformity.conforms", quantity="position", count=12, probability=0.98, level=0.95,
-    **dict.fromkeys(JUDGED, SMALL),
+OPEN = report_finding(
+    "conformity.undecided", quantity="position", count=12, probability=0.5, most_probable=0.7,
+    level=0.95, pose="7", target="", error=SMALL, **dict.fromkeys(STATED, SMALL),
 )  # fmt: skip
 GROWN = report_finding("gates.errors-grew", quantity="position", times=1.4)
 
@@ -271,10 +273,12 @@ GROWN = report_finding("gates.errors-grew", quantity="position", times=1.4)
 def test_most_severe_finding_decides_the_verdict():
     undecided = report_finding("workflow.no-held-out-poses")
     info = report_finding("workflow.frame-freedoms", count=6, frames=("base",), still=0)
-    findings = (info, UNDETERMINED, undecided, MISSING)
+    findings = (info, UNDETERMINED, undecided, NOISE)
     verdicts = [decide_verdict(findings[:count]).name for count in (4, 3, 2, 1)]
     assert verdicts == ["NOT_CALIBRATED", "UNDECIDED", "RESERVATIONS", "CALIBRATED"]
-    assert [v.exit_code for v in Verdict] == [0, 0, 2, 0]
+    for limit, verdict in ((MISSING, Verdict.RESERVATIONS), (OPEN, Verdict.RESERVATIONS)):
+        assert decide_verdict((info, limit)) is verdict
+        assert decide_verdict((limit, undecided)) is Verdict.UNDECIDED
 
 
 @pytest.mark.parametrize(
@@ -302,20 +306,19 @@ def test_next_step_of_a_good_calibration_agrees_with_the_recommendation(
         ((NOISE,), {}, "check-noise"),
         ((NOISE, SESSIONS), {}, "check-residuals"),
         ((MISSING,), {}, "Measure orientation as well, or omit its limit."),
-        ((EXCEEDED,), {}, "measure-more"),
-        ((EXCEEDED, CONFORMS), {}, "less-noise"),
-        ((EXCEEDED, MISSING, CONFORMS), {}, "measure-more"),
+        ((EXCEEDED,), {}, "improve-accuracy"),
+        ((OPEN,), {}, "less-noise"),
+        ((OPEN, UNDETERMINED), {}, "resolve-warnings"),
+        ((EXCEEDED, MISSING), {}, "largest source of the expected position error"),
         # what no calibration reduces
         ((EXCEEDED,), {"position": 0.83, "orientation": 0.0}, "improve-machine"),
         ((EXCEEDED,), {"position": 0.83}, "83 % of the variance of the expected position error"),
-        ((EXCEEDED,), {"position": 0.4, "orientation": 0.9}, "measure-more"),
+        ((EXCEEDED,), {"position": 0.4, "orientation": 0.9}, "improve-accuracy"),
         ((EXCEEDED, GROWN), {"position": 0.83}, "measure-more"),
     ],
 )
 def test_next_step_is_what_would_help(findings, repeatability, expected):
-    is_failed = findings != (UNDETERMINED,)
-    verdict = Verdict.NOT_CALIBRATED if is_failed else Verdict.RESERVATIONS
-    step = choose_next_step(verdict, findings, (), APPLY, repeatability)
+    step = choose_next_step(decide_verdict(findings), findings, (), APPLY, repeatability)
     assert step.code == f"workflow.next-{expected}" or expected in str(step)
 
 

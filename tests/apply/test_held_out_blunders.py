@@ -228,7 +228,7 @@ def test_small_blunder_is_a_reservation_and_exceeded_limits_fail_with_it(robot, 
     options = CalibrationOptions(held_out=split[1].labels)
     assert calibrate(robot, wrong, options).verdict is Verdict.RESERVATIONS
     strict = calibrate(robot, wrong, replace(options, limit_position=30 * UM))
-    assert strict.verdict is Verdict.NOT_CALIBRATED
-    limit = get_finding(strict.findings, "gates.limit-exceeded")
+    assert (strict.verdict, strict.exit_code) == (Verdict.RESERVATIONS, 2)
+    limit = get_finding(strict.findings, "conformity.fails")
     assert (limit.data["pose"], limit.data["target"]) == (split[1].labels[WRONG], "a")
     assert strict.next_step.code == "workflow.next-check-held-out"

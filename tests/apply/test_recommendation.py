@@ -183,28 +183,32 @@ def test_values_of_doubtful_use_are_kept_until_held_out_poses_decide(printer) ->
         finding = recommend_values(Verdict.UNDECIDED, fitted.start, test, errors, findings)
         assert finding.code == code
     for degrees, code in ((1.0, "values.keep-doubtful-residuals"), (5.0, "values.apply-fitted")):
-        doubtful = replace(test, degrees=degrees, p_value=5e-3)
+        doubtful = replace(test, degrees=degrees, chi_square=25.0, p_value=5e-3)
         assert recommend_values(Verdict.UNDECIDED, fitted.start, doubtful, None).code == code
     others = lc.validate(fitted.identification, probe(printer, WRONG["radius by 0.5 mm"], 5))
     finding = recommend_values(Verdict.CALIBRATED, fitted.start, test, others, (no_gain,))
     assert finding.code == "values.apply"
 
 
-def test_p_value_of_a_gain_is_uniform_where_the_values_before_are_right(printer) -> None:
+@pytest.mark.parametrize("known", [(7.0, np.inf), (0.0, 0.0)], ids=["known noise", "unknown noise"])
+def test_probability_of_better_values_is_uniform_where_both_are_equally_good(
+    printer, known
+) -> None:
     rng = np.random.default_rng(6)
     rows = np.arange(6)
     kind = Component(("z",)).with_tool(printer.tool)
     observed = Observations.from_sigma(kind, rows, np.zeros((6, 1)), SIGMA)
-    change = SIGMA * rng.standard_normal((6, 1))
+    half = SIGMA * rng.standard_normal((6, 1))
     p_values = []
     for noise in 7.0 * SIGMA * rng.standard_normal((2000, 6, 1)):  # sigma is wrong by a factor of 7
-        errors = summarize_kinds(sum_kinds([observed], [noise], [noise - change]))[-1]
-        p_values.append(errors.compute_gain_p_value(6))
-    for level in (0.05, 0.5):
+        errors = summarize_kinds(sum_kinds([observed], [noise + half], [noise - half]))[-1]
+        p_values.append(errors.compute_better_probability(*known, 6))
+    for level in (0.05, 0.5, 0.95):
         share = np.mean(np.array(p_values) < level)
         assert share == pytest.approx(level, abs=4.0 * np.sqrt(level * (1.0 - level) / 2000))
-    nothing = summarize_kinds(sum_kinds([observed], [change], [change]))[-1]
-    assert np.isnan(nothing.compute_gain_p_value(1))
+    nothing = summarize_kinds(sum_kinds([observed], [half], [half]))[-1]
+    assert np.isnan(nothing.compute_better_probability(0.0, 0.0, 1))
+    assert nothing.compute_better_probability(*known, 6) == 0.5
 
 
 @pytest.mark.evidence
@@ -224,25 +228,32 @@ def test_wrong_values_are_replaced_in_the_same_printer_with_a_guessed_noise(prin
     assert f"Recommendation: {report.recommendation}" in str(report)
 
 
-def test_gain_is_standard_normal_where_the_values_before_are_right(printer) -> None:
-    rng = np.random.default_rng(5)
-    rows = np.arange(8)
-    kind = Component(("z",)).with_tool(printer.tool)
-    observed = Observations.from_sigma(kind, rows, np.zeros((8, 1)), SIGMA)
-    change = SIGMA * rng.standard_normal((8, 1))
-    gains = []
-    for noise in SIGMA * rng.standard_normal((2000, 8, 1)):
-        kinds = summarize_kinds(sum_kinds([observed], [noise], [noise - change]))
-        gains.append(kinds[-1].gain)
-    assert np.mean(gains) == pytest.approx(0.0, abs=4.0 / np.sqrt(2000))
-    assert np.std(gains) == pytest.approx(1.0, abs=4.0 / np.sqrt(4000))
-    size = float(np.linalg.norm(change)) / SIGMA
-    right_after = [
-        summarize_kinds(sum_kinds([observed], [noise + change], [noise]))[-1].gain
-        for noise in SIGMA * rng.standard_normal((2000, 8, 1))
-    ]
-    assert np.mean(right_after) == pytest.approx(size, abs=4.0 / np.sqrt(2000))
-    assert summarize_kinds(sum_kinds([observed], [change], [change]))[-1].gain == 0.0
+def list_map() -> np.ndarray:
+    """Return 145 points (n, 3) [m] of a height map, in rings."""
+    points = [(0.0, 0.0, 0.0)]
+    for i in range(1, 7):
+        angles = 2.0 * np.pi * np.arange(24) / 24 + i
+        points += [(0.0125 * i * np.cos(a), 0.0125 * i * np.sin(a), 0.0) for a in angles]
+    return np.array(points)
+
+
+@pytest.mark.parametrize("hold_out", [0.0, 0.25])
+def test_values_that_an_uneven_bed_explains_are_kept(printer, hold_out) -> None:
+    """The residuals vary slowly with the pose, and every nominal value is in its interval."""
+    points = list_map()
+    data = probe(printer, {}, 1, points=points)
+    (rows,) = data.observations
+    x, y = (points[:, i] / 0.075 for i in (0, 1))
+    bed = 80e-6 * (np.sin(3.0 * x + 1.0) * np.cos(2.0 * y) + 0.5 * np.cos(4.0 * y - x))
+    uneven = replace(data, observations=(replace(rows, measured=rows.measured + bed[:, None]),))
+    options = lc.CalibrationOptions(hold_out=hold_out, check_conventions=False)
+    report = lc.calibrate(printer, uneven, options)
+    assert report.identification.posterior.discrepancy is not None
+    assert report.recommendation.code.startswith("values.keep"), report
+    wrong = probe(printer, {"radius": 3e-3, "tower1.stop": 1e-3}, 1, points=points)
+    (rows,) = wrong.observations
+    uneven = replace(wrong, observations=(replace(rows, measured=rows.measured + bed[:, None]),))
+    assert lc.calibrate(printer, uneven, options).recommendation.code.startswith("values.apply")
 
 
 def test_values_that_held_out_poses_do_not_confirm_are_kept(printer) -> None:

@@ -195,10 +195,10 @@ def test_errors_without_an_actuator_are_not_compensable():
 def test_exceeded_limit_fails_with_quantity_and_limit(split_data):
     fit = identify(hexapod(), split_data[0])
     assert validate(fit, split_data[1], limit_position=0.01 * MM, limit_angle=1e-4).passed
-    failed = validate(fit, split_data[1], limit_position=1e-7, limit_angle=1e-4)
+    failed = validate(hexapod(), split_data[1], limit_position=1e-7, limit_angle=1e-2)
     assert not failed.passed
     (failure,) = failed.failures
-    assert failure.code == "gates.limit-exceeded"
+    assert failure.code == "conformity.fails"
     assert failure.data["quantity"] == "position"
     assert failure.data["limit"].value == pytest.approx(1e-4)
     assert failure.data["limit"].unit == "mm"

@@ -17,6 +17,7 @@ from loopcal.apply.verdict import (
     ALL_POSES,
     FEW_POSES,
     LEAVE_OUT,
+    LIMIT_MISSED,
     SEARCH_LEVEL,
     Verdict,
     choose_next_step,
@@ -146,9 +147,14 @@ class CalibrationReport(TableResult):
         return decide_verdict(self.findings)
 
     @property
+    def has_failed(self) -> bool:
+        """Whether the identified values are for no machine."""
+        return self.verdict is Verdict.NOT_CALIBRATED
+
+    @property
     def exit_code(self) -> int:
-        """2 where a quality gate is not met, else 0."""
-        return self.verdict.exit_code
+        """2 where a quality gate is not met, be it that of a limit, else 0."""
+        return 2 if self.failures else 0
 
     @property
     def failures(self) -> tuple[Finding, ...]:
@@ -225,9 +231,11 @@ class CalibrationReport(TableResult):
         """The verdict in one sentence."""
         fit = self.identification
         fitted, verdict = _count_fitted_poses(fit, self.split.fitted), self.verdict.value
+        missed = [str(f.data["quantity"]) for f in self.findings if f.code in LIMIT_MISSED]
         return (
             f"{verdict[0].upper()}{verdict[1:]}: {self.robot.name}, {len(fit.names)} parameters "
             f"from {name_count(fitted, 'pose')}."
+            + (f" The limit of {' and '.join(missed)} is not met." if missed else "")
         )
 
     def __str__(self) -> str:

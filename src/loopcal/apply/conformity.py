@@ -6,18 +6,20 @@ value alone accepts errors above the limit, or rejects errors below it, with an 
 probability of conformity is the one that the true error keeps the limit, given the measurement and
 its noise (JCGM 106:2012, section 7). The decision rule is that of ISO 14253-1: conformity needs at
 least this probability, 95 % by default, and so does nonconformity. In between the measurement
-decides nothing. In terms of the estimate, the rule is guarded acceptance: the acceptance limit is
-the limit less a guard band (JCGM 106, section 8).
+decides nothing. In terms of the estimate, both are guarded: the acceptance limit is the limit less
+a guard band, and the rejection limit is the limit plus another one (JCGM 106, section 8).
 
-For the largest of e errors: the true components are normal with variance tau^2, whose square root
-is not known (uniform prior), and the measured ones add noise with the stated covariance S_i. Given
-tau, the true error i is normal with
+For the largest of e errors: the true error i is normal with variance v_i = tau^2 / u_i, and the
+measured one adds noise of covariance S_i, the stated one times s^2. Neither tau, the u_i (over 4,
+chi-square of 4 degrees of freedom: some errors are larger than others) nor s is known. Given these,
 
-    V = (S_i^-1 + I / tau^2)^-1    and mean    V S_i^-1 d_i
+    V = (S_i^-1 + I / v_i)^-1    and mean    V S_i^-1 d_i
 
-and the largest is below L with the probability prod_i P(|t_i| < L). The square of an error has the
-distribution of a chi-square with the same first three moments (Imhof, Biometrika 48, 419, 1961, doi
-10.1093/biomet/48.3-4.419). Derivation: docs/theory/accuracy.md.
+describe the true error i, and the largest is below L with the probability prod_i P(|t_i| < L). What
+errors of few poses do not show, whether they are noise, is judged to the disadvantage of each
+statement by two priors of tau. The square of an error has the distribution of a chi-square with the
+same first three moments (Imhof, Biometrika 48, 419, 1961, doi 10.1093/biomet/48.3-4.419).
+Derivation: docs/theory/accuracy.md.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -35,7 +37,12 @@ from loopcal.errors import EstimationError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.observations import Observations
-from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct, invert_increasing
+from loopcal.numerics.statistics import (
+    compute_chi_square_quantile,
+    compute_chi_square_tail,
+    find_distinct,
+    invert_increasing,
+)
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray
@@ -45,11 +52,38 @@ LEVEL = 0.95  # probability that conformity and nonconformity need: the default 
 # Probabilities of the bounds of an interval, and of the estimate between them.
 INTERVAL = (0.025, 0.5, 0.975)
 # What findings state of an estimate with its interval, and of its limit.
-STATED = ("estimate", "expanded", "low", "high", "limit", "guard_band", "acceptance_limit")
+STATED = (
+    *("estimate", "expanded", "low", "high", "limit"),
+    *("guard_band", "acceptance_limit", "rejection_limit"),
+)
+STATED_NUMBERS = ("count", "probability", "most_probable", "level")
 NODES = 32  # values of tau in each of the two searches
-MOST = 2000  # errors that are compared one by one
-NEGLIGIBLE = 1e-6  # density of tau, in terms of the largest one, that is left out
-BISECTIONS = 24  # bisections of a quantile: each halves its interval
+MOST = 300  # errors that are compared one by one
+NEGLIGIBLE = 1e-4  # density of tau, in terms of the largest one, that is left out
+BISECTIONS = 20  # bisections of a quantile: each halves its interval
+LEAST_SPREAD = 0.03  # smallest tau, in terms of the noise
+
+
+class Spread(NamedTuple):
+    """What is known of true errors before they are measured.
+
+    slope : exponent of tau in its prior density over log(tau).
+    tails, shares : values of u_i, and their probabilities.
+    """
+
+    slope: float
+    tails: FloatArray
+    shares: FloatArray
+
+
+# Small errors are as probable as large ones: uniform in log(tau); all but a few are normal.
+SMALL = Spread(0.0, np.array([0.002, 0.05, 1.0]), np.array([0.005, 0.01, 0.985]))
+# Errors may be large: uniform in tau; and a few are larger than others: quantiles of chi-square of
+# 4 degrees of freedom over 4, which give errors the tails of Student's t.
+LARGE = Spread(
+    1.0, np.array([0.0517, 0.1338, 0.3047, 0.6175, 1.346]), np.array([0.01, 0.04, 0.15, 0.3, 0.5])
+)
+NOISE_QUANTILES = np.array([1.0, 3.0, 5.0]) / 6.0  # of its chi-square, where sigma is uncertain
 
 
 class Decision(Enum):
@@ -68,8 +102,9 @@ class Conformity(Result):
     ----------
     limit : largest allowed error [m] or [rad].
     estimate : the median of the true error. low, high : bounds of its interval of 95 %.
-    bound : the value that the true error keeps with the probability `level`.
-    probability : of conformity. level : that the decision rule asks for.
+    floor, bound : the values that the true error exceeds, and keeps, with the probability `level`.
+    probability, most_probable : of conformity, by what speaks against it and by what speaks for it.
+    level : probability that the decision rule asks for.
     count : number of errors, of which the largest is compared.
     """
 
@@ -77,14 +112,16 @@ class Conformity(Result):
     estimate: float
     low: float
     high: float
+    floor: float
     bound: float
     probability: float
+    most_probable: float
     level: float = LEVEL
     count: int = 1
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields(
-        *("limit", "estimate", "low", "high", "expanded", "probability", "level"),
-        *("guard_band", "acceptance_limit", "count"),
+        *("limit", "estimate", "low", "high", "floor", "bound", "expanded", "probability"),
+        *("most_probable", "level", "guard_band", "acceptance_limit", "rejection_limit", "count"),
         decision="decision.value",
         rule=lambda _: "ISO 14253-1, JCGM 106",
     )
@@ -111,11 +148,16 @@ class Conformity(Result):
         return self.limit - self.guard_band
 
     @property
+    def rejection_limit(self) -> float:
+        """The limit plus a guard band: estimates from it are rejected."""
+        return self.limit + self.estimate - self.floor
+
+    @property
     def decision(self) -> Decision:
         """What the rule decides."""
         if self.probability >= self.level:
             return Decision.CONFORMS
-        return Decision.FAILS if self.probability <= 1.0 - self.level else Decision.UNDECIDED
+        return Decision.FAILS if self.most_probable <= 1.0 - self.level else Decision.UNDECIDED
 
 
 def judge_estimate(
@@ -144,16 +186,21 @@ def judge_estimate(
             "of freedom cannot be compared; give finite numbers, and an uncertainty of 0 or more"
         )
     if uncertainty == 0.0:
-        return Conformity(
-            limit, estimate, estimate, estimate, estimate, float(estimate <= limit), level
-        )
+        p, x = float(estimate <= limit), estimate
+        return Conformity(limit, x, x, x, x, x, p, p, level)
     law = norm(estimate, uncertainty) if np.isinf(degrees) else t(degrees, estimate, uncertainty)
-    low, middle, high, bound = law.ppf([*INTERVAL, level])
-    return Conformity(limit, middle, low, high, bound, float(law.cdf(limit)), level)
+    low, middle, high, floor, bound = law.ppf([*INTERVAL, 1.0 - level, level])
+    probability = float(law.cdf(limit))
+    return Conformity(limit, middle, low, high, floor, bound, probability, probability, level)
 
 
 def judge_largest_error(
-    components: FloatArray, covariance: FloatArray, limit: float, level: float = LEVEL
+    components: FloatArray,
+    covariance: FloatArray,
+    limit: float,
+    level: float = LEVEL,
+    noise_scale: float = 1.0,
+    noise_degrees: float = np.inf,
 ) -> Conformity:
     """Compare the largest of e true errors with an upper limit.
 
@@ -162,6 +209,9 @@ def judge_largest_error(
     components : (e, c) measured differences [m] or [rad], NaN where not measured.
     covariance : (e, c, c) of their noise. limit : the upper limit.
     level : probability that the decision rule asks for.
+    noise_scale : factor s on the standard deviations of the noise; above 1 it speaks against
+        nonconformity, but not for conformity. noise_degrees : of freedom of s; infinite where it
+        is known.
 
     Raises
     ------
@@ -171,14 +221,24 @@ def judge_largest_error(
     mean, noise = _rotate(components, covariance)
     if not len(mean):
         raise EstimationError("no error is measured, so none can be compared with a limit")
-    exceed = _find_distribution(mean, noise)
-    size = np.sqrt((mean**2).sum(axis=1))
-    widest = 2.0 * float(size.max() + 10.0 * np.sqrt(np.nansum(noise, axis=1).max()))
-    low, estimate, high, bound = (
-        invert_increasing(exceed, p, widest, BISECTIONS) for p in (*INTERVAL, level)
+    # what exceeds the stated noise may be an error of the machine
+    large, small = (
+        _find_distribution(mean, noise, scale, noise_degrees, spread)
+        for scale, spread in ((min(noise_scale, 1.0), LARGE), (noise_scale, SMALL))
     )
+    size = np.sqrt((mean**2).sum(axis=1))
+    widest = 2.0 * float(size.max() + 10.0 * noise_scale * np.sqrt(np.nansum(noise, axis=1).max()))
+
+    def both(limit: float) -> float:
+        return 0.5 * (large(limit) + small(limit))
+
+    laws = zip((small, both, large, small, large), (*INTERVAL, 1.0 - level, level), strict=True)
+    low, middle, high, floor, bound = (
+        invert_increasing(law, p, widest, BISECTIONS) for law, p in laws
+    )
+    lowest, highest = sorted((large(limit), small(limit)))
     return Conformity(
-        limit, estimate, low, high, bound, float(exceed(limit)), level, count=len(mean)
+        limit, middle, low, high, floor, bound, lowest, highest, level, count=len(mean)
     )
 
 
@@ -186,22 +246,25 @@ def judge_limits(
     observations: Sequence[Observations],
     after: PoseErrors,
     limits: Mapping[str, float | None],
-    share: float = 1.0,
+    noise_scale: float = 1.0,
+    noise_degrees: float = np.inf,
 ) -> dict[str, Conformity]:
     """Compare the largest true error of each quantity with its limit.
 
     Nothing is said of a quantity that no row measures, or whose noise nobody stated.
 
     observations : the rows. after : their errors. limits : by quantity [m], [rad].
-    share : of the noise that the errors contain. It is below 1 where setup parameters were fitted
-        to the same rows and took up some of it.
+    noise_scale, noise_degrees : see `judge_largest_error`. The scale contains the share of the
+        noise that is left where setup parameters were fitted to the same rows.
     """
     judged = {}
     for quantity, limit in limits.items():
         covariance = _collect_covariance(observations, quantity)
         if limit is not None and covariance is not None and len(covariance):
             errors = after[quantity].components
-            judged[quantity] = judge_largest_error(errors, share * covariance, limit)
+            judged[quantity] = judge_largest_error(
+                errors, covariance, limit, LEVEL, noise_scale, noise_degrees
+            )
     return judged
 
 
@@ -210,23 +273,37 @@ def report_conformity(
     limits: Mapping[str, float | None],
     after: PoseErrors,
     units: Mapping[str, Unit],
+    poses: Sequence[str],
 ) -> list[Finding]:
-    """Return the statement on each limit, or why there is none."""
+    """Return the one statement on each limit: by the probability of conformity or, where nobody
+    stated the noise, by the measured error, noise included.
+
+    poses : (r,) labels of the rows.
+    """
     findings = []
     for quantity, limit in limits.items():
-        if limit is None or not len(after[quantity].rows):
+        errors = after[quantity]
+        if limit is None:
             continue
-        if quantity not in judged:
-            findings.append(report_finding("conformity.noise-not-stated", quantity=quantity))
+        if not len(errors.rows):
+            findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
             continue
-        result, unit = judged[quantity], units[quantity]
-        values: dict[str, Any] = {
-            name: Quantity(float(getattr(result, name)) / unit.factor_to_si, unit.symbol)
-            for name in STATED
+        worst, unit, result = int(np.argmax(errors.size)), units[quantity], judged.get(quantity)
+        numbers: dict[str, float] = {"error": float(errors.size[worst]), "limit": limit}
+        code = "gates.limit-exceeded" if numbers["error"] > limit else "gates.limit-kept"
+        stated: dict[str, Any] = {
+            "pose": poses[errors.rows[worst]],
+            "target": errors.targets[worst],
         }
-        values |= {name: getattr(result, name) for name in ("count", "probability", "level")}
-        code = f"conformity.{result.decision.name.lower()}"
-        findings.append(report_finding(code, quantity=quantity, **values))
+        if result is not None:
+            code = f"conformity.{result.decision.name.lower()}"
+            numbers |= {name: getattr(result, name) for name in STATED}
+            stated |= {name: getattr(result, name) for name in STATED_NUMBERS}
+        stated |= {
+            name: Quantity(float(number) / unit.factor_to_si, unit.symbol)
+            for name, number in numbers.items()
+        }
+        findings.append(report_finding(code, quantity=quantity, **stated))
     return findings
 
 
@@ -275,69 +352,84 @@ def _rotate(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray,
     return np.where(is_absent, 0.0, errors)[kept], variance[kept]
 
 
-def _find_distribution(errors: FloatArray, noise: FloatArray) -> Callable[[float], float]:
+def _find_distribution(
+    errors: FloatArray, noise: FloatArray, scale: float, degrees: float, spread: Spread
+) -> Callable[[float], float]:
     """Return the distribution function of the largest true error, from errors (e, c) and the
     variances (e, c) of their noise, NaN where not measured.
     """
-    tau, weight = _weigh_scales(errors, noise)
-    is_absent, scale = np.isnan(noise), tau[:, None, None] ** 2
-    total = np.where(is_absent, 1.0, noise) + scale
-    kept = np.where(is_absent, 0.0, scale / total)
-    variance = np.where(is_absent, 0.0, kept * noise)
+    variance, tau, weight, share = _weigh_scales(errors, noise, scale, degrees, spread)
+    is_absent, true = np.isnan(variance), tau[:, None, None, None] ** 2
+    true = true / spread.tails[:, None, None]
+    kept = np.where(is_absent, 0.0, true / (np.where(is_absent, 1.0, variance) + true))
+    left = np.where(is_absent, 0.0, kept * variance)
     square = (kept * errors) ** 2
-    moments = np.stack([(variance**k + k * variance ** (k - 1) * square) for k in (1, 2, 3)])
-    (mean, second, third), count = _group_similar(moments.sum(axis=3))
+    moments = np.stack([(left**k + k * left ** (k - 1) * square).sum(axis=-1) for k in (1, 2, 3)])
+    (mean, second, third, share), count = _group_similar(np.concatenate([moments, share[None]]))
     is_exact = second <= (1e-12 * mean) ** 2
     third = np.where(is_exact, 1.0, third)
-    degrees = np.where(is_exact, 1.0, second**3 / third**2)
-    unit = np.where(is_exact, 1.0, np.sqrt(second / degrees))
+    freedom = np.where(is_exact, 1.0, second**3 / third**2)
+    unit = np.where(is_exact, 1.0, np.sqrt(second / freedom))
 
     def probability(limit: float) -> float:
-        tail = compute_chi_square_tail(degrees, np.maximum((limit**2 - mean) / unit + degrees, 0.0))
-        tail = np.where(is_exact, mean > limit**2, tail)
+        tail = compute_chi_square_tail(freedom, np.maximum((limit**2 - mean) / unit + freedom, 0.0))
+        tail = (np.where(is_exact, mean > limit**2, tail) * share).sum(axis=1)
         with np.errstate(divide="ignore"):
-            total = float(np.exp((count * np.log1p(-tail)).sum(axis=1)) @ weight)
-        return min(total, 1.0)  # the weights add up to one but for rounding
+            each = np.exp((count * np.log1p(-np.minimum(tail, 1.0))).sum(axis=1))
+        return min(float(each @ weight), 1.0)  # the weights add up to one but for rounding
 
     return probability
 
 
 def _group_similar(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return moments (3, k, g) of squared errors and their counts: beyond `MOST` errors there are
-    groups of similar ones, but the largest errors stay single.
+    """Return moments and shares (4, g, k, e) of squared errors, and their counts: beyond `MOST`
+    errors there are groups of similar ones, but the largest errors stay single.
     """
-    e = moments.shape[2]
+    e = moments.shape[-1]
     if e <= MOST:
         return moments, np.ones(e)
     single = e - MOST // 2
     starts = np.linspace(0, single, MOST // 2, endpoint=False).astype(np.intp)
     starts = np.concatenate([find_distinct(starts), np.arange(single, e)])
     count = np.diff(starts, append=e).astype(np.float64)
-    order = np.argsort(moments[0, 0], kind="stable")
-    return np.add.reduceat(moments[:, :, order], starts, axis=2) / count, count
+    order = np.argsort(moments[0, 0, -1], kind="stable")
+    return np.add.reduceat(moments[..., order], starts, axis=-1) / count, count
 
 
-def _weigh_scales(errors: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return values (k,) of tau and their posterior probabilities (k,), by a search that finds
-    where the density is, and one that resolves it.
+def _weigh_scales(
+    errors: FloatArray, noise: FloatArray, scale: float, degrees: float, spread: Spread
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return g pairs of noise and tau: variances (g, 1, e, c) and tau (g,), their posterior
+    probabilities (g,), and of each error (g, k, e) those of the k `tails`.
+
+    A first search finds where the density is, and a second one resolves it.
     """
-    typical = float(np.sqrt(np.nanmean(noise)))
+    factors = scale**2 * np.ones(1)
+    if np.isfinite(degrees):
+        factors = scale**2 * degrees / compute_chi_square_quantile(degrees, NOISE_QUANTILES)
+    typical = float(np.sqrt(scale**2 * np.nanmean(noise)))
     largest = 10.0 * (float(np.abs(errors).max()) + typical)
     if typical == 0.0 or largest == 0.0:
-        return np.array([max(largest, 1.0)]), np.ones(1)
-    is_present = ~np.isnan(noise)
-    squares, variances = errors[is_present] ** 2, noise[is_present]
+        share = np.broadcast_to(spread.shares[:, None], (1, len(spread.shares), len(errors)))
+        return noise[None, None], np.full(1, max(largest, 1.0)), np.ones(1), share
 
-    def weigh(low: float, high: float) -> tuple[FloatArray, FloatArray]:
-        """Return logarithms of tau from low to high, and densities relative to the largest."""
+    def weigh(low: float, high: float) -> tuple[FloatArray, ...]:
+        """Return variances, tau, densities in terms of the largest, and shares."""
         nodes = np.linspace(low, high, NODES)
-        total = variances + np.exp(2.0 * nodes)[:, None]
-        density = nodes - 0.5 * (np.log(total) + squares / total).sum(axis=1)  # uniform in tau
-        return nodes, np.exp(density - density.max())
+        variance = np.repeat(factors, NODES)[:, None, None, None] * noise
+        tau = np.tile(np.exp(nodes), len(factors))
+        total = variance + tau[:, None, None, None] ** 2 / spread.tails[:, None, None]
+        each = -0.5 * np.nansum(np.log(total) + errors**2 / total, axis=-1)
+        each += np.log(spread.shares)[:, None]
+        best = each.max(axis=1, keepdims=True)
+        part = np.exp(each - best)
+        sums = part.sum(axis=1, keepdims=True)
+        density = (best + np.log(sums)).sum(axis=(1, 2)) + spread.slope * np.log(tau)
+        return variance, tau, np.exp(density - density.max()), part / sums
 
-    nodes, weight = weigh(math.log(1e-3 * typical), math.log(largest))
-    chosen = np.flatnonzero(weight > NEGLIGIBLE)
+    _, tau, weight, _ = weigh(math.log(LEAST_SPREAD * typical), math.log(largest))
+    chosen = np.flatnonzero((weight.reshape(len(factors), NODES) > NEGLIGIBLE).any(axis=0))
     first, last = max(chosen[0] - 1, 0), min(chosen[-1] + 1, NODES - 1)
-    nodes, weight = weigh(float(nodes[first]), float(nodes[last]))
+    variance, tau, weight, share = weigh(math.log(tau[first]), math.log(tau[last]))
     kept = weight > NEGLIGIBLE
-    return np.exp(nodes[kept]), weight[kept] / weight[kept].sum()
+    return variance[kept], tau[kept], weight[kept] / weight[kept].sum(), share[kept]

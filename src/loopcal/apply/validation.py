@@ -42,6 +42,7 @@ from loopcal.diagnose.row_errors import (
 )
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertainty
+from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY, ResidualTest
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.findings.wording import list_names, name_count, round_to_digits
@@ -50,7 +51,7 @@ from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.statistics import compute_chi_square_quantile, find_distinct
+from loopcal.numerics.statistics import compute_f_quantile, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore
@@ -73,6 +74,26 @@ PREFIX = "held_out"
 
 
 @dataclass(frozen=True)
+class NoiseKnowledge:
+    """What a calibration knows of the noise of measurements: the factor on the stated sigmas, and
+    its degrees of freedom, see `loopcal.estimate.residual_test`.
+    """
+
+    scale: float = 1.0
+    degrees: float = 0.5 / SIGMA_UNCERTAINTY**2
+
+    @classmethod
+    def of(cls, test: ResidualTest) -> NoiseKnowledge:
+        """Return what the residuals of a fit show; sigma as stated where they show nothing, or are
+        larger than noise can be.
+        """
+        if test.failed:
+            return cls(degrees=test.stated_degrees)
+        is_known = test.sigma_scale > 0.0 and test.noise_degrees > 0.0
+        return cls(test.sigma_scale, test.noise_degrees) if is_known else cls()
+
+
+@dataclass(frozen=True)
 class ErrorChange:
     """The rms error of one quantity before and after calibration."""
 
@@ -81,6 +102,7 @@ class ErrorChange:
     after: float
     noise_floor: float
     values: int  # number of measured components
+    noise: NoiseKnowledge = NoiseKnowledge()
 
     @property
     def times(self) -> float:
@@ -99,8 +121,9 @@ class ErrorChange:
     @property
     def largest_noise(self) -> float:
         """The rms that noise alone exceeds with the probability `NOISE_LEVEL`."""
-        square = compute_chi_square_quantile(max(self.values, 1), NOISE_LEVEL) / max(self.values, 1)
-        return self.noise_floor * float(np.sqrt(square))
+        degrees = np.nan_to_num(self.noise.degrees, nan=np.inf)  # infinity is no number of JSON
+        square = compute_f_quantile(max(self.values, 1), degrees, NOISE_LEVEL)
+        return self.noise_floor * self.noise.scale * float(np.sqrt(square))
 
     @property
     def is_noise(self) -> bool:
@@ -136,6 +159,7 @@ class Validation(DrawnResult):
     setup_count : number of setup parameters that were fitted to these rows.
     absorbed : number of residuals that estimated poses take up, where a reading is missing.
     judged : number of poses whose rows or redundant readings are compared.
+    noise : what the calibration knows of the noise of these rows.
     blunders : poses that neither the calibration nor the others explain. They are part of all
         statistics; `without_blunders` are the statistics without them, None where there are none.
     conformity : by quantity with a limit, the largest true error and the probability that it keeps
@@ -164,6 +188,7 @@ class Validation(DrawnResult):
     blunders: tuple[Blunder, ...] = ()
     without_blunders: Validation | None = None
     conformity: Mapping[str, Conformity] = field(default_factory=dict)
+    noise: NoiseKnowledge = NoiseKnowledge()
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("poses", "before", "after", "commanded_before", "commanded_after"),
@@ -174,7 +199,7 @@ class Validation(DrawnResult):
             notes=lambda v: [str(f) for f in v.findings if f.severity is not Severity.FAILURE],
         ),
         *fields("findings", "blunders", without_blunders=lambda v: v._list_without_blunders()),
-        *fields("frame", "alignment", "kinds", "setup_count", "absorbed", "judged"),
+        *fields("frame", "alignment", "kinds", "setup_count", "absorbed", "judged", "noise"),
         *(
             Field(name, lambda v, i=i: [row[i] for row in v.list_sizes()], "row")
             for i, name in enumerate(("pose", "target", "quantity", "unit", "before", "after"))
@@ -229,13 +254,15 @@ class Validation(DrawnResult):
         """
         if self.has_several_kinds or not self.quantities:
             weighted = self.kinds[-1]
-            return {"weighted": ErrorChange(weighted.before, weighted.after, 1.0, weighted.count)}
+            rms = (weighted.before, weighted.after, 1.0, weighted.count)
+            return {"weighted": ErrorChange(*rms, self.noise)}
         return {
             quantity: ErrorChange(
                 self.before.statistics(quantity).rms,
                 errors.statistics.rms,
                 self.noise_floor.rms[quantity],
                 int(np.isfinite(errors.components).sum()),
+                self.noise,
             )
             for quantity, errors in self.after.quantities.items()
         }
@@ -343,10 +370,12 @@ def validate(
     check_limit("limit_position", limit_position)
     check_limit("limit_angle", limit_angle)
     robot, old, nuisance = fit, before, None
+    noise = NoiseKnowledge(1.0 if uncertainty is None else uncertainty.noise_scale)
     reused = []
     if isinstance(fit, Identification):
         robot, old, nuisance = fit.robot, before or fit.initial, fit.nuisance
         uncertainty = collect_uncertainty(fit) if uncertainty is None else uncertainty
+        noise = NoiseKnowledge.of(fit.residual_test)
         reused = [] if are_rows_known else _report_reused(fit.posterior.fitted_rows, data)
     assert isinstance(robot, Mechanism)
     check_actuators(data, robot)
@@ -381,22 +410,23 @@ def validate(
             raise DataError(unpredicted[0])
         compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
     limits = {"position": limit_position, "orientation": limit_angle}
-    result = _summarize(robot, compared, limits)
+    result = _summarize(robot, compared, limits, noise)
     blunders = _find_blunders(robot, compared, uncertainty)
     rest = None
     if blunders:
         named = {label for blunder in blunders for label in blunder.poses}
         wrong = np.array([label in named for label in data.labels])
-        rest = _summarize(robot, compared.without(wrong), limits)
+        rest = _summarize(robot, compared.without(wrong), limits, noise)
     left_out = ~compared.usable & compared.predictable
-    share = max(result.values_left, 0) / max(result.kinds[-1].count, 1)
-    conformity = judge_limits(compared.data.observations, result.after, limits, share)
+    left = np.sqrt(max(result.values_left, 0) / max(result.kinds[-1].count, 1))
+    conformity = judge_limits(
+        compared.data.observations, result.after, limits, left * noise.scale, noise.degrees
+    )
     return replace(
         result,
         unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
         findings=(
-            *_check_limits(result, limits),
-            *report_conformity(conformity, limits, result.after, result.units),
+            *report_conformity(conformity, limits, result.after, result.units, result.poses),
             *_report_blunders(blunders, result, rest),
             *unpredicted,
             *reused,
@@ -413,7 +443,10 @@ def validate(
 
 
 def _summarize(
-    robot: Mechanism, compared: PredictionComparison, limits: Mapping[str, float | None]
+    robot: Mechanism,
+    compared: PredictionComparison,
+    limits: Mapping[str, float | None],
+    noise: NoiseKnowledge,
 ) -> Validation:
     """Return the errors of a comparison, without findings."""
     rows = compared.data.observations
@@ -438,6 +471,7 @@ def _summarize(
         setup_count=compared.after.fitted_count,
         absorbed=int(compared.absorbed.sum()),
         judged=compared.count_judged(),
+        noise=noise,
     )
 
 
@@ -447,34 +481,6 @@ def find_error_units(robot: Mechanism, errors: PoseErrors) -> dict[str, Unit]:
 
 
 # Limits.
-
-
-def _check_limits(errors: Validation, limits: Mapping[str, float | None]) -> list[Finding]:
-    """Report limits that the largest error exceeds, and limits on what no row measures."""
-    findings = []
-    for quantity, limit in limits.items():
-        of_rows = errors.after[quantity]
-        if limit is None:
-            continue
-        if not len(of_rows.rows):
-            findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
-            continue
-        worst, size, unit = int(np.argmax(of_rows.size)), of_rows.size.max(), errors.units[quantity]
-        if size > limit:
-            error, allowed = (
-                Quantity(float(x) / unit.factor_to_si, unit.symbol) for x in (size, limit)
-            )
-            findings.append(
-                report_finding(
-                    "gates.limit-exceeded",
-                    quantity=quantity,
-                    pose=errors.poses[of_rows.rows[worst]],
-                    target=of_rows.targets[worst],
-                    error=error,
-                    limit=allowed,
-                )
-            )
-    return findings
 
 
 # Setup parameters: frames, targets, surfaces and offsets.

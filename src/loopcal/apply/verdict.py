@@ -7,12 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from enum import Enum
+from typing import Any
 
 from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation import FEW_ROWS, Validation
 from loopcal.diagnose.fit_examination import StartCheck, StartVerdict
 from loopcal.diagnose.gauge_freedoms import report_undetermined
-from loopcal.estimate.residual_test import SIGNIFICANCE, ResidualTest, coverage_factor
+from loopcal.estimate.residual_test import LEVEL, SIGNIFICANCE, ResidualTest
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure.kinds.joints import Closure
@@ -37,11 +38,11 @@ LEAVE_OUT = "values.leave-out"  # recommendation to calibrate without a wrong po
 # Number of poses up to which one that is wrong changes the values by more than their uncertainty.
 FEW_POSES = 50
 SEARCH_LEVEL = 0.001  # probability of excluding a pose of all where none is wrong
-LIMIT_EXCEEDED = "gates.limit-exceeded"  # finding that an error is above a stated limit
 # Finding that a limit was stated for something that no row measures.
 LIMIT_NOT_MEASURED = "gates.limit-not-measured"
-# Finding that an error without the noise of its measurement keeps a limit.
-CONFORMS = "conformity.conforms"
+# Findings that a limit is not met: a statement beside the verdict, which is about the geometry.
+LIMIT_MISSED = {"conformity.fails", "gates.limit-exceeded", LIMIT_NOT_MEASURED}
+LIMIT_OPEN = "conformity.undecided"  # finding that noise leaves open whether a limit is kept
 # Finding that heights fit with either sign: the wrong one leads to the wrong geometry.
 SIGN_UNDECIDED = "conventions.height-sign-undecided"
 # Next step of a good calibration whose values are not recommended.
@@ -155,37 +156,37 @@ class Verdict(Enum):
     NOT_CALIBRATED = "not calibrated"
     UNDECIDED = "undecided"
 
-    @property
-    def exit_code(self) -> int:
-        """Exit code of a command with this verdict: 2 where a quality gate is not met, else 0."""
-        return 2 if self is Verdict.NOT_CALIBRATED else 0
-
 
 def decide_verdict(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict that findings lead to.
 
-    1. Not calibrated: any failure. Failures are a fit that did not converge, a geometry that
-       reaches no held-out pose, residuals that contradict the stated noise, an estimated noise
-       that explains everything, errors on held-out poses that grew by more than 10 % and beyond
-       noise (without poses that do not fit), and a limit that is exceeded at any held-out pose.
+    1. Not calibrated: any failure but that of a limit. Failures are a fit that did not converge, a
+       geometry that reaches no held-out pose, residuals that contradict the stated noise and its
+       uncertainty, an estimated noise that explains everything, and errors on held-out poses that
+       grew by more than 10 % and beyond noise (without poses that do not fit).
     2. Undecided: no pose was held out, or too few to judge an error, or the setup parameters that
        were fitted to them leave no measured value to check, or poses that do not fit dominate the
        errors.
     3. Calibrated with reservations: any warning, such as outliers, a prior that the data
-       contradict, or undetermined parameter combinations that change poses.
+       contradict, or undetermined parameter combinations that change poses; or a missed limit.
     4. Calibrated: everything else.
 
     The first rule that applies decides.
     """
     findings = tuple(findings)
     severities, codes = {f.severity for f in findings}, {f.code for f in findings}
-    if Severity.FAILURE in severities:
+    if list_failures(findings) - LIMIT_MISSED:
         return Verdict.NOT_CALIBRATED
     if codes & TOO_LITTLE_VALIDATION:
         return Verdict.UNDECIDED
-    if Severity.WARNING in severities:
+    if severities & {Severity.WARNING, Severity.FAILURE}:
         return Verdict.RESERVATIONS
     return Verdict.CALIBRATED
+
+
+def list_failures(findings: Iterable[Finding]) -> AbstractSet[str]:
+    """Return the codes of quality gates that are not met."""
+    return {f.code for f in findings if f.severity is Severity.FAILURE}
 
 
 def choose_next_step(
@@ -205,57 +206,55 @@ def choose_next_step(
     is_applied = verdict is not Verdict.NOT_CALIBRATED and recommendation.startswith("values.apply")
     if is_applied and SIGN_UNDECIDED in codes:
         return report_finding("workflow.next-check-height-sign")
+    failed = list_failures(findings)
+    warned = {f.code for f in findings if f.severity is Severity.WARNING}
+    if failed | warned and failed <= LIMIT_MISSED and warned <= {LIMIT_OPEN}:
+        return _choose_limit_step(failed, findings, repeatability or {})
     if verdict is Verdict.CALIBRATED:
         return report_finding(NEXT_WITH_VALUES.get(recommendation, "workflow.next-use-result"))
     if codes & BASE_MOVED:
         return report_finding("workflow.next-check-base-targets")
     wrong = dict.fromkeys(label for f in findings if f.code == BLUNDER for label in f.data["poses"])
-    if wrong and verdict is not Verdict.RESERVATIONS:
+    if wrong and (failed or verdict is not Verdict.RESERVATIONS):
         poses = tuple(f"pose {label}" for label in wrong)
         return report_finding("workflow.next-check-held-out", poses=poses)
     if verdict is Verdict.UNDECIDED:
-        if recommendation == "values.keep-doubtful-residuals":  # too few poses to hold any out
-            return report_finding("workflow.next-measure-more")
-        if codes & TOO_FEW_HELD_OUT:
-            return report_finding("workflow.next-hold-out-more")
-        return report_finding("workflow.next-hold-out")
+        more = "hold-out-more" if codes & TOO_FEW_HELD_OUT else "hold-out"
+        # too few poses to hold any out
+        is_doubtful = recommendation == "values.keep-doubtful-residuals"
+        return report_finding(f"workflow.next-{'measure-more' if is_doubtful else more}")
     if outliers:
         poses = tuple(f"pose {label}" for label in outliers)
         return report_finding("workflow.next-check-outliers", poses=poses)
     if verdict is Verdict.RESERVATIONS:
         return report_finding("workflow.next-resolve-warnings")
-    failed = {f.code for f in findings if f.severity is Severity.FAILURE}
     if any(code.startswith("fit.") for code in failed) or "gates.poses-unreachable" in failed:
         return report_finding("workflow.next-check-data")
     if any(code.startswith("noise.") for code in failed):
         if codes & DEPENDENT:
             return report_finding("workflow.next-check-residuals")
         return report_finding("workflow.next-check-noise")
-    limits = _choose_limit_step(failed, findings, repeatability or {})
-    return limits or report_finding("workflow.next-measure-more")
+    return report_finding("workflow.next-measure-more")
 
 
 def _choose_limit_step(
     failed: AbstractSet[str], findings: Sequence[Finding], repeatability: Mapping[str, float]
-) -> Finding | None:
-    """Return the next step where only limits fail; None without a better one than to measure more.
+) -> Finding:
+    """Return the next step where nothing but limits is missed or open.
 
     failed : codes of the failures. repeatability : see `choose_next_step`.
     """
-    of_limits = [f for f in findings if f.code in (LIMIT_NOT_MEASURED, LIMIT_EXCEEDED)]
-    quantities = [str(f.data["quantity"]) for f in of_limits]
-    listed = " and ".join(quantities)
-    if failed == {LIMIT_NOT_MEASURED}:
-        return report_finding("workflow.next-measure-quantity", quantity=listed)
-    if failed != {LIMIT_EXCEEDED}:
-        return None
-    if set(quantities) <= {f.data["quantity"] for f in findings if f.code == CONFORMS}:
-        return report_finding("workflow.next-less-noise", quantity=listed)
+    step, codes = "less-noise", {LIMIT_OPEN}
+    if failed:
+        is_measured = failed != {LIMIT_NOT_MEASURED}
+        step = "improve-accuracy" if is_measured else "measure-quantity"
+        codes = failed - {LIMIT_NOT_MEASURED} if is_measured else failed
+    quantities = [str(f.data["quantity"]) for f in findings if f.code in codes]
     for quantity in quantities:
         share = repeatability.get(quantity, 0.0)
-        if share > 0.5:
+        if step == "improve-accuracy" and share > 0.5:
             return report_finding("workflow.next-improve-machine", share=share, quantity=quantity)
-    return None
+    return report_finding(f"workflow.next-{step}", quantity=" and ".join(quantities))
 
 
 # Whether a machine is given the identified values or keeps its current ones.
@@ -270,6 +269,9 @@ def recommend_values(
 ) -> Finding:
     """Return the recommendation to apply the identified values or to keep the current ones.
 
+    Values are applied that are better beyond the stated uncertainty at the fitted poses, and at the
+    held-out ones with the probability `LEVEL`.
+
     start : the current values against the fit. residual_test : of the fit, for the scale of the
         noise. errors : at held-out poses; None without any. findings : of the calibration.
     """
@@ -283,14 +285,16 @@ def recommend_values(
         if is_open:
             return report_finding("values.keep-undecided")
         return report_finding(_judge_fitted(residual_test, findings))
+    known = (0.0, 0.0) if is_open else (checked.noise.scale, checked.noise.degrees)
+    every = checked.kinds[-1]
+    probability = every.compute_better_probability(*known, checked.values_left)
     if is_open:
-        p_value = checked.kinds[-1].compute_gain_p_value(checked.values_left)
-        code = "values.apply-held-out" if p_value < SIGNIFICANCE else "values.keep-undecided"
-        return report_finding(code, p_value=p_value, poses=checked.judged)
-    gain = checked.kinds[-1].gain / residual_test.sigma_scale
-    needed = coverage_factor(residual_test.noise_degrees)
-    code = "values.apply" if gain >= needed else "values.keep-not-confirmed"
-    return report_finding(code, gain=gain, needed=float(needed), poses=checked.judged)
+        # nothing but the held-out poses speaks for the values
+        code = "apply-held-out" if 1.0 - probability < SIGNIFICANCE else "keep-undecided"
+    else:
+        code = "apply" if probability >= LEVEL else "keep-not-confirmed"
+    stated: dict[str, Any] = {"probability": probability, "needed": LEVEL}
+    return report_finding(f"values.{code}", poses=checked.judged, **stated)
 
 
 def _judge_fitted(test: ResidualTest, findings: Iterable[Finding]) -> str:

@@ -23,6 +23,7 @@ from loopcal.diagnose.error_frames import (
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.residual_patterns import collect_residual_rows
+from loopcal.diagnose.value_comparison import compare_with_truth
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
@@ -397,6 +398,9 @@ def check_start_values(fit: Identification) -> StartCheck:
     if test.sigma_scale > 0.0:
         each = gain / fit.rank / test.sigma_scale**2
         p_value = float(compute_f_tail(fit.rank, test.noise_degrees, each))
+    if p_value < SIGNIFICANCE and any(part.is_added for part in fit.posterior.parts):
+        # errors that the residuals show beside noise explain a gain, too
+        p_value = max(p_value, compare_with_truth(fit, fit.initial.values).p_value)
     ratio = float(before / after) if after > 0.0 else None
     if p_value < SIGNIFICANCE:
         return judged(StartVerdict.NOT_CALIBRATED, p_value, "not-calibrated", ratio=ratio)

@@ -41,6 +41,7 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 MOST_COMPONENTS = 3  # components of the largest error
+MOST_DEGREES = 1e10  # of Student's t, beyond which it is normal
 # Kind of the readings of redundant actuators, which must agree on one pose.
 READINGS = "actuator readings"
 
@@ -241,37 +242,39 @@ class KindErrors:
 
     @property
     def gain(self) -> float:
-        """How clearly the geometry after calibration is the better one [standard deviations].
+        """By how much the geometry after calibration predicts these rows better [sigma].
 
-        With the whitened residuals b of the geometry before and the change d = b - a: b.d / |d|.
-        Where the geometry before is the truth, b is noise, and this has the standard normal
-        distribution, if d was estimated from other rows. Where the one after is the truth, the mean
-        is |d|. 0 where the predictions are equal.
+        With the whitened residuals b and a of the geometries before and after, and d = b - a:
+        (|b|^2 - |a|^2) / (2 |d|). The true errors b' and a' contain no noise n, so that
+        (|b'|^2 - |a'|^2) / (2 |d|) is this plus n.d / |d|, which is standard normal where d was
+        estimated from other rows. 0 where the predictions are equal.
         """
         if self.change == 0.0:
             return 0.0
-        product = 0.5 * (self.before**2 - self.after**2 + self.change**2)
-        return float(np.sqrt(self.count) * product / self.change)
+        return float(np.sqrt(self.count)) * (self.before**2 - self.after**2) / (2.0 * self.change)
 
-    def compute_gain_p_value(self, values: int) -> float:
-        """Return the probability of such a gain where the geometry before is the truth.
+    def compute_better_probability(
+        self, noise_scale: float, noise_degrees: float, values: int
+    ) -> float:
+        """Return the probability that the geometry after calibration predicts these rows better,
+        without their noise; NaN where too little is known.
 
-        It is the same whatever the noise is, and NaN where too few values are left. With
-        g = b.d / |d| as in `gain`, the rest |b|^2 - g^2 of b is independent of g and has one
-        degree of freedom less than b, so g over the root mean square of the rest has Student's t
-        distribution: a common factor of all sigmas cancels.
-
+        noise_scale, noise_degrees : factor on the stated sigmas, and its degrees of freedom. With
+            none, the part of b that is orthogonal to d is the noise: equal for both geometries.
         values : measured values that are left to check the geometry.
         """
         from scipy.special import stdtr
 
-        degrees = min(self.count, values) - 1
-        if degrees < 1 or not np.isfinite(self.change):
+        scale, degrees = noise_scale, noise_degrees
+        if not noise_degrees > 0.0:
+            along = 0.5 * self.change * np.sqrt(self.count) + self.gain  # b.d / |d|
+            degrees = min(self.count, values) - 1
+            scale = np.sqrt(max(self.count * self.before**2 - along**2, 0.0) / max(degrees, 1))
+        if not degrees >= 1 or not np.isfinite(self.gain):
             return float("nan")
-        rest = max(self.count * self.before**2 - self.gain**2, 0.0)
-        if rest == 0.0:
-            return 0.0 if self.gain > 0.0 else 1.0
-        return float(stdtr(degrees, -self.gain / np.sqrt(rest / degrees)))
+        if scale == 0.0 or self.gain == 0.0:
+            return 0.5 + 0.5 * float(np.sign(self.gain))
+        return float(stdtr(min(degrees, MOST_DEGREES), self.gain / scale))
 
 
 def compute_statistics(values: FloatArray) -> Statistics:

@@ -96,7 +96,7 @@ IMPORTANCE = """
 fit.bad-start fit.no-descent fit.no-progress fit.out-of-iterations
 gates.poses-unreachable gates.errors-grew
 noise.residuals-too-large residuals.frame-moved residuals.base-targets-moved
-gates.limit-exceeded gates.limit-not-measured conformity.fails conformity.undecided
+conformity.fails gates.limit-exceeded gates.limit-not-measured conformity.undecided
 outliers.all-poses outliers.some outliers.pose outliers.ambiguous outliers.search-not-converged
 outliers.conflict
 workflow.no-held-out-poses workflow.few-held-out-poses workflow.held-out-setup

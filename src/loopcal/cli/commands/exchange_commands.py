@@ -351,8 +351,8 @@ def import_(
         if corrected is not None and data is not None:
             report = lc.calibrate(robot, opt.read_measurements([data], robot))
             opt.print_convention_note(report.conventions, [data])
-            is_written = force or not report.failures
-            if report.failures:
+            is_written = force or not report.has_failed
+            if report.has_failed:
                 facts = {"reasons": list_reasons(report.failures), "is_written": is_written}
                 failure = report_finding(
                     "gates.correction-not-written", file=str(corrected), **facts

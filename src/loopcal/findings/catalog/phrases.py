@@ -227,13 +227,25 @@ which +/- describes it."""
 
 
 def conformity_probability(data: Data) -> str:
-    """Return a probability as per cent, and what is close to certain as a bound."""
-    probability = float(data["probability"])
-    if probability > ALMOST_CERTAIN:
+    """Return the bounds of a probability as per cent, and what is close to certain as one bound."""
+    return _format_probability(float(data["probability"]), float(data["most_probable"]))
+
+
+def better_probability(data: Data) -> str:
+    """Return the probability that values are better, as per cent."""
+    return _format_probability(float(data["probability"]), float(data["probability"]))
+
+
+def _format_probability(lowest: float, highest: float) -> str:
+    if lowest > ALMOST_CERTAIN:
         return f"more than {100.0 * ALMOST_CERTAIN:g} %"
-    if probability < 1.0 - ALMOST_CERTAIN:
+    if highest < 1.0 - ALMOST_CERTAIN:
         return f"less than {100.0 * (1.0 - ALMOST_CERTAIN):.1g} %"
-    return f"{100.0 * probability:.3g} %" if probability > 0.99 else f"{100.0 * probability:.2g} %"
+    low, high = (
+        f"{100.0 * min(max(p, 1.0 - ALMOST_CERTAIN), ALMOST_CERTAIN):.{3 if p > 0.99 else 2}g}"
+        for p in (lowest, highest)
+    )
+    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def largest_error(data: Data) -> str:

@@ -356,11 +356,16 @@ def _list_statements(content: Mapping[str, Any]) -> Iterator[Content]:
             "limit": "limit",
             "guard_band": "guard band",
             "acceptance_limit": "acceptance limit",
+            "rejection_limit": "rejection limit",
         }
-        lengths = (f"{words} {stated[k] * scale:.3g} {unit}" for k, words in numbers.items())
+        lengths = (
+            f"{words} {stated[k] * scale:.3g} {unit}" for k, words in numbers.items() if k in stated
+        )
+        highest = stated.get("most_probable", stated["probability"])
         declaration = (
-            f"{', '.join(lengths)}, probability of conformity {100 * stated['probability']:.3g} %; "
-            f"conformity is accepted from {100 * stated['level']:.3g} %. {PREDICTED}"
+            f"{', '.join(lengths)}, probability of conformity {100 * stated['probability']:.3g} to "
+            f"{100 * highest:.3g} %; conformity and nonconformity are stated from "
+            f"{100 * stated['level']:.3g} %. {PREDICTED}"
         )
         yield {
             "name": f"Conformity of the largest {quantity} error at held-out poses",

@@ -79,7 +79,7 @@ WARNING = f"""\
 
 def name_robot_file(report: CalibrationReport, force: bool = False) -> str:
     """Return the name of a report's robot file; `force` names a failed one like any other."""
-    return FAILED_ROBOT if report.failures and not force else ROBOT
+    return FAILED_ROBOT if report.has_failed and not force else ROBOT
 
 
 def list_reasons(failures: Iterable[object]) -> tuple[str, ...]:
@@ -98,10 +98,12 @@ def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
         return None
     status = str(result.get("fit", {}).get("status", ""))
     reasons = list_reasons(result.get("reasons") or ())
-    if status not in ("", CONVERGED) and not reasons:
+    has_stopped = status not in ("", CONVERGED)
+    if has_stopped and not reasons:
         reasons = (f"the fit did not converge ({status.replace('_', ' ')})",)
-    has_failed = result.get("verdict") == FAILED_VERDICT or result.get("passed") is False
-    if has_failed or reasons:
+    # a missed limit is a reason beside the verdict: it says nothing against the geometry
+    has_failed = has_stopped or result.get("verdict") == FAILED_VERDICT
+    if has_failed or ("verdict" not in result and (reasons or result.get("passed") is False)):
         return report_finding("gates.run-not-calibrated", run=str(path), reasons=reasons)
     if "verdict" not in result and (status != CONVERGED or "passed" not in result):
         return report_finding("gates.run-without-verdict", run=str(path))
@@ -382,7 +384,7 @@ def save_run(
     document = build_document(report, inputs, command)
     text = remove_mark(format_robot(report.robot, report.identification.plus_minus))
     name = name_robot_file(report, force)
-    text = WARNING + text if report.failures else text
+    text = WARNING + text if report.has_failed else text
     return write_run_folder(path, document, report.arrays(), text, force, name)
 
 

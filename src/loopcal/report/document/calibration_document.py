@@ -82,8 +82,8 @@ MEANING = {
     "warning. The recommendation below states whether to use the corrected values.",
     Verdict.RESERVATIONS: "All quality gates are met, but the warnings below affect the accuracy "
     "of the corrected values. The recommendation below states whether to use them.",
-    Verdict.UNDECIDED: "No quality gate failed, but the held-out poses do not suffice to state the "
-    "accuracy at poses that were not fitted.",
+    Verdict.UNDECIDED: "The held-out poses do not suffice to state the accuracy at poses that were "
+    "not fitted.",
     Verdict.NOT_CALIBRATED: "A quality gate is not met. Do not write these values to a machine.",
 }
 """What each verdict means for the user."""
