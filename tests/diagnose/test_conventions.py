@@ -439,7 +439,8 @@ def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None
     from loopcal.papers.hexapod_42 import steps
 
     setup, printed = steps.make_setup(), steps.PRINTED.table("table_4", "PP")
-    robot, values, sigma = setup.robot, printed.values * steps.TO_SI, steps.find_rounding(printed)
+    robot, values = setup.robot, printed.values / steps.TO_PRINTED
+    sigma = printed.unit / steps.TO_PRINTED / np.sqrt(12.0)
     right = steps.to_measurements(setup, values, sigma)
     assert not compare_conventions(robot, right).is_refused
     kind = Pose(f"euler-{steps.PRINTED.find('rotation', 'order')}").with_tool(robot.tool)

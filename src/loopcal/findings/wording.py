@@ -193,7 +193,9 @@ def _word(value: Any, spec: str) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return round_to_digits(value)
     if spec == "percent":
-        return f"{round_to_digits(100.0 * value)} %"
+        if 0.9995 <= value < 1.0:
+            return "more than 99.9 %"
+        return "less than 0.0001 %" if 0.0 < value < 1e-6 else f"{round_to_digits(100.0 * value)} %"
     if spec == "factor":
         return f"{value:.0f}" if 100.0 <= value < 1e6 else f"{value:.2g}"
     if spec == "sentence":
