@@ -4,10 +4,12 @@
 Each cause h is a component of the variance of the whitened rows, K_h = Z Z' for independent errors
 with columns Z of unit variance. What nothing estimated explains of the residuals has the covariance
 sigma^2 (1 + tau^2 K_h); its likelihood over that of noise alone, averaged over log tau, is
-the evidence of h, and with equal probabilities before the data it gives those after them. Few wrong
-poses are errors of any size in the rows of k of n poses, for each choice of k of them. The most
-probable cause is taken into the covariance, and the others are compared again, until noise alone
-explains the rest. See docs/theory/residual-patterns.md.
+the evidence of h, and with equal probabilities before the data it gives those after them. A noise
+that is larger than stated is K = 1: without it, any other cause would explain too large residuals
+of any kind. Few wrong poses are errors of any size in the rows of k of n poses, for each choice of
+k of them. The most probable cause is taken into the covariance, and the others are compared again,
+until noise alone explains the rest, or rows are wrong, which pull the fit. See
+docs/theory/residual-patterns.md.
 """
 
 from __future__ import annotations
@@ -34,10 +36,11 @@ from loopcal.numerics.statistics import (
     VarianceComponent,
     compute_any_probability,
     compute_f_tail,
+    estimate_variance_component,
 )
 from loopcal.typing import IntArray
 
-NOISE, OUTLIERS = "noise", "outliers"
+NOISE, LARGER, OUTLIERS = "noise", "larger-noise", "outliers"
 CAUSE = "residuals.cause"  # code of the finding
 EXCLUDED = 0.05  # probability of noise alone below which a cause is named
 OUTLYING = 0.1  # largest share of the poses that may be wrong
@@ -52,7 +55,7 @@ class Cause(NamedTuple):
     probability: float
     second: str  # the next probable source
     second_probability: float
-    effect: Effect | None  # None for outliers
+    effect: Effect | None  # None for outliers and a larger noise
     size: VarianceComponent | None  # of the effect, in columns of unit variance
     p_value: float  # (Sidak) of such an effect by noise alone, in any of those that are compared
 
@@ -102,41 +105,52 @@ def compare_causes(
         logs = [
             size.evidence - np.log(alike[e.source]) for size, e in zip(sizes, listed, strict=True)
         ]
-        wrong, without = -np.inf, remainder
+        wrong = -np.inf
         if all(cause.source != OUTLIERS for cause in causes):
-            wrong, without = find_wrong_poses(remainder, pose, known)
-        share = np.array([0.0, wrong, *logs])
+            wrong = measure_wrong_poses(remainder, pose, known)
+        larger = _estimate_larger_noise(remainder, known) if known else -np.inf
+        share = np.array([0.0, wrong, larger, *logs])
         share = np.exp(share - share.max())
         share /= share.sum()
         if share[0] > EXCLUDED:
             break
-        sources = [NOISE, OUTLIERS, *(effect.source for effect in listed)]
+        sources = [NOISE, OUTLIERS, LARGER, *(effect.source for effect in listed)]
         total = {name: float(share[[s == name for s in sources]].sum()) for name in sources}
         first, second, *_ = sorted(total, key=lambda name: -total[name])
         stated = (total[first], second, total[second])
         best = int(np.argmax(np.where([s == first for s in sources], share, -1.0)))
-        if best == 1:
+        if first in (OUTLIERS, LARGER):
             causes.append(Cause(first, "", *stated, None, None, np.nan))
-            remainder = without
+            if first == OUTLIERS:  # they have pulled the fit, so that the rest says nothing
+                break
+            known = 0.0
             continue
-        effect = listed.pop(best - 2)
-        spectrum, size = spectra[best - 2], sizes[best - 2]
+        effect = listed.pop(best - 3)
+        spectrum, size = spectra[best - 3], sizes[best - 3]
         p_value = compute_any_probability(spectrum.compute_tail(known), len(effects))
         causes.append(Cause(first, effect.name, *stated, effect, size, p_value))
         remainder = remainder.add(spectrum, size.ratio)
     return tuple(causes)
 
 
-def find_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> tuple[float, Remainder]:
-    """Return the evidence of few wrong poses, and what the most probable ones leave. The pose that
-    fits the others least is excluded, and so on.
+def _estimate_larger_noise(remainder: Remainder, known: float) -> float:
+    """Return the evidence of a noise of unknown size beside the stated one."""
+    square = float(remainder.residual @ remainder.weigh(remainder.residual))
+    count = max(round(remainder.degrees), 1)
+    y = np.full(count, np.sqrt(square / count))
+    return estimate_variance_component(np.ones(count), y, known).evidence
+
+
+def measure_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> float:
+    """Return the evidence of few wrong poses. The pose that fits the others least is excluded, and
+    so on.
     """
     order = np.argsort(pose, kind="stable")
     names, count = np.unique(pose, return_counts=True)
     member = np.full((len(names), int(count.max())), -1)  # rows of each pose
     member[np.arange(member.shape[1]) < count[:, None]] = order
     is_row = member >= 0
-    total, evidence, best, kept = 0.0, [-np.inf], -np.inf, remainder
+    total, evidence = 0.0, [-np.inf]
     for k in range(1, min(max(int(OUTLYING * len(names)), 1), MOST_WRONG) + 1):
         square = float(remainder.residual @ remainder.weigh(remainder.residual))
         P = remainder.taken[member] * is_row[..., None]
@@ -160,9 +174,4 @@ def find_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> tupl
         total += spectrum.estimate(known).evidence - np.log((len(names) - k + 1) / k)
         remainder = remainder.add(spectrum, np.inf)
         evidence.append(total - k * np.log(2.0))  # more wrong poses are less probable
-        if evidence[-1] > best:
-            best, kept = evidence[-1], remainder
-    top = max(evidence)
-    if np.isinf(top):
-        return top, kept
-    return top + float(np.log(np.exp(np.array(evidence) - top).sum())), kept
+    return float(np.logaddexp.reduce(evidence))
