@@ -438,8 +438,9 @@ def test_effect(rows: ResidualRows, effect: Effect) -> float:
         spectrum = rows.remainder.find_spectrum(effect.scaled)
         is_open = spectrum.rest[1] >= FEWEST_LEFT and len(spectrum.y) > 0
         return spectrum.compute_tail() if is_open else np.nan
-    length = np.linalg.norm(effect.columns, axis=0)
-    u, s, _ = np.linalg.svd(rows.project(effect.columns / length), full_matrices=False)
+    columns = effect.columns[:, effect.columns.any(axis=0)]  # of a drive that does not move: 0
+    length = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(rows.project(columns / length), full_matrices=False)
     basis = u[:, s > LEFT]
     q, explained = basis.shape[1], float(((basis.T @ rows.residual) ** 2).sum())
     left = rows.degrees - q
