@@ -198,8 +198,7 @@ def test_data_without_slow_errors_have_no_discrepancy(case, size):
         data = make(seed)
         fit = identify(lc.load_robot(data.robot_name), data)
         found += bool(find(adjust_uncertainty(fit, data)))
-    # 5 or 6 % each: the standard deviation of their share, three times
-    assert found <= count * (LEVEL + 3.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / count))
+    assert found <= binom.isf(1e-3, count, LEVEL)
 
 
 def test_clean_heights_are_hardly_ever_widened():

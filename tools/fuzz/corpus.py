@@ -204,6 +204,7 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
     """Yield the command lines of a machine that has been calibrated."""
     few = "--poses 8 --hold-out 1 --candidates 16"
     plan, name = _planning_options(recipe), recipe.words.split()[2]
+    volume = "z=695mm..705mm" if recipe.robot == "3-prs" else "x=-5mm..5mm"
     if recipe.robot.startswith("hexapod"):
         yield Line(("per-leg", "robot.yaml", "data.csv"), 2)
     sheet = "plan/measurements.csv" if recipe.robot in PLANNED else "more.csv"
@@ -240,6 +241,8 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         0.5 compare run later --data more.csv --json
         1 repeatability robot.yaml data.csv
         1 certificate run facts.yaml
+        1 accuracy run --volume {volume}
+        0.5 accuracy run --volume {volume} --frame base --json
         5 compensate run targets.csv -o out.csv
         1 compensate run targets.csv --mode commands
         1 compensate truth.yaml targets.csv -o out.csv --json

@@ -29,6 +29,7 @@ from loopcal.diagnose.residual_map import MapTest, check_map
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.identification import prepare_fitted_data
+from loopcal.estimate.null_space import choose_pivots
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy, combine_degrees
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.residual_test import (
@@ -259,8 +260,6 @@ def find_measured_directions(rows: SlowErrorRows) -> list[FloatArray]:
     """Return the directions (6, d) of the errors of place, then of rotation, that rows measure;
     they are base axes where the rows measure all three.
     """
-    from scipy.linalg import qr
-
     by_axis, listed = rows.rows.reshape(len(rows.rows), 6, -1), []
     for first in (3, 0):
         own = by_axis[:, first : first + 3]
@@ -269,9 +268,9 @@ def find_measured_directions(rows: SlowErrorRows) -> list[FloatArray]:
         information, axes = np.linalg.eigh(np.einsum("rak,rbk->ab", own, own))
         axes = axes[:, information > UNMEASURED_SHARE * information[-1]]
         # the same space by base axes, as far as it contains them
-        Q = np.asarray(qr(axes @ axes.T, pivoting=True)[0])
+        chosen = choose_pivots(axes.T, True)
         directions = np.zeros((6, axes.shape[1]))
-        directions[first : first + 3] = Q[:, : axes.shape[1]]
+        directions[first : first + 3] = np.linalg.qr(axes @ axes[chosen].T)[0]
         listed.append(directions)
     return listed
 
