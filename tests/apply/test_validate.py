@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal.apply.validation import validate
+from loopcal.apply.validation import ErrorChange, NoiseKnowledge, validate
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
 from loopcal.diagnose.row_errors import METRICS, Metric, compute_noise_floor, compute_row_errors
 from loopcal.errors import DataError
@@ -291,3 +291,11 @@ def test_setup_parameters_fitted_for_the_earlier_geometry_are_reported():
     assert before not in {f.code for f in alike.findings}
     own = validate(fit, more)
     np.testing.assert_allclose(alike.before.position, own.before.position, rtol=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [np.inf, np.nan, 8.0])
+def test_noise_bounds_errors_also_where_sigma_is_exact(degrees: float) -> None:
+    """NaN is an infinite number that was read from JSON."""
+    noise = NoiseKnowledge(1.0, degrees)
+    assert ErrorChange(1.0, 5.0, 1.0, 30, noise).has_grown
+    assert ErrorChange(1.0, 1.2, 1.0, 30, noise).is_noise

@@ -58,10 +58,13 @@ def test_false_alarm_rate_holds_whatever_the_stated_sigma_is(ratio: float, sets:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("method", [LeastSquares(), None])
 def test_a_wrong_pose_is_found_whatever_the_stated_sigma_is(ratio, method) -> None:
-    """12 sigma of the true noise, in units of it; the only name."""
+    """12 sigma of the true noise, in units of it; the only name.
+
+    A sigma that is known within 25 % is contradicted from a factor of about 3 on, so not by 2.
+    """
     for seed in range(2):
         error = draw_normal(seed)
         error[4] += 12.0 * np.array([0.6, 0.0, -0.8])
@@ -69,7 +72,7 @@ def test_a_wrong_pose_is_found_whatever_the_stated_sigma_is(ratio, method) -> No
         result = find_outliers(identify(robot, data, method), data)
         assert result.names == ("5",)
         codes = [finding.code for finding in result.summary]
-        assert ("outliers.larger-noise" in codes) == (ratio == 2.0)
+        assert ("outliers.larger-noise" in codes) == (ratio == 4.0)
         assert result.scale == pytest.approx(ratio, rel=0.5)
 
 
