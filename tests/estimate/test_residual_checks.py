@@ -22,6 +22,7 @@ from loopcal.diagnose.fit_examination import (
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Tukey
 from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.residual_test import SIGMA_AS_STATED, NoiseKnowledge
 from loopcal.estimate.result import residuals_from_arrays
 from loopcal.measure.simulation import simulate
 from loopcal.report.validation_view import describe_improvements, view_errors
@@ -178,6 +179,31 @@ def stored(tmp_path_factory) -> tuple[lc.CalibrationReport, lc.Run]:
     folder = tmp_path_factory.mktemp("runs") / "run"
     lc.save_run(folder, report)
     return report, lc.load_run(folder)
+
+
+def test_a_stored_run_knows_as_much_of_the_noise_as_its_fit(stored) -> None:
+    """Otherwise `loopcal validate` calls errors noise that are none by the fit itself."""
+    report, run = stored
+    uncertainty = run.load_uncertainty()
+    assert uncertainty is not None
+    assert uncertainty.noise.degrees > SIGMA_AS_STATED.degrees
+    assert uncertainty.noise == NoiseKnowledge.of(report.identification.residual_test)
+
+
+def test_a_stored_run_with_too_large_residuals_knows_its_noise_as_stated(tmp_path) -> None:
+    robot = lc.load_robot("hexapod-42")
+    data = lc.load_measurements(EXAMPLE, robot)
+    rows = [replace(o, covariance=o.covariance / 100.0) for o in data.observations]
+    report = lc.calibrate(
+        robot,
+        replace(data, observations=tuple(rows)),
+        lc.CalibrationOptions(fit=lc.FitOptions(sigma_uncertainty=0.0)),
+    )
+    lc.save_run(tmp_path / "run", report)
+    uncertainty = lc.load_run(tmp_path / "run").load_uncertainty()
+    assert uncertainty is not None
+    assert uncertainty.noise.scale == 1.0
+    assert uncertainty.noise == NoiseKnowledge.of(report.identification.residual_test)
 
 
 def test_stored_residuals_have_labels_components_and_readings(stored) -> None:

@@ -42,7 +42,7 @@ from loopcal.diagnose.row_errors import (
 )
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertainty
-from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY, ResidualTest
+from loopcal.estimate.residual_test import SIGMA_AS_STATED, NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.findings.wording import list_names, name_count, round_to_digits
@@ -74,26 +74,6 @@ PREFIX = "held_out"
 
 
 @dataclass(frozen=True)
-class NoiseKnowledge:
-    """What a calibration knows of the noise of measurements: the factor on the stated sigmas, and
-    its degrees of freedom, see `loopcal.estimate.residual_test`.
-    """
-
-    scale: float = 1.0
-    degrees: float = 0.5 / SIGMA_UNCERTAINTY**2
-
-    @classmethod
-    def of(cls, test: ResidualTest) -> NoiseKnowledge:
-        """Return what the residuals of a fit show; sigma as stated where they show nothing, or are
-        larger than noise can be.
-        """
-        if test.failed:
-            return cls(degrees=test.stated_degrees)
-        is_known = test.sigma_scale > 0.0 and test.noise_degrees > 0.0
-        return cls(test.sigma_scale, test.noise_degrees) if is_known else cls()
-
-
-@dataclass(frozen=True)
 class ErrorChange:
     """The rms error of one quantity before and after calibration."""
 
@@ -102,7 +82,7 @@ class ErrorChange:
     after: float
     noise_floor: float
     values: int  # number of measured components
-    noise: NoiseKnowledge = NoiseKnowledge()
+    noise: NoiseKnowledge = SIGMA_AS_STATED
 
     @property
     def times(self) -> float:
@@ -189,7 +169,7 @@ class Validation(DrawnResult):
     blunders: tuple[Blunder, ...] = ()
     without_blunders: Validation | None = None
     conformity: Mapping[str, Conformity] = field(default_factory=dict)
-    noise: NoiseKnowledge = NoiseKnowledge()
+    noise: NoiseKnowledge = SIGMA_AS_STATED
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("poses", "before", "after", "commanded_before", "commanded_after"),
@@ -371,7 +351,7 @@ def validate(
     check_limit("limit_position", limit_position)
     check_limit("limit_angle", limit_angle)
     robot, old, nuisance = fit, before, None
-    noise = NoiseKnowledge(1.0 if uncertainty is None else uncertainty.noise_scale)
+    noise = SIGMA_AS_STATED if uncertainty is None else uncertainty.noise
     reused = []
     if isinstance(fit, Identification):
         robot, old, nuisance = fit.robot, before or fit.initial, fit.nuisance

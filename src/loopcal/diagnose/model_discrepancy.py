@@ -97,7 +97,7 @@ class SlowError(NamedTuple):
 
     directions: FloatArray  # (6, d) unit vectors of rotation and place
     size: VarianceComponent
-    p_value: float  # without them
+    p_value: float  # without them, in any of the tests that are made
 
 
 class SlowErrors(NamedTuple):
@@ -142,11 +142,14 @@ def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | No
     measured = np.hstack([np.zeros((6, 0)), *groups])
     short = project(SHORT_KERNELS[:1], measured, FINE_CENTERS) if measured.size else []
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
-    level = compute_single_level(LEVEL, len(tested) + len(short))
-    slow = [detect_slow_errors(rows, groups, known, level) for rows in (*tested, *short)]
+    lengths = (*tested, *short)
+    level = compute_single_level(LEVEL, len(lengths))
+    slow = [detect_slow_errors(rows, groups, known, level) for rows in lengths]
     if not any(slow):
         return find_rough_errors(linear, T)
     found = min((each for each in slow if each), key=lambda each: min(e.p_value for e in each))
+    tests = len(lengths) * len(groups)
+    found = [e._replace(p_value=compute_any_probability(e.p_value, tests)) for e in found]
     fine = [*project(KERNELS, measured, FINE_CENTERS), *short]
     fine += project(SHORT_KERNELS[1:], measured, FINE_CENTERS)
     divided = [SlowErrors(rows, divide_by_direction(rows, found, groups, known)) for rows in fine]
@@ -279,7 +282,8 @@ def divide_by_direction(
     rows: SlowErrorRows, found: Sequence[SlowError], groups: Sequence[FloatArray], known: float
 ) -> tuple[SlowError, ...]:
     """Return errors that were found in some of the groups of directions, with a size for each
-    direction whose own residuals show them; with a common size where none does by itself.
+    direction whose own residuals show them; with a common size where none does by itself. Their
+    p-values stay those with which they were found.
     """
     kinds = {_is_place(error.directions) for error in found}
     together = [directions for directions in groups if _is_place(directions) in kinds]
@@ -288,7 +292,9 @@ def divide_by_direction(
     shown = detect_slow_errors(rows, single, known, level)
     kinds = {_is_place(error.directions) for error in shown}
     rest = [directions for directions in together if _is_place(directions) not in kinds]
-    return (*shown, *detect_slow_errors(rows, rest, known, 1.0))
+    divided = (*shown, *detect_slow_errors(rows, rest, known, 1.0))
+    p_values = {_is_place(error.directions): error.p_value for error in found}
+    return tuple(e._replace(p_value=p_values[_is_place(e.directions)]) for e in divided)
 
 
 def detect_slow_errors(

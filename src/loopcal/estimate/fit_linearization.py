@@ -32,6 +32,7 @@ from loopcal.estimate.posterior import (
     posterior_from_arrays,
 )
 from loopcal.estimate.problem import Problem, problem_of, spread_rows
+from loopcal.estimate.residual_test import NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.measure.measurements import Measurements
@@ -185,7 +186,7 @@ class FitUncertainty(NamedTuple):
     ----------
     posterior : of the machine. names : (U,) nuisance parameters.
     slope : (U, p) S [SI / SI]. root : (U, w) T [SI], see `NuisanceEstimate`.
-    noise_scale : factor on the stated sigmas of the rows.
+    noise_scale : factor on the stated sigmas of the rows. noise : what the fit says of other rows.
     """
 
     posterior: Posterior
@@ -193,6 +194,7 @@ class FitUncertainty(NamedTuple):
     slope: FloatArray
     root: FloatArray
     noise_scale: float
+    noise: NoiseKnowledge
 
     def __repr__(self) -> str:
         p, u = len(self.posterior.unit), len(self.names)
@@ -229,14 +231,17 @@ def collect_uncertainty(fit: Identification) -> FitUncertainty:
     nuisance = fit.nuisance
     root = np.nan_to_num(nuisance.root, posinf=0.0)
     slope = nuisance.slope / fit.tolerance
-    scale = fit.residual_test.sigma_scale
-    return FitUncertainty(
-        fit.posterior, nuisance.names, slope, root, scale if np.isfinite(scale) else 1.0
-    )
+    scale = np.nan_to_num(fit.residual_test.sigma_scale, nan=1.0)
+    noise = NoiseKnowledge.of(fit.residual_test)
+    return FitUncertainty(fit.posterior, nuisance.names, slope, root, float(scale), noise)
 
 
 def uncertainty_from_arrays(
-    robot: Mechanism, names: tuple[str, ...], arrays: Mapping[str, np.ndarray], noise_scale: float
+    robot: Mechanism,
+    names: tuple[str, ...],
+    arrays: Mapping[str, np.ndarray],
+    noise_scale: float,
+    noise: NoiseKnowledge,
 ) -> FitUncertainty | None:
     """Return the joint uncertainty of a corrected robot and its nuisance parameters `names` in the
     arrays of a run folder; None in one that has none. Raises as `posterior_from_arrays`.
@@ -244,7 +249,7 @@ def uncertainty_from_arrays(
     if SLOPE not in arrays or ROOT not in arrays:
         return None
     posterior = posterior_from_arrays(robot, arrays)
-    return FitUncertainty(posterior, names, arrays[SLOPE], arrays[ROOT], noise_scale)
+    return FitUncertainty(posterior, names, arrays[SLOPE], arrays[ROOT], noise_scale, noise)
 
 
 def fold_sources(

@@ -21,6 +21,7 @@ docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -172,6 +173,45 @@ class ResidualTest:
             factor = coverage_factor(self.noise_degrees)
             return report_finding("noise.few-degrees", factor=float(factor), **data)
         return report_finding("noise.estimated", **data)
+
+
+@dataclass(frozen=True)
+class NoiseKnowledge:
+    """What a calibration knows of the noise of measurements: the factor on the stated sigmas, and
+    its degrees of freedom.
+    """
+
+    scale: float = 1.0
+    degrees: float = 0.5 / SIGMA_UNCERTAINTY**2
+
+    @classmethod
+    def of(cls, test: ResidualTest) -> NoiseKnowledge:
+        """Return what the residuals of a fit show; sigma as stated where they show nothing, or are
+        larger than noise can be.
+        """
+        if test.failed:
+            return cls(degrees=test.stated_degrees)
+        is_known = test.sigma_scale > 0.0 and test.noise_degrees > 0.0
+        return cls(test.sigma_scale, test.noise_degrees) if is_known else SIGMA_AS_STATED
+
+    @classmethod
+    def restore(cls, fit: Mapping[str, Any]) -> NoiseKnowledge:
+        """Return the same from the `fit` of a stored result; sigma as stated where it is of an
+        earlier version, or did not converge.
+        """
+        scale, p_value = fit.get("sigma_scale"), fit.get("p_value")
+        if scale is None or "noise_degrees" not in fit:
+            return SIGMA_AS_STATED
+        stated = count_sigma_degrees(fit["noise"], fit["sigma_uncertainty"])
+        if fit["noise"] == "given" and p_value is not None and p_value < SIGNIFICANCE:
+            return cls(degrees=stated)
+        degrees = fit["noise_degrees"]
+        degrees = np.inf if degrees is None else degrees
+        return cls(scale, degrees) if scale > 0.0 and degrees > 0.0 else SIGMA_AS_STATED
+
+
+SIGMA_AS_STATED = NoiseKnowledge()
+"""What is known where no fit has shown anything."""
 
 
 def choose_severity(p_value: float) -> Severity:

@@ -186,12 +186,14 @@ class Run(Result):
         measurements; None for a robot file, or a run that does not contain it.
         """
         from loopcal.estimate.fit_linearization import uncertainty_from_arrays
+        from loopcal.estimate.residual_test import NoiseKnowledge
 
         if not self.result:
             return None
-        scale, names = self.result["fit"].get("sigma_scale"), tuple(self.nuisance_values)
+        fit, names = self.result["fit"], tuple(self.nuisance_values)
+        scale, noise = fit.get("sigma_scale"), NoiseKnowledge.restore(fit)
         return uncertainty_from_arrays(
-            self.identified_robot, names, self.arrays, 1.0 if scale is None else scale
+            self.identified_robot, names, self.arrays, 1.0 if scale is None else scale, noise
         )
 
     def load_budget(self) -> dict[str, Any]:

@@ -74,6 +74,10 @@ STATED: dict[str, Any] = {
         "local?": PARAMETERS,  # setup parameters
         "dropped?": ([str],),
         "sigma_scale?": Number,
+        "noise_degrees?": Number,
+        "noise?": str,
+        "p_value?": Number,
+        "sigma_uncertainty?": Number,
     },
     "verdict?": (Literal["calibrated", "reservations", "not_calibrated", "undecided"],),
     "passed?": (bool,),
