@@ -144,8 +144,10 @@ class Conformity(Result):
 
     @property
     def acceptance_limit(self) -> float:
-        """The limit less the guard band: estimates up to it are accepted."""
-        return self.limit - self.guard_band
+        """The limit less the guard band: estimates up to it are accepted. 0 where the guard band
+        is wider than the limit: no error is shown to be so small.
+        """
+        return max(self.limit - self.guard_band, 0.0)
 
     @property
     def rejection_limit(self) -> float:

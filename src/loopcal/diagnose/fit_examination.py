@@ -30,7 +30,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
@@ -202,7 +202,9 @@ class FitExamination(Result):
             findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
         lack = self.lack_of_fit
         findings += [f for f in lack.findings if lack.groups or f.code == "residuals.no-repeats"]
-        findings.append(self.clusters.finding)
+        is_of_outliers = bool(self.outliers.suspects) and self.clusters.unit == "pose"
+        if not (is_of_outliers and self.clusters.finding.severity is Severity.WARNING):
+            findings.append(self.clusters.finding)  # the rows of a wrong pose share its error
         return (*findings, *(group.finding for group in self.correlated))
 
 
