@@ -120,7 +120,9 @@ def test_import_and_calibrate_give_the_page_numbers_for_a_real_machine(
             assert row["estimate"] == pytest.approx(value, abs=0.06)  # one decimal is printed [mm]
             variance = sum(source["parameters"][row["name"]] for source in noise)  # [m^2]
             assert 1.96e3 * variance**0.5 == pytest.approx(half, rel=0.03)
-            assert half < row["plus_minus"] < 2.1 * half
+            # slow errors in y turn line A about D most: the page states 3 times for it, 1.7 else
+            times = 3.1 if row["name"] == "A.anchor.x" else 1.75
+            assert half < row["plus_minus"] < times * half
             assert abs(row["estimate"] - other) < 1.05 * half
 
 

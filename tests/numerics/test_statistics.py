@@ -47,16 +47,18 @@ def test_without_weights_or_elements_nothing_is_tested():
     assert compute_component_tail(np.ones(3), np.zeros(3)) == 1.0
 
 
-def test_size_is_the_mean_over_its_distribution():
+@pytest.mark.parametrize("typical", [np.inf, 0.5])
+def test_size_is_the_mean_over_its_distribution(typical):
     rng = np.random.default_rng(5)
     weights = np.r_[WEIGHTS, np.zeros(30)]
     y = np.sqrt(1.0 + 4.0 * weights) * rng.standard_normal(42)
-    found = estimate_variance_component(weights, y, 8.0)
+    found = estimate_variance_component(weights, y, 8.0, typical=typical)
 
     def density(tau: float, power: int) -> float:
         scale = 1.0 + tau**2 * weights
         square = float((y**2 / scale).sum()) + 8.0
-        value = (tau**2 * square / 50.0) ** power
+        variance = tau**2 * square / 50.0
+        value = variance**power / (1.0 + variance / typical)  # half-Cauchy
         return value * np.prod(scale) ** -0.5 * (square / 50.0) ** -25.0
 
     moments = [integrate.quad(density, 0.0, 200.0, args=(k,), limit=400)[0] for k in range(3)]

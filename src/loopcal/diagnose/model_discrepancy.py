@@ -165,10 +165,16 @@ def _score(slow: SlowErrors) -> float:
     """
     rows, score = slow.rows, 0.0
     for error in slow.errors:
-        sizes = (rows.errors.amplitude.T @ error.directions).T * rows.sizes
-        square = error.size.variance * float((sizes**2).sum())
+        square = error.size.variance * measure_size(rows, error.directions)
         score += error.size.gain - np.log1p(square / float(rows.residuals @ rows.residuals))
     return score
+
+
+def measure_size(rows: SlowErrorRows, directions: FloatArray) -> float:
+    """Return the whitened sum of squares of errors of unit variance in directions (6, d), before
+    the elimination of the parameters.
+    """
+    return float((((rows.errors.amplitude.T @ directions).T * rows.sizes) ** 2).sum())
 
 
 def find_rough_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | None:
@@ -320,7 +326,8 @@ def detect_slow_errors(
         # residuals that the errors cannot change say how large the noise is
         y = tests[best][1]
         rest = (max(float(residuals @ residuals - y @ y), 0.0), len(residuals) - len(y))
-        size = estimate_variance_component(w, y, known, rest)
+        typical = float(rows.residuals @ rows.residuals) / measure_size(rows, groups[best])
+        size = estimate_variance_component(w, y, known, rest, typical)
         found.append(SlowError(groups[best], size, p_values[best]))
         # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
         shrink = 1.0 / np.sqrt(1.0 + size.ratio * w) - 1.0

@@ -171,12 +171,17 @@ def compute_component_tail(
 
 
 def estimate_variance_component(
-    weights: FloatArray, y: FloatArray, known: float = 0.0, rest: tuple[float, float] = (0.0, 0.0)
+    weights: FloatArray,
+    y: FloatArray,
+    known: float = 0.0,
+    rest: tuple[float, float] = (0.0, 0.0),
+    typical: float = np.inf,
 ) -> VarianceComponent:
     """Return the size of a component; arguments as of `compute_component_tail`.
 
     `known` degrees of freedom say that sigma is 1; infinite ones, that it is exactly 1. `rest` :
-    sum of squares and number of elements of weight 0.
+    sum of squares and number of elements of weight 0. `typical` : the square of the scale of a
+    half-Cauchy prior of sigma tau. Without one, few elements bound no mean of the variance.
     """
     largest = float(weights.max())
     tau = np.geomspace(SMALLEST, LARGEST, STEPS) / np.sqrt(largest)
@@ -191,9 +196,10 @@ def estimate_variance_component(
     inside = density[(tau > EVIDENT[0]) & (tau < EVIDENT[1])] - density[0]
     top = float(inside.max(initial=-np.inf))
     evidence = top + float(np.log(np.exp(inside - top).mean())) if len(inside) else np.nan
-    share = np.exp(density - density.max()) * np.gradient(tau)
-    share /= share.sum()
     values = ratio * variance
+    probable = density - np.log1p(values / typical)
+    share = np.exp(probable - probable.max()) * np.gradient(tau)
+    share /= share.sum()
     mean = float(share @ values)
     # sigma^2 at each tau has a relative variance of its own
     own = 2.0 / max(count - 4.0, 1.0)
