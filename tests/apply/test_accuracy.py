@@ -276,7 +276,8 @@ def test_the_largest_true_error_in_a_volume_is_below_the_statement() -> None:
         stated = bound_errors(fit, VOLUME, "base")
         assert stated.simultaneous >= stated.pointwise
         assert stated.refinement < 0.01
-        points = np.random.default_rng(seed).uniform(*np.transpose([*VOLUME.values()]), (200, 3))
+        low, high = np.transpose([*VOLUME.values()])
+        points = np.random.default_rng(seed).uniform(low, high, (200, 3))
         q = inverse(fit.robot, points).q
         error = geometry.pose_difference(forward(truth, q).T, forward(fit.robot, q).T)
         below += np.linalg.norm(error[:, 3:], axis=1).max() <= stated.simultaneous

@@ -202,13 +202,13 @@ def test_probability_of_better_values_is_uniform_where_both_are_equally_good(
     p_values = []
     for noise in 7.0 * SIGMA * rng.standard_normal((2000, 6, 1)):  # sigma is wrong by a factor of 7
         errors = summarize_kinds(sum_kinds([observed], [noise + half], [noise - half]))[-1]
-        p_values.append(errors.compute_better_probability(*known, 6))
+        p_values.append(errors.compute_better_probability(known[0], known[1], 6))
     for level in (0.05, 0.5, 0.95):
         share = np.mean(np.array(p_values) < level)
         assert share == pytest.approx(level, abs=4.0 * np.sqrt(level * (1.0 - level) / 2000))
     nothing = summarize_kinds(sum_kinds([observed], [half], [half]))[-1]
     assert np.isnan(nothing.compute_better_probability(0.0, 0.0, 1))
-    assert nothing.compute_better_probability(*known, 6) == 0.5
+    assert nothing.compute_better_probability(known[0], known[1], 6) == 0.5
 
 
 @pytest.mark.evidence

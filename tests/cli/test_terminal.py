@@ -5,6 +5,7 @@ import os
 import pty
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
@@ -52,7 +53,7 @@ def test_hint_is_shown_only_for_commands_with_its_options():
 
 
 def test_change_of_a_freed_limb_has_no_hint_to_free_it():
-    data = {"chi_square": 99.0, "degrees": 7.0, "p_value": 1e-9, "level": 0.05}
+    data: dict[str, Any] = {"chi_square": 99.0, "degrees": 7.0, "p_value": 1e-9, "level": 0.05}
     data |= {"kind": "none", "names": (), "change": "", "alternatives": ()}
     machine, limb = (
         report_finding("prior.machine-changed", subject=subject, **data)

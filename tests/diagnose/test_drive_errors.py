@@ -74,7 +74,7 @@ def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: f
     found = spectrum.estimate(known)
     # steps of the two grids: 1.5 and 4 %
     assert np.sqrt(found.ratio) == pytest.approx(sizes[np.argmax(logs)], rel=0.05)
-    grid = np.linspace(*np.log(EVIDENT), 400)
+    grid = np.linspace(np.log(EVIDENT[0]), np.log(EVIDENT[1]), 400)
     mean = np.exp(np.interp(grid, np.log(sizes), logs)).mean()
     assert found.evidence == pytest.approx(np.log(mean), abs=0.05)
 

@@ -140,7 +140,7 @@ def test_change_of_a_machine_is_tested_with_the_noise_of_both_calibrations():
         solved = np.linalg.solve(P, moved[..., None])[..., 0]
         tail = float(((moved * solved).sum(axis=1) >= statistic).mean())
         changes = compare_information(first.posterior, identify(ROBOT, again).posterior)
-        assert changes.compute_p_value(statistic, 9) == pytest.approx(tail, abs=0.03)
+        assert changes.compute_p_value(float(statistic), 9) == pytest.approx(tail, abs=0.03)
         assert change.moved == (change.p_value < 0.05)
 
 

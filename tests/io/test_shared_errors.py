@@ -281,7 +281,7 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
         entries = each.nuisance_parameters.table.entries
         assert {e.name: e.tolerance for e in entries} == expected
     with pytest.raises(lc.DataError, match="the scope of 'a' is 'some'"):
-        lc.StatedValue("a", 1.0, scope="some")
+        lc.StatedValue("a", 1.0, scope="some")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(
@@ -337,7 +337,7 @@ def test_a_warm_machine_is_corrected_to_the_reference_temperature(tmp_path):
     gantry = lc.load_robot("core-xy")
     truth = gantry.with_values(sample_truth(gantry, 1, 2)[0])
     poses = sample_workspace(gantry, 30, 2).coordinates
-    sensor = lc.Sensor(lc.Position(), lc.Gaussian([1e-6] * 3))
+    sensor = lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-6)))
     cold = lc.simulate(truth, poses, lc.Instrument((sensor,)), 2)
     (rows,) = cold.observations
     warm = replace(cold, observations=(replace(rows, measured=rows.measured * (1.0 + 34.5e-6)),))
@@ -415,7 +415,7 @@ def test_a_contradicted_scale_of_all_sessions_is_named_with_its_value():
 
 def test_units_of_files_do_not_matter_to_a_scale(tmp_path):
     gantry = lc.load_robot("core-xy")
-    sensor = lc.Sensor(lc.Position(), lc.Gaussian([1e-6] * 3))
+    sensor = lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-6)))
     poses = sample_workspace(gantry, 20, 2).coordinates
     data = lc.simulate(gantry, poses, lc.Instrument((sensor,)), 2)
     save_measurements(data, tmp_path / "mm.csv", gantry)
