@@ -94,7 +94,7 @@ def search_outliers(setup: Setup) -> list[list[Any]]:
         ]
         drops = [whole - test.chi_square for test in tests]
         first = first or [
-            [data.labels[i], test.chi_square, test.degrees, test.p_value, drop]
+            [data.labels[i], test.chi_square, test.degrees, test.exact_p_value, drop]
             for i, test, drop in zip(keep, tests, drops, strict=True)
         ]
         worst = int(np.argmax(drops))
