@@ -198,7 +198,8 @@ def _explain_residuals(
     for found in [f for f in fit.findings if f.code == SHARED and f.data["cause"] == POSE]:
         findings.append(found)
         split = split.change(partial(add_shared_errors, finding=found))
-    if not (named & {DRIVES, BACKLASH} or not (named or failed)):
+    is_of_drives = named & {DRIVES, BACKLASH} if named else not failed
+    if not is_of_drives:
         drives = None
     if drives is not None:
         split = split.change(drives.add_to_readings)

@@ -298,10 +298,12 @@ def _use_map(posterior: Posterior | None) -> tuple[Finding, Posterior]:
     return report_finding("compensation.map-gain", **values), corrected
 
 
-def _correct(posterior: Posterior | None, solution: Solution) -> FloatArray:
-    """Return the twists (n, 6) by which the map of the residuals corrects solved poses."""
+def _correct(posterior: Posterior | None, solution: Solution) -> FloatArray | None:
+    """Return the twists (n, 6) by which the map of the residuals corrects solved poses; None
+    without a map.
+    """
     if posterior is None or (own := posterior.discrepancy) is None or not own.is_corrected:
-        return np.zeros((len(solution.q), 6))
+        return None
     robot = posterior.robot
     S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
     return own.correct(solution.T, S.parameters[0][..., posterior.places])
@@ -309,19 +311,19 @@ def _correct(posterior: Posterior | None, solution: Solution) -> FloatArray:
 
 def _predict(posterior: Posterior | None, solution: Solution) -> FloatArray:
     """Return where the machine is at solved poses (n, 4, 4)."""
-    return geometry.apply_twist(solution.T, _correct(posterior, solution))
+    twists = _correct(posterior, solution)
+    return solution.T if twists is None else geometry.apply_twist(solution.T, twists)
 
 
 def _aim(
     posterior: Posterior | None, robot: Mechanism, targets: ArrayLike, wanted: FloatArray
 ) -> Solution:
     """Return the poses of the identified robot that the map of the residuals takes to targets."""
-    best = inverse(robot, targets)
-    if posterior is None or posterior.discrepancy is None or not posterior.discrepancy.is_corrected:
-        return best
+    best, is_pose = inverse(robot, targets), np.shape(targets)[-2:] == (4, 4)
     for _ in range(MAP_STEPS):
-        aimed = geometry.apply_twist(wanted, -_correct(posterior, best))
-        is_pose = np.shape(targets)[-2:] == (4, 4)
+        if (twists := _correct(posterior, best)) is None:
+            break
+        aimed = geometry.apply_twist(wanted, -twists)
         best = inverse(robot, aimed if is_pose else read_coordinates(aimed, robot.controlled))
     return best
 

@@ -341,9 +341,10 @@ def _parse_range(text: str) -> tuple[str, tuple[float, float]]:
     match = re.fullmatch(r"(\w+)=(.+)\.\.(.+)", text)
     if match is None:
         raise UnitError(f"{text!r} is no range; write a coordinate and its ends: x=-40mm..40mm")
+    from loopcal.mechanism.platform_coordinates import list_dimensions
+
     name, *ends = match.groups()
-    dimension = Dimension.LENGTH if name in ("x", "y", "z") else Dimension.ANGLE
-    low, high = (parse_quantity(end, dimension) for end in ends)
+    low, high = (parse_quantity(end, *list_dimensions((name,))) for end in ends)
     if not low < high:
         raise UnitError(f"{text!r} ends below its beginning; give the smaller value first")
     return name, (low, high)

@@ -136,10 +136,8 @@ def _add_patterns(
     effects_of = [D[:, rows].reshape(-1, D.shape[-1]) for rows in (slice(0, 3), slice(3, 6))]
     tool = [(E, float(((E @ posterior.root) ** 2).sum())) for E in effects_of]
     for effect in effects:
-        whole = effect.effect.whole
-        columns = effect.effect.columns if whole is None else whole
         moments = take_root(effect.moments, np.diag(effect.moments))
-        root = rows.root @ (rows.gain.T @ columns) @ moments
+        root = rows.root @ (rows.gain.T @ effect.effect.acting) @ moments
         finding = _report_effect(effect, _measure_growth(tool, root))
         fit = add_covariance(fit, root, effect.degrees, finding)
     for cause in shared:

@@ -130,14 +130,12 @@ def list_drive_effects(linear: FitLinearization, rows: ResidualRows) -> list[Eff
     assert states is not None
     readings = linear.data.readings[None]
     S = differentiate_pose(robot, robot.values[None], readings, states.state).readings[0]
-    values = np.zeros((len(rows.residual), S.shape[-1]))
-    places = np.zeros(len(rows.residual), dtype=np.int64)
+    values, places = np.zeros((len(rows.residual), S.shape[-1])), rows.locate_poses(linear.data)
     for number, r in enumerate(kinds):
         evaluated, white = evaluate_rows(r, poses, np.zeros(1, np.int64), linear.solution.nuisance)
         Z = r.whiten_columns(white, evaluated.jacobian)[0] @ S[r.poses]
         own = rows.kind == number
         values[own] = Z[rows.row[own], rows.column[own]]
-        places[own] = r.poses[rows.row[own]]
     values *= list_units(linear)
     chosen = find_distinct(places)
     of_poses = (places[:, None] == chosen)[:, :, None] * values[:, None, :]

@@ -105,9 +105,7 @@ def compare_causes(
         logs = [
             size.evidence - np.log(alike[e.source]) for size, e in zip(sizes, listed, strict=True)
         ]
-        wrong = -np.inf
-        if all(cause.source != OUTLIERS for cause in causes):
-            wrong = measure_wrong_poses(remainder, pose, known)
+        wrong = measure_wrong_poses(remainder, pose, known)
         larger = _estimate_larger_noise(remainder, known) if known else -np.inf
         share = np.array([0.0, wrong, larger, *logs])
         share = np.exp(share - share.max())

@@ -59,12 +59,7 @@ def check_map(
     stacked = collect_rows(linear.data, *linearize_smooth_errors(linear, errors))
     if stacked is None:
         return untested
-    observations = [o for o in linear.data.observations if len(o)]
-    poses = np.zeros(len(rows.kind), dtype=np.intp)
-    for i, o in enumerate(observations):
-        of_kind = rows.kind == i
-        poses[of_kind] = o.rows.reshape(len(o), -1)[rows.row[of_kind], 0]
-    regions = errors.group_regions(T, FEWEST_REGIONS)[poses]
+    regions = errors.group_regions(T, FEWEST_REGIONS)[rows.locate_poses(linear.data)]
     slow = stacked.rows[:, -errors.count - 1 : -1]
     extended = np.hstack([rows.basis, slow])
     free = rows.basis.shape[1]

@@ -240,12 +240,17 @@ class Effect:
     # (R, c) the same with their means, where the sizes are drawn and their mean is an error, too
     whole: FloatArray | None = None
 
+    @property
+    def acting(self) -> FloatArray:
+        """(R, c) the columns by which the sizes act on the estimate."""
+        return self.columns if self.whole is None else self.whole
+
     @cached_property
     def unit(self) -> FloatArray:
         """(c,) sizes [SI], equal for equal labels, that add the variance 1 to the rows that they
         change.
         """
-        columns = self.columns if self.whole is None else self.whole
+        columns = self.acting
         unit = np.ones(columns.shape[1])
         for label in set(self.labels):
             own = np.array([each == label for each in self.labels])
@@ -257,7 +262,7 @@ class Effect:
     @cached_property
     def scaled(self) -> FloatArray:
         """(R, c) the columns in these units: independent sizes of one variance are the effect."""
-        return (self.columns if self.whole is None else self.whole) * self.unit
+        return self.acting * self.unit
 
 
 def list_effects(
@@ -409,14 +414,11 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     """
     listed = list_effects(rows, data, robot, with_poses=data.n_poses <= MOST_POSES)
     order = TIME if any(effect.source == TIME for effect in listed) else ORDER
-    effects = [effect for effect in listed if np.isfinite(test_effect(rows, effect))]
-    p_value = test_correlation(rows)[1]
-    tests = len(effects) + int(np.isfinite(p_value))
+    effects, p_value = list(listed), test_correlation(rows)[1]
+    p_values = [test_effect(rows, effect) for effect in effects]
+    tests = int(np.isfinite([*p_values, p_value]).sum())
     significant: list[EffectSizes] = []
-    while effects:
-        p_values = [test_effect(rows, effect) for effect in effects]
-        if not np.isfinite(p_values).any():
-            break
+    while np.isfinite(p_values).any():
         best = int(np.nanargmin(p_values))
         p_any = compute_any_probability(p_values[best], tests)
         if not p_any < LEVEL:
@@ -424,6 +426,7 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
         effect = effects.pop(best)
         significant.append(estimate_sizes(rows, effect, p_any))
         rows = rows.with_effects(effect.columns)
+        p_values = [test_effect(rows, effect) for effect in effects]
     if significant:
         p_value = test_correlation(rows)[1]
     p_any = compute_any_probability(p_value, tests)

@@ -189,10 +189,8 @@ class NoiseKnowledge:
         """Return what the residuals of a fit show; sigma as stated where they show nothing, or are
         larger than noise can be.
         """
-        if test.failed:
-            return cls(degrees=test.stated_degrees)
-        is_known = test.sigma_scale > 0.0 and test.noise_degrees > 0.0
-        return cls(test.sigma_scale, test.noise_degrees) if is_known else SIGMA_AS_STATED
+        numbers = (test.sigma_scale, test.noise_degrees, test.stated_degrees)
+        return cls._choose(*numbers, has_failed=test.failed)
 
     @classmethod
     def restore(cls, fit: Mapping[str, Any]) -> NoiseKnowledge:
@@ -203,10 +201,17 @@ class NoiseKnowledge:
         if scale is None or "noise_degrees" not in fit:
             return SIGMA_AS_STATED
         stated = count_sigma_degrees(fit["noise"], fit["sigma_uncertainty"])
-        if fit["noise"] == "given" and p_value is not None and p_value < SIGNIFICANCE:
-            return cls(degrees=stated)
+        has_failed = fit["noise"] == "given" and p_value is not None and p_value < SIGNIFICANCE
         degrees = fit["noise_degrees"]
         degrees = np.inf if degrees is None else degrees
+        return cls._choose(scale, degrees, stated, has_failed=has_failed)
+
+    @classmethod
+    def _choose(
+        cls, scale: float, degrees: float, stated_degrees: float, *, has_failed: bool
+    ) -> NoiseKnowledge:
+        if has_failed:
+            return cls(degrees=stated_degrees)
         return cls(scale, degrees) if scale > 0.0 and degrees > 0.0 else SIGMA_AS_STATED
 
 

@@ -226,6 +226,42 @@ LARGEST_SKEW = 0.1
 which +/- describes it."""
 
 
+CAUSES = {
+    "noise": "noise alone",
+    "larger-noise": "a noise larger than stated",
+    "outliers": "wrong rows of few poses",
+    "pose": "an error that the targets of a pose share",
+    "target": "an error of each target",
+    "session": "an error of each session",
+    "block": "an error of each block of poses",
+    "walk": "a slow motion of instrument or frame",
+    "order": "a drift in the order of the rows",
+    "time": "a drift in time",
+    "temperature": "a dependence on a temperature",
+    "reading": "a dependence on a reading",
+    "smooth": "a model error that varies slowly with the pose",
+    "drives": "errors of the drives at single poses",
+    "backlash": "backlash",
+}
+"""What may cause residuals."""
+
+NAMED_CAUSES = {
+    "temperature": "the temperature {name}",
+    "reading": "a dependence on the reading {name}",
+}
+"""Those of them of which a finding states the name."""
+
+
+def cause_words(data: Data) -> str:
+    """Return the most probable cause of residuals."""
+    return NAMED_CAUSES.get(data["cause"], CAUSES[data["cause"]]).format(name=data["name"])
+
+
+def second_words(data: Data) -> str:
+    """Return the second cause, which has no name."""
+    return CAUSES[data["second"]]
+
+
 def conformity_probability(data: Data) -> str:
     """Return the bounds of a probability as per cent, and what is close to certain as one bound."""
     return _format_probability(float(data["probability"]), float(data["most_probable"]))
