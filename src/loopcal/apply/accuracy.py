@@ -470,10 +470,13 @@ class VolumeAccuracy(Result):
             f"Errors of {self.points} points: {self.reference}.",
         ]
         if self.spacing:
-            lines.append(f"The last refinement of the grid changed it by {self.refinement:.1%}.")
+            lines.append(
+                f"The last refinement of the grid changed it by {100.0 * self.refinement:.1f} %."
+            )
         if self.extrapolated:
             lines.append(
-                f"{self.extrapolated:.0%} of the points are less certain than every measured pose."
+                f"{100.0 * self.extrapolated:.0f} % of the points are less certain than every "
+                "measured pose."
             )
         return "\n".join(lines)
 
