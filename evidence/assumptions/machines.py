@@ -38,7 +38,6 @@ class Effects:
         each of four sessions, of its step from pose to pose, and of an error that all targets of a
         pose have in common. is_named : whether the data name the sessions.
     sag : [m], by which the platform hangs lower at the edge of the workspace than in its center.
-    scale : standard deviation of the relative error of the lengths of the instrument.
     """
 
     noise: float = 1.0
@@ -48,7 +47,6 @@ class Effects:
     walk: float = 0.0
     shared: float = 0.0
     sag: float = 0.0
-    scale: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,6 @@ def measure_machine(
     if isinstance(setup.kind, lc.Position):
         arms = np.stack([R[:n].apply(target) for target in TARGETS], axis=1)
         measured = (measured[:, None] + arms).reshape(n, -1)
-    measured *= 1.0 + effects.scale * rng.standard_normal()
     stated = np.full(len(setup.kind.noise_columns), setup.sigma[0])
     if isinstance(setup.kind, lc.Pose):
         stated[:3] = setup.sigma[1]
