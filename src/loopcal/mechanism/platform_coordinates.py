@@ -23,9 +23,14 @@ EULER = ("roll", "pitch", "yaw")
 COORDINATES = (*POSITION, *EULER, *TILT)
 
 
+def get_dimension(coordinate: str) -> Dimension:
+    """Return the dimension of a coordinate: x, y, z are lengths, others angles."""
+    return Dimension.LENGTH if coordinate in POSITION else Dimension.ANGLE
+
+
 def list_dimensions(names: tuple[str, ...]) -> tuple[Dimension, ...]:
     """Return the dimensions of coordinates."""
-    return tuple(Dimension.LENGTH if name in POSITION else Dimension.ANGLE for name in names)
+    return tuple(map(get_dimension, names))
 
 
 def check_coordinates(names: tuple[str, ...]) -> None:

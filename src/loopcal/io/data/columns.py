@@ -29,6 +29,7 @@ from loopcal.io.core.csv_table import (
     suggest_header,
 )
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
@@ -422,11 +423,6 @@ def name_measured(column: str, robot: Mechanism) -> str:
 def name_covariance(a: str, b: str, robot: Mechanism) -> str:
     """Return the name of the covariance of two noise columns."""
     return f"{COVARIANCE}{name_measured(a, robot)}.{name_measured(b, robot)}"
-
-
-def get_dimension(coordinate: str) -> Dimension:
-    """Return the dimension of a controlled coordinate: x, y, z are lengths, others angles."""
-    return Dimension.LENGTH if coordinate in ("x", "y", "z") else Dimension.ANGLE
 
 
 SHEET_COLUMNS = ("step", "role", "hold", "tolerance")

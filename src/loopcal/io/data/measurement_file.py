@@ -36,7 +36,6 @@ from loopcal.io.data.columns import (
     NumberColumn,
     PoseColumn,
     TextColumn,
-    get_dimension,
     list_columns,
     read_context,
 )
@@ -51,6 +50,7 @@ from loopcal.io.data.kind_settings import (
 )
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import EXAMPLES, SMALLEST_SD, find_sd_fault
 

@@ -22,10 +22,11 @@ import numpy as np
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import read_table, require_columns
-from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
+from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN
 from loopcal.io.formats.program_format import DECIMALS, format_short
 from loopcal.io.runs.plan_folder import SHEET, VIA
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 

@@ -27,11 +27,11 @@ from loopcal.io.core.csv_table import (
 )
 from loopcal.io.core.outputs import FolderKind
 from loopcal.io.core.text_file import write_text
-from loopcal.io.data.columns import COMMANDED, NOTE, get_dimension
+from loopcal.io.data.columns import COMMANDED, NOTE
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.plain_text import escape_formula
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
 
 if TYPE_CHECKING:
     from loopcal.apply.compensation import Compensation
@@ -91,7 +91,7 @@ def format_compensation(result: Compensation) -> str:
         errors["U"] = result.uncertainty.expanded
     for title, error in errors.items():
         for name, column in zip(NAMES, result.drop_rounding(error).T.tolist(), strict=True):
-            unit = robot.get_unit(Dimension.LENGTH if name in "xyz" else Dimension.ANGLE)
+            unit = robot.get_unit(get_dimension(name))
             cells = [_format_error(value / unit.factor_to_si) for value in column]
             columns[f"{NOTE} {title} {name} [{unit.symbol}]"] = cells
     return format_columns(columns | {f"{NOTE} status": map(str, result.findings)})

@@ -16,7 +16,7 @@ from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import Validation
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.findings.wording import count_decimals, name_count
-from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
+from loopcal.mechanism.platform_coordinates import POSITION, get_dimension, read_coordinates
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
@@ -251,7 +251,7 @@ def _draw_line(
 
 def _unit_of(name: str) -> Unit:
     """Return the unit in which a controlled coordinate is drawn."""
-    return DISPLAY_UNITS[Dimension.LENGTH if name in POSITION else Dimension.ANGLE]
+    return DISPLAY_UNITS[get_dimension(name)]
 
 
 # Errors on measured poses before and after calibration, beside the noise floor and the limits.
