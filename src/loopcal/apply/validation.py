@@ -42,6 +42,7 @@ from loopcal.diagnose.row_errors import (
 )
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertainty
+from loopcal.estimate.posterior import ModelDiscrepancy
 from loopcal.estimate.residual_test import SIGMA_AS_STATED, NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
@@ -391,13 +392,14 @@ def validate(
             raise DataError(unpredicted[0])
         compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
     limits = {"position": limit_position, "orientation": limit_angle}
-    result = _summarize(robot, compared, limits, noise)
+    slow = None if uncertainty is None else uncertainty.posterior.discrepancy
+    result = _summarize(robot, compared, limits, noise, slow)
     blunders = _find_blunders(robot, compared, uncertainty)
     rest = None
     if blunders:
         named = {label for blunder in blunders for label in blunder.poses}
         wrong = np.array([label in named for label in data.labels])
-        rest = _summarize(robot, compared.without(wrong), limits, noise)
+        rest = _summarize(robot, compared.without(wrong), limits, noise, slow)
     left_out = ~compared.usable & compared.predictable
     left = np.sqrt(max(result.values_left, 0) / max(result.kinds[-1].count, 1))
     conformity = judge_limits(
@@ -428,13 +430,19 @@ def _summarize(
     compared: PredictionComparison,
     limits: Mapping[str, float | None],
     noise: NoiseKnowledge,
+    slow: ModelDiscrepancy | None,
 ) -> Validation:
-    """Return the errors of a comparison, without findings."""
+    """Return the errors of a comparison, without findings; `slow` errors are those of the fit."""
     rows = compared.data.observations
     before, after = compared.before.residuals(rows), compared.after.residuals(rows)
     missed = compared.before.differences(rows, compared.reached)
     reached = [m - r for m, r in zip(missed, after, strict=True)]
     errors = compute_row_errors(rows, after)
+    kinds = compared.kind_errors()
+    if slow is not None:
+        numbers = (compared.measure_slow_gain(slow.errors), float(slow.degrees.min()))
+        every = replace(kinds[-1], slow=numbers[0], slow_degrees=numbers[1])
+        kinds = (*kinds[:-1], every)
     return Validation(
         poses=compared.rows,
         before=compute_row_errors(rows, before),
@@ -448,7 +456,7 @@ def _summarize(
         limit_angle=limits["orientation"],
         units=find_error_units(robot, errors),
         alignment=group_setup(compared.after),
-        kinds=compared.kind_errors(),
+        kinds=kinds,
         setup_count=compared.after.fitted_count,
         absorbed=int(compared.absorbed.sum()),
         judged=compared.count_judged(),

@@ -269,8 +269,9 @@ def recommend_values(
 ) -> Finding:
     """Return the recommendation to apply the identified values or to keep the current ones.
 
-    Values are applied that are better beyond the stated uncertainty at the fitted poses, and at the
-    held-out ones with the probability `LEVEL`.
+    Values are applied that are better beyond the noise at the fitted poses, and at the held-out
+    ones with the probability `LEVEL`. Slow errors that neighboring poses share make both uncertain:
+    where they explain the gain at the fitted poses, the held-out ones decide alone.
 
     start : the current values against the fit. residual_test : of the fit, for the scale of the
         noise. errors : at held-out poses; None without any. findings : of the calibration.
@@ -284,6 +285,8 @@ def recommend_values(
     if checked is None or min(checked.judged, checked.values_left) < FEW_ROWS:
         if is_open:
             return report_finding("values.keep-undecided")
+        if start.verdict is StartVerdict.WITHIN_ERRORS:  # only other regions could show a gain
+            return report_finding("values.keep-within-noise")
         return report_finding(_judge_fitted(residual_test, findings))
     known = (0.0, 0.0) if is_open else (checked.noise.scale, checked.noise.degrees)
     every = checked.kinds[-1]
@@ -294,6 +297,7 @@ def recommend_values(
     else:
         code = "apply" if probability >= LEVEL else "keep-not-confirmed"
     stated: dict[str, Any] = {"probability": probability, "needed": LEVEL}
+    stated["is_slow"] = every.slow > 0.0
     return report_finding(f"values.{code}", poses=checked.judged, **stated)
 
 

@@ -22,7 +22,12 @@ from loopcal.diagnose.error_frames import (
     linearize_tool_errors,
     locate_measured_poses,
 )
-from loopcal.diagnose.model_discrepancy import add_slow_errors, find_slow_errors
+from loopcal.diagnose.model_discrepancy import (
+    SlowErrors,
+    add_slow_errors,
+    exclude_slow_errors,
+    find_slow_errors,
+)
 from loopcal.diagnose.residual_patterns import (
     BLOCK,
     ORDER,
@@ -40,6 +45,8 @@ from loopcal.diagnose.residual_patterns import (
     estimate_correlated_errors,
     estimate_sizes,
     find_patterns,
+    test_correlation,
+    test_effect,
 )
 from loopcal.diagnose.residual_patterns import MOST_POSES as EVEN_CHOICE
 from loopcal.estimate.false_alarms import FALSE_ALARMS
@@ -55,6 +62,8 @@ from loopcal.numerics.statistics import choose_evenly, compute_median, find_dist
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
+# Probability without an effect, from which slow errors of the poses explain what shows it.
+LEFT_OVER = FALSE_ALARMS["residual patterns"]
 SHARED = "residuals.shared-errors"  # code of the finding
 # Code of the finding that independent errors would mean that sigma is too large.
 TOO_SMALL = "noise.residuals-too-small"
@@ -93,17 +102,17 @@ def adjust_uncertainty(
     slow = find_slow_errors(linear, T)
     if rows is not None:
         is_doubted |= fit.residual_test.exact_p_value < DOUBTFUL
-        fit = _add_patterns(fit, linear, rows, is_slow=slow is not None, is_doubted=is_doubted)
+        fit = _add_patterns(fit, linear, rows, slow, is_doubted=is_doubted)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 
 def _add_patterns(
-    fit: Identification, linear: FitLinearization, rows: ResidualRows, *, is_slow: bool,
+    fit: Identification, linear: FitLinearization, rows: ResidualRows, slow: SlowErrors | None, *,
     is_doubted: bool,
 ) -> Identification:  # fmt: skip
     """Return a fit whose covariance allows for the patterns of its residuals, or for their causes
-    where these are known. A dependence on a reading is a slow error of the poses, and counts once
-    where such errors were found.
+    where these are known. What slow errors of the poses explain counts once, with these: a
+    dependence on a reading, and the order of rows that follows the places.
     """
     data = linear.data
     patterns = find_patterns(rows, data, fit.robot)
@@ -119,12 +128,21 @@ def _add_patterns(
             for cause in causes
             if cause.effect is not None and cause.effect.source in CODES
         ]
-    effects = [e for e in effects if not (is_slow and e.effect.source == READING)]
     shared = [c for c in causes if c.source in (POSE, TARGET, WALK)]
+    rest, is_correlated = rows, patterns.is_correlated
+    if slow is not None and slow.is_slow:
+        rest = exclude_slow_errors(linear, rows, slow)
+        effects = [
+            e
+            for e in effects
+            if e.effect.source != READING and test_effect(rest, e.effect) < LEFT_OVER
+        ]
+        shared = [c for c in shared if c.effect and test_effect(rest, c.effect) < LEFT_OVER]
+        is_correlated &= test_correlation(rest)[1] < LEFT_OVER
     # errors that groups of rows share make neighbors alike; a walk begins at zero, and correlated
     # errors anywhere, so that what both add contains either
     is_shared = {SESSION, BLOCK, POSE, TARGET} & {cause.source for cause in causes}
-    is_correlated = patterns.is_correlated and not is_shared
+    is_correlated &= not is_shared
     if not (effects or shared or is_correlated):
         return fit
     # orientation and position (3 n, p) of evenly chosen measured poses, frames fitted, by the

@@ -334,6 +334,7 @@ class StartVerdict(Enum):
 
     BEST = "best"
     WITHIN_NOISE = "within noise"
+    WITHIN_ERRORS = "within noise and other errors"
     NOT_CALIBRATED = "not calibrated"
     OPEN = "open"
 
@@ -400,7 +401,8 @@ def check_start_values(fit: Identification) -> StartCheck:
     if test.sigma_scale > 0.0:
         each = gain / fit.rank / test.sigma_scale**2
         p_value = float(compute_f_tail(fit.rank, test.noise_degrees, each))
-    if p_value < SIGNIFICANCE and any(part.is_added for part in fit.posterior.parts):
+    is_beyond_noise = p_value < SIGNIFICANCE
+    if is_beyond_noise and any(part.is_added for part in fit.posterior.parts):
         # errors that the residuals show beside noise explain a gain, too
         p_value = max(p_value, compare_with_truth(fit, fit.initial.values).p_value)
     ratio = float(before / after) if after > 0.0 else None
@@ -410,6 +412,8 @@ def check_start_values(fit: Identification) -> StartCheck:
         return judged(StartVerdict.OPEN, p_value, "needs-sigma", ratio=ratio)
     if test.failed:
         return judged(StartVerdict.OPEN, p_value, "undecided", ratio=ratio)
+    if is_beyond_noise:
+        return judged(StartVerdict.WITHIN_ERRORS, p_value, "within-errors", ratio=ratio)
     return judged(StartVerdict.WITHIN_NOISE, p_value, "within-noise", ratio=ratio)
 
 

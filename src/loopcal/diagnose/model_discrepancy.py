@@ -25,7 +25,8 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.residual_map import MapTest, check_map
+from loopcal.diagnose.residual_map import MapTest, check_map, collect_columns
+from loopcal.diagnose.residual_patterns import ResidualRows
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.identification import prepare_fitted_data
@@ -39,7 +40,12 @@ from loopcal.estimate.residual_test import (
     count_sigma_degrees,
 )
 from loopcal.estimate.result import Identification, add_covariance
-from loopcal.estimate.smooth_errors import CENTERS, SmoothErrors, describe_smooth_errors
+from loopcal.estimate.smooth_errors import (
+    CENTERS,
+    FINE_CENTERS,
+    SmoothErrors,
+    describe_smooth_errors,
+)
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.solutions import forward
@@ -67,7 +73,6 @@ NEGLIGIBLE = 1e-12  # share of the largest variance by slow errors below which o
 # among all, with more centers.
 KERNELS = ((0.6, False), (1.7, True))
 SHORT_KERNELS = ((0.3, False), (0.35, False), (0.42, False), (0.5, False))
-FINE_CENTERS = 150
 # Share of the information on the direction that the rows sense best, below which they do not
 # measure a direction: errors of it are seen a tenth as well.
 UNMEASURED_SHARE = 0.01
@@ -79,6 +84,7 @@ LEVEL = FALSE_ALARMS["model discrepancy"]
 # Probability without errors in a direction below which it has some, once its machine shows any.
 DIRECTION_LEVEL = 0.3
 FEWEST_REGIONS = 8  # with fewer, a quarter is not a share of the regions
+TOO_LARGE = "noise.residuals-too-large"  # code of the finding that noise does not explain
 NAMED = 0.5  # share of the largest component of errors from which an axis is named
 
 
@@ -203,6 +209,17 @@ def find_rough_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | N
     return SlowErrors(rows, tuple(rough), is_slow=False) if rough else None
 
 
+def exclude_slow_errors(
+    linear: FitLinearization, rows: ResidualRows, slow: SlowErrors
+) -> ResidualRows:
+    """Return the rows of a fit as if it had also estimated slow errors, as far as these exceed the
+    noise: what other errors than these show.
+    """
+    columns = rows.project(collect_columns(linear, slow.rows.errors.scaled(slow.amplitude)))
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return rows.with_effects(u[:, s**2 > slow.errors[-1].size.noise])
+
+
 def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
     """Return a fit whose uncertainty includes slow errors that were found in its residuals.
 
@@ -214,6 +231,13 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
     degrees = np.concatenate([np.full(e.directions.shape[1], e.size.degrees) for e in ordered])
     root = _columns(rows.slope, rows.errors, amplitude)
     S, noise = _columns(rows.rows, rows.errors, amplitude), ordered[-1].size.noise
+    # the errors leave y' (1 + S S')^-1 y of the residuals
+    w, u = np.linalg.eigh(S @ S.T)
+    own = float((w / (1.0 + w) * (u.T @ rows.residuals) ** 2).sum())
+    test = fit.residual_test.explain(fit.residual_test.chi_square - own)
+    if test is not fit.residual_test:
+        findings = (test.finding if f.code == TOO_LARGE else f for f in fit.findings)
+        fit = replace(fit, residual_test=test, findings=tuple(findings))
     if not slow.test.is_gain:  # no map is kept
         S = S[:, :0]
     # the coefficients given -y = S c + noise: residuals are predicted less measured values

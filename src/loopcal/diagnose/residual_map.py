@@ -56,12 +56,8 @@ def check_map(
     untested, rows = MapTest(np.nan, np.nan, np.nan, 0), collect_residual_rows(linear)
     if rows is None or len(T) != linear.data.n_poses:
         return untested
-    stacked = collect_rows(linear.data, *linearize_smooth_errors(linear, errors))
-    if stacked is None:
-        return untested
     regions = errors.group_regions(T, FEWEST_REGIONS)[rows.locate_poses(linear.data)]
-    slow = stacked.rows[:, -errors.count - 1 : -1]
-    extended = np.hstack([rows.basis, slow])
+    extended = np.hstack([rows.basis, collect_columns(linear, errors)])
     free = rows.basis.shape[1]
     penalty = np.where(np.arange(extended.shape[1]) < free, 0.0, noise)
     left = [
@@ -77,6 +73,13 @@ def check_map(
     number = np.isin(regions, np.flatnonzero(known)).sum()
     rms = np.sqrt(np.array([before.sum(), after.sum()]) / number).tolist()
     return MapTest(rms[0], rms[1], float((removed.sum() - half) / before.sum()), count)
+
+
+def collect_columns(linear: FitLinearization, errors: SmoothErrors) -> FloatArray:
+    """Return the columns (R, m) of smooth errors in the rows of a fit of exact readings."""
+    stacked = collect_rows(linear.data, *linearize_smooth_errors(linear, errors))
+    assert stacked is not None
+    return stacked.rows[:, -errors.count - 1 : -1]
 
 
 def _leave_out(

@@ -23,7 +23,9 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.estimate.pose_estimate import PoseFit, fit_poses, predict_from_readings
+from loopcal.estimate.posterior import combine_degrees
 from loopcal.estimate.result import SMALLEST_EFFECT
+from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import report_finding
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.kind import list_error_groups
@@ -239,6 +241,9 @@ class KindErrors:
     # root mean square of their difference, which is that of the two predictions [sigma]; NaN
     # where it was not stored
     change: float = np.nan
+    # standard deviation of `gain` by slow errors of the poses [sigma], and its degrees of freedom
+    slow: float = 0.0
+    slow_degrees: float = 1.0
 
     @property
     def gain(self) -> float:
@@ -257,7 +262,8 @@ class KindErrors:
         self, noise_scale: float, noise_degrees: float, values: int
     ) -> float:
         """Return the probability that the geometry after calibration predicts these rows better,
-        without their noise; NaN where too little is known.
+        without their noise and, where they have slow errors, at other poses of the same region; NaN
+        where too little is known.
 
         noise_scale, noise_degrees : factor on the stated sigmas, and its degrees of freedom. With
             none, the part of b that is orthogonal to d is the noise: equal for both geometries.
@@ -272,9 +278,13 @@ class KindErrors:
             scale = np.sqrt(max(self.count * self.before**2 - along**2, 0.0) / max(degrees, 1))
         if not degrees >= 1 or not np.isfinite(self.gain):
             return float("nan")
-        if scale == 0.0 or self.gain == 0.0:
+        squares = np.array([scale, self.slow]) ** 2
+        total = squares.sum()
+        if total == 0.0 or self.gain == 0.0:
             return 0.5 + 0.5 * float(np.sign(self.gain))
-        return float(stdtr(min(degrees, MOST_DEGREES), self.gain / scale))
+        both = zip(squares, (degrees, self.slow_degrees), strict=True)
+        degrees = min(float(combine_degrees(total, both)), MOST_DEGREES)
+        return float(stdtr(degrees, self.gain / np.sqrt(total)))
 
 
 def compute_statistics(values: FloatArray) -> Statistics:
@@ -503,6 +513,23 @@ class PredictionComparison:
         if readings is not None:
             totals = {k: t for k, t in {**totals, READINGS: readings}.items() if t[0]}
         return summarize_kinds(totals)
+
+    def measure_slow_gain(self, errors: SmoothErrors) -> float:
+        """Return the standard deviation of `KindErrors.gain` of all rows by slow errors e of their
+        poses: that of d.e / |d|, with the change d of the predictions.
+        """
+        rows, T = self.data.observations, self.after.T[0]
+        both = (self.before.residuals(rows), self.after.residuals(rows))
+        own = errors.recentered(T[self.usable])
+        twists, square, by_errors = own.twists(T), 0.0, np.zeros(own.count)
+        for i, (o, first, last) in enumerate(zip(rows, *both, strict=True)):
+            change = o.whitener @ np.where(o.present, first - last, 0.0)[..., None]
+            square += float((change**2).sum())
+            jacobian = o.evaluate(self.after.T, *self.after._inputs_of(i, o)).jacobian[0]
+            J = jacobian.reshape(len(o), -1, jacobian.shape[-2], 6)
+            by_twist = np.einsum("rm,rkmc->rkc", (o.whitener.swapaxes(-1, -2) @ change)[..., 0], J)
+            by_errors += np.einsum("rkc,rkce->e", by_twist, twists[o.rows.reshape(len(o), -1)])
+        return float(np.linalg.norm(by_errors) / np.sqrt(square)) if square > 0.0 else 0.0
 
     def _sum_readings(self) -> FloatArray | None:
         """Return the totals of redundant readings, see `summarize_kinds`."""

@@ -22,7 +22,7 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,7 @@ class ResidualTest:
         Where a loss chose the weights: of all weighted residuals.
     degrees : its degrees of freedom, equations minus rank.
     p_value : probability of a larger chi_square, sigmas being as uncertain as stated; NaN where
-        nothing can be tested.
+        nothing can be tested. Where errors other than noise explain it, that of what they leave.
     dof : equations minus the number of parameters that the method effectively uses.
     noise : "given", "estimated", or "assumed" where nobody stated it.
     sigma_scale : factor s on the stated sigmas; 1 where they are exact and not contradicted.
@@ -98,6 +98,13 @@ class ResidualTest:
     intervals: bool
     converged: bool = True
     weighted: bool = False
+
+    def explain(self, left: float) -> ResidualTest:
+        """Return the test where other errors than noise leave this of chi_square, if the residuals
+        exceed the noise, and what is left does not.
+        """
+        p_value = float(compute_f_tail(self.degrees, self.stated_degrees, left / self.degrees))
+        return replace(self, p_value=p_value) if self.failed and p_value >= SIGNIFICANCE else self
 
     @property
     def exact_p_value(self) -> float:
@@ -146,13 +153,16 @@ class ResidualTest:
         if self.degrees < 0.5:
             return report_finding("noise.no-degrees-of-freedom")
         code = "noise.consistent"
+        each = self.chi_square / self.degrees
         if self.p_value < SIGNIFICANCE:
             code = "noise.residuals-too-large"
+        elif compute_f_tail(self.degrees, self.stated_degrees, each) < SIGNIFICANCE:
+            code = "noise.explained"
         elif self.is_notable:
             code = "noise.doubtful"
         elif self.exact_p_value > 1.0 - SIGNIFICANCE and self.p_value > 1.0 - NOTABLE:
             code = "noise.residuals-too-small"
-        ratio = float(np.sqrt(self.chi_square / self.degrees))
+        ratio = float(np.sqrt(each))
         return report_finding(
             code,
             ratio=ratio,

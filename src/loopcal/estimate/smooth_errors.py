@@ -27,6 +27,9 @@ from loopcal.typing import FloatArray, IntArray
 CENTERS = 40
 """Largest number of centers: more of them are closer to each other than the error varies."""
 
+FINE_CENTERS = 150
+"""The same where the length of the errors is chosen, or rows of all poses are compared."""
+
 DENSE = np.sqrt(0.5)
 """Correlation of errors at neighboring centers from which these are dense."""
 
@@ -89,6 +92,14 @@ class SmoothErrors:
         apart = _spread(x, len(x), 1.0)
         centers = x[apart if len(apart) >= fewest else _spread(x, fewest)]
         return np.argmin(((x[:, None] - centers) ** 2).sum(axis=2), axis=1)
+
+    def recentered(self, T: FloatArray, most: int = FINE_CENTERS) -> SmoothErrors:
+        """Return the errors with up to `most` of the poses T (n, 4, 4) as centers."""
+        x = self._normalize(T)
+        centers = x[_spread(x, most)]
+        triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
+        whitening = np.asarray(np.linalg.inv(triangle).T, dtype=np.float64)
+        return replace(self, centers=centers, whitening=whitening)
 
     def scaled(self, amplitude: FloatArray) -> SmoothErrors:
         """Return the errors with other amplitudes (6, d)."""
@@ -158,11 +169,9 @@ def describe_smooth_errors(
         by_rotation | (np.arange(6) >= 3)
     )
     scale = np.where(used, length * np.where(used, half, 1.0), np.inf)
-    x = (x - origin) / scale
-    centers = x[_spread(x, most)]
-    triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
-    whitening = np.asarray(np.linalg.inv(triangle).T, dtype=np.float64)
-    return SmoothErrors(tool, rotation, origin, scale, centers, whitening, np.eye(6))
+    nothing = np.zeros((0, 6))
+    errors = SmoothErrors(tool, rotation, origin, scale, nothing, nothing, np.eye(6))
+    return errors.recentered(T, most)
 
 
 def _spread(x: FloatArray, most: int, apart: float = SAME) -> list[int]:
