@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coverage of 95 % intervals, chi-square rejections, and simulated / predicted spread of poses."""
+"""Coverage of 95 % intervals, chi-square rejections, simulated / predicted spread of poses, and
+coverage of statements over volumes.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import loopcal as lc
 from loopcal import geometry
 from loopcal.estimate.descent import SpectralModel
-from loopcal.estimate.identification import IdentifiedTrials, identify_trials
+from loopcal.estimate.identification import (
+    IdentifiedTrials,
+    compute_trial_posterior,
+    identify_trials,
+)
 from loopcal.estimate.penalties import MAP, LeastSquares, Method
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
@@ -170,11 +177,84 @@ def evaluate_case(case: Case, count: int = FITS) -> dict[str, float]:
     }
 
 
-QUICK = {"FITS": 250}
+VOLUME_FITS, INSIDE = 400, 200
+"""Machines of each statement over a volume, and random points of it at which they are compared,
+with those of a coarse grid.
+"""
+
+LISTED = np.random.default_rng(SEED).uniform(-1.0, 1.0, (12, 6))
+VOLUMES = {
+    "hexapod-42": (
+        lc.Volume({"x": (-0.03, 0.03), "y": (-0.03, 0.03), "z": (0.18, 0.22)}),
+        lc.Volume({"z": (0.18, 0.22)}, {"pitch": (0.0, 0.1)}, radius=0.03),
+        lc.Volume(points=[0.0, 0.0, 0.2, 0.0, 0.0, 0.0] + LISTED * ([0.02] * 3 + [0.1] * 3)),
+    ),
+    "linear-delta": (
+        lc.Volume({"x": (-0.04, 0.04), "y": (-0.04, 0.04), "z": (0.03, 0.15)}),
+        lc.Volume({"z": (0.03, 0.15)}, radius=0.05),
+        lc.Volume(points=[0.0, 0.0, 0.1] + LISTED[:, :3] * 0.05),
+    ),
+}
+"""Box, cylinder and list of points by robot."""
+
+
+def draw_inside(robot: Mechanism, volume: lc.Volume, rng: np.random.Generator) -> Array:
+    """Return random points (n, c) of a volume with its corners or rim; all of a list."""
+    if volume.points is not None:
+        return np.asarray(volume.points)
+    home = volume.list_values(robot)
+    points = np.column_stack([rng.choice(home[name], INSIDE) for name in robot.controlled])
+    for name, (low, high) in volume.ranges.items():
+        points[:, robot.controlled.index(name)] = rng.uniform(low, high, INSIDE)
+    if volume.radius is not None:
+        angle, r = (
+            rng.uniform(0.0, 2.0 * np.pi, INSIDE),
+            volume.radius * rng.uniform(size=INSIDE) ** 0.5,
+        )
+        x, y = (robot.controlled.index(name) for name in volume.find_circle(robot))
+        points[:, x] += r * np.cos(angle)
+        points[:, y] += r * np.sin(angle)
+    return np.concatenate([points, volume.list_points(robot, 3)])
+
+
+def evaluate_volumes(case: Case, count: int) -> list[list[Any]]:
+    """Return for each volume how often the largest true error is below the simultaneous and the
+    pointwise statement, and how often the error of a point is below its own U.
+    """
+    robot = load_robot(case.robot)
+    truth = sample_truth(robot, count, SEED)
+    coordinates = sample_workspace(robot, case.poses, SEED).coordinates
+    trials = simulate_trials(robot, truth, coordinates, make_instrument(case, 1.0), SEED)
+    fits = identify_trials(robot, trials, case.method)
+    rng, rows = np.random.default_rng(SEED), []
+    for words, volume in zip(("box", "cylinder", "list"), VOLUMES[case.robot], strict=True):
+        below = []
+        for i in np.flatnonzero(fits.converged):
+            posterior = compute_trial_posterior(fits, trials, int(i))
+            stated = lc.bound_errors(posterior, volume, "base", int(i))
+            points = lc.inverse(posterior.robot, draw_inside(robot, volume, rng))
+            true = lc.forward(robot.with_values(truth[i]), points.q)
+            size = np.linalg.norm(geometry.pose_difference(points.T, true.T)[:, 3:], axis=1)
+            own = lc.pose_uncertainty(posterior, points, frame="base").expanded_position
+            largest = size.max()
+            below.append(
+                (largest <= stated.simultaneous, largest <= stated.pointwise, (size <= own).mean())
+            )
+        rows.append(
+            [f"{case.name}, {words}", len(below), *(100.0 * np.mean(below, axis=0)).tolist()]
+        )
+    return rows
+
+
+QUICK = {"FITS": 250, "VOLUME_FITS": 20, "INSIDE": 50}
 
 
 def check(tables: dict[str, Any]) -> None:
     """Assert what holds at the quick size."""
+    for _, fits, together, _, own in tables["volumes"]["rows"]:
+        assert fits >= 0.99 * VOLUME_FITS
+        assert together >= 80.0  # 16 of 20: below in 0.3 % of runs where 95 % is true
+        assert own >= 85.0
     for name, fits, covered, *_ in tables["coverage"]["rows"]:
         assert fits >= 0.99 * FITS
         assert abs(covered - 95.0) < 4.0 or "noise" in name
@@ -209,6 +289,22 @@ def collect() -> dict:
                 ],
                 "formats": ["", "d", ".2f", ".2f", ".2f", ".3f"],
                 "rows": rows,
-            }
+            },
+            "volumes": {
+                "columns": [
+                    "case",
+                    "fits",
+                    "largest error below the simultaneous statement [%]",
+                    "largest error below the pointwise statement [%]",
+                    "errors of points below their U [%]",
+                ],
+                "formats": ["", "d", ".1f", ".1f", ".1f"],
+                "rows": [
+                    row
+                    for case in CASES
+                    if case.robot in VOLUMES and isinstance(case.method, MAP)
+                    for row in evaluate_volumes(case, VOLUME_FITS)
+                ],
+            },
         },
     }

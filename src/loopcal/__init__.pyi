@@ -4,9 +4,7 @@
 from .apply.accuracy import AccuracyMap as AccuracyMap
 from .apply.accuracy import AccuracySimulation as AccuracySimulation
 from .apply.accuracy import PoseUncertainty as PoseUncertainty
-from .apply.accuracy import VolumeAccuracy as VolumeAccuracy
 from .apply.accuracy import accuracy_map as accuracy_map
-from .apply.accuracy import bound_errors as bound_errors
 from .apply.accuracy import pose_uncertainty as pose_uncertainty
 from .apply.accuracy import simulate_accuracy as simulate_accuracy
 from .apply.calibration import calibrate as calibrate
@@ -25,6 +23,9 @@ from .apply.run_comparison import compare_runs as compare_runs
 from .apply.validation import Validation as Validation
 from .apply.validation import validate as validate
 from .apply.verdict import Verdict as Verdict
+from .apply.volume_accuracy import Volume as Volume
+from .apply.volume_accuracy import VolumeAccuracy as VolumeAccuracy
+from .apply.volume_accuracy import bound_errors as bound_errors
 from .diagnose.bootstrap import Bootstrap as Bootstrap
 from .diagnose.bootstrap import bootstrap as bootstrap
 from .diagnose.conventions.convention_check import ConventionCheck as ConventionCheck

@@ -265,7 +265,7 @@ EXCEEDED = report_finding(
 )
 OPEN = report_finding(
     "conformity.undecided", quantity="position", count=12, probability=0.5, most_probable=0.7,
-    level=0.95, pose="7", target="", error=SMALL, **dict.fromkeys(STATED, SMALL),
+    is_volume=False, level=0.95, pose="7", target="", error=SMALL, **dict.fromkeys(STATED, SMALL),
 )  # fmt: skip
 GROWN = report_finding("gates.errors-grew", quantity="position", times=1.4)
 

@@ -13,6 +13,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.apply.conformity import Conformity
 from loopcal.apply.verdict import LIMIT_MISSED, Verdict
 from loopcal.diagnose.fit_examination import StartVerdict
 from loopcal.estimate.residual_test import LEVEL, SIGNIFICANCE
@@ -51,9 +52,16 @@ def says(report: CalibrationReport, beginning: str) -> bool:
     return report.recommendation.code.startswith(f"values.{beginning}")
 
 
+def list_decisions(report: CalibrationReport) -> dict[str, Conformity]:
+    """Return the decisions on limits by quantity at held-out poses, and for the volume."""
+    judged = {} if report.validation is None else dict(report.validation.conformity)
+    stated = None if report.volume is None else report.volume.conformity
+    return judged if stated is None else judged | {"volume": stated}
+
+
 def list_limits(report: CalibrationReport, decision: str) -> set[str]:
-    """Return the quantities of which a conformity is decided so."""
-    judged = {} if report.validation is None else report.validation.conformity
+    """Return the quantities of which a conformity is decided so, and `volume`."""
+    judged = list_decisions(report)
     return {quantity for quantity, c in judged.items() if c.decision.name == decision}
 
 
@@ -66,8 +74,17 @@ CONTRADICTIONS: dict[str, Callable[[CalibrationReport], bool]] = {
         & {
             f.data["quantity"]
             for f in r.findings
-            if f.code in {*LIMIT_MISSED, "conformity.undecided"}
+            if f.code in {*LIMIT_MISSED, "conformity.undecided"} and not f.data.get("is_volume")
         }
+    ),
+    "a volume states an error that the fit does not state": lambda r: (
+        r.volume is not None and not r.states_expected_error
+    ),
+    "no volume is stated, and nothing says why": lambda r: (
+        r.volume is None and not list_codes(r) & {"accuracy.volume-open", "fit.out-of-iterations"}
+    ),
+    "a limit is kept in a volume, and missed at held-out poses": lambda r: (
+        "position" in list_limits(r, "FAILS") and "volume" in list_limits(r, "CONFORMS")
     ),
     "a limit is missed, and the exit code is 0": lambda r: (
         bool(list_limits(r, "FAILS")) and (r.exit_code != 2 or "is not met" not in r.headline)
@@ -119,7 +136,7 @@ CONTRADICTIONS: dict[str, Callable[[CalibrationReport], bool]] = {
     "a decision is not the one of its probability": lambda r: any(
         (c.decision.name == "CONFORMS") != (c.bound <= c.limit * (1.0 + 1e-5))
         or (c.decision.name == "FAILS") != (c.floor >= c.limit * (1.0 - 1e-5))
-        for c in ({} if r.validation is None else r.validation.conformity).values()
+        for c in list_decisions(r).values()
         if abs(c.probability - LEVEL) > 1e-3 and abs(c.most_probable - 1.0 + LEVEL) > 1e-3
     ),
 }
@@ -154,6 +171,7 @@ def draw_report(name: str, seed: int) -> CalibrationReport:
         hold_out=float(rng.choice([0.2, 0.4])),
         seed=seed,
         limit_position=sigma * 10.0 ** rng.uniform(-0.5, 1.0),
+        volume=sample_workspace(nominal, 20, seed).coordinates,
         check_conventions=False,
         fit=lc.FitOptions(sigma_uncertainty=float(rng.choice([0.0, 0.1, 0.25, 0.5]))),
     )

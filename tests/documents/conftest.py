@@ -16,7 +16,9 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.
 def calibration() -> lc.CalibrationReport:
     robot = lc.load_robot("hexapod-42")
     data = lc.load_measurements(EXAMPLE, robot)
-    return lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
+    return lc.calibrate(
+        robot, data, lc.CalibrationOptions(hold_out=0.25, volume={"x": (-0.02, 0.02)})
+    )
 
 
 @pytest.fixture(scope="session")

@@ -201,6 +201,7 @@ def test_view_opens_without_requests_and_errors_and_turns_by_keys(browser, page)
     assert re.fullmatch(text, said.inner_text())
     figure.get_by_label("errors", exact=True).uncheck()
     tab.emulate_media(media="print")
+    assert tab.get_by_text("simultaneously at all points").is_visible()
     assert figure.locator("> svg").is_visible()
     assert not canvas.is_visible()
     assert count_pages(tab.pdf(prefer_css_page_size=True)) <= MOST_PAGES

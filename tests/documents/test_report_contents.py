@@ -21,6 +21,8 @@ pytestmark = pytest.mark.slow
 LIMIT = 60e-6
 """Limit on the position error [m]."""
 
+VOLUME = lc.Volume({"x": (-0.02, 0.02)}, {"y": [0.25]})
+
 
 @pytest.fixture(scope="module")
 def report(robot, data) -> lc.CalibrationReport:  # noqa: F811
@@ -33,7 +35,7 @@ def report(robot, data) -> lc.CalibrationReport:  # noqa: F811
     changed = replace(data, observations=(replace(rows, measured=measured, context=context),))
     held_out = tuple(data.labels[6::4])
     fit = lc.FitOptions(excluded_poses=("4",))
-    options = lc.CalibrationOptions(fit=fit, held_out=held_out, limit_position=LIMIT)
+    options = lc.CalibrationOptions(fit=fit, held_out=held_out, limit_position=LIMIT, volume=VOLUME)
     return lc.calibrate(robot, changed, options)
 
 
@@ -71,6 +73,11 @@ CONTENTS = [
         "verdict",
         r"against the limit 0.06 mm: .*with (?:more than )?[\d.]+ % probability",
     ),  # guard-banded
+    (
+        "verdict",
+        r"\(box x -20 mm to 20 mm, y 250 mm\), the position error is at most .*, simultaneously",
+    ),
+    ("verdict", r"in the volume: .* against the limit 0.06 mm"),
     ("determined", r"The data determine all \d+ parameters"),
     ("outliers", r"No outliers among .*Excluded from the fit by its options: 4\."),
     ("errors", r"Before: .*frames.*After: .*Noise floor: "),

@@ -132,7 +132,8 @@ def check_value(tag: str, text: str) -> None:
 def run(tmp_path_factory, robot, data):  # noqa: F811
     """Return the folder of a run with an instrument and a limit."""
     measured = with_instrument(data, FACTS | {"laboratory": HOSTILE})
-    options = lc.CalibrationOptions(hold_out=0.25, limit_position=1e-3)
+    volume = {"x": (-0.01, 0.01)}
+    options = lc.CalibrationOptions(hold_out=0.25, limit_position=1e-3, volume=volume)
     path = tmp_path_factory.mktemp("certificate") / "run"
     return lc.save_run(path, lc.calibrate(robot, measured, options))
 
@@ -181,7 +182,8 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
         unit = r"\metre" if row["unit"] == "mm" else r"\radian"
         assert read_text(quantity, "si:real/si:unit") == unit
     assert read_text(root, ".//dcc:metaData/dcc:conformity") == "pass"
-    verdict, limit = (e.text or "" for e in root.findall(".//dcc:declaration/dcc:content", NAMES))
+    declared = [e.text or "" for e in root.findall(".//dcc:declaration/dcc:content", NAMES)]
+    verdict, volume, limit, limit_of_volume = declared
     content = json.loads((run / "result.json").read_text("utf-8"))
     assert verdict.startswith(content["headline"])
     assert content["expected_error"]["finding"]["text"] in verdict
@@ -190,6 +192,13 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     assert all(text in verdict for text in warnings)
     judged = content["validation"]["conformity"]["position"]
     assert f"guard band {1e3 * judged['guard_band']:.3g} mm" in limit
+    stated = content["volume"]
+    assert volume == stated["findings"][0]["text"]
+    assert f"guard band {1e3 * stated['conformity']['guard_band']:.3g} mm" in limit_of_volume
+    bounds = {read_text(q, "dcc:name/dcc:content"): q for q in quantities}
+    for name in ("simultaneous", "pointwise"):
+        (bound,) = (q for words, q in bounds.items() if f", {name}" in words)
+        assert float(read_text(bound, "si:real/si:value")) == stated[name]
 
 
 def test_rules_refuse_what_the_schema_refuses(tmp_path, run) -> None:

@@ -14,7 +14,6 @@ is known, and that of Student's t for the effective degrees of freedom where it 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -49,18 +48,18 @@ from loopcal.estimate.residual_test import coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.measure.instrument import Instrument, make_random_stream
+from loopcal.measure.instrument import Instrument
 from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import list_dimensions, read_coordinates
+from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.states import Status
-from loopcal.mechanism.workspace import find_reachable, resolve_poses
+from loopcal.mechanism.workspace import resolve_poses
 from loopcal.numerics.statistics import compute_f_quantile
 from loopcal.results.description import Field, fields, label_axes, within
-from loopcal.results.result import DrawnResult, Result, TableResult
+from loopcal.results.result import DrawnResult, TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 
 # Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
@@ -68,9 +67,6 @@ from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 COMPONENT_LEVEL = 0.954499736103642
 LEVEL = 0.95  # share of the errors below the expanded uncertainty of a length or an angle
 BLOCK = 1024  # poses whose sensitivities are in memory at once
-DRAWS = 4000  # of the posterior, for the largest error in a volume
-REFINED = 0.01  # share by which a fine grid of a volume still changes the largest error
-MOST_POINTS = 4096  # of a grid of a volume
 BATCH = 250  # trials that are identified at once; progress is reported between them
 
 Axes = Literal["base", "platform"]
@@ -430,158 +426,6 @@ def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
     largest = float(np.nanmax(reference))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(values == largest, 1.0, values / largest)
-
-
-@dataclass(frozen=True, eq=False)
-class VolumeAccuracy(Result):
-    """The largest position error in a volume, with a confidence of 95 %.
-
-    Attributes
-    ----------
-    simultaneous : the errors at all points of the volume are at most this, together [m].
-    pointwise : the error at each single point is at most this; others may exceed it [m].
-    points : number of compared points. spacing : of neighbors, by coordinate [m, rad]; empty for a
-        list of points.
-    refinement : share by which the last refinement changed `simultaneous`; NaN for a list.
-    extrapolated : share of the points that are less certain than every measured pose.
-    reference : point, axes and frame to which the errors refer.
-    """
-
-    simultaneous: float
-    pointwise: float
-    points: int
-    spacing: Mapping[str, float]
-    refinement: float
-    extrapolated: float
-    reference: Finding
-
-    FIELDS: ClassVar[tuple[Field, ...]] = fields(
-        *("simultaneous", "pointwise", "points", "spacing", "refinement", "extrapolated"),
-        frame=lambda volume: str(volume.reference),
-    )
-
-    def __str__(self) -> str:
-        together, single = (
-            f"{round_to_digits(1e3 * value)} mm" for value in (self.simultaneous, self.pointwise)
-        )
-        lines = [
-            f"With 95 % confidence the position error is at most {together} at all points",
-            f"together, and at most {single} at each single point.",
-            f"Errors of {self.points} points: {self.reference}.",
-        ]
-        if self.spacing:
-            lines.append(
-                f"The last refinement of the grid changed it by {100.0 * self.refinement:.1f} %."
-            )
-        if self.extrapolated:
-            lines.append(
-                f"{100.0 * self.extrapolated:.0f} % of the points are less certain than every "
-                "measured pose."
-            )
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
-
-def bound_errors(
-    fit: Identification | Posterior,
-    volume: Mapping[str, tuple[float, float]] | ArrayLike,
-    frame: str = FITTED,
-    seed: int = 0,
-) -> VolumeAccuracy:
-    """State the largest position error of the tool in a volume, at all of its points together.
-
-    The errors of all points are drawn together from the posterior: parameters, frames and slow
-    errors of a pose are common to them. The statement is the 95 % quantile of the largest error of
-    each draw. Scatter of the readings, which each approach draws anew, is not contained.
-
-    Parameters
-    ----------
-    volume : ranges of controlled coordinates as in `workspace:` of a robot file [m, rad]; others
-        stay at home. Its grid is refined until the statement changes by less than 1 %. Or points
-        (n, c), of which no others are compared.
-    frame : see `pose_uncertainty`. seed : of the draws.
-
-    Raises
-    ------
-    EstimationError : the robot does not reach a part of the volume, or the data do not determine
-        its errors there. DataError : another coordinate.
-    """
-    posterior = fit.posterior if isinstance(fit, Identification) else fit
-    robot = posterior.robot
-    if not isinstance(volume, Mapping):
-        return _bound_points(posterior, np.asarray(volume, dtype=np.float64), frame, seed)
-    for name in volume:
-        check_choice("volume", name, robot.controlled)
-    home = read_coordinates(robot.home[None], robot.controlled)[0]
-    stated, count = None, 3
-    while True:
-        axes = [
-            np.linspace(*volume[name], count) if name in volume else home[i : i + 1]
-            for i, name in enumerate(robot.controlled)
-        ]
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-        found = _bound_points(posterior, points, frame, seed)
-        change = np.inf if stated is None else abs(found.simultaneous / stated.simultaneous - 1.0)
-        spacing = {name: (high - low) / (count - 1) for name, (low, high) in volume.items()}
-        stated = replace(found, spacing=spacing, refinement=change)
-        if change < REFINED or (2 * count - 1) ** len(volume) > MOST_POINTS:
-            return stated
-        count = 2 * count - 1
-
-
-def _bound_points(
-    posterior: Posterior, points: FloatArray, frame: str, seed: int
-) -> VolumeAccuracy:
-    """Return the statement for points (n, c) alone."""
-    robot, reasons = posterior.robot, Counter[str]()
-    reached = find_reachable(robot, points, reasons)
-    if not reached.all():
-        reason = reasons.most_common(1)[0][0]
-        raise EstimationError(
-            f"the robot reaches {100.0 * reached.mean():.0f} % of the points of this volume "
-            f"({reason}); make the volume smaller"
-        )
-    solution, home = inverse(robot, points), solve_home(robot)
-    single = pose_uncertainty(posterior, solution, frame=frame, origin=home, origin_name="home")
-    if not np.isfinite(single.position).all():
-        raise EstimationError(
-            "the measurements do not determine the position error in this volume; measure more "
-            "poses, or state the error in another frame"
-        )
-    chosen = choose_error_frame(posterior, frame, home, "home")
-    root = posterior.without_discrepancy.root / posterior.unit[:, None]
-    own = 0 if posterior.discrepancy is None else 6  # errors of each pose alone
-    random, largest, pointwise = make_random_stream(seed, 0), np.zeros(DRAWS), 0.0
-    left = float(single.degrees.position.min())
-    size = np.sqrt(left / random.chisquare(left, DRAWS)) if np.isfinite(left) else 1.0
-    common: FloatArray | None = None
-    for first in range(0, len(points), BLOCK // 4):
-        part = solution.take(np.arange(first, min(first + BLOCK // 4, len(points))))
-        errors = linearize_tool_errors(posterior, part, chosen)
-        slow = errors.by_discrepancy[:, 3:]
-        shared = slow[..., : slow.shape[2] - own]
-        effects = np.concatenate(
-            [errors.by_parameters[:, 3:] @ root, errors.by_frame[:, 3:], shared], axis=2
-        )
-        if common is None:
-            common = random.standard_normal((effects.shape[2], DRAWS))
-        drawn = effects @ common
-        if own:
-            drawn += slow[..., -own:] @ random.standard_normal((len(slow), own, DRAWS))
-        length = size * np.linalg.norm(drawn, axis=1)
-        largest = np.maximum(largest, length.max(axis=0))
-        pointwise = max(pointwise, float(np.quantile(length, LEVEL, axis=1).max()))
-    outside = 0.0
-    if posterior.frames is not None:
-        measured = forward(robot, posterior.frames.readings)
-        seen = pose_uncertainty(posterior, measured, frame=frame, origin=home, origin_name="home")
-        outside = float((_ratio(single.position, seen.position) > 1.0).mean())
-    simultaneous = float(np.quantile(largest, LEVEL))
-    reference = single.reference
-    return VolumeAccuracy(
-        simultaneous, pointwise, len(points), {}, float("nan"), outside, reference
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,13 +18,16 @@ from loopcal.apply.validation import Validation, validate
 from loopcal.apply.verdict import (
     ALL_POSES,
     FEW_POSES,
+    LIMIT_MISSED,
     SEARCH_LEVEL,
+    explains_residuals,
     report_fit,
     report_freedoms,
     report_scale,
     report_unexplained,
     report_validation,
 )
+from loopcal.apply.volume_accuracy import VolumeAccuracy, as_volume, bound_errors
 from loopcal.checks import check_choice
 from loopcal.diagnose.adjusted_uncertainty import SHARED, add_shared_errors, adjust_uncertainty
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
@@ -38,7 +41,7 @@ from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.diagnose.residual_patterns import POSE
 from loopcal.engine import collect_versions
-from loopcal.errors import DataError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.determinable_setup import (
     fix_undetermined_setup,
     report_equal_setup,
@@ -123,6 +126,8 @@ def calibrate(
     data = fix_undetermined_setup(robot, data)
     instruments = (name for name, *_ in list_instrument_frames(data))
     check_choice("frame", options.frame, (FITTED, BASE, RELATIVE, *instruments))
+    if options.volume is not None:  # before the fit: what the nominal robot does not reach
+        next(as_volume(options.volume).list_grids(robot))
     kept = exclude_poses(data, options.fit.excluded_poses)
     if options.prior is not None:
         filled = exclude_poses(fill_in_reading_sigma(robot, data), options.fit.excluded_poses)
@@ -279,6 +284,7 @@ def _report(
     examination = examine_fit(fit, fitted, count.progress, options.frame) if fit.converged else None
     count.begin("computing the uncertainty budget")
     budget = compute_error_budget(fit, fitted, options.frame) if fit.converged else None
+    volume, of_volume = _bound_volume(fit, errors if held_out is not None else None, options)
     count.begin("looking for further measurements")
     suggestions = None
     if fit.converged and fit.unidentifiable:
@@ -305,6 +311,7 @@ def _report(
         *report_unexplained(fit, examined),
         *impossible,
         *(report_validation(errors, held_out is not None) if fit.converged else ()),
+        *of_volume,
         *([report_finding("workflow.held-out-repeats", names=repeats)] if repeats else []),
         *check_instruments(split.list_observations()),
         *report_freedoms(fit, fitted),
@@ -336,8 +343,31 @@ def _report(
         model_choice=choice,
         change=change,
         comparison=comparison,
+        volume=volume,
         provenance=Provenance(collect_versions(), {"hold_out": options.seed}, options.to_dict()),
     )
+
+
+def _bound_volume(
+    fit: Identification, errors: Validation | None, options: CalibrationOptions
+) -> tuple[VolumeAccuracy | None, list[Finding]]:
+    """Return the largest position error in the volume of the options, with the decision on its
+    limit, unless held-out errors exceed that anyway; or the finding why there is none.
+    """
+    if options.volume is None or not fit.converged:
+        return None, []
+    if not (fit.residual_test.intervals and explains_residuals(fit)):
+        return None, [report_finding("accuracy.volume-open", reason="noise")]
+    missed = errors is not None and any(
+        f.code in LIMIT_MISSED and f.data["quantity"] == "position" for f in errors.findings
+    )
+    limit = None if missed else options.limit_position
+    try:
+        stated = bound_errors(fit, options.volume, options.frame, limit=limit)
+    except EstimationError as error:
+        reason = str(error).split(";")[0]
+        return None, [report_finding("accuracy.volume-open", reason=reason)]
+    return stated, [] if limit is None else [stated.findings[-1]]
 
 
 def _search_before_split(

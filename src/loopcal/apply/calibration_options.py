@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.apply.volume_accuracy import VolumeLike, as_volume
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.options import OBJECT, FitOptions, check_labels
@@ -53,7 +54,10 @@ class CalibrationOptions:
     held_out : labels of the poses to keep out, instead of a share. Neither is allowed where the
         data state their held-out poses (`Measurements.is_held_out`).
     seed : of the random choice of held-out poses.
-    limit_position, limit_angle : largest allowed errors [m], [rad] on held-out poses.
+    limit_position, limit_angle : largest allowed errors [m], [rad] on held-out poses; that of the
+        position also in the volume.
+    volume : in which the largest position error is stated: a `loopcal.Volume`, ranges of controlled
+        coordinates, or points, see `loopcal.bound_errors`.
     choose_model : free only as many parameters as held-out predictions justify.
     prior : the posterior of an earlier calibration of this machine; its knowledge is kept.
     compare_with : stored values, such as those of a firmware or published ones: by name [SI], or a
@@ -76,6 +80,7 @@ class CalibrationOptions:
     seed: int = 1
     limit_position: float | None = None
     limit_angle: float | None = None
+    volume: VolumeLike | None = None
     choose_model: bool = False
     prior: Posterior | None = None
     free_limb: str | None = None
@@ -96,6 +101,8 @@ class CalibrationOptions:
                 f"hold_out is {self.hold_out} and held_out names {len(self.held_out)} poses; give "
                 "one of the two"
             )
+        if self.volume is not None:
+            object.__setattr__(self, "volume", as_volume(self.volume))
         check_limit("limit_position", self.limit_position)
         check_limit("limit_angle", self.limit_angle)
         if self.free_limb is not None and self.prior is None:

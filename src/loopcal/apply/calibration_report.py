@@ -22,6 +22,7 @@ from loopcal.apply.verdict import (
     Verdict,
     choose_next_step,
     decide_verdict,
+    explains_residuals,
     recommend_values,
 )
 from loopcal.estimate.result import Identification
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from loopcal.apply.error_budget import ErrorBudget
     from loopcal.apply.height_errors import HeightErrors
     from loopcal.apply.validation import Validation
+    from loopcal.apply.volume_accuracy import VolumeAccuracy
     from loopcal.diagnose.conventions.convention_check import ConventionCheck
     from loopcal.diagnose.cross_validation import ModelChoice
     from loopcal.diagnose.fit_examination import FitExamination, ReadingError, StartCheck
@@ -98,6 +100,8 @@ class CalibrationReport(TableResult):
     model_choice : the comparison of parameter sets, where it was asked for.
     change : whether the machine changed since the earlier calibration that is the prior.
     comparison : the joint test of stored values, where they were given.
+    volume : the largest position error in the volume of the options; None without one, or where the
+        fit states no error.
     provenance : versions, seeds and options.
     """
 
@@ -117,6 +121,7 @@ class CalibrationReport(TableResult):
     model_choice: ModelChoice | None
     change: Change | None
     comparison: ValueComparison | None
+    volume: VolumeAccuracy | None
     provenance: Provenance
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
@@ -127,6 +132,7 @@ class CalibrationReport(TableResult):
         *fields("instruments", "validation"),
         Field("change", is_optional=True),
         Field("expected_error", "budget", is_optional=True),
+        Field("volume", is_optional=True),
         Field("comparison", is_optional=True),
         Field("model_choice", is_optional=True),
         Field("examination", is_optional=True),
@@ -218,20 +224,17 @@ class CalibrationReport(TableResult):
 
     @property
     def states_expected_error(self) -> bool:
-        """Whether the budget is the expected error of the machine: not where the residuals
-        contradict the noise, and no discrepancy of the model explains that, and not where they
-        are doubtful.
-        """
-        fit = self.identification
-        explained = fit.posterior.discrepancy is not None or not fit.residual_test.failed
-        return self.budget is not None and explained and not fit.residual_test.is_doubtful
+        """Whether the budget is the expected error of the machine, see `explains_residuals`."""
+        return self.budget is not None and explains_residuals(self.identification)
 
     @property
     def headline(self) -> str:
         """The verdict in one sentence."""
         fit = self.identification
         fitted, verdict = _count_fitted_poses(fit, self.split.fitted), self.verdict.value
-        missed = [str(f.data["quantity"]) for f in self.findings if f.code in LIMIT_MISSED]
+        missed = dict.fromkeys(
+            str(f.data["quantity"]) for f in self.findings if f.code in LIMIT_MISSED
+        )
         return (
             f"{verdict[0].upper()}{verdict[1:]}: {self.robot.name}, {len(fit.names)} parameters "
             f"from {name_count(fitted, 'pose')}."
@@ -242,6 +245,7 @@ class CalibrationReport(TableResult):
         """Return verdict, expected and validated errors, findings, recommendation and next step."""
         errors = self.validation or self.fitted_errors
         lines = [self.headline, *([str(self.budget)] if self.states_expected_error else [])]
+        lines += [] if self.volume is None else map(str, self.volume.findings)
         if errors is not None:
             lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]
             lines += errors.describe_rms()

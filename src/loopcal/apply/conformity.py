@@ -244,6 +244,16 @@ def judge_largest_error(
     )
 
 
+def judge_draws(draws: FloatArray, limit: float, level: float = LEVEL) -> Conformity:
+    """Compare a true error, of which draws (n,) from its distribution are given, with an upper
+    limit.
+    """
+    _check_level(level)
+    low, middle, high, floor, bound = np.quantile(draws, [*INTERVAL, 1.0 - level, level]).tolist()
+    probability = float((draws <= limit).mean())
+    return Conformity(limit, middle, low, high, floor, bound, probability, probability, level)
+
+
 def judge_limits(
     observations: Sequence[Observations],
     after: PoseErrors,
@@ -291,22 +301,38 @@ def report_conformity(
             findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
             continue
         worst, unit, result = int(np.argmax(errors.size)), units[quantity], judged.get(quantity)
-        numbers: dict[str, float] = {"error": float(errors.size[worst]), "limit": limit}
-        code = "gates.limit-exceeded" if numbers["error"] > limit else "gates.limit-kept"
+        measured = float(errors.size[worst])
         stated: dict[str, Any] = {
             "pose": poses[errors.rows[worst]],
             "target": errors.targets[worst],
+            "error": _show(measured, unit),
         }
         if result is not None:
-            code = f"conformity.{result.decision.name.lower()}"
-            numbers |= {name: getattr(result, name) for name in STATED}
-            stated |= {name: getattr(result, name) for name in STATED_NUMBERS}
-        stated |= {
-            name: Quantity(float(number) / unit.factor_to_si, unit.symbol)
-            for name, number in numbers.items()
-        }
-        findings.append(report_finding(code, quantity=quantity, **stated))
+            findings.append(report_decision(quantity, result, unit, **stated))
+            continue
+        code = "gates.limit-exceeded" if measured > limit else "gates.limit-kept"
+        findings.append(report_finding(code, quantity=quantity, limit=_show(limit, unit), **stated))
     return findings
+
+
+def report_decision(quantity: str, result: Conformity, unit: Unit, **measured: Any) -> Finding:
+    """Return the decision on a limit in words.
+
+    measured : pose, target and size of the largest measured error; without any, the error is that
+        of a volume.
+    """
+    return report_finding(
+        f"conformity.{result.decision.name.lower()}",
+        quantity=quantity,
+        is_volume=not measured,
+        **{"pose": "", "target": "", "error": None, **measured},
+        **{name: _show(getattr(result, name), unit) for name in STATED},
+        **{name: getattr(result, name) for name in STATED_NUMBERS},
+    )
+
+
+def _show(number: float, unit: Unit) -> Quantity:
+    return Quantity(float(number) / unit.factor_to_si, unit.symbol)
 
 
 def _check_level(level: float) -> None:

@@ -85,6 +85,15 @@ def report_fit(fit: Identification) -> list[Finding]:
     return [replace(f, severity=severities.get(f.code, f.severity)) for f in fit.findings]
 
 
+def explains_residuals(fit: Identification) -> bool:
+    """Return whether the covariance of a fit is that of its errors: not where the residuals
+    contradict the noise, and no discrepancy of the model explains that, and not where they are
+    doubtful.
+    """
+    test = fit.residual_test
+    return (fit.posterior.discrepancy is not None or not test.failed) and not test.is_doubtful
+
+
 def report_unexplained(fit: Identification, examined: Iterable[Finding]) -> list[Finding]:
     """Return whether an estimated noise takes in the whole of measurements that do not fit.
 
@@ -249,7 +258,7 @@ def _choose_limit_step(
         is_measured = failed != {LIMIT_NOT_MEASURED}
         step = "improve-accuracy" if is_measured else "measure-quantity"
         codes = failed - {LIMIT_NOT_MEASURED} if is_measured else failed
-    quantities = [str(f.data["quantity"]) for f in findings if f.code in codes]
+    quantities = dict.fromkeys(str(f.data["quantity"]) for f in findings if f.code in codes)
     for quantity in quantities:
         share = repeatability.get(quantity, 0.0)
         if step == "improve-accuracy" and share > 0.5:

@@ -221,6 +221,7 @@ def _parse_pose_share(text: str) -> float:
     return share
 
 
+Parts = tuple[tuple[str, Any], ...]  # of a volume, see `loopcal.apply.volume_accuracy`
 FILE = click.Path(path_type=Path)
 LENGTH, POSITIVE_LENGTH = (_quantity(Dimension.LENGTH, positive) for positive in (False, True))
 ANGLE, POSITIVE_ANGLE = (_quantity(Dimension.ANGLE, positive) for positive in (False, True))
@@ -336,29 +337,33 @@ def frame(of: str, names: str = "fitted, base, relative, or the frame of an inst
     return option(help_text, of=of, metavar="NAME")
 
 
-def _parse_range(text: str) -> tuple[str, tuple[float, float]]:
-    """Return a controlled coordinate and its range [SI] in a text such as x=-40mm..40mm."""
-    match = re.fullmatch(r"(\w+)=(.+)\.\.(.+)", text)
-    if match is None:
-        raise UnitError(f"{text!r} is no range; write a coordinate and its ends: x=-40mm..40mm")
-    from loopcal.mechanism.platform_coordinates import list_dimensions
+def _parse_volume(text: str) -> tuple[str, Any]:
+    """Return a part of a volume, or `points` and the file of them."""
+    from loopcal.apply.volume_accuracy import POINTS, parse_volume_part
 
-    name, *ends = match.groups()
-    low, high = (parse_quantity(end, *list_dimensions((name,))) for end in ends)
-    if not low < high:
-        raise UnitError(f"{text!r} ends below its beginning; give the smaller value first")
-    return name, (low, high)
+    return (POINTS, Path(text)) if Path(text).is_file() else parse_volume_part(text)
 
 
-VOLUME: Any = option(
-    "Range of a controlled coordinate, such as x=-40mm..40mm; others stay at home. Give it once "
-    "for each coordinate of the volume.",
-    type=Parsed("range", _parse_range),
-    multiple=True,
-    required=True,
-    metavar="NAME=LOW..HIGH",
-    callback=lambda _context, _option, ranges: dict(ranges),
-)
+def volume(**settings: Any) -> Any:
+    """Declare the option for a working volume, of which `read_volume` makes one value."""
+    return option(
+        "Volume in which the largest position error is stated: x=-40mm..40mm for a range of a "
+        "controlled coordinate, radius=40mm for a cylinder, theta=0deg,5deg for single values; or "
+        "a CSV file of points. Give each part; other coordinates stay at home.",
+        type=Parsed("volume", _parse_volume),
+        multiple=True,
+        metavar="PART|FILE",
+        **settings,
+    )
+
+
+def read_volume(parts: Parts, robot: lc.Mechanism) -> lc.Volume | None:
+    """Return the volume that the parts of the command line state together; None without any."""
+    from loopcal.apply.volume_accuracy import POINTS, join_volume
+    from loopcal.io.runs.result_files import load_targets
+
+    loaded = ((n, load_targets(of, robot)[0] if n == POINTS else of) for n, of in parts)
+    return join_volume(loaded) if parts else None
 
 
 def _limit(kind: Parsed, quantity: str, example: str) -> Any:

@@ -128,6 +128,7 @@ def view_calibration(
     fit = report.identification
     stated = fit.to_dict()
     task = ["", str(report.budget)] if report.states_expected_error else []
+    task += [] if report.volume is None else [str(f) for f in report.volume.findings]
     blocks: list[Block] = [report.headline, *task]
     if report.validation is not None:
         blocks += view_errors(report.validation, "held-out")

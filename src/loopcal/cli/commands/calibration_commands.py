@@ -53,6 +53,7 @@ def calibrate(
     frame: str = opt.frame(OPTIONS),
     limit_position: float | None = opt.LIMIT_POSITION,
     limit_angle: float | None = opt.LIMIT_ANGLE,
+    volume: opt.Parts = opt.volume(),
     seed: int = opt.seed("the choice of held-out poses", OPTIONS),
     allowed: dict[str, bool] = opt.ALLOWED,
     force: bool = opt.force(
@@ -78,6 +79,7 @@ def calibrate(
     Examples:
       loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
       loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm
+      loopcal calibrate robot.yaml data.csv -o run --volume radius=80mm --volume z=0mm..60mm
       loopcal calibrate printer.yaml heights.csv -o run --noise estimated
       loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
@@ -94,6 +96,7 @@ def calibrate(
         inputs["prior"] = prior / RESULT
     if compare is not None:
         inputs["compare"] = find_robot_file(compare)
+    inputs.update(("volume", file) for name, file in volume if name == "points")
     machine = lc.load_robot(robot)
     settings = lc.CalibrationOptions(
         fit,
@@ -101,6 +104,7 @@ def calibrate(
         seed=seed,
         limit_position=limit_position,
         limit_angle=limit_angle,
+        volume=opt.read_volume(volume, machine),
         choose_model=choose_model,
         prior=None if prior is None else lc.load_run(prior).load_posterior(),
         free_limb=free_limb,
@@ -149,19 +153,30 @@ def budget(run: Path = opt.RUN) -> Output:
 @opt.command()
 def accuracy(
     run: Path = opt.RUN,
-    volume: dict[str, tuple[float, float]] = opt.VOLUME,
-    frame: str = opt.frame("loopcal.apply.accuracy:bound_errors"),
+    volume: opt.Parts = opt.volume(required=True),
+    frame: str = opt.frame("loopcal.apply.volume_accuracy:bound_errors"),
+    limit_position: float | None = opt.option(
+        "Largest allowed position error in the volume, such as 0.02mm; above it the exit code is "
+        "2.",
+        type=opt.POSITIVE_LENGTH,
+    ),
 ) -> Output:
     """State the largest position error of the tool in a volume, with a confidence of 95 %.
 
-    The errors of all points of the volume are at most the first number together; the second holds
-    for each single point. Scatter of the readings is not contained. RUN is a run folder.
+    The errors of all points of the volume are at most the first number together (simultaneously);
+    the second holds for each single point (pointwise). RUN is a run folder.
 
     Examples:
       loopcal accuracy run --volume x=-40mm..40mm --volume y=-40mm..40mm
+      loopcal accuracy run --volume radius=80mm --volume z=0mm..60mm --limit-position 0.02mm
+      loopcal accuracy run --volume points.csv --frame tracker
     """
-    stated = lc.bound_errors(lc.load_run(run).load_posterior(), volume, frame)
-    return Output(stated, lambda: str(stated).splitlines())
+    calibrated = lc.load_run(run)
+    posterior = calibrated.load_stated_errors()
+    region = opt.read_volume(volume, posterior.robot)
+    assert region is not None, "the option is required"
+    stated = lc.bound_errors(posterior, region, frame, limit=limit_position)
+    return Output(stated, lambda: str(stated).splitlines(), stated.failures)
 
 
 @opt.command()

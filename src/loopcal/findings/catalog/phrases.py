@@ -296,7 +296,10 @@ def largest_error(data: Data) -> str:
     if expanded.value > 0.0:
         places = max(0, 1 - math.floor(math.log10(expanded.value)))
         value, uncertainty = (f"{x.value:.{places}f}" for x in (estimate, expanded))
-    template = "Largest {quantity} error of {count}, without the noise of the measurement: "
+    template = (
+        "Largest {quantity} error {is_volume:if|in the volume|of {count}, without the noise of the "
+        "measurement}: "
+    )
     subject = f"{fill_template(template, **data)}{value} {unit}"
     low, high = data["low"].value, data["high"].value
     if abs(high + low - 2.0 * estimate.value) <= LARGEST_SKEW * (high - low):

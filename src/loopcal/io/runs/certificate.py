@@ -2,8 +2,8 @@
 """A digital calibration certificate of a run: the XML of PTB's schema, DCC 3.3.0, with D-SI values.
 
 Every value is in SI, with its expanded uncertainty (coverage probability 95 %); sentences for
-people are in mm and deg. The certificate states what the run states: parameters, errors at
-held-out poses, conformity with limits, and the instruments. Elements and their order:
+people are in mm and deg. The certificate states what the run states: parameters, errors at held-out
+poses and in a volume, conformity with limits, and the instruments. Elements and their order:
 https://ptb.de/dcc/v3.3.0/; the values: https://ptb.de/si/v2.2.1/.
 """
 
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from xml.etree.ElementTree import Element, indent, register_namespace, tostring
 
 from loopcal.errors import DataError
+from loopcal.findings.catalog.phrases import conformity_probability
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.runs.run_folder import refuse_changed_run
@@ -147,6 +148,12 @@ PREDICTED = (
     "measurement."
 )
 """What the results and the statements on limits are about."""
+
+VOLUME_BOUNDS = {
+    "simultaneous": "simultaneously at all points",
+    "pointwise": "pointwise, at a single point",
+}
+"""Key of a bound of the error in a volume -> words."""
 
 UNITS = {Dimension.LENGTH: r"\metre", Dimension.ANGLE: r"\radian"}
 """Dimension -> unit in the D-SI; ratios have the unit one."""
@@ -302,6 +309,14 @@ def _list_results(content: Mapping[str, Any]) -> Iterator[Content]:
         scaled = (None if x is None else x * unit.factor_to_si for x in values)
         parameters.append(_quantity(row["name"], UNITS.get(unit.dimension, r"\one"), *scaled))
     yield {"name": "Identified parameters", "data": {"quantity": parameters}}
+    if volume := content.get("volume"):
+        bound = "upper bound of the position error with 95 % confidence"
+        bounds = [
+            _quantity(f"{bound}, {words}", r"\metre", volume[name])
+            for name, words in VOLUME_BOUNDS.items()
+        ]
+        name = f"Position error in the working volume, {volume['frame']}"
+        yield {"name": name, "data": {"quantity": bounds}}
     errors = content.get("validation")
     if not errors:
         return
@@ -348,7 +363,15 @@ def _list_statements(content: Mapping[str, Any]) -> Iterator[Content]:
     sentences = [*([headline] if headline else []), *(f["text"] for f in stated), SCOPE]
     yield {"name": "Verdict, warnings and expected error", "declaration": " ".join(sentences)}
     judged = (content.get("validation") or {}).get("conformity") or {}
-    for quantity, stated in judged.items():
+    decisions = [
+        (quantity, "at held-out poses", one, PREDICTED) for quantity, one in judged.items()
+    ]
+    if volume := content.get("volume"):
+        told = [f["text"] for f in volume["findings"] if not f["code"].startswith("conformity.")]
+        yield {"name": "Position error in the working volume", "declaration": " ".join(told)}
+        if volume.get("conformity"):
+            decisions.append(("position", "in the working volume", volume["conformity"], ""))
+    for quantity, where, stated, meaning in decisions:
         unit, scale = ("mm", 1e3) if quantity == "position" else ("deg", math.degrees(1.0))
         numbers = {
             "estimate": "Estimate",
@@ -361,14 +384,13 @@ def _list_statements(content: Mapping[str, Any]) -> Iterator[Content]:
         lengths = (
             f"{words} {stated[k] * scale:.3g} {unit}" for k, words in numbers.items() if k in stated
         )
-        highest = stated.get("most_probable", stated["probability"])
+        probability = conformity_probability({"most_probable": stated["probability"], **stated})
         declaration = (
-            f"{', '.join(lengths)}, probability of conformity {100 * stated['probability']:.3g} to "
-            f"{100 * highest:.3g} %; conformity and nonconformity are stated from "
-            f"{100 * stated['level']:.3g} %. {PREDICTED}"
+            f"{', '.join(lengths)}, probability of conformity {probability}; "
+            f"conformity and nonconformity are stated from {100 * stated['level']:.3g} %. {meaning}"
         )
         yield {
-            "name": f"Conformity of the largest {quantity} error at held-out poses",
+            "name": f"Conformity of the largest {quantity} error {where}",
             "norm": "ISO 14253-1:2017",
             "declaration": declaration,
             "conformity": CONFORMITY[stated["decision"]],

@@ -181,6 +181,20 @@ class Run(Result):
 
         return posterior_from_arrays(self.identified_robot, self.arrays)
 
+    def load_stated_errors(self) -> Posterior:
+        """Return the posterior of a run whose errors are those to expect of the machine.
+
+        Raises
+        ------
+        DataError : the run failed, or its residuals contradict the noise. EstimationError : see
+            `load_posterior`.
+        """
+        if self.failure is not None:
+            raise DataError(self.failure)
+        if self.result.get("states_expected_error") is False:
+            raise DataError(report_finding("accuracy.volume-open", reason="noise"))
+        return self.load_posterior()
+
     def load_uncertainty(self) -> FitUncertainty | None:
         """Return what the fit knows of machine and setup parameters together, to check other
         measurements; None for a robot file, or a run that does not contain it.

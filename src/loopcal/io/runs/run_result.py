@@ -65,6 +65,20 @@ BUDGET: dict[str, Any] = {
     "finding": {"text": str},
     "sources?": ([SOURCE],),  # earlier versions state none
 }
+VOLUME: dict[str, Any] = {
+    "simultaneous": float,
+    "pointwise": float,
+    "frame": str,
+    "findings": [{"code": str, "text": str}],
+    "conformity?": (
+        {
+            "decision": Literal["conforms", "does not conform", "neither conforms nor fails"],
+            **dict.fromkeys(("estimate", "expanded", "limit", "guard_band"), float),
+            **dict.fromkeys(("acceptance_limit", "rejection_limit", "level"), float),
+            **dict.fromkeys(("probability", "most_probable"), float),
+        },
+    ),
+}
 STATED: dict[str, Any] = {
     "format": Literal[1, 2],
     "made_by": {"command": [str], "inputs": {"*": {"path": str, "sha256": str}}},
@@ -84,6 +98,7 @@ STATED: dict[str, Any] = {
     "reasons?": [str],
     "split?": ({"held_out": [str]},),
     "expected_error?": (BUDGET,),
+    "volume?": (VOLUME,),
     "nulls?": {"*": str},
     "files?": {"*": str},
 }

@@ -125,6 +125,8 @@ def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
     if budget and result.get("states_expected_error"):
         yield budget["finding"]["text"]
         yield build_share_table(budget)
+    stated = (result.get("volume") or {}).get("findings", ())
+    yield from (f["text"] for f in stated if not f["code"].startswith(CONFORMITY))
     judged = [f for f in record.findings if f["code"].startswith(CONFORMITY)]
     yield from list_findings(judged)
     if judged and record.validation is not None:

@@ -255,7 +255,7 @@ class CalibrationRecord:
 
 # Options of a stored calibration in words.
 
-UNITS = {"limit_position": "m", "limit_angle": "rad"}
+UNITS = {"limit_position": "m", "limit_angle": "rad", "volume": "[m, rad]"}
 """Units of options that are numbers [SI]."""
 
 
@@ -281,6 +281,8 @@ def describe_value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list):
+        if value and isinstance(value[0], list):  # a table, such as the points of a volume
+            return f"{len(value)} rows"
         return ", ".join(map(describe_value, value))
     if not isinstance(value, dict):
         return str(value)
