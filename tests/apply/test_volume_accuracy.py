@@ -127,8 +127,10 @@ def test_a_volume_says_what_the_robot_does_not_reach_and_what_it_extrapolates() 
     assert "pointwise" in str(wide)
 
 
-def test_scatter_of_the_readings_counts_at_each_point() -> None:
-    """As in the uncertainty of a pose; at more points, more of it."""
+def test_scatter_of_the_readings_counts_for_one_approach_to_any_point_or_to_each_of_a_list() -> (
+    None
+):
+    """As in the uncertainty of a pose; of a list with more points, more of it."""
     robot = load_robot("linear-delta")
     fit, _ = calibrate_delta(2)
     posterior = fit.posterior
@@ -140,7 +142,16 @@ def test_scatter_of_the_readings_counts_at_each_point() -> None:
     many = bound_errors(shaken, [*point] * 9, "base")
     assert many.pointwise == pytest.approx(one.pointwise, rel=0.05)
     assert many.simultaneous > 1.2 * one.simultaneous
-    assert "counts once at each point" in str(many)
+    assert "one approach to each point" in str(many)
+    fine, coarse = (
+        bound_errors(
+            shaken, Volume({"z": (0.05, 0.0501)}, {"x": [1e-6 * i for i in range(n)]}), "base"
+        )
+        for n in (40, 1)
+    )  # one approach, however many points are compared
+    assert fine.simultaneous == pytest.approx(coarse.simultaneous, rel=0.01)
+    assert fine.simultaneous == pytest.approx(one.simultaneous, rel=0.05)
+    assert "one approach to any point" in str(fine)
 
 
 def test_a_limit_is_judged_by_the_drawn_errors() -> None:

@@ -301,9 +301,9 @@ def bound_errors(
     """State the largest position error of the tool in a volume, at all of its points together.
 
     The errors of all points are drawn together from the posterior. The statement is the 95 %
-    quantile of the largest error of each draw. Errors that each pose has by itself, such as the
-    scatter of the readings, count once at each point. Points that the robot does not reach are left
-    out, and the statement says so.
+    quantile of the largest error of each draw. The scatter of the readings counts for one approach
+    to any point of a box or cylinder, and for one to each point of a list. Points that the robot
+    does not reach are left out, and the statement says so.
 
     Parameters
     ----------
@@ -321,11 +321,12 @@ def bound_errors(
     chosen = choose_error_frame(posterior, frame, home, "home")
     compute = partial(pose_uncertainty, posterior, frame=frame, origin=home, origin_name="home")
     grids, refinement = volume.list_grids(robot), math.nan
-    grid = next(grids)
-    drawn = _draw_errors(posterior, inverse(robot, grid.points), compute, chosen, seed)
+    grid, is_list = next(grids), volume.points is not None
+    draw = partial(_draw_errors, posterior, compute, chosen, is_list, seed)
+    drawn = draw(inverse(robot, grid.points))
     for grid in grids:
         last = drawn.simultaneous
-        drawn = _draw_errors(posterior, inverse(robot, grid.points), compute, chosen, seed)
+        drawn = draw(inverse(robot, grid.points))
         refinement = abs(drawn.simultaneous - last) / max(last, np.finfo(float).tiny)
         if refinement < REFINED:
             break
@@ -375,13 +376,17 @@ class _DrawnErrors(NamedTuple):
 
 def _draw_errors(
     posterior: Posterior,
-    solution: Solution,
     compute: Callable[[Solution], PoseUncertainty],
     frame: ErrorFrame,
+    is_list: bool,
     seed: int,
+    solution: Solution,
 ) -> _DrawnErrors:
     """Return errors of poses that the robot reaches; EstimationError where the data do not
     determine them.
+
+    is_list : whether the scatter of the readings is that of an approach to each pose; otherwise it
+        is that of one approach to any.
     """
     single = compute(solution)
     if not np.isfinite(single.position).all():
@@ -390,7 +395,8 @@ def _draw_errors(
             "poses, or state the error in another frame"
         )
     root = posterior.without_discrepancy.root / posterior.unit[:, None]
-    own = 0 if posterior.discrepancy is None else 6  # slow errors of each pose alone
+    # effects of each pose alone: those of a discrepancy, and of an approach to each
+    own = 6 * (posterior.discrepancy is not None) + is_list * len(posterior.repeatability)
     random, largest, pointwise = make_random_stream(seed, 0), np.zeros(DRAWS), []
     left = float(single.degrees.position.min())
     size = np.sqrt(left / random.chisquare(left, DRAWS)) if np.isfinite(left) else 1.0
@@ -398,10 +404,10 @@ def _draw_errors(
     for first in range(0, len(solution.q), BLOCK // 4):
         part = solution.take(np.arange(first, min(first + BLOCK // 4, len(solution.q))))
         errors = linearize_tool_errors(posterior, part, frame)
-        slow, alone = np.split(errors.by_discrepancy, [errors.by_discrepancy.shape[2] - own], 2)
-        effects = (errors.by_parameters @ root, errors.by_frame, slow)
-        shared = np.concatenate(effects, axis=2)[:, 3:]
-        alone = np.concatenate([alone, errors.by_readings], axis=2)[:, 3:]
+        others = (errors.by_readings, errors.by_discrepancy)
+        others = others[::-1] if is_list else others
+        effects = np.concatenate([errors.by_parameters @ root, errors.by_frame, *others], axis=2)
+        shared, alone = np.split(effects[:, 3:], [effects.shape[2] - own], axis=2)
         if common is None:
             common = random.standard_normal((shared.shape[2], DRAWS))
         drawn = shared @ common
