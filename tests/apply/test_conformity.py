@@ -14,6 +14,10 @@ from loopcal.apply.conformity import (
     SMALL,
     Decision,
     Spread,
+    _find_distribution,
+    _find_equal_errors,
+    _mix,
+    _rotate,
     judge_estimate,
     judge_largest_error,
     judge_limits,
@@ -34,9 +38,9 @@ from loopcal.units import find_unit
 from tests.estimate.problems import UM, noise
 
 
-def isotropic(sigma: float, count: int) -> np.ndarray:
-    """Return covariances (e, 3, 3) of equal noise."""
-    return np.tile(sigma**2 * np.eye(3), (count, 1, 1))
+def isotropic(sigma: float, count: int, components: int = 3) -> np.ndarray:
+    """Return covariances (e, c, c) of equal noise."""
+    return np.tile(sigma**2 * np.eye(components), (count, 1, 1))
 
 
 def test_estimate_of_12_um_against_15_um_conforms_with_98_percent() -> None:
@@ -113,13 +117,57 @@ def test_distribution_is_that_of_drawn_errors(spread: Spread) -> None:
                 t = mean + rng.multivariate_normal(np.zeros(3), V, len(which))
                 sizes[which, e] = np.linalg.norm(t, axis=1)
     largest = sizes.max(axis=1)
-    judged = judge_largest_error(errors, np.tile(noise, (6, 1, 1)), 6.0)
-    share, is_small = (largest <= 6.0).mean(), spread is SMALL
-    found = judged.most_probable if is_small else judged.probability
-    assert found == pytest.approx(share, abs=0.015)
-    expected = np.quantile(largest, [0.025, 0.05] if is_small else [0.95, 0.975])
-    found = [judged.low, judged.floor] if is_small else [judged.bound, judged.high]
-    assert found == pytest.approx(expected, rel=0.03)
+    rotated = _rotate(errors, np.tile(noise, (6, 1, 1)))
+    below = _find_distribution(*rotated, 1.0, np.inf, spread).below
+    for limit in (6.0, *np.quantile(largest, [0.025, 0.05, 0.95, 0.975])):
+        assert below(limit) == pytest.approx((largest <= limit).mean(), abs=0.015)
+
+
+def draw_statements(sets: int, seed: int) -> np.ndarray:
+    """Return (2, 2) the number of statements "conforms" and "does not conform", right and wrong,
+    where limits are within a quarter of the largest true error, and this of the size of the noise.
+
+    Errors are normal, with the tails of Student's t, of equal sizes, with one large, or of heights.
+    """
+    rng, counts = np.random.default_rng(seed), np.zeros((2, 2), dtype=int)
+    for i in range(sets):
+        n, kind, true = (6, 15, 25)[i % 3], i // 3 % 5, 10 ** rng.uniform(-0.3, 0.8)
+        t = rng.standard_normal((n, 1 if kind == 4 else 3))
+        if kind == 1:
+            t *= np.sqrt(4.0 / rng.chisquare(4, (n, 1)))
+        if kind == 2:
+            t *= 1.6 / np.linalg.norm(t, axis=1, keepdims=True)
+        t[0] *= 4.0 if kind == 3 else 1.0
+        t *= true
+        # sigma known to 25 % in every second set
+        scale, degrees = (np.exp(0.25 * rng.standard_normal()), 8.0) if i % 2 else (1.0, np.inf)
+        errors = _rotate(t + scale * rng.standard_normal(t.shape), isotropic(1.0, n, t.shape[1]))
+        large = _find_distribution(*errors, 1.0, degrees, LARGE).below
+        small = _find_distribution(*errors, 1.0, degrees, SMALL)
+        small = _mix(small, _find_equal_errors(*errors, 1.0, degrees))
+        for share in (0.77, 0.85, 0.93, 0.98, 1.02, 1.07, 1.15, 1.23):
+            limit = share * float(np.linalg.norm(t, axis=1).max())
+            low, high = sorted((large(limit), small(limit)))
+            counts[0, int(share < 1.0)] += low >= LEVEL
+            counts[1, int(share > 1.0)] += high <= 1.0 - LEVEL
+    return counts
+
+
+@pytest.mark.parametrize("sets", [60, pytest.param(1200, marks=pytest.mark.evidence)])
+def test_at_most_one_statement_in_20_is_wrong_where_limits_are_near_the_true_error(sets) -> None:
+    for right, wrong in draw_statements(sets, seed=4):
+        count = right + wrong
+        assert count >= 0.5 * sets
+        # at most 5 % of statements, up to a chance of 1 %
+        assert wrong <= binom.ppf(0.99, count, 1.0 - LEVEL), (wrong, count)
+
+
+@pytest.mark.parametrize("limit", [1e-3, 1e-2, 0.05])
+def test_noise_alone_fails_no_limit_far_below_it(limit) -> None:
+    for seed in range(3):
+        errors = np.random.default_rng(seed).standard_normal((12, 3))
+        judged = judge_largest_error(errors, isotropic(1.0, 12), limit)
+        assert judged.decision is Decision.UNDECIDED
 
 
 def test_groups_of_many_similar_errors_change_little(monkeypatch) -> None:
