@@ -86,21 +86,18 @@ class Volume:
         for name, (low, high) in self.ranges.items():
             if name in self.values or not -math.inf < low < high < math.inf:
                 raise DataError(f"give {name} of the volume one range, the lower end first")
+        for name, values in self.values.items():
+            if not len(check_array(values, f"the values of {name} in the volume", (None,))):
+                raise DataError(f"the volume has no value of {name}; give one, or leave it out")
         if self.radius is not None and not 0.0 < self.radius < math.inf:
             raise DataError(f"the radius of the volume is {self.radius:g} m; give one above 0")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what is stated."""
-        stated = {"ranges": self.ranges or None, "values": self.values or None}
-        stated |= {"radius": self.radius, "points": self.points}
-        return {name: value for name, value in stated.items() if value is not None}
 
     def find_circle(self, robot: Mechanism) -> tuple[str, ...]:
         """Return the two coordinates of the circle of a cylinder; none of other volumes."""
         if self.radius is None:
             return ()
         free = [n for n in POSITION if n in robot.controlled and n not in self.ranges][:2]
-        if len(free) < 2 or any(len(self.values.get(name, "1")) != 1 for name in free):
+        if len(free) < 2 or any(len(self.values.get(name, [0.0])) != 1 for name in free):
             raise DataError(
                 f"a radius needs two of x, y, z that {robot.name} is commanded in, without a range "
                 "and with one value as center; leave out a range, or the radius"

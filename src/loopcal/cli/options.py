@@ -366,13 +366,13 @@ def read_volume(parts: Parts, robot: lc.Mechanism) -> lc.Volume | None:
     return join_volume(loaded) if parts else None
 
 
-def _limit(kind: Parsed, quantity: str, example: str) -> Any:
-    text = f"Largest allowed {quantity} error on poses that were not fitted, such as {example}"
-    return option(f"{text}; above it the exit code is 2.", type=kind)
+def _limit(kind: Parsed, quantity: str, where: str, example: str) -> Any:
+    text = f"Largest allowed {quantity} error on poses that were not fitted{where}"
+    return option(f"{text}, such as {example}; above it the exit code is 2.", type=kind)
 
 
-LIMIT_POSITION = _limit(POSITIVE_LENGTH, "position", "0.02mm")
-LIMIT_ANGLE = _limit(POSITIVE_ANGLE, "orientation", "0.01deg")
+LIMIT_POSITION = _limit(POSITIVE_LENGTH, "position", " or in a volume", "0.02mm")
+LIMIT_ANGLE = _limit(POSITIVE_ANGLE, "orientation", "", "0.01deg")
 
 
 def profile(help: str, **settings: Any) -> Any:  # noqa: A002

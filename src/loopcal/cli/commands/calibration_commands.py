@@ -155,11 +155,7 @@ def accuracy(
     run: Path = opt.RUN,
     volume: opt.Parts = opt.volume(required=True),
     frame: str = opt.frame("loopcal.apply.volume_accuracy:bound_errors"),
-    limit_position: float | None = opt.option(
-        "Largest allowed position error in the volume, such as 0.02mm; above it the exit code is "
-        "2.",
-        type=opt.POSITIVE_LENGTH,
-    ),
+    limit_position: float | None = opt.LIMIT_POSITION,
 ) -> Output:
     """State the largest position error of the tool in a volume, with a confidence of 95 %.
 

@@ -255,6 +255,7 @@ class CalibrationRecord:
 
 # Options of a stored calibration in words.
 
+EMPTY: tuple[Any, ...] = (None, [], {})  # values of options that state nothing
 UNITS = {"limit_position": "m", "limit_angle": "rad", "volume": "[m, rad]"}
 """Units of options that are numbers [SI]."""
 
@@ -272,7 +273,7 @@ def list_options(options: object) -> list[tuple[str, str]]:
             f"{describe_value(value)} {UNITS.get(key, '')}".strip(),
         )
         for key, value in stated.items()
-        if value not in (None, [], {})
+        if value not in EMPTY
     ]
 
 
@@ -288,5 +289,7 @@ def describe_value(value: Any) -> str:
         return str(value)
     if OBJECT in value:  # `<Posterior of ...>` of Python
         return str(value[OBJECT]).strip("<>").split(" ")[0]
-    settings = ", ".join(f"{k} {describe_value(v)}" for k, v in value.items() if k != "name")
+    settings = ", ".join(
+        f"{k} {describe_value(v)}" for k, v in value.items() if k != "name" and v not in EMPTY
+    )
     return f"{value['name']} ({settings})" if "name" in value else settings
