@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal.engine import CONVERGED, Group
+from loopcal.engine import BASE, CONVERGED, PLATFORM, Group
 from tests import zoo
 from tests.engine.cases import (
     actuated_joint_values,
@@ -96,6 +96,8 @@ def compile_limb_derivative(letters, ending, chosen, slots, size):
             length,
             slots,
             slice(0),
+            (BASE,),
+            (PLATFORM,),
         )
         twist, joints, own = v[:6], v[6 : 6 + count], v[6 + count :]
         moved = homogeneous(jnp, rotation(jnp, twist[:3]) @ T[:3, :3], T[:3, 3] + twist[3:])

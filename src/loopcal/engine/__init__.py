@@ -6,6 +6,7 @@ another engine is accepted when it passes tests/engine. All functions are pure; 
 them at the same time.
 """
 
+from loopcal.engine.program import BASE as BASE
 from loopcal.engine.program import CONVERGED as CONVERGED
 from loopcal.engine.program import ENDINGS as ENDINGS
 from loopcal.engine.program import EXHAUSTED as EXHAUSTED
@@ -13,6 +14,7 @@ from loopcal.engine.program import LENGTH as LENGTH
 from loopcal.engine.program import NEAR_GOAL as NEAR_GOAL
 from loopcal.engine.program import NOT_FINITE as NOT_FINITE
 from loopcal.engine.program import PITCH as PITCH
+from loopcal.engine.program import PLATFORM as PLATFORM
 from loopcal.engine.program import STALLED as STALLED
 from loopcal.engine.program import Block as Block
 from loopcal.engine.program import ClosureBlocks as ClosureBlocks

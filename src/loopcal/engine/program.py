@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The input and output of the engine: the structure of a mechanism, apart from its parameters.
 
-A limb is a chain from the base to a tip (link 0, joint 0, link 1, ..., link J) and an ending that
-ties the tip to an attachment frame on the platform: `rigid` (6 rows: rotation times the size,
-position), `ball` (3 rows: position) or `distance` (1 row: |attachment - tip| - length). A joint
-moves along or about the z axis of the link frame before it: `R` turns by theta and advances by
-pitch * theta, `P` advances by theta. Limbs of one structure form a group and are evaluated
-together. The rod of a `distance` ending counts as joint J, whose value is added to its length.
+Nodes are bodies whose poses closure determines: the platform, and other bodies that carry three or
+more joints. A limb is a chain from the base or a node to a tip (link 0, joint 0, link 1, ..., link
+J) and an ending that ties the tip to an attachment frame on another node: `rigid` (6 rows: rotation
+times the size, position), `ball` (3 rows: position) or `distance` (1 row: |attachment - tip| -
+length). A joint moves along or about the z axis of the link frame before it: `R` turns by theta and
+advances by pitch * theta, `P` advances by theta. Limbs of one structure form a group and are
+evaluated together. The rod of a `distance` ending counts as joint J, whose value is added to its
+length.
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ PITCH, LENGTH = 6, 7
 """Values of `Slot.axis` beside the axes 0..5 of a twist."""
 ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
 """Endings of a limb, with the number of their closure equations."""
+BASE, PLATFORM = -1, 0
+"""Numbers of the base and of the platform among the bodies that limbs join; the others follow."""
 CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 """Values of `State.status`."""
 NEAR_GOAL = 8
@@ -64,6 +68,7 @@ class Group:
     links : (k, J + 2, 4, 4) nominal link transforms, the attachment last [m].
     pitch : (k, J) nominal advance per turn angle [m/rad]. length : (k,) nominal rod length [m].
     slots : displacements of each limb. columns : their place in e, limb by limb.
+    on, to : (k,) the bodies at which the limbs begin and end: all BASE, all PLATFORM or all others.
     """
 
     limbs: tuple[int, ...]
@@ -77,6 +82,8 @@ class Group:
     length: FloatArray
     slots: tuple[Slot, ...]
     columns: slice
+    on: tuple[int, ...]
+    to: tuple[int, ...]
 
     @cached_property
     def has_plain_link(self) -> tuple[bool, ...]:
@@ -104,6 +111,7 @@ class Program:
     """A mechanism in the form that the engine computes with.
 
     groups : the limbs. freedoms : positions in a twist of the platform's m freedoms.
+    others : the freedoms of each node but the platform.
     size : characteristic length [m]; an angle times the size compares with a length.
     n_displacements, n_joints : lengths of e and of q.
     sigma : (n_joints,) standard deviations of q that weigh redundant actuators; None without
@@ -119,6 +127,39 @@ class Program:
     n_joints: int
     sigma: tuple[float, ...] | None = None
     may_stay_open: bool = False
+    others: tuple[tuple[int, ...], ...] = ()
+
+    @property
+    def nodes(self) -> tuple[tuple[int, ...], ...]:
+        """Freedoms of all nodes, those of the platform first."""
+        return (self.freedoms, *self.others)
+
+    @cached_property
+    def unknown_twists(self) -> list[tuple[int, int]]:
+        """The node and the freedom of each column of A, node by node."""
+        return [(node, f) for node, freedoms in enumerate(self.nodes) for f in freedoms]
+
+    @cached_property
+    def elimination_order(self) -> tuple[int, ...]:
+        """The nodes in the order in which a factorization eliminates them, the platform last.
+
+        Each is the one with the fewest neighbors among the rest, which become neighbors of each
+        other: a tree is eliminated from its leaves, where no row gets longer.
+        """
+        near: dict[int, set[int]] = {node: set() for node in range(len(self.nodes))}
+        for group in self.groups:
+            for ends in zip(group.on, group.to, strict=True):
+                if min(ends) >= PLATFORM:
+                    near[ends[0]].add(ends[1])
+                    near[ends[1]].add(ends[0])
+        order: list[int] = []
+        while len(near) > 1:
+            node = min((i for i in near if i != PLATFORM), key=lambda i: (len(near[i]), i))
+            order.append(node)
+            joined = near.pop(node)
+            for other in joined:
+                near[other] = (near[other] | joined) - {node, other}
+        return (*order, PLATFORM)
 
     def list_drives(self, joints: tuple[FloatArray, ...]) -> FloatArray:
         """Return values (t, n, a) of the actuated joints, of those of groups (t, n, k, J + 1)."""
@@ -145,7 +186,11 @@ class Program:
 
     @cached_property
     def has_square_limbs(self) -> bool:
-        """Whether each limb has as many unknown joints as equations, drives among them."""
+        """Whether the limbs have as many unknown joints as equations, drives among them, where the
+        platform rests: each limb for itself, or with the other nodes.
+        """
+        if self.others:
+            return self.count_equations(free=True) == sum(map(len, self.others))
         return all(len(g.rows) == len(g.unknown_joints(free=True)) for g in self.groups)
 
     @cached_property
@@ -180,13 +225,14 @@ class Program:
 
     @cached_property
     def idle_limbs(self) -> Program:
-        """The limbs of the idle groups alone, with a platform that stays where the start has it."""
-        return replace(self, groups=tuple(self.groups[i] for i in self.idle_groups), freedoms=())
+        """The limbs of the idle groups alone, with nodes that stay where the start has them."""
+        groups = tuple(self.groups[i] for i in self.idle_groups)
+        return replace(self, groups=groups, freedoms=(), others=((),) * len(self.others))
 
     @cached_property
     def is_square(self) -> bool:
-        """Whether closure with locked actuators has as many equations as the platform freedoms."""
-        return self.count_equations(free=False) == len(self.freedoms)
+        """Whether closure with locked actuators has as many equations as the nodes freedoms."""
+        return self.count_equations(free=False) == len(self.unknown_twists)
 
     def count_equations(self, *, free: bool) -> int:
         """Return the number of closure equations without passive joints, and with `free` drives."""
@@ -198,7 +244,7 @@ class State:
     """Positions of a mechanism for t trials and n poses.
 
     T : (t, n, 4, 4) platform in base [m]. joints : for each group all joint values
-        (t, n, k, J + 1) [m, rad].
+        (t, n, k, J + 1) [m, rad]. others : the other nodes in base, each (t, n, 4, 4) [m].
     status : (t, n) CONVERGED; STALLED: no closure near here; EXHAUSTED: out of iterations;
         NOT_FINITE: not finite, or singular.
     residual : (t, n) norm of the closure residual [m]. iterations : (t, n) Newton steps.
@@ -212,6 +258,7 @@ class State:
     residual: FloatArray
     iterations: IntArray
     closure_sign: NDArray[np.int8]
+    others: tuple[FloatArray, ...] = ()
 
     def select(self, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
         """Return rows (trial, pose) of a state that broadcasts to a shape (t, n), as (rows, 1)."""
@@ -223,7 +270,8 @@ class State:
             chosen(a)
             for a in (self.T, self.status, self.residual, self.iterations, self.closure_sign)
         )
-        return State(T, tuple(chosen(a) for a in self.joints), *rest)
+        joints, others = (tuple(map(chosen, arrays)) for arrays in (self.joints, self.others))
+        return State(T, joints, *rest, others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +314,8 @@ class Block:
     """Linearized closure of a group, c' rows of each limb: U dtheta + A y + E de + Q dq.
 
     Shapes (t, n, k, c', columns). theta : the eliminated joints, with U triangular. y : the
-    platform's freedoms in base axes. e, q : all displacements and joints of the limb itself.
+    freedoms of all nodes in base axes, see `Program.unknown_twists`. e, q : all displacements and
+    joints of the limb itself.
     """
 
     U: FloatArray

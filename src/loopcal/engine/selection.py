@@ -66,7 +66,8 @@ class Engine:
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
     solve_triangles, compare_poses : None where the functions of `loopcal.numerics` and of
-        `loopcal.geometry` do it.
+        `loopcal.geometry` do it. solves_nodes : whether programs may have nodes but the platform;
+        NumPy computes those of an engine that does not.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Engine:
     fold_poses: Callable[..., tuple[FloatArray, BoolArray]]
     solve_triangles: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
+    solves_nodes: bool = False
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -112,6 +114,7 @@ def select_engine(choice: str = "") -> Engine:
     return engine
 
 
+@cache
 def _make_numpy_engine() -> Engine:
     """Return the engine in NumPy, whose modules are imported for it alone."""
     from loopcal.engine.numpy_engine.certificate import certify
@@ -122,7 +125,7 @@ def _make_numpy_engine() -> Engine:
     from loopcal.engine.numpy_engine.targets import reach
 
     functions = solve, certify, reach, linearize, fold, differentiate, fold_poses
-    return Engine(NUMPY, np.__version__, *functions)
+    return Engine(NUMPY, np.__version__, *functions, solves_nodes=True)
 
 
 def _is_native_installed() -> bool:
@@ -152,6 +155,12 @@ def get_current_engine() -> Engine:
     return select_engine(os.environ.get(VARIABLE, ""))
 
 
+def _get_engine_for(program: Program) -> Engine:
+    """Return the current engine, or NumPy for nodes that it does not solve."""
+    current = get_current_engine()
+    return current if current.solves_nodes or not program.others else _make_numpy_engine()
+
+
 def solve(
     program: Program,
     e: FloatArray,
@@ -175,7 +184,7 @@ def solve(
     Rows that fail are marked in `status`; nothing is raised. The closure sign is that of the limbs
     that constrain the platform: a limb whose joints only follow it may pass its own singularities.
     """
-    current = get_current_engine()
+    current = _get_engine_for(program)
     state = current.solve(program, e, q, start, task, free, max_iterations, goal)
     if not program.idle_groups:
         return state
@@ -193,7 +202,7 @@ def certify(program: Program, e: FloatArray, start: State, goal: State) -> NDArr
 
     e : (t | 1, n_displacements) [m, rad]. start : (t | 1, 1). goal : solutions (t, n).
     """
-    return get_current_engine().certify(program, e, start, goal)
+    return _get_engine_for(program).certify(program, e, start, goal)
 
 
 def reach(program: Program, e: FloatArray, target: Target, start: State) -> Reached:
@@ -204,7 +213,7 @@ def reach(program: Program, e: FloatArray, target: Target, start: State) -> Reac
     All actuators are free, and the platform has six freedoms or the poses keep the others. Limbs
     begin at the start's joint values. Closure with locked actuators is square.
     """
-    return get_current_engine().reach(program, e, target, start)
+    return _get_engine_for(program).reach(program, e, target, start)
 
 
 def linearize(
@@ -215,7 +224,7 @@ def linearize(
     e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
     free : eliminate the actuated joints too, at their values in `state`.
     """
-    return get_current_engine().linearize(program, e, q, state, free)
+    return _get_engine_for(program).linearize(program, e, q, state, free)
 
 
 def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
@@ -229,22 +238,30 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def differentiate(
-    program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    state: State,
+    inputs: ParameterMap,
+    nodes: int = 1,
 ) -> tuple[FloatArray, FloatArray]:
-    """Differentiate the platform at a state (t, n), D = -A^-1 [E de/dp + Q dq/dp].
+    """Differentiate the first nodes at a state (t, n), D = -A^-1 [E de/dp + Q dq/dp].
 
     e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
-    inputs : how parameters and readings move e and q.
+    inputs : how parameters and readings move e and q. nodes : 1 for the platform alone.
 
     Redundant actuators are weighted by the standard deviations of the program. Singular rows have
     infinities or NaN.
 
     Returns
     -------
-    by_parameter, by_reading : (t, n, 6, p) and (t, n, 6, n_joints) twist of the platform per unit
-        of each, zero outside its freedoms.
+    by_parameter, by_reading : (t, n, 6 nodes, p) and (t, n, 6 nodes, n_joints) twists per unit of
+        each, node by node, zero outside their freedoms.
     """
-    return get_current_engine().differentiate(program, e, q, state, inputs)
+    differentiate = _get_engine_for(program).differentiate
+    if program.others:
+        return differentiate(program, e, q, state, inputs, nodes)
+    return differentiate(program, e, q, state, inputs)
 
 
 def fold_poses(
@@ -267,7 +284,7 @@ def fold_poses(
         was observed are finite. Its rows are zero elsewhere.
     """
     arguments = program, e, q, state, inputs, observed
-    return get_current_engine().fold_poses(factor, *arguments)
+    return _get_engine_for(program).fold_poses(factor, *arguments)
 
 
 def solve_triangles(

@@ -14,8 +14,8 @@ from loopcal.mechanism.limb_rows import (
     linearize_limbs,
     name_passive_joints,
     solve_passive_motion,
+    stack_closure_rows,
     stack_driven_columns,
-    stack_platform_rows,
 )
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import driven_values
@@ -194,7 +194,7 @@ def differentiate_lengths(program: Program, e: FloatArray, state: State) -> Floa
     Each limb has one driven joint and one closure equation: dl = -A dy / Q.
     """
     blocks = engine.linearize(program, e, program.list_drives(state.joints), state)
-    A, Q = stack_platform_rows(blocks), stack_driven_columns(program, blocks)
+    A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
     columns = np.concatenate([g.actuator[g.actuator[:, 0] >= 0][0] for g in program.groups])
     out = np.empty_like(A)
     with np.errstate(all="ignore"):

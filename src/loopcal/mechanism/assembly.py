@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.errors import MechanismError
 from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
@@ -22,8 +23,8 @@ AXES = ("rx", "ry", "rz", "x", "y", "z")
 TWIST_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 """Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too."""
 
-BASE = "base"
-"""Name of the base of a chain of stages."""
+BASE, PLATFORM = "base", "platform"
+"""Names of the base, also of a chain of stages, and of the platform."""
 
 MOST_LIMBS, MOST_JOINTS, MOST_ACTUATORS, MOST_PARAMETERS = 100, 50, 200, 2000
 """Largest numbers of limbs, joints of one limb, actuators and parameters."""
@@ -79,13 +80,13 @@ class Cone(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """A serial chain from base to platform: link, joint, link, ..., link, ending, attachment.
+    """A serial chain between two bodies: link, joint, link, ..., link, ending, attachment.
 
-    links : one more than joints. ending : rigid, ball or distance. attachment : on the platform, in
-        its frame.
+    links : one more than joints. ending : rigid, ball or distance. attachment : on the body at its
+        end, in the frame of that body.
     length : nominal length of the rod of a `distance` ending at joint value zero [m].
     actuator : drive of that length, None for a rod of fixed length.
-    cones : allowed inclinations of the rod.
+    cones : allowed inclinations of the rod. on, to : the bodies at which it begins and ends.
     """
 
     name: str
@@ -96,6 +97,8 @@ class Limb:
     length: float = 0.0
     actuator: str | None = None
     cones: tuple[Cone, ...] = ()
+    on: str = BASE
+    to: str = PLATFORM
 
     @property
     def drives(self) -> tuple[str, ...]:
@@ -199,6 +202,8 @@ class Assembly:
     stages : of a chain, each after the one that it is attached to; the fields above are those of
         all stages together, with the name of the stage before those of limbs and parameters.
     closure : of over-constrained loops, `exact` or `least-squares`.
+    bodies : name -> first guess (4, 4) of the home pose in the base, of each body beside base and
+        platform that limbs join. They have the freedoms of the platform.
     """
 
     name: str
@@ -217,6 +222,13 @@ class Assembly:
     common_errors: tuple[CommonError, ...] = ()
     stages: tuple[AttachedStage, ...] = ()
     closure: str = "exact"
+    bodies: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @cached_property
+    def numbers(self) -> Mapping[str, int]:
+        """The number of each body, as an engine knows it."""
+        names = (BASE, PLATFORM, *self.bodies)
+        return {name: number for number, name in enumerate(names, engine.BASE)}
 
     @cached_property
     def driven_joints(self) -> tuple[str, ...]:
@@ -269,7 +281,9 @@ class AttachedStage:
 
 def is_serial(assembly: Assembly) -> bool:
     """Return whether the pose is the product of driven joints: one limb without passive joints."""
-    if assembly.stages or len(assembly.limbs) != 1 or len(assembly.freedoms) < len(AXES):
+    if assembly.stages or assembly.bodies or len(assembly.limbs) != 1:
+        return False
+    if len(assembly.freedoms) < len(AXES):
         return False
     (limb,) = assembly.limbs
     return limb.ending == "rigid" and all(joint.actuator for joint in limb.joints)

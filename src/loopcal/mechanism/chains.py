@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, STALLED, State
+from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
 from loopcal.mechanism.actuation import Derivatives
 from loopcal.mechanism.limb_rows import follow_limb, measure_rod
 from loopcal.mechanism.model import Mechanism, ParameterUnits, Stage
@@ -74,6 +74,7 @@ def join_stage_states(robot: Mechanism, states: Sequence[State]) -> ChainState:
         np.maximum.reduce([state.residual for state in states]),
         np.maximum.reduce([state.iterations for state in states]),
         np.multiply.reduce([state.closure_sign for state in states]).astype(np.int8),
+        tuple(body for state in states for body in state.others),
         poses,
         tuple(state.closure_sign for state in states),
     )
@@ -82,11 +83,21 @@ def join_stage_states(robot: Mechanism, states: Sequence[State]) -> ChainState:
 def split_stage_states(robot: Mechanism, state: State) -> list[State]:
     """Return the states of the stages of a chain; each has the status of the chain."""
     assert isinstance(state, ChainState)
+    counts = [len(stage.robot.program.others) for stage in robot.stages]
+    first = np.cumsum([0, *counts])
     return [
         State(
-            pose, state.joints[stage.groups], state.status, state.residual, state.iterations, sign
+            pose,
+            state.joints[stage.groups],
+            state.status,
+            state.residual,
+            state.iterations,
+            sign,
+            state.others[first[i] : first[i + 1]],
         )
-        for stage, pose, sign in zip(robot.stages, state.poses, state.signs, strict=True)
+        for i, (stage, pose, sign) in enumerate(
+            zip(robot.stages, state.poses, state.signs, strict=True)
+        )
     ]
 
 
@@ -360,6 +371,8 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
     for group, joints in zip(robot.program.groups, robot.home_state.joints, strict=True):
         displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
         for k in range(len(group.limbs)):
+            if (group.on[k], group.to[k]) != (BASE, PLATFORM):
+                continue
             slides = "P" in group.joints or bool(group.pitch[k].any()) or group.actuator[-1, k] >= 0
             if slides or any(slot.axis == PITCH for slot in group.slots):
                 continue  # a joint changes the distance of its neighbors

@@ -17,6 +17,7 @@ from loopcal.findings.wording import name_count
 from loopcal.mechanism.assembly import (
     AXES,
     BASE,
+    PLATFORM,
     Address,
     Assembly,
     AttachedStage,
@@ -153,9 +154,10 @@ def _close_at_home(
     slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size, a = compute_characteristic_length(assembly), len(assembly.driven_joints)
+    others = (freedoms,) * len(assembly.bodies)
     groups, places, count = _group_limbs(assembly, slots, {})
     guess = _make_first_guess(assembly, groups)
-    idle = find_idle_joints(Program(groups, freedoms, size, count, a), guess)
+    idle = find_idle_joints(Program(groups, freedoms, size, count, a, others=others), guess)
     _check_drives(assembly, idle)
     if idle:
         groups, places, count = _group_limbs(assembly, slots, idle)
@@ -178,7 +180,7 @@ def _close_at_home(
         assembly,
         table,
         table.nominal,
-        Program(groups, freedoms, size, count, a, weights),
+        Program(groups, freedoms, size, count, a, weights, others=others),
         _map_slots(assembly, table, places, count),
         size,
         guess,
@@ -196,24 +198,22 @@ def _close_at_home(
 
 
 def compute_characteristic_length(assembly: Assembly) -> float:
-    """Return the root mean square distance [m] between the points where limbs leave the base, those
-    where they end on the platform, and each other.
+    """Return the root mean square distance [m] between the points where limbs begin on the base or
+    another body, those where they end, and each other.
 
     If all coincide, it is that of links and rods; DEFAULT_SIZE if every length is zero.
     """
-    home = assembly.home
-    gaps = [
-        (home @ limb.attachment.transform)[:3, 3] - limb.links[0].transform[:3, 3]
-        for limb in assembly.limbs
-    ]
+    at_home = {BASE: np.eye(4), PLATFORM: assembly.home, **assembly.bodies}
+    feet = [(at_home[limb.on] @ limb.links[0].transform)[:3, 3] for limb in assembly.limbs]
+    ends = [(at_home[limb.to] @ limb.attachment.transform)[:3, 3] for limb in assembly.limbs]
+    gaps = np.subtract(ends, feet)
     reach = [limb.attachment.transform[:3, 3] for limb in assembly.limbs]
-    feet = [limb.links[0].transform[:3, 3] for limb in assembly.limbs]
     spread = np.concatenate([gaps, reach, np.subtract(feet, np.mean(feet, axis=0))])
     size = float(np.sqrt((spread**2).sum() / len(gaps)))
-    ends = [
+    steps = [
         link.transform[:3, 3] for limb in assembly.limbs for link in (*limb.links, limb.attachment)
     ]
-    lengths = [*np.linalg.norm(ends, axis=1), *(limb.length for limb in assembly.limbs)]
+    lengths = [*np.linalg.norm(steps, axis=1), *(limb.length for limb in assembly.limbs)]
     if size > POINT * max(lengths):
         return size
     return float(np.sqrt(np.mean(np.square(lengths)))) or DEFAULT_SIZE
@@ -285,9 +285,11 @@ def _group_limbs(
     address in e, and the length of e.
     """
     alike: dict[tuple[Any, ...], list[int]] = {}
+    numbers = assembly.numbers
     for i, limb in enumerate(assembly.limbs):
         structure = tuple((j.kind, bool(j.actuator)) for j in limb.joints), bool(limb.actuator)
-        alike.setdefault((limb.ending, structure, locked.get(i, ())), []).append(i)
+        ends = (min(numbers[name], 1) for name in (limb.on, limb.to))
+        alike.setdefault((limb.ending, structure, locked.get(i, ()), *ends), []).append(i)
     driven = {name: i for i, name in enumerate(assembly.driven_joints)}
     groups, places, count = [], {}, 0
     for members in alike.values():
@@ -319,6 +321,8 @@ def _group_limbs(
                 np.array([m.length for m in limbs]),
                 slots,
                 slice(first, count),
+                tuple(numbers[m.on] for m in limbs),
+                tuple(numbers[m.to] for m in limbs),
             )
         )
     return tuple(groups), places, count
@@ -408,14 +412,15 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
         [[*(j.start for j in assembly.limbs[i].joints), 0.0] for i in group.limbs]
         for group in groups
     )
-    return make_start(assembly.home[None, None], tuple(np.array([[rows]]) for rows in joints))
+    home, *others = (T[None, None] for T in (assembly.home, *assembly.bodies.values()))
+    return make_start(home, tuple(np.array([[rows]]) for rows in joints), tuple(others))
 
 
 def _find_home(robot: Mechanism) -> State:
     """Return the closed state at the controlled coordinates of the home pose."""
     program, values = robot.program, robot.values[None]
     shared = program.shared_drive_count
-    movable = len(program.freedoms) - program.count_equations(free=True) - shared
+    movable = len(program.unknown_twists) - program.count_equations(free=True) - shared
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms or more, but names only "
@@ -523,7 +528,8 @@ def _join_programs(stages: Sequence[Stage], size: float) -> Program:
             )
         limbs += len(stage.robot.assembly.limbs)
         first, joints = first + own.n_displacements, joints + own.n_joints
-    return Program(tuple(groups), tuple(range(len(AXES))), size, first, joints)
+    others = tuple(body for stage in stages for body in stage.robot.program.others)
+    return Program(tuple(groups), tuple(range(len(AXES))), size, first, joints, others=others)
 
 
 def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:

@@ -37,7 +37,14 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.states import Status, driven_values, replace_rows, select_rows, without_poses
+from loopcal.mechanism.states import (
+    Status,
+    driven_values,
+    list_bodies,
+    replace_rows,
+    select_rows,
+    without_poses,
+)
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
     TERMS,
@@ -456,13 +463,14 @@ def compute_limb_frames(
         )
     e, _ = robot.slots(values)
     frames: dict[int, FloatArray] = {}
+    bodies, shape = list_bodies(state), state.T.shape
     for group, joints in zip(robot.program.groups, state.joints, strict=True):
         displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
         for k, limb in enumerate(group.limbs):
             chain, attachment = follow_limb(group, k, displacements[:, k], joints[:, :, k])
-            frames[limb] = np.stack(
-                [*(np.broadcast_to(f, state.T.shape) for f in chain), state.T @ attachment], axis=2
-            )
+            placed = [bodies[group.on[k]] @ frame for frame in chain]
+            placed.append(bodies[group.to[k]] @ attachment)
+            frames[limb] = np.stack([np.broadcast_to(f, shape) for f in placed], axis=2)
     return tuple(frames[i] for i in sorted(frames))
 
 

@@ -44,19 +44,19 @@ SINGULAR = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """N rows: displacements e (N, d), platforms T (N, 1, 4, 4), joints of groups (N, 1, k, J + 1).
+    """N rows: displacements e (N, d), nodes (N, 1, 4, 4), joints of groups (N, 1, k, J + 1).
 
     program : with every joint driven, so that engines linearize without elimination.
     """
 
     program: Program
     e: FloatArray
-    T: FloatArray
+    nodes: tuple[FloatArray, ...]
     joints: tuple[FloatArray, ...]
 
     def linearize(self) -> list[engine.Block]:
         """Return A, E and Q of each group, (N, k, r, columns), with all rows of the endings."""
-        state = make_start(self.T, self.joints)
+        state = make_start(self.nodes[0], self.joints, self.nodes[1:])
         q = self.program.list_drives(self.joints)
         blocks = engine.linearize(self.program, self.e, q, state).closure
         return [engine.Block(*(a[:, 0] for a in (b.U, b.A, b.E, b.Q))) for b in blocks]
@@ -65,10 +65,11 @@ class _Rows:
         """Return the residual (N, k, r) of a group [m], with all rows of its ending."""
         group, joints = self.program.groups[number], self.joints[number]
         own = self.e[:, group.columns].reshape(len(self.e), len(group.limbs), -1)
-        out = []
+        bodies, out = (*self.nodes, np.eye(4)), []  # the base has the number -1
         for k in range(len(group.limbs)):
             frames, attachment = follow_limb(group, k, own[:, k], joints[:, :, k])
-            tip, end = frames[-1][:, 0], (self.T @ attachment)[:, 0]
+            tip = (bodies[group.on[k]] @ frames[-1])[:, 0]
+            end = (bodies[group.to[k]] @ attachment)[:, 0]
             gap = end[:, :3, 3] - tip[:, :3, 3]
             if group.ending == "distance":
                 length = measure_rod(group, k, own[:, k]) + joints[:, 0, k, -1]
@@ -83,15 +84,18 @@ class _Rows:
         return np.stack(out, axis=1)
 
     def move(self, unknown: str, index: int, change: float) -> _Rows:
-        """Return the rows after a change of a freedom, of a joint or of a slot of all limbs."""
+        """Return the rows after a change of a freedom, by its number among those of all nodes, of
+        a joint or of a slot of all limbs.
+        """
         if unknown == "freedom":
-            T = self.T.copy()
-            if index < 3:
-                turn = geometry.exp_so3(change * np.eye(3)[index])
+            node, f = self.program.unknown_twists[index]
+            T = self.nodes[node].copy()
+            if f < 3:
+                turn = geometry.exp_so3(change * np.eye(3)[f])
                 T[..., :3, :3] = turn @ T[..., :3, :3]
             else:
-                T[..., index - 3, 3] += change
-            return replace(self, T=T)
+                T[..., f - 3, 3] += change
+            return replace(self, nodes=(*self.nodes[:node], T, *self.nodes[node + 1 :]))
         if unknown == "joint":
             joints = tuple(a.copy() for a in self.joints)
             for a in joints:
@@ -106,21 +110,26 @@ class _Rows:
 
 
 def differentiate_open(
-    program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    state: State,
+    inputs: ParameterMap,
+    nodes: int = 1,
 ) -> tuple[FloatArray, FloatArray]:
-    """Differentiate the platform of a least-squares closure; see `loopcal.engine.differentiate`."""
-    by_input, freedoms = differentiate_unknowns(program, e, q, state, inputs), program.freedoms
-    p, m = inputs.pattern.parameters, len(freedoms)
-    out = np.zeros((*state.T.shape[:2], 6, by_input.shape[-1]))
-    out[:, :, list(freedoms)] = by_input[:, :, :m]
+    """Differentiate the nodes of a least-squares closure; see `loopcal.engine.differentiate`."""
+    by_input, p = differentiate_unknowns(program, e, q, state, inputs), inputs.pattern.parameters
+    freedoms = [6 * node + f for node, f in program.unknown_twists if node < nodes]
+    out = np.zeros((*state.T.shape[:2], 6 * nodes, by_input.shape[-1]))
+    out[:, :, freedoms] = by_input[:, :, : len(freedoms)]
     return out[..., :p], out[..., p:]
 
 
 def differentiate_unknowns(
     program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
 ) -> FloatArray:
-    """Differentiate the unknowns of a least-squares closure, (t, n, u, p + a): the freedoms of the
-    platform, then the joints of `list_unknown_joints`. Arguments are those of
+    """Differentiate the unknowns of a least-squares closure, (t, n, u, p + a): the freedoms of all
+    nodes, then the joints of `list_unknown_joints`. Arguments are those of
     `loopcal.engine.differentiate`.
     """
     t, n = state.T.shape[:2]
@@ -128,14 +137,14 @@ def differentiate_unknowns(
         np.broadcast_to(g.insert_driven(own, q), (t, n, *own.shape[2:]))
         for g, own in zip(program.groups, state.joints, strict=True)
     ]
-    count = len(program.freedoms) + len(list_unknown_joints(program))
+    count = len(program.unknown_twists) + len(list_unknown_joints(program))
     out = np.zeros((t * n, count, inputs.pattern.parameters + program.n_joints))
     for first in range(0, t * n, CHUNK):
         trial, pose = np.divmod(np.arange(first, min(first + CHUNK, t * n)), n)
         rows = _Rows(
             program.with_driven_joints,
             e[trial if len(e) > 1 else 0 * trial],
-            state.T[trial, pose][:, None],
+            tuple(T[trial, pose][:, None] for T in (state.T, *state.others)),
             tuple(own[trial, pose][:, None] for own in joints),
         )
         with np.errstate(all="ignore"):
@@ -219,7 +228,7 @@ def _map_inputs(
 
 def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> FloatArray:
     """Return the unknowns by parameters and readings (N, u, p + a)."""
-    m, N, width = len(program.freedoms), len(rows.T), inputs.joints.shape[2]
+    m, N, width = len(program.unknown_twists), len(rows.e), inputs.joints.shape[2]
     unknown = [g.unknown_joints(False) for g in program.groups]
     total = m + sum(len(g.limbs) * len(u) for g, u in zip(program.groups, unknown, strict=True))
     moves_slots = bool(inputs.displacements.any())
@@ -282,7 +291,7 @@ def _bend(
     """Return (dJ)'r of each group by freedoms, slots and joints, (N, k, m + u, ..); zero where the
     loops are closed, and by slots which no input moves.
     """
-    m, groups, N = len(program.freedoms), program.groups, len(rows.T)
+    m, groups, N = len(program.unknown_twists), program.groups, len(rows.e)
     out = []
     for group in groups:
         lead = N, len(group.limbs), m + len(group.unknown_joints(False))
@@ -291,14 +300,15 @@ def _bend(
     largest = max(np.nanmax(np.abs(r), initial=0.0) for r in residuals)
     if largest <= CLOSED * program.size:
         return out
-    moves = [("freedom", f, i) for i, f in enumerate(program.freedoms)]
+    moves = [("freedom", i, i) for i in range(m)]
     moves += [("joint", j, j) for j in range(max(len(g.joints) for g in groups) + 1)]
     if moves_slots:
         moves += [("slot", i, i) for i in range(max(len(g.slots) for g in groups))]
     for kind, index, place in moves:
         part = {"freedom": 0, "slot": 1, "joint": 2}[kind]
         # one length of the change for all limbs; of a joint an angle counts as its arc
-        change = CHANGE * (1.0 if kind == "freedom" and index < 3 else program.size)
+        is_turn = kind == "freedom" and program.unknown_twists[index][1] < 3
+        change = CHANGE * (1.0 if is_turn else program.size)
         ahead, behind = (rows.move(kind, index, s * change).linearize() for s in (1, -1))
         for g, group in enumerate(groups):
             if place < out[g][part].shape[3]:

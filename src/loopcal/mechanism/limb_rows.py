@@ -45,7 +45,7 @@ def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
 class LimbRows(NamedTuple):
     """Linearized closure rows of one limb.
 
-    A : (t, n, r, m) against the platform's freedoms. by_parameter : (t, n, r, ..) against the
+    A : (t, n, r, M) against the freedoms of all nodes. by_parameter : (t, n, r, ..) against the
     parameters in `parameters`. by_reading : (t, n, r, ..) against the actuators in `readings`, of
     summed drives against driven joints.
     """
@@ -185,11 +185,26 @@ class LinearizedLimbs(NamedTuple):
         return driven * self.joints_by_reading[:, :, None, limb.readings]
 
 
-def stack_platform_rows(blocks: engine.ClosureBlocks) -> FloatArray:
-    """Return all closure rows against the platform's freedoms, (t, n, c, m)."""
+def stack_closure_rows(blocks: engine.ClosureBlocks) -> FloatArray:
+    """Return all closure rows against the freedoms of all nodes, (t, n, c, M)."""
     return np.concatenate(
         [b.A.reshape(*b.A.shape[:2], -1, b.A.shape[-1]) for b in blocks.closure], axis=2
     )
+
+
+def reduce_to_platform(
+    program: engine.Program, blocks: engine.ClosureBlocks
+) -> tuple[FloatArray, FloatArray]:
+    """Return the closure rows that contain no twist of other nodes than the platform, against its
+    freedoms (t, n, c, m) and the actuated joints (t, n, c, a), by an orthogonal reduction.
+    """
+    A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
+    if not program.others:
+        return A, Q
+    m = len(program.freedoms)
+    orthogonal, _ = np.linalg.qr(A[..., m:], mode="complete")
+    free = np.swapaxes(orthogonal[..., A.shape[-1] - m :], -1, -2)
+    return np.matmul(free, A[..., :m]), np.matmul(free, Q)
 
 
 def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray:
@@ -211,8 +226,8 @@ def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) 
 def follow_limb(
     group: Group, k: int, displacements: FloatArray, joints: FloatArray
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Return the frames T_base_link behind each link 0..J of limb k, each (t, n | 1, 4, 4), the
-    last one the tip, and T_platform_attachment (t, 1, 4, 4).
+    """Return the frames (t, n | 1, 4, 4) behind each link 0..J of limb k in the body where it
+    begins, the last one the tip, and the attachment (t, 1, 4, 4) in the body where it ends.
 
     displacements : (t, s) of this limb. joints : (t, n, J + 1) its joint values.
     """

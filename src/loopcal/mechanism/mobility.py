@@ -27,7 +27,7 @@ from loopcal.mechanism.assembly import (
     refuse_more,
     select_rows,
 )
-from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.limb_rows import reduce_to_platform, stack_closure_rows, stack_driven_columns
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     COORDINATES,
@@ -64,7 +64,9 @@ def check_mobility(robot: Mechanism) -> None:
     e = robot.slots(robot.values[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, home), home)
     scale = 1 / robot.twist_scale[list(program.freedoms)]
-    A, Q = stack_platform_rows(blocks)[0, 0] * scale, stack_driven_columns(program, blocks)[0, 0]
+    _refuse_free_bodies(robot, stack_closure_rows(blocks)[0, 0])
+    A, Q = (rows[0, 0] for rows in reduce_to_platform(program, blocks))
+    A = A * scale
     names = [AXES[f] for f in program.freedoms]
     _, s, V = np.linalg.svd(A, full_matrices=True)
     m, a = len(names), program.n_joints
@@ -110,6 +112,27 @@ def check_mobility(robot: Mechanism) -> None:
         _check_open_sums(robot, scale)
 
 
+def _refuse_free_bodies(robot: Mechanism, rows: FloatArray) -> None:
+    """Refuse bodies that can move while the platform rests and all actuators are locked, by the
+    closure rows (c, M) of all nodes at home.
+    """
+    program = robot.program
+    m, columns = len(program.freedoms), program.unknown_twists
+    scale = [1 / robot.twist_scale[f] for _, f in columns[m:]]
+    _, s, V = np.linalg.svd(rows[:, m:] * scale, full_matrices=True)
+    if (rank := count_rank(s)) < len(scale):
+        node, _ = columns[m + int(np.abs(V[rank]).argmax())]
+        own = [i for i, (other, _) in enumerate(columns[m:]) if other == node]
+        names = [AXES[columns[m + i][1]] for i in own]
+        finding = report_finding(
+            "mechanism.free-body",
+            name=robot.name,
+            body=tuple(robot.assembly.bodies)[node - 1],
+            motion=tuple(list_main_freedoms(names, V[rank][own])),
+        )
+        raise MechanismError(finding)
+
+
 def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
     """Refuse sums that leave the platform free at home; scale : (m,) of its freedoms."""
     e, tau = robot.slots(robot.values[None])
@@ -130,7 +153,8 @@ def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     """
     program = robot.program
     e, q = robot.slots(robot.values[None])[0], driven_values(program, state)
-    rows = stack_platform_rows(engine.linearize(program, e, q, state, free=True))[0, 0]
+    blocks = engine.linearize(program, e, q, state, free=True)
+    rows = reduce_to_platform(program, blocks)[0][0, 0]
     columns = _differentiate_controlled(robot, state.T[0, 0])
     scale = 1 / robot.twist_scale[list(program.freedoms)]
     s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)

@@ -19,6 +19,7 @@ from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
 from loopcal.mechanism.actuation import solve_open_sums
+from loopcal.mechanism.assembly import BASE
 from loopcal.mechanism.chains import join_stage_states, solve_serial, solve_stages
 from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings, inverse_trials
 from loopcal.mechanism.model import Mechanism
@@ -281,6 +282,21 @@ def _draw_starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
         return join_stage_states(
             robot, [_draw_starts(stage.robot, rng, n) for stage in robot.stages]
         )
+    T, joints = _draw_poses(robot, rng, n, robot.home), []
+    for group, home in zip(robot.program.groups, robot.home_state.joints, strict=True):
+        values = np.array(np.broadcast_to(home, (1, n, *home.shape[2:])))
+        for j, letter in enumerate(group.joints):
+            if letter == "R" and not group.locked[j]:
+                values[..., j] = rng.uniform(-np.pi, np.pi, values.shape[:-1])
+            elif letter == "P":
+                values[..., j] += robot.size * rng.normal(size=values.shape[:-1])
+        joints.append(values)
+    others = [_draw_poses(robot, rng, n, body[0, 0])[None] for body in robot.home_state.others]
+    return make_start(T[None], tuple(joints), tuple(others))
+
+
+def _draw_poses(robot: Mechanism, rng: np.random.Generator, n: int, home: FloatArray) -> FloatArray:
+    """Draw poses (n, 4, 4) of a node with the home pose (4, 4)."""
     free, size = robot.program.freedoms, robot.size
     turns = [f for f in free if f < 3]
     if len(turns) == 3:
@@ -289,20 +305,11 @@ def _draw_starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
     else:
         w = np.zeros((n, 3))
         w[:, turns] = rng.uniform(-np.pi, np.pi, (n, len(turns)))
-        R = geometry.exp_so3(w) @ robot.home[:3, :3]
-    middle = np.mean([limb.links[0].transform[:3, 3] for limb in robot.assembly.limbs], axis=0)
+        R = geometry.exp_so3(w) @ home[:3, :3]
+    feet = [limb.links[0].transform[:3, 3] for limb in robot.assembly.limbs if limb.on == BASE]
     direction = rng.normal(size=(n, 3)) * size
     shift = direction * np.exp(rng.uniform(np.log(SCALES[0]), np.log(SCALES[1]), (n, 1)))
-    position = np.tile(robot.home[:3, 3], (n, 1))
+    position = np.tile(home[:3, 3], (n, 1))
     axes = [f - 3 for f in free if f >= 3]
-    position[:, axes] = (middle + shift)[:, axes]
-    joints = []
-    for group, home in zip(robot.program.groups, robot.home_state.joints, strict=True):
-        values = np.array(np.broadcast_to(home, (1, n, *home.shape[2:])))
-        for j, letter in enumerate(group.joints):
-            if letter == "R" and not group.locked[j]:
-                values[..., j] = rng.uniform(-np.pi, np.pi, values.shape[:-1])
-            elif letter == "P":
-                values[..., j] += size * rng.normal(size=values.shape[:-1])
-        joints.append(values)
-    return make_start(geometry.make_pose(R, position)[None], tuple(joints))
+    position[:, axes] = (np.mean(feet, axis=0) + shift)[:, axes]
+    return geometry.make_pose(R, position)

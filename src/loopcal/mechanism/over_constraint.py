@@ -10,7 +10,7 @@ and no reading can close them again. Derivation: docs/theory/over-constraint.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
@@ -24,7 +24,7 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
-from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.limb_rows import stack_closure_rows, stack_driven_columns
 from loopcal.mechanism.mobility import RANK, check_assembly, count_rank
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
@@ -48,7 +48,7 @@ share of the robot's size, or this many radians. Home alone may be a special pos
 class _Rows(NamedTuple):
     """The closure equations at one pose with the passive joints eliminated.
 
-    A : (c, m) by the platform's freedoms, rotations over the robot's size. Q : (c, a) by driven
+    A : (c, M) by the freedoms of all nodes, rotations over the robot's size. Q : (c, a) by driven
     joints. E : (c, d) by displacements. limb : (c,) the limb of each equation. absorbed : (j, d) by
     displacements, the equations that determine the j passive joints.
     """
@@ -69,7 +69,7 @@ class _Rows(NamedTuple):
         return out
 
     def constrain(self, limb: int) -> FloatArray:
-        """Return an orthonormal basis (r, m) of what a limb constrains with its drives free."""
+        """Return an orthonormal basis (r, M) of what a limb constrains with its drives free."""
         own = self.limb == limb
         left, s, _ = np.linalg.svd(self.Q[own], full_matrices=True)
         undriven = left[:, count_rank(s) :]
@@ -86,8 +86,8 @@ def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
     program, e = robot.program, robot.slots(robot.parameters.nominal[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, state), state)
-    scale = 1 / robot.twist_scale[list(program.freedoms)]
-    A, Q = stack_platform_rows(blocks)[0] * scale, stack_driven_columns(program, blocks)[0]
+    scale = 1 / robot.twist_scale[[f for _, f in program.unknown_twists]]
+    A, Q = stack_closure_rows(blocks)[0] * scale, stack_driven_columns(program, blocks)[0]
     E, limb = _stack_displacements(program, blocks.closure)
     absorbed, _ = _stack_displacements(program, blocks.passive)
     n = state.T.shape[1]
@@ -146,7 +146,7 @@ def _list_repeated(robot: Mechanism, rows: _Rows) -> tuple[dict[str, Any], ...]:
         stresses = rows.find_repeated(np.arange(last + 1))[:, rows.limb == last]
         wrenches = _find_basis(stresses @ rows.A[rows.limb == last])
         by_others: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-        for wrench, direction in _name_directions(wrenches, robot.program.freedoms):
+        for wrench, direction in _name_directions(wrenches, _list_columns(robot, last)):
             others = tuple(names[i] for i in _find_others(rows, last, wrench))
             by_others.setdefault(others, []).append(direction)
         out += [
@@ -177,15 +177,18 @@ def _find_others(rows: _Rows, last: int, wrench: FloatArray) -> list[int]:
 
 
 def _name_directions(
-    wrenches: FloatArray, freedoms: tuple[int, ...]
+    wrenches: FloatArray, columns: Mapping[int, int]
 ) -> list[tuple[FloatArray, dict[str, Any]]]:
-    """Return a basis of the wrenches (r, m), each (m,) with the direction that it constrains, as
+    """Return a basis of the wrenches (r, M), each (M,) with the direction that it constrains, as
     the catalog words it: a rotation without force, else the translation along the force. Axes of
     the base first.
+
+    columns : freedom -> column, of the body on which the wrenches are named.
     """
     whole = np.zeros((len(wrenches), 6))
-    whole[:, list(freedoms)] = wrenches
+    whole[:, list(columns)] = wrenches[:, list(columns.values())]
     _, s, V = np.linalg.svd(whole[:, 3:].T, full_matrices=True)
+    whole = np.concatenate([whole, wrenches], axis=1)
     forces = int((s > SAME).sum())
     couples = V[forces:] @ whole
     moving = V[:forces] @ whole
@@ -195,12 +198,22 @@ def _name_directions(
         for axis in _choose_axes(basis[:, part]):
             weights = np.linalg.lstsq(basis[:, part].T, axis, rcond=None)[0]
             wrench = weights @ basis
-            unit = wrench[list(freedoms)] / np.linalg.norm(wrench)
+            unit = wrench[6:] / np.linalg.norm(wrench[:6])
             size = np.abs(axis)
             name = "xyz"[int(size.argmax())] if size.max() > 1 - SAME else ""
             vector = () if name else tuple(round(float(v), 3) + 0.0 for v in axis)
             out.append((unit, {"turns": turns, "name": name, "vector": vector}))
     return out
+
+
+def _list_columns(robot: Mechanism, limb: int) -> dict[int, int]:
+    """Return freedom -> column of A, of the body on which a limb ends, or begins if it ends on the
+    base.
+    """
+    ((group, k),) = ((g, g.limbs.index(limb)) for g in robot.program.groups if limb in g.limbs)
+    body = group.to[k] if group.to[k] != engine.BASE else group.on[k]
+    twists = enumerate(robot.program.unknown_twists)
+    return {f: column for column, (node, f) in twists if node == body}
 
 
 def _choose_axes(vectors: FloatArray) -> FloatArray:
@@ -227,7 +240,7 @@ def _find_sufficient_freedoms(
     used = np.zeros(len(freedoms), bool)
     for rows in _linearize(robot, find_nearby_states(robot)):
         _, s, W = np.linalg.svd(np.concatenate([rows.A, rows.Q], axis=1), full_matrices=True)
-        motions = W[count_rank(s) :, : len(freedoms)]
+        motions = W[count_rank(s) :, : rows.A.shape[1]].reshape(-1, len(freedoms))
         largest = np.abs(motions).max(axis=0, initial=0.0)
         used |= largest > SAME * largest.max(initial=1e-300)
     still = np.flatnonzero(~used)
@@ -245,12 +258,15 @@ def _find_sufficient_freedoms(
 
 def find_self_stress(robot: Mechanism) -> FloatArray:
     """Return wrenches (r, limbs, m) that limbs exert in r self-stresses at home, by the freedoms of
-    the platform with rotations over the robot's size.
+    the body on which they end with rotations over the robot's size.
     """
     rows = _linearize(robot, robot.home_state)[0]
     numbers = np.arange(len(robot.assembly.limbs))
     stresses = rows.find_repeated(numbers)
-    own = [stresses[:, rows.limb == i] @ rows.A[rows.limb == i] for i in numbers]
+    own = []
+    for i in numbers:
+        columns = list(_list_columns(robot, i).values())
+        own.append(stresses[:, rows.limb == i] @ rows.A[rows.limb == i][:, columns])
     return np.stack(own, axis=1)
 
 

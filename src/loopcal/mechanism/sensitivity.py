@@ -52,12 +52,14 @@ def differentiate_pose(
     q: FloatArray,
     state: State,
     columns: ParameterUnits | None = None,
+    nodes: int = 1,
 ) -> Derivatives:
     """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
     Return the twists (omega in base axes, velocity of the platform's origin) per unit of each
-    parameter (t, n, 6, p), all in SI or those of `columns`, and reading (t, n, 6, a). Rows of
-    singular states have infinities or NaN.
+    parameter (t, n, 6, p), all in SI or those of `columns`, and reading (t, n, 6, a); of several
+    `nodes` their twists node by node, the platform first. Rows of singular states have infinities
+    or NaN.
     """
     if robot.stages:
         return differentiate_platform(robot, values, q, state, differentiate_pose, columns)
@@ -70,7 +72,7 @@ def differentiate_pose(
         inputs = chosen.linearize(values, tau, q)
         is_open = robot.program.may_stay_open
         differentiate = differentiate_open if is_open else engine.differentiate
-        derivatives = differentiate(robot.program, e, joints, state, inputs)
+        derivatives = differentiate(robot.program, e, joints, state, inputs, nodes)
         if robot.has_sums:
             by_parameters, by_joints = derivatives
             turns = differentiate_joints_by_readings(robot, values, q)
@@ -122,7 +124,9 @@ def differentiate_passive_joints(
         return PassiveSensitivity(names, *whole)
     parameters = np.zeros((t, n, len(names), len(robot.parameters)))
     readings = np.zeros((t, n, len(names), len(robot.actuators)))
-    platform, freedoms = differentiate_pose(robot, values, q, state), list(robot.program.freedoms)
+    nodes = len(robot.program.nodes)
+    platform = differentiate_pose(robot, values, q, state, nodes=nodes)
+    freedoms = [6 * node + f for node, f in robot.program.unknown_twists]
     summed = None
     if robot.has_sums:
         summed = differentiate_driven_joints(robot, values, q, state, platform)
@@ -168,7 +172,7 @@ def _differentiate_open_joints(
         names.index(f"{limbs[i].name}.{limbs[i].joints[j].name}")
         for i, j in list_unknown_joints(program)
     ]
-    return places, exact[:, :, len(program.freedoms) :]
+    return places, exact[:, :, len(program.unknown_twists) :]
 
 
 def differentiate_sensed_values(

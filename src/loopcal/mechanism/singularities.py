@@ -28,7 +28,7 @@ from loopcal.mechanism.actuation import differentiate_lengths
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.chains import find_carrying_actuators, split_stage_states, transport_to_end
 from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings
-from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.limb_rows import reduce_to_platform
 from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
@@ -233,7 +233,7 @@ def _compute_margins(
     e, _ = robot.slots(robot.values[None])
     blocks = engine.linearize(program, e, driven_values(program, state), state)
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
-    A, Q = stack_platform_rows(blocks)[0], stack_driven_columns(program, blocks)[0]
+    A, Q = (rows[0] for rows in reduce_to_platform(program, blocks))
     if robot.has_sums:
         A, Q = _sum_rows(robot, state, A, Q)
     A = A / robot.twist_scale[list(program.freedoms)]

@@ -31,7 +31,7 @@ from loopcal.mechanism.kinematics import (
     forward_trials,
     needs_readings,
 )
-from loopcal.mechanism.limb_rows import name_passive_joints, stack_platform_rows
+from loopcal.mechanism.limb_rows import name_passive_joints, reduce_to_platform
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
@@ -133,8 +133,11 @@ def measure_distance(robot: Mechanism, a: State, b: State) -> FloatArray:
     """Return the largest difference (n,) of poses and joints of states (1, n | 1), lengths per
     size.
     """
-    twist = np.abs(geometry.pose_difference(*np.broadcast_arrays(a.T[0], b.T[0])))
-    largest = np.maximum(twist[:, :3].max(axis=1), twist[:, 3:].max(axis=1) / robot.size)
+    largest = np.zeros(b.T.shape[1])
+    for T, other in zip((a.T, *a.others), (b.T, *b.others), strict=True):
+        twist = np.abs(geometry.pose_difference(*np.broadcast_arrays(T[0], other[0])))
+        turned, moved = twist[:, :3].max(axis=1), twist[:, 3:].max(axis=1) / robot.size
+        largest = np.maximum(largest, np.maximum(turned, moved))
     for group, mine, other in zip(robot.program.groups, a.joints, b.joints, strict=True):
         unit = np.array([1.0 if kind == "R" else robot.size for kind in f"{group.joints}P"])
         gap = np.abs(mine - other)[0] / unit
@@ -258,7 +261,7 @@ def _select_new(
 
 def has_one_solution(robot: Mechanism) -> bool:
     """Return whether a pose has one set of readings, whatever the start: those of driven rods."""
-    if robot.stages or not determine_platform(robot):
+    if robot.stages or robot.program.others or not determine_platform(robot):
         return False
     return all(g.ending == "distance" and g.actuator[-1, 0] >= 0 for g in robot.program.groups)
 
@@ -824,7 +827,8 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
         return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))
     e, _ = robot.slots(values)
     unused = np.zeros((1, n, robot.program.n_joints))
-    rows = stack_platform_rows(engine.linearize(robot.program, e, unused, state, free=True))
+    blocks = engine.linearize(robot.program, e, unused, state, free=True)
+    rows, _ = reduce_to_platform(robot.program, blocks)
     both = np.concatenate([rows, columns[..., freedoms]], axis=2)
     right = np.zeros((*both.shape[:3], len(names)))
     right[:, :, rows.shape[2] :] = np.eye(len(names))

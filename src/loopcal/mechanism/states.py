@@ -45,11 +45,20 @@ def is_closed(status: np.ndarray) -> BoolArray:
     return (status == Status.CONVERGED.value) | (status == Status.OTHER_MODE.value)
 
 
-def make_start(T: FloatArray, joints: tuple[FloatArray, ...]) -> State:
-    """Return the state (t, n) of platforms and joints from which an iteration starts."""
+def make_start(
+    T: FloatArray, joints: tuple[FloatArray, ...], others: tuple[FloatArray, ...] = ()
+) -> State:
+    """Return the state (t, n) of platforms, joints and other nodes from which an iteration
+    starts.
+    """
     zero = np.zeros(T.shape[:2])
     none = zero.astype(np.int8)
-    return State(T, joints, none, zero, zero.astype(np.int64), none)
+    return State(T, joints, none, zero, zero.astype(np.int64), none, others)
+
+
+def list_bodies(state: State) -> list[FloatArray]:
+    """Return the poses of all bodies by their number: the platform, other nodes, the base last."""
+    return [state.T, *state.others, np.eye(4)]
 
 
 def select_rows(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:

@@ -38,6 +38,7 @@ def has_driven_rods(program: Program) -> bool:
     """Return whether the mechanism has six freedoms and six limbs, each a driven rod alone."""
     return (
         len(program.freedoms) == 6
+        and not program.others
         and sum(len(group.limbs) for group in program.groups) == 6
         and all(
             g.ending == "distance" and not g.joints and g.actuator[0, 0] >= 0

@@ -15,7 +15,17 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.engine.numpy_engine.householder import SMALLEST, triangularize
-from loopcal.engine.program import LENGTH, PITCH, Block, ClosureBlocks, Group, Program, Slot, State
+from loopcal.engine.program import (
+    BASE,
+    LENGTH,
+    PITCH,
+    Block,
+    ClosureBlocks,
+    Group,
+    Program,
+    Slot,
+    State,
+)
 from loopcal.typing import FloatArray
 
 CHUNK = 5120
@@ -29,24 +39,24 @@ def linearize(
 ) -> ClosureBlocks:
     """Linearize closure and eliminate the passive joints; see `loopcal.engine.linearize`."""
     t, n = state.T.shape[:2]
-    T, trial = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0), np.arange(t * n) // max(n, 1)
+    bodies, trial = list_bodies(state), np.arange(t * n) // max(n, 1)
     closure, passive, eliminated = [], [], []
     for group, joints in zip(program.groups, state.joints, strict=True):
         values = joints if free else group.insert_driven(joints, q)
         theta = values.reshape(t * n, *values.shape[2:]).transpose(2, 1, 0)
         unknown = group.unknown_joints(free)
         with np.errstate(all="ignore"):
-            chain = Chain(group, place_links(group, e).select(trial), T, theta, program.size)
+            chain = Chain(group, place_links(group, e).select(trial), bodies, theta, program.size)
             columns = chain.stack(
                 *(chain.rows_of_joint(j) for j in unknown),
-                *(chain.rows_of_freedom(f) for f in program.freedoms),
+                *(chain.rows_of_twist(node, f) for node, f in program.unknown_twists),
                 *(chain.rows_of_slot(s) for s in group.slots),
                 *(chain.rows_of_joint(j) for j in range(chain.last)),
             )
             rows = triangularize(columns, len(unknown)) if unknown else columns
         rows = rows.transpose(3, 2, 0, 1).reshape(t, n, len(group.limbs), *rows.shape[:2])
         u = len(unknown)
-        cuts = np.cumsum([u, len(program.freedoms), len(group.slots)])
+        cuts = np.cumsum([u, len(program.unknown_twists), len(group.slots)])
         passive.append(Block(*np.split(rows[..., :u, :], cuts, axis=-1)))
         closure.append(Block(*np.split(rows[..., u:, :], cuts, axis=-1)))
         eliminated.append(tuple(unknown))
@@ -109,11 +119,19 @@ def place_links(group: Group, e: FloatArray) -> PlacedLinks:
     return PlacedLinks(nominal, rotation, slope, origin, pitch, length, rotates)
 
 
-class Chain:
-    """The limbs of a group at platform T (3, 4, N) and joint values theta (J + 1, k, N).
+def list_bodies(state: State) -> FloatArray:
+    """Return the poses (nodes, 3, 4, t n) of all nodes at a state, as a view of a single one."""
+    poses = [T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0) for T in (state.T, *state.others)]
+    return poses[0][None] if len(poses) == 1 else stack(poses)
 
-    `residual` gives the rows of its ending, the `rows_of_` methods their derivatives. Only limbs
-    that end in a distance have `distance`, `direction` and `moment`.
+
+class Chain:
+    """The limbs of a group at nodes (nodes, 3, 4, N) and joint values theta (J + 1, k, N).
+
+    platform : (3, 3, 1 | k, N) rotation of the body where a limb ends. carrier : (3, 4, 1 | k, N)
+    the body where it begins, None for the base. `residual` gives the rows of its ending, the
+    `rows_of_` methods their derivatives. Only limbs that end in a distance have `distance`,
+    `direction` and `moment`.
     """
 
     group: Group
@@ -121,7 +139,8 @@ class Chain:
     theta: FloatArray
     size: float
     last: int
-    before: list[FloatArray]
+    carrier: FloatArray | None
+    before: list[FloatArray | None]
     axes: list[FloatArray]
     origins: list[FloatArray]
     platform: FloatArray
@@ -132,13 +151,19 @@ class Chain:
     distance: FloatArray
 
     def __init__(
-        self, group: Group, links: PlacedLinks, T: FloatArray, theta: FloatArray, size: float
+        self, group: Group, links: PlacedLinks, bodies: FloatArray, theta: FloatArray, size: float
     ) -> None:
         self.group, self.links, self.theta, self.size = group, links, theta, size
         self.last = len(group.joints) + 1
         # rotation before each link, axis of each joint, origin behind each link
-        self.before, self.axes, self.origins = [links.nominal[0]], [], [links.origin[0]]
         rotation, point = links.rotation[0], links.origin[0]
+        self.carrier = None
+        if group.on[0] != BASE:
+            self.carrier = carrier = _select_bodies(bodies, group.on)
+            rotation = matmul(carrier[:, :3], rotation)
+            point = matvec(carrier[:, :3], point) + carrier[:, 3]
+        self.before = [None if self.carrier is None else self.carrier[:, :3]]
+        self.axes, self.origins = [], [point]
         for j, letter in enumerate(group.joints):
             axis, value = rotation[:, 2], theta[j]
             self.axes.append(axis)
@@ -153,11 +178,12 @@ class Chain:
             self.origins.append(point)
             if links.rotates[j + 1]:
                 rotation = matmul(rotation, links.rotation[j + 1])
-        self.platform = T[:, :3, None]
+        end = _select_bodies(bodies, group.to)
+        self.platform = end[:, :3]
         self.before.append(self.platform)
         self.tip, self.tip_rotation = point, rotation
         self.arm = matvec(self.platform, links.origin[self.last])
-        self.gap = self.arm + T[:, 3, None] - point
+        self.gap = self.arm + end[:, 3] - point
         if group.ending == "distance":
             self.distance = np.sqrt(dot(self.gap, self.gap))
 
@@ -208,6 +234,34 @@ class Chain:
         axis[f % 3] = 1.0
         return self.rows_of_turn(axis, self.arm) if f < 3 else self.rows_of_shift(axis)
 
+    def rows_of_carrier(self, f: int) -> FloatArray:
+        """Return the rows of a freedom of the body on which the limbs begin; it moves the tip."""
+        assert self.carrier is not None
+        axis = np.zeros((3, 1, 1))
+        axis[f % 3] = 1.0
+        if f >= 3:
+            return -self.rows_of_shift(axis)
+        return -self.rows_of_turn(axis, self.tip - self.carrier[:, 3])
+
+    def list_slopes(self, program: Program) -> list[FloatArray]:
+        """Return the rows of the freedoms of the bodies at which the limbs begin, then end."""
+        on, to = (
+            () if i == BASE else program.nodes[i] for i in (self.group.on[0], self.group.to[0])
+        )
+        return [*map(self.rows_of_carrier, on), *map(self.rows_of_freedom, to)]
+
+    def rows_of_twist(self, node: int, f: int) -> FloatArray:
+        """Return the rows of a freedom of a node, zero in limbs that it does not touch."""
+        rows: FloatArray = np.zeros((1, 1, 1))
+        for ends, slopes in (
+            (self.group.to, self.rows_of_freedom),
+            (self.group.on, self.rows_of_carrier),
+        ):
+            if node in ends:
+                share = np.equal(ends, node)
+                rows = rows + (slopes(f) if share.all() else slopes(f) * share[:, None])
+        return rows
+
     def rows_of_joint(self, j: int) -> FloatArray:
         """Return the rows of a unit change of joint j; it moves the tip, hence the minus sign."""
         if j == len(self.group.joints):
@@ -226,7 +280,8 @@ class Chain:
         if axis == PITCH:
             return -self.rows_of_shift(self.theta[j] * self.axes[j])
         local = self.links.slope[j][:, axis] if axis < 3 else self.links.nominal[j][:, axis - 3]
-        direction = matvec(self.before[j], local) if j else local
+        before = self.before[j]
+        direction = local if before is None else matvec(before, local)
         arm = np.zeros((3, 1, 1)) if j == self.last else self.tip - self.origins[j]
         rows = self.rows_of_shift(direction) if axis >= 3 else self.rows_of_turn(direction, arm)
         return rows if j == self.last else -rows
@@ -241,13 +296,23 @@ class Chain:
         return out
 
 
+def _select_bodies(bodies: FloatArray, numbers: Sequence[int]) -> FloatArray:
+    """Return the poses (3, 4, k, N) of bodies; (3, 4, 1, N | 1) where all are the same one."""
+    if len(set(numbers)) > 1:
+        return np.ascontiguousarray(bodies[list(numbers)].transpose(1, 2, 0, 3))
+    return np.eye(4)[:3, :, None, None] if numbers[0] == BASE else bodies[numbers[0], :, :, None]
+
+
 def list_coordinates(
     program: Program, q: FloatArray, start: State, shape: tuple[int, int]
 ) -> FloatArray:
-    """Return the coordinates (12 + joint values, t n) of a start, the actuated joints set to q."""
+    """Return the coordinates (12 a node + joint values, t n) of a start, the actuated joints set
+    to q.
+    """
     count = sum(joints.shape[2] * joints.shape[3] for joints in start.joints)
-    out = np.empty((12 + count, *shape))
-    out[:12].reshape(3, 4, *shape)[:] = start.T[:, :, :3].transpose(2, 3, 0, 1)
+    out = np.empty((12 * len(program.nodes) + count, *shape))
+    for i, T in enumerate((start.T, *start.others)):
+        out[12 * i : 12 * i + 12].reshape(3, 4, *shape)[:] = T[:, :, :3].transpose(2, 3, 0, 1)
     flat = out.reshape(len(out), shape[0] * shape[1])
     limbs = split_joints(program, flat)
     for group, joints, theta in zip(program.groups, start.joints, limbs, strict=True):
@@ -259,6 +324,12 @@ def list_coordinates(
     return flat
 
 
+def split_bodies(program: Program, coordinates: FloatArray) -> FloatArray:
+    """Return the poses (nodes, 3, 4, N) of the nodes as a view into coordinates."""
+    count = len(program.nodes)
+    return coordinates[: 12 * count].reshape(count, 3, 4, coordinates.shape[1])
+
+
 def divide_rows(count: int) -> list[slice]:
     """Return parts of almost equal size, at most CHUNK rows each, that are computed together."""
     step = -(-count // max(-(-count // CHUNK), 1))
@@ -267,7 +338,7 @@ def divide_rows(count: int) -> list[slice]:
 
 def split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:
     """Return the joint values (J + 1, k, N) of each group as views into coordinates."""
-    out, first = [], 12
+    out, first = [], 12 * len(program.nodes)
     for group in program.groups:  # the rod counts as a joint
         values, limbs = len(group.joints) + 1, len(group.limbs)
         last = first + values * limbs

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Solve closure for the platform pose and the free joints: Newton with step control, row by row.
 
-A step is a Householder reduction of each limb (its own joints) and one of the platform. A row has
+A step is a Householder reduction of each limb (its own joints) and one of each node. A row has
 converged when a step below 1e-7 of the robot's size has been applied (the next one would be below
 rounding) and the reducible part of its residual is at most 1e-13 of the size; it then stays as it
 is. Derivation: docs/theory/engine.md.
@@ -26,6 +26,7 @@ from loopcal.engine.numpy_engine.closure import (
     list_coordinates,
     matmul,
     place_links,
+    split_bodies,
     split_joints,
 )
 from loopcal.engine.numpy_engine.householder import (
@@ -33,11 +34,19 @@ from loopcal.engine.numpy_engine.householder import (
     count_reflections,
     triangularize,
 )
+from loopcal.engine.numpy_engine.nodes import (
+    Front,
+    factor_nodes,
+    gather_twists,
+    list_pairs,
+    solve_nodes,
+)
 from loopcal.engine.program import (
     CONVERGED,
     EXHAUSTED,
     NEAR_GOAL,
     NOT_FINITE,
+    PLATFORM,
     STALLED,
     Group,
     Program,
@@ -55,7 +64,7 @@ OPEN = 1e-9
 def have_closed_form(program: Program) -> bool:
     """Return whether every limb ends in a distance and its rod or a prismatic joint is unknown."""
     unknown = [g.unknown_joints(free=True) for g in program.groups]
-    return all(
+    return not program.others and all(
         g.ending == "distance" and len(j) == 1 and g.joints[j[0] : j[0] + 1] in ("", "P")
         for g, j in zip(program.groups, unknown, strict=True)
     )
@@ -107,7 +116,7 @@ def _close_group(
     a'g - d = +- sqrt((a'g)^2 - |g|^2 + reach^2), whose sign is that of a'g.
     """
     (j,) = group.unknown_joints(free=True)
-    chain = Chain(group, links, T, theta, size)
+    chain = Chain(group, links, T[None], theta, size)
     if j == len(group.joints):
         theta[j] = chain.distance - links.length
         return chain.distance - (links.length + theta[j]), np.full(theta[j].shape, -1.0)
@@ -135,8 +144,8 @@ SINGULAR = 1e-11
 class Iterate(NamedTuple):
     """A Newton iterate of N rows.
 
-    coordinates : (12 + joint values, N) platform rotation and position (3, 4), then all joints.
-    step : (6 + unknown joints, N) Newton step from there: twist, then unknown joints.
+    coordinates : (12 a node + joint values, N) rotation and position (3, 4) of each node, then all
+        joints. step : (6 a node + unknown joints, N) Newton step: twists, then unknown joints.
     residual : (N,) norm of the closure residual [m]. reducible : (N,) the part of it that a further
         step can remove [m]. length : (N,) length of the step [m], angles times the robot's size.
     sign : (N,) sign of the determinant. pivot : (N,) smallest relative pivot of the limbs.
@@ -305,37 +314,38 @@ class _Equations:
 
         together : all rows have the Jacobian of the first one.
         """
-        program, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
-        T, limbs = coordinates[:12].reshape(3, 4, N), split_joints(program, coordinates)
+        program, N = self.program, coordinates.shape[1]
+        bodies, limbs = split_bodies(program, coordinates), split_joints(program, coordinates)
         if together:
-            T = T[..., :1]
-        eliminated = [self._eliminate(i, T, theta, together) for i, theta in enumerate(limbs)]
+            bodies = bodies[..., :1]
+        eliminated = [self._eliminate(i, bodies, theta, together) for i, theta in enumerate(limbs)]
         tops, lows, signs, pivots = map(list, zip(*eliminated, strict=True))
+        fronts = [front for of_group in lows for front in of_group]
         if self.task is not None:
-            residual, slopes = self.task(T.transpose(2, 0, 1), self.rows)
+            residual, slopes = self.task(bodies[0].transpose(2, 0, 1), self.rows)
             demand = [slopes[..., list(program.freedoms)], residual[..., None]]
-            lows.append(np.concatenate(demand, axis=2).transpose(1, 2, 0))
-        if (missing := m - sum(map(len, lows))) > 0:
-            lows.append(np.zeros((missing, m + 1, N)))
-        low = np.concatenate(lows) if len(lows) > 1 else lows[0]
+            rows = np.concatenate(demand, axis=2).transpose(1, 2, 0)
+            fronts.append(Front((PLATFORM,), rows))
+        sides = N if together else 1
         inner = np.zeros(N)
         for top in tops:
             if len(top):
                 inner += add_terms(add_terms(top[:, -1] ** 2))
-        norm = np.sqrt(inner + add_terms(low[:, m:] ** 2).reshape(N))
-        sign, pivot = reduce(np.multiply, signs), reduce(np.minimum, pivots)
-        count = count_reflections(len(low), m)
-        low = triangularize(low, m, overwrite=True)
-        diagonal = np.diagonal(low[:m, :m])
-        sign = sign * (-1.0) ** count * np.multiply.reduce(np.sign(diagonal), axis=-1)
-        y = back_substitute(low[:m, :m], -low[:m, m:]).reshape(m, N)
-        reducible = np.sqrt(inner + add_terms(low[:m, m:] ** 2).reshape(N))
-        twist = np.zeros((6, N))
-        twist[list(program.freedoms)] = y
+        right = np.concatenate([front.rows[:, -sides:] for front in fronts])
+        norm = np.sqrt(inner + add_terms(right**2).reshape(N))
+        factored, sign = factor_nodes(program, fronts, sides)
+        removable = np.concatenate([front.rows[:, -sides:] for front in factored])
+        reducible = np.sqrt(inner + add_terms(removable**2).reshape(N))
+        y = {node: part.reshape(-1, N) for node, part in solve_nodes(program, factored, sides)}
+        sign, pivot = reduce(np.multiply, signs) * sign, reduce(np.minimum, pivots)
+        twist = np.zeros((6 * len(program.nodes), N))
+        for node, freedoms in enumerate(program.nodes):
+            twist[[6 * node + f for f in freedoms]] = y[node]
         turns = [top[:, -1] for top in tops]
-        for i, top in enumerate(tops):
+        for i, (group, top) in enumerate(zip(program.groups, tops, strict=True)):
             if u := len(top):
-                rest = turns[i] + np.add.reduce(top[:, u : u + m] * y[:, None], axis=1)
+                own = gather_twists(group, y)
+                rest = turns[i] + np.add.reduce(top[:, u : u + len(own)] * own, axis=1)
                 turns[i] = back_substitute(top[:, :u], -rest[:, None])[:, 0]
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns)])
         length = self._length(twist, turns)
@@ -349,31 +359,31 @@ class _Equations:
         if self.redundant:
             return out
         equations, coordinates = self.select(of), coordinates.take(of, axis=1)
-        T, square = coordinates[:12].reshape(3, 4, len(of)), np.zeros(len(of))
+        bodies, square = split_bodies(program, coordinates), np.zeros(len(of))
         values = split_joints(program, coordinates)
         limbs = zip(program.groups, equations.links, values, strict=True)
         for group, links, theta in limbs:
-            residual = Chain(group, links, T, theta, program.size).residual()
+            residual = Chain(group, links, bodies, theta, program.size).residual()
             square += add_terms(add_terms(residual**2))
         if self.task is not None:
-            residual, _ = self.task(T.transpose(2, 0, 1), equations.rows)
+            residual, _ = self.task(bodies[0].transpose(2, 0, 1), equations.rows)
             square += np.add.reduce(residual**2, axis=1)
         out[of] = np.sqrt(square)
         return out
 
     def _eliminate(
-        self, i: int, T: FloatArray, theta: FloatArray, together: bool
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        self, i: int, bodies: FloatArray, theta: FloatArray, together: bool
+    ) -> tuple[FloatArray, list[Front], FloatArray, FloatArray]:
         """Eliminate the joints of the limbs in group i.
 
-        Returns the rows (u, columns, k, N) that determine these joints, the rows (.., m + 1, N)
-        without them, and the sign of the determinant and the smallest relative pivot (N,). Rows
-        `together` are one matrix (.., m + N, 1) with N right sides.
+        Returns the rows (u, columns, k, N) that determine these joints, the rows without them, and
+        the sign of the determinant and the smallest relative pivot (N,). Rows `together` are one
+        matrix with N right sides.
         """
         program, group, unknown = self.program, self.program.groups[i], self.unknown[i]
-        chain, u, m = Chain(group, self.links[i], T, theta, program.size), len(unknown), 0
+        chain, u = Chain(group, self.links[i], bodies, theta, program.size), len(unknown)
         columns = [chain.rows_of_joint(j) for j in unknown]
-        columns += [chain.rows_of_freedom(f) for f in program.freedoms]
+        columns += chain.list_slopes(program)
         if self.redundant:
             j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
             sigma = np.array(program.sigma)[group.actuator[j], None]
@@ -390,17 +400,25 @@ class _Equations:
             sign = (-1.0) ** count * np.prod(np.sign(diagonal), axis=(0, 2))
             largest = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)
             pivot = (np.abs(diagonal).min(axis=-1) / largest).min(axis=0)
-        low = rows[u:, u:].transpose(2, 0, 1, 3).reshape(-1, rows.shape[1] - u, T.shape[-1])
+        low = rows[u:, u:].transpose(2, 0, 1, 3)  # limb by limb
+        fronts = [
+            Front(nodes, low[limbs].reshape(-1, *low.shape[2:]))
+            for nodes, limbs in list_pairs(group)
+        ]
         if self.redundant:
             # each row in standard deviations of the actuator that drives its limb
-            m = len(program.freedoms)
-            low = np.delete(low / np.abs(low[:, m, None]), m, axis=1)
-        return rows[:u], low, sign, pivot
+            m = len(columns) - u - 1
+            fronts = [
+                Front(nodes, np.delete(low / np.abs(low[:, m, None]), m, axis=1))
+                for nodes, low in fronts
+            ]
+        return rows[:u], fronts, sign, pivot
 
     def _length(self, twist: FloatArray, turns: list[FloatArray]) -> FloatArray:
         """Return the length of a step [m]: its largest part, an angle times the robot's size."""
         size = self.program.size
-        turned, moved = np.maximum.reduce(np.abs(twist).reshape(2, 3, -1), axis=1)
+        parts = np.abs(twist).reshape(-1, 2, 3, twist.shape[1])
+        turned, moved = np.maximum.reduce(parts, axis=(0, 2))
         length = np.maximum(turned * size, moved)
         for group, unknown, turn in zip(self.program.groups, self.unknown, turns, strict=True):
             for j, part in zip(unknown, turn, strict=True):
@@ -420,11 +438,13 @@ class _Equations:
 
     def move(self, now: Iterate, fraction: FloatArray) -> FloatArray:
         """Return the coordinates a fraction (N,) of its step beyond an iterate."""
-        out, N = now.coordinates.copy(), len(fraction)
-        twist, T, new = fraction * now.step[:6], now.coordinates[:12], out[:12].reshape(3, 4, N)
-        new[:, :3] = matmul(exponential(twist[:3]), T.reshape(3, 4, N)[:, :3])
-        new[:, 3] += twist[3:]
-        first = 6
+        out, nodes = now.coordinates.copy(), len(self.program.nodes)
+        twists = (fraction * now.step[: 6 * nodes]).reshape(nodes, 6, -1)
+        old, bodies = (split_bodies(self.program, a) for a in (now.coordinates, out))
+        for twist, T, new in zip(twists, old, bodies, strict=True):
+            new[:, :3] = matmul(exponential(twist[:3]), T[:, :3])
+            new[:, 3] += twist[3:]
+        first = 6 * nodes
         for theta, unknown in zip(split_joints(self.program, out), self.unknown, strict=True):
             last = first + len(unknown) * theta.shape[1]
             if unknown:
@@ -435,15 +455,18 @@ class _Equations:
 
 def _pack(program: Program, solved: Solved, shape: tuple[int, int]) -> State:
     """Return solved rows as a state with the axes (t, n)."""
-    T = np.zeros((solved.coordinates.shape[1], 4, 4))
-    T[:, :3], T[:, 3, 3] = solved.coordinates[:12].T.reshape(-1, 3, 4), 1.0
+    bodies = np.zeros((len(program.nodes), solved.coordinates.shape[1], 4, 4))
+    bodies[:, :, :3] = split_bodies(program, solved.coordinates).transpose(0, 3, 1, 2)
+    bodies[..., 3, 3] = 1.0
+    T, *others = bodies.reshape(-1, *shape, 4, 4)
     limbs = split_joints(program, solved.coordinates)
     joints = tuple(a.transpose(2, 1, 0).reshape(*shape, *a.shape[1::-1]) for a in limbs)
     return State(
-        T.reshape(*shape, 4, 4),
+        T,
         joints,
         solved.status.reshape(shape),
         solved.residual.reshape(shape),
         solved.steps.reshape(shape),
         np.sign(np.nan_to_num(solved.sign)).astype(np.int8).reshape(shape),
+        tuple(others),
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of the platform in parameters and readings, by the wrenches of the closure rows.
+"""Derivatives of the nodes in parameters and readings, by the wrenches of the closure rows.
 
 A closure row without passive joints is a wrench on the limb's tip, a moment and a force that the
 passive joints do not feel. Its product with the velocity that a displacement or a joint causes is
@@ -16,9 +16,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine.numpy_engine.closure import Chain, cross, dot, place_links
-from loopcal.engine.numpy_engine.householder import back_substitute, fold, triangularize
-from loopcal.engine.program import LENGTH, PITCH, Group, ParameterMap, Program, State, TwistRows
+from loopcal.engine.numpy_engine.closure import Chain, cross, dot, list_bodies, place_links
+from loopcal.engine.numpy_engine.householder import fold, triangularize
+from loopcal.engine.numpy_engine.nodes import Front, factor_nodes, list_pairs, solve_nodes
+from loopcal.engine.program import (
+    BASE,
+    LENGTH,
+    PITCH,
+    Group,
+    ParameterMap,
+    Program,
+    State,
+    TwistRows,
+)
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 CHUNK = 1024
@@ -26,18 +36,24 @@ CHUNK = 1024
 
 
 def differentiate(
-    program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    state: State,
+    inputs: ParameterMap,
+    nodes: int = 1,
 ) -> tuple[FloatArray, FloatArray]:
-    """Differentiate the platform; see `loopcal.engine.differentiate`."""
+    """Differentiate the first nodes; see `loopcal.engine.differentiate`."""
     t, n = state.T.shape[:2]
-    p, a, m = inputs.pattern.parameters, program.n_joints, len(program.freedoms)
-    T = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0)
+    p, a = inputs.pattern.parameters, program.n_joints
+    bodies = list_bodies(state)
     limbs = [
         (place_links(g, e), g.insert_driven(values, q), _select_entries(g, inputs))
         for g, values in zip(program.groups, state.joints, strict=True)
     ]
-    by_parameter, by_reading = np.zeros((t * n, 6, p)), np.zeros((t * n, 6, a))
-    freedoms = list(program.freedoms)
+    by_parameter, by_reading = (np.zeros((t * n, 6 * nodes, width)) for width in (p, a))
+    freedoms = [6 * node + f for node, f in program.unknown_twists if node < nodes]
+    m = len(freedoms)
     for first in range(0, t * n, CHUNK):
         part = slice(first, first + CHUNK)
         trial, pose = np.divmod(np.arange(t * n)[part], n)
@@ -45,7 +61,8 @@ def differentiate(
         with np.errstate(all="ignore"):
             for group, (links, values, entries) in zip(program.groups, limbs, strict=True):
                 theta = values.reshape(t * n, len(group.limbs), -1)[part].transpose(2, 1, 0).copy()
-                chain = Chain(group, links.select(trial), T[..., part].copy(), theta, program.size)
+                own = bodies[..., part].copy()
+                chain = Chain(group, links.select(trial), own, theta, program.size)
                 closed = _close(program, chain, entries.driven)
                 A.append(closed.freedoms)
                 columns = closed.columns.transpose(3, 0, 1, 2)
@@ -54,15 +71,14 @@ def differentiate(
                 driving.append(entries.by_reading(columns, readings, group))
                 sigma.append(_deviations(program, group, closed))
             weights = 1.0 / np.concatenate(sigma) if program.sigma else None
-            inverse = _invert(np.concatenate(A), weights)
-            steps = np.ascontiguousarray(-inverse.transpose(2, 0, 1))
+            steps = np.ascontiguousarray(_invert(program, A, weights)[:m].transpose(2, 0, 1))
             for out, of_groups in ((by_parameter, moving), (by_reading, driving)):
                 right = of_groups[0] if len(of_groups) == 1 else np.concatenate(of_groups, axis=1)
-                if m == 6:
+                if m == 6 * nodes:
                     np.matmul(steps, right, out=out[part])
                 else:
                     out[part, freedoms] = np.matmul(steps, right)
-    return by_parameter.reshape(t, n, 6, p), by_reading.reshape(t, n, 6, a)
+    return by_parameter.reshape(t, n, 6 * nodes, p), by_reading.reshape(t, n, 6 * nodes, a)
 
 
 class _Entries(NamedTuple):
@@ -133,8 +149,8 @@ def _select_entries(group: Group, inputs: ParameterMap) -> _Entries:
 
 
 class _ClosedRows(NamedTuple):
-    """Closure rows of a group: r of each limb, against the platform's freedoms (r k, m, N) and
-    against its slots and driven joints (r, c, k, N).
+    """Closure rows of a group: r of each limb, against the freedoms of the bodies at which it
+    begins, then ends (r, m, k, N), and against its slots and driven joints (r, c, k, N).
     """
 
     freedoms: FloatArray
@@ -146,8 +162,16 @@ def _close(program: Program, chain: Chain, driven: tuple[int, ...]) -> _ClosedRo
     group = chain.group
     shares = _eliminate(chain)
     moment, force = _list_wrenches(chain, shares)
-    at_center = moment + cross(chain.arm[:, None], force)
-    platform = np.concatenate([at_center, force])[list(program.freedoms)]
+    freedoms = []
+    if group.on[0] != BASE:
+        assert chain.carrier is not None
+        arm = (chain.tip - chain.carrier[:, 3])[:, None]
+        wrench = -np.concatenate([moment + cross(arm, force), force])
+        freedoms.append(wrench[list(program.nodes[group.on[0]])])
+    if group.to[0] != BASE:
+        at_center = moment + cross(chain.arm[:, None], force)
+        wrench = np.concatenate([at_center, force])
+        freedoms.append(wrench[list(program.nodes[group.to[0]])])
     r, k, N = moment.shape[1:]
     columns = np.zeros((r, len(group.slots) + len(driven), k, N))
     # the tip moves with its links, hence the minus signs
@@ -178,7 +202,8 @@ def _close(program: Program, chain: Chain, driven: tuple[int, ...]) -> _ClosedRo
         if group.joints[j] == "R":
             about = -dot(chain.axes[j][:, None], bending[j])
             columns[:, c] = about + chain.links.pitch[j] * along
-    return _ClosedRows(platform.transpose(1, 2, 0, 3).reshape(r * k, -1, N), columns)
+    both = freedoms[0] if len(freedoms) == 1 else np.concatenate(freedoms)
+    return _ClosedRows(both.swapaxes(0, 1), columns)
 
 
 def _eliminate(chain: Chain) -> FloatArray:
@@ -207,9 +232,9 @@ def _list_wrenches(chain: Chain, shares: FloatArray) -> tuple[FloatArray, FloatA
 
 def _take_to_link(chain: Chain, j: int, vectors: FloatArray) -> FloatArray:
     """Return vectors (3, r, k, N) in the axes before link j."""
-    if not j:
-        return vectors
     axes = chain.before[j]
+    if axes is None:
+        return vectors
     return np.stack([dot(axes[:, i, None], vectors) for i in range(3)])
 
 
@@ -223,18 +248,32 @@ def _deviations(program: Program, group: Group, closed: _ClosedRows) -> FloatArr
     return (np.abs(drive) * sigma[:, None]).reshape(-1, drive.shape[-1])
 
 
-def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
-    """Return the inverse (m, c, N) of A (c, m, N), with weights (c, N) the weighted least-squares
-    one.
+def _invert(
+    program: Program, closed: Sequence[FloatArray], weights: FloatArray | None
+) -> FloatArray:
+    """Return -A^-1 (M, c, N) of the closure rows A, of each group (r, m, k, N) and c together; with
+    weights (c, N) the least-squares inverse. The freedoms of the platform come first.
 
     Singular matrices give infinities or NaN.
     """
-    c, m, N = A.shape
-    unit = np.broadcast_to(np.eye(c)[..., None], (c, c, N))
+    c = sum(a.shape[0] * a.shape[2] for a in closed)
+    unit = np.eye(c)[..., None]
     if weights is not None:
-        A, unit = A * weights[:, None], unit * weights[:, None]
-    rows = triangularize(np.concatenate([A, unit], axis=1), m)
-    return back_substitute(rows[:m, :m], rows[:m, m:])
+        unit = unit * weights[:, None]
+    fronts, first = [], 0
+    for group, rows in zip(program.groups, closed, strict=True):
+        r, m, k, N = rows.shape
+        for nodes, limbs in list_pairs(group):
+            own = first + (np.arange(r)[:, None] * k + np.arange(k)[limbs]).ravel()
+            by_freedoms = rows[:, :, limbs].swapaxes(1, 2).reshape(len(own), m, N)
+            if weights is not None:
+                by_freedoms = by_freedoms * weights[own, None]
+            sides = np.broadcast_to(unit[own], (len(own), c, N))
+            fronts.append(Front(nodes, np.concatenate([by_freedoms, sides], axis=1)))
+        first += r * k
+    factored, _ = factor_nodes(program, fronts, c)
+    solved = dict(solve_nodes(program, factored, c))
+    return np.concatenate([solved[node] for node in range(len(program.nodes))])
 
 
 # --- Rows of poses, [G D | r], folded for some trials at a time, so that they fit the cache.
