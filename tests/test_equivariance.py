@@ -48,8 +48,10 @@ def draw_readings(name: str) -> Array:
 def make_motion(robot: Mechanism, seed: int = 1) -> Array:
     """Return a rigid motion (4, 4) that keeps the plane of a planar robot."""
     w, v = 0.2 * np.random.default_rng(seed).standard_normal((2, 3))
-    if not {"rx", "ry", "z"} & set(robot.freedoms):
-        w[:2], v[2] = 0.0, 0.0
+    for normal, axis in enumerate("xyz"):
+        across = {"rx", "ry", "rz", axis} - {"r" + axis}
+        if not across & set(robot.freedoms):
+            w[np.arange(3) != normal], v[normal] = 0.0, 0.0
     return geometry.make_pose(geometry.exp_so3(w), v)
 
 

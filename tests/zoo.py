@@ -517,8 +517,8 @@ def scale_lengths(assembly: Assembly, s: float) -> Assembly:
 
 
 def move_base(assembly: Assembly, G: Array) -> Assembly:
-    """Move the base: multiply first links and home by G (4, 4) from the left; of a chain the mounts
-    of the stages on its base.
+    """Move the base: multiply what is on it and the homes of bodies by G (4, 4) from the left; of a
+    chain the mounts of the stages on its base.
     """
     if assembly.stages:
         moved = (
@@ -528,9 +528,17 @@ def move_base(assembly: Assembly, G: Array) -> Assembly:
         return replace(assembly, stages=tuple(moved))
 
     def limb_of(limb: Limb) -> Limb:
+        if limb.to == "base":
+            end = replace(limb.attachment, transform=G @ limb.attachment.transform)
+            limb = replace(limb, attachment=end)
+        if limb.on != "base":
+            return limb
         first = replace(limb.links[0], transform=G @ limb.links[0].transform)
         return replace(limb, links=(first, *limb.links[1:]))
 
     return replace(
-        assembly, limbs=tuple(limb_of(limb) for limb in assembly.limbs), home=G @ assembly.home
+        assembly,
+        limbs=tuple(limb_of(limb) for limb in assembly.limbs),
+        home=G @ assembly.home,
+        bodies={name: G @ T for name, T in assembly.bodies.items()},
     )

@@ -266,12 +266,15 @@ class State:
         def chosen(a: np.ndarray) -> np.ndarray:
             return np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None]
 
-        T, *rest = (
-            chosen(a)
-            for a in (self.T, self.status, self.residual, self.iterations, self.closure_sign)
+        return State(
+            chosen(self.T),
+            tuple(map(chosen, self.joints)),
+            chosen(self.status),
+            chosen(self.residual),
+            chosen(self.iterations),
+            chosen(self.closure_sign),
+            tuple(map(chosen, self.others)),
         )
-        joints, others = (tuple(map(chosen, arrays)) for arrays in (self.joints, self.others))
-        return State(T, joints, *rest, others)
 
 
 @dataclass(frozen=True, eq=False)

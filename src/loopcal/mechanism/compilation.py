@@ -38,6 +38,7 @@ from loopcal.mechanism.mobility import (
     check_mobility,
     count_rank,
     find_idle_joints,
+    refuse_free_bodies,
     refuse_singular_home,
     refuse_uncontrolled,
 )
@@ -430,6 +431,7 @@ def _find_home(robot: Mechanism) -> State:
     target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
+        refuse_free_bodies(robot, robot.home_state)
         if not shared:
             refuse_uncontrolled(robot, robot.home_state)
         refuse_singular_home(robot, state)

@@ -242,7 +242,7 @@ def follow_limb(
     placed = (group.links[k] @ displaced)[:, None]
     frames = [placed[:, :, 0]]
     for j, letter in enumerate(group.joints):
-        motion = _move_joint(letter, joints[..., j], pitch[:, None, j])
+        motion = move_joint(letter, joints[..., j], pitch[:, None, j])
         frames.append(frames[-1] @ motion @ placed[:, :, j + 1])
     return frames, placed[:, :, -1]
 
@@ -258,7 +258,7 @@ def measure_rod(group: Group, k: int, displacements: FloatArray) -> FloatArray:
     return length
 
 
-def _move_joint(letter: str, value: FloatArray, pitch: FloatArray) -> FloatArray:
+def move_joint(letter: str, value: FloatArray, pitch: FloatArray) -> FloatArray:
     """Return the motion (.., 4, 4) of a joint about (R) or along (P) the z axis."""
     T = np.zeros((*value.shape, 4, 4))
     T[..., 2, 2] = T[..., 3, 3] = 1.0

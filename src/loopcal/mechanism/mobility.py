@@ -64,7 +64,7 @@ def check_mobility(robot: Mechanism) -> None:
     e = robot.slots(robot.values[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, home), home)
     scale = 1 / robot.twist_scale[list(program.freedoms)]
-    _refuse_free_bodies(robot, stack_closure_rows(blocks)[0, 0])
+    refuse_free_bodies(robot, home)
     A, Q = (rows[0, 0] for rows in reduce_to_platform(program, blocks))
     A = A * scale
     names = [AXES[f] for f in program.freedoms]
@@ -112,12 +112,16 @@ def check_mobility(robot: Mechanism) -> None:
         _check_open_sums(robot, scale)
 
 
-def _refuse_free_bodies(robot: Mechanism, rows: FloatArray) -> None:
-    """Refuse bodies that can move while the platform rests and all actuators are locked, by the
-    closure rows (c, M) of all nodes at home.
+def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
+    """Refuse bodies that can move while the platform rests and all actuators are locked, at a state
+    (1, 1).
     """
-    program = robot.program
+    program, e = robot.program, robot.slots(robot.values[None])[0]
+    if not program.others:
+        return
     m, columns = len(program.freedoms), program.unknown_twists
+    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    rows = stack_closure_rows(blocks)[0, 0]
     scale = [1 / robot.twist_scale[f] for _, f in columns[m:]]
     _, s, V = np.linalg.svd(rows[:, m:] * scale, full_matrices=True)
     if (rank := count_rank(s)) < len(scale):

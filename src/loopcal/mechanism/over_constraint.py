@@ -264,7 +264,7 @@ def find_self_stress(robot: Mechanism) -> FloatArray:
     numbers = np.arange(len(robot.assembly.limbs))
     stresses = rows.find_repeated(numbers)
     own = []
-    for i in numbers:
+    for i in numbers.tolist():
         columns = list(_list_columns(robot, i).values())
         own.append(stresses[:, rows.limb == i] @ rows.A[rows.limb == i][:, columns])
     return np.stack(own, axis=1)

@@ -277,12 +277,9 @@ def test_exceeded_joint_limits_and_cones_are_reported() -> None:
 INVALID_RECORDS = {
     "branch": (
         replace(SLIDER, limbs=(*SLIDER.limbs, replace(SLIDER.limbs[0], name="branch", on="rod"))),
-        "limb 'branch' starts on limb 'rod': loopcal has no limbs that branch from limbs",
+        "limb 'branch1' names 'rod', which is not a body; add it to `bodies:`",
     ),
-    "end on a limb": (
-        change_limb(to="elbow"),
-        "limb 'rod' ends on 'elbow': loopcal has no limbs that branch",
-    ),
+    "end on a limb": (change_limb(to="elbow"), "limb 'rod1' names 'elbow', which is not a body"),
     "idle drive": (
         replace(SLIDER, actuators={**SLIDER.actuators, "z": LengthDrive("length")}),
         "'z' drives no joint",

@@ -37,7 +37,7 @@ from loopcal.mechanism.over_constraint import (
     find_self_stress,
     is_over_constrained,
 )
-from loopcal.mechanism.states import Status, driven_values
+from loopcal.mechanism.states import Status, driven_values, list_bodies
 from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -103,7 +103,12 @@ def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
     pairs = zip(robot.program.groups, robot.home_state.joints, strict=True)
     values = {i: own[0, 0, k] for group, own in pairs for k, i in enumerate(group.limbs)}
     numbers = {limb.name: i for i, limb in enumerate(robot.assembly.limbs)}
-    center, scale = robot.home[:3, 3], 1 / robot.twist_scale
+    bodies, scale = list_bodies(robot.home_state), 1 / robot.twist_scale
+    # the wrenches of a limb are those on the body where it ends
+    centers = [
+        bodies[robot.assembly.numbers[limb.to]][..., :3, 3].reshape(3)
+        for limb in robot.assembly.limbs
+    ]
     for limb in record.limbs:
         count = 0 if limb.copies is None else limb.copies.count
         members = [numbers[limb.name + str(i + 1)] for i in range(count)] or [numbers[limb.name]]
@@ -121,7 +126,7 @@ def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
                     u = turn @ frame_from_axis(_last_axis(joint), name).T @ axis
                     twist = np.concatenate([np.zeros(3), u])
                     if added.joint == "R":
-                        twist = np.concatenate([u, np.cross(u, center - point)])
+                        twist = np.concatenate([u, np.cross(u, centers[i] - point)])
                     # wrenches are those by freedoms over `scale`
                     works.append(stress[:, i] @ (twist / scale))
                 yield AddedJoint(limb.name, name, place, added, np.array(works).T)

@@ -327,9 +327,9 @@ class Copies:
 class Shifts:
     """Unknown lengths of a limb: positions of an element in its placed frame, or the rod's length.
 
-    `of` is a joint, `tip` (`base` in a limb without joints), `platform` or `rod`. Parameters are
-    called `limb.NAME.axis`, or `limb.NAME` for a rod's length, with NAME = `of` unless `name` is
-    given.
+    `of` is a joint, `tip` (in a limb without joints its first body, such as `base`), its second
+    body, such as `platform`, or `rod`. Parameters are called `limb.NAME.axis`, or `limb.NAME` for a
+    rod's length, with NAME = `of` unless `name` is given.
     """
 
     of: str
@@ -373,18 +373,35 @@ class RodCone:
 
 
 @dataclass(frozen=True)
-class LimbRecord:
-    """A limb: joints from the base on, then its ending on the platform.
+class BodyRecord:
+    """A body inside the loops, beside base and platform, that limbs join.
 
     Attributes
     ----------
-    on, to : where it begins and ends; only `base` and `platform` exist.
+    home : first guess of its pose in the base at home; without it the joints of a rigid limb, at
+        their `start`, place the body.
+    copies : repeat the body around an axis. Copy i of a limb that names it joins copy i of the
+        body, and is written in the frame of that copy.
+    """
+
+    name: str
+    home: PoseRecord | None = None
+    copies: Copies | None = None
+
+
+@dataclass(frozen=True)
+class LimbRecord:
+    """A limb: joints from one body on, then its ending on another one.
+
+    Attributes
+    ----------
+    on, to : the bodies where it begins and ends: `base`, `platform`, or one of `bodies:`.
     chain : its joints. tip : its end, in the last carried frame; in a limb without joints its point
-        on the base.
+        on the first body.
     ending : `rigid`, `ball` (tip and attachment meet in a point) or `distance` (a rod of `length`
         between them).
-    attach : the attachment in the platform frame. actuated : the drive of a `distance` of variable
-        length.
+    attach : the attachment in the frame of the second body. actuated : the drive of a `distance` of
+        variable length.
     cones : allowed inclinations of that rod. copies : repeat the limb around an axis. errors : its
         unknowns in the ideal model.
     """
@@ -538,23 +555,12 @@ class LimbsFile:
     freedoms: tuple[Freedom, ...] = ("rx", "ry", "rz", "x", "y", "z")
     controlled: tuple[str, ...] = ()
     actuators: Mapping[str, Drive] = field(default_factory=dict)
+    bodies: tuple[BodyRecord, ...] = ()
     limbs: tuple[LimbRecord, ...] = ()
     error_model: Literal["ideal", "complete"] = "ideal"
     parameters: tuple[NamedParameter, ...] = ()
     tolerances: LinkTolerances = field(default_factory=LinkTolerances)
     closure: Literal["exact", "least-squares"] = "exact"
-
-
-def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
-    """Refuse a limb that does not join base and platform; raises MechanismError."""
-    for key, stated, allowed in (("starts on", limb.on, "base"), ("ends on", limb.to, "platform")):
-        if stated == allowed:
-            continue
-        what = f"limb {stated!r}" if stated in names else f"{stated!r}"
-        raise MechanismError(
-            f"limb {limb.name!r} {key} {what}: loopcal has no limbs that branch from limbs; let it "
-            f"{key.replace('s on', ' on')} the {allowed}, or model the branch as separate limbs"
-        )
 
 
 # Drives of `limbs` files whose readings are sums of joint values: `sum: {m: 1, n: 2}`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms of any limbs between base and platform, written joint by joint in a short file.
+"""Mechanisms of any limbs between bodies, written joint by joint in a short file.
 
 `error_model: ideal` has the unknowns that the file names (`errors:` of a limb, `unknown:` of a
 drive, `parameters:`). `complete` adds six for every link transform, less those that its joint
@@ -8,26 +8,32 @@ repeats. How to write such a file: docs/robots.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from loopcal.errors import MechanismError
+from loopcal.errors import MechanismError, suggest_names
+from loopcal.geometry import invert_pose
 from loopcal.mechanism.assembly import (
     AXES,
+    BASE,
     MOST_COPIES,
     MOST_LIMBS,
+    PLATFORM,
     Actuator,
     Address,
     Assembly,
     Cone,
     Joint,
+    Limb,
     LinearMap,
     refuse_more,
 )
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
+    BodyRecord,
+    Copies,
     Cylindrical,
     Drive,
     JointRecord,
@@ -54,7 +60,6 @@ from loopcal.mechanism.families.limb_records import (
     list_readings,
     matrix_from_place,
     place_triangle,
-    refuse_branch,
     triangle_errors,
     weight_errors,
 )
@@ -82,6 +87,7 @@ from loopcal.mechanism.families.records import (
     single_error,
     standard_deviation,
 )
+from loopcal.mechanism.limb_rows import move_joint
 from loopcal.typing import FloatArray
 from loopcal.units import ARTICLES, Dimension
 
@@ -274,8 +280,9 @@ class Limbs(LimbsFile, RobotRecord):
     freedoms : of the platform, in base axes. controlled : coordinates in which it is commanded.
     actuators : drives by name; a drive that is not listed reads the joint value. In a limb with
         copies, `q` means q1, q2, ..
-    limbs : from base to platform. error_model, parameters : see the module. tolerances : of the
-        complete model. closure : how over-constrained loops close.
+    bodies : those beside base and platform. limbs : from body to body. error_model, parameters :
+        see the module. tolerances : of the complete model. closure : how over-constrained loops
+        close.
     """
 
     family = "limbs"
@@ -286,9 +293,6 @@ class Limbs(LimbsFile, RobotRecord):
             raise MechanismError(
                 f"{self.name} has no limbs; write those that join the base to the platform"
             )
-        names = tuple(limb.name for limb in self.limbs)
-        for limb in self.limbs:
-            refuse_branch(limb, names)
         counts = [1 if limb.copies is None else limb.copies.count for limb in self.limbs]
         for limb, count in zip(self.limbs, counts, strict=True):
             if not 1 <= count <= MOST_COPIES:
@@ -296,7 +300,8 @@ class Limbs(LimbsFile, RobotRecord):
                     f"limb {limb.name!r} has {count} copies; give 1 to {MOST_COPIES}"
                 )
         refuse_more(MOST_LIMBS, sum(counts), f"{self.name} has", "limbs")
-        members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
+        named = {body.name: body for body in self.bodies}
+        members = {limb.name: tuple(_copies(limb, named)) for limb in self.limbs}
         copies = [member for group in members.values() for member in group]
         drives = self._place_drives(copies)
         errors = join_errors(
@@ -331,7 +336,8 @@ class Limbs(LimbsFile, RobotRecord):
             freedoms=self.freedoms,
             controlled=self.controlled,
         )
-        return replace(assembly, closure=self.closure)
+        bodies = _place_bodies(self, [member.placed.limb for member in copies])
+        return replace(assembly, closure=self.closure, bodies=bodies)
 
     def _place_drives(self, copies: list[_Member]) -> dict[str, PlacedDrive]:
         """Return the drives by name, in the order of the readings, with their joints."""
@@ -366,7 +372,13 @@ class Limbs(LimbsFile, RobotRecord):
             standard_deviation(self.tolerances.lengths, "the lengths"),
             standard_deviation(self.tolerances.angles, "the angles"),
         )
-        errors = [complete_errors(member.placed, spread, offsets=False) for member in copies]
+        # the first rigid limb of a body places its frame, so that errors of its end are none
+        rigid = [m.placed.limb for m in copies[::-1] if m.record.ending == "rigid"]
+        places = {limb.to: limb.name for limb in rigid if limb.to != PLATFORM}
+        errors = [
+            complete_errors(m.placed, spread, False, places.get(m.placed.limb.to) == m.placed.name)
+            for m in copies
+        ]
         for name, placed in drives.items():
             dimension, offset = placed.dimension, placed.drive.offset
             sd = spread.angle if dimension is Dimension.ANGLE else spread.length
@@ -421,19 +433,111 @@ Drives = Mapping[str, PlacedDrive]
 """Drives by name, with the joints that they move."""
 
 
-def _copies(limb: LimbRecord) -> Iterator[_Member]:
+def _copies(limb: LimbRecord, bodies: Mapping[str, BodyRecord]) -> Iterator[_Member]:
     """Yield the copies of a limb."""
-    if limb.copies is None:
-        yield _Member(limb, _place_copy(limb, "", np.eye(4)), "")
-        return
-    step = limb.copies.step if limb.copies.step is not None else 2 * np.pi / limb.copies.count
-    for i in range(limb.copies.count):
-        turn, suffix = rotate_about(limb.copies.about, limb.copies.start + i * step), str(i + 1)
-        yield _Member(limb, _place_copy(limb, suffix, turn), suffix)
+    count = 0 if limb.copies is None else limb.copies.count
+    for end in {limb.on, limb.to}.intersection(bodies):
+        copies = bodies[end].copies
+        if copies is not None and copies.count != count:
+            raise MechanismError(
+                f"limb {limb.name!r} has {count} copies, and body {end!r} has {copies.count}; give "
+                f"both the same `copies:`, or name one copy, such as {end + '1'!r}"
+            )
+    turns = _list_turns(limb.copies)
+    for number, turn in enumerate(turns, 1):
+        suffix = str(number) if limb.copies else ""
+        yield _Member(limb, _place_copy(limb, suffix, turn, bodies), suffix)
 
 
-def _place_copy(limb: LimbRecord, suffix: str, turn: FloatArray) -> PlacedLimb:
-    """Return one copy of a limb, rotated, with the suffix on its names."""
+def _list_turns(copies: Copies | None) -> list[FloatArray]:
+    """Return the rotations (4, 4) of copies, the identity alone for a single limb or body."""
+    if copies is None:
+        return [np.eye(4)]
+    step = copies.step if copies.step is not None else 2 * np.pi / copies.count
+    return [rotate_about(copies.about, copies.start + i * step) for i in range(copies.count)]
+
+
+def _place_bodies(record: Limbs, limbs: Sequence[Limb]) -> dict[str, FloatArray]:
+    """Return the first guesses (4, 4) of the home poses of all bodies but base and platform.
+
+    Raises MechanismError: two bodies with one name, an unknown one, or one without a guess.
+    """
+    homes = [
+        (body.name + (str(i + 1) if body.copies else ""), body.home and turn @ body.home.matrix)
+        for body in record.bodies
+        for i, turn in enumerate(_list_turns(body.copies))
+    ]
+    names = [name for name, _ in homes]
+    _check_ends(limbs, names)
+    known = {BASE: np.eye(4)} | {name: T for name, T in homes if T is not None}
+    _follow_rigid_limbs(known, [limb for limb in limbs if PLATFORM not in (limb.on, limb.to)])
+    known[PLATFORM] = record.home.matrix  # less certain than what the base carries
+    _follow_rigid_limbs(known, limbs)
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise MechanismError(
+            f"body {missing[0]!r} has no rigid limb from a body with a known pose; state its "
+            "`home:` under `bodies:`"
+        )
+    return {name: known[name] for name in names}
+
+
+def _follow_rigid_limbs(known: dict[str, FloatArray], limbs: Sequence[Limb]) -> None:
+    """Add the poses of bodies that rigid limbs join to bodies of known poses."""
+    count = 0
+    while count < len(known):
+        count = len(known)
+        for limb in limbs:
+            if limb.ending == "rigid" and (limb.on in known) != (limb.to in known):
+                step = _follow_at_start(limb) @ invert_pose(limb.attachment.transform)
+                if limb.on in known:
+                    known[limb.to] = known[limb.on] @ step
+                else:
+                    known[limb.on] = known[limb.to] @ invert_pose(step)
+
+
+def _check_ends(limbs: Sequence[Limb], names: Sequence[str]) -> None:
+    """Refuse two bodies with one name or without limbs, and limbs that do not join two bodies."""
+    joined = {end for limb in limbs for end in (limb.on, limb.to)}
+    for name in names:
+        if name in (BASE, PLATFORM) or names.count(name) > 1:
+            raise MechanismError(
+                f"two bodies are called {name!r}, base and platform among them; rename one"
+            )
+        if name not in joined:
+            raise MechanismError(
+                f"no limb joins the body {name!r}; let limbs begin or end on it, or leave it out"
+            )
+    for limb in limbs:
+        for name in (limb.on, limb.to):
+            if name not in (BASE, PLATFORM, *names):
+                raise MechanismError(
+                    f"limb {limb.name!r} names {name!r}, which is not a body"
+                    f"{suggest_names(name, names)}; add it to `bodies:`, or name one of "
+                    f"{', '.join((BASE, PLATFORM, *names))}"
+                )
+        if limb.on == limb.to:
+            raise MechanismError(
+                f"limb {limb.name!r} begins and ends on {limb.on!r}, which it cannot move; name "
+                "two bodies under `on:` and `to:`"
+            )
+
+
+def _follow_at_start(limb: Limb) -> FloatArray:
+    """Return the tip (4, 4) of a limb in the body where it begins, its joints at their start."""
+    T = limb.links[0].transform
+    for joint, link in zip(limb.joints, limb.links[1:], strict=True):
+        motion = move_joint(joint.kind, np.array(joint.start), np.array(joint.pitch))
+        T = T @ motion @ link.transform
+    return T
+
+
+def _place_copy(
+    limb: LimbRecord, suffix: str, turn: FloatArray, bodies: Mapping[str, BodyRecord]
+) -> PlacedLimb:
+    """Return one copy of a limb, rotated, with the suffix on its names; in a body with copies of
+    its own it is not rotated.
+    """
     if limb.ending != "distance" and (limb.length or limb.actuated or limb.cones):
         raise MechanismError(
             f"limb {limb.name!r} ends {limb.ending} and states a length, drive or cone of a rod; "
@@ -448,18 +552,39 @@ def _place_copy(limb: LimbRecord, suffix: str, turn: FloatArray) -> PlacedLimb:
     for i, joint in enumerate(limb.chain):
         number = 1 + sum(other.joint == joint.joint for other in limb.chain[:i])
         steps += _place_joint(joint, joint.name or f"{joint.joint}{number}", suffix)
-    tip, attachment = matrix_from_place(limb.tip), turn @ matrix_from_place(limb.attach)
+    own = [name in bodies and bodies[name].copies is not None for name in (limb.on, limb.to)]
+    first, last = (np.eye(4) if is_copied else turn for is_copied in own)
+    on, to = (
+        name + suffix * is_copied for name, is_copied in zip((limb.on, limb.to), own, strict=True)
+    )
+    tip, attachment = matrix_from_place(limb.tip), last @ matrix_from_place(limb.attach)
     if steps:
-        steps[0] = replace(steps[0], place=turn @ steps[0].place)
+        steps[0] = replace(steps[0], place=first @ steps[0].place)
     else:
-        tip = turn @ tip
+        tip = first @ tip
     drive = limb.actuated + suffix if limb.actuated else None
     cones = []
     for cone in limb.cones:
         x, y, z = axis_vector(cone.axis).tolist()
         cones.append(Cone(cone.end, (x, y, z), cone.angle))
-    name, ending, length = limb.name + suffix, limb.ending, limb.length
-    return place_limb(name, tuple(steps), tip, ending, attachment, length, drive, tuple(cones))
+    for step in steps:
+        if step.joint.name == limb.to:
+            raise MechanismError(
+                f"limb {limb.name!r} has a joint {limb.to!r}, like the body on which it ends; "
+                "rename the joint"
+            )
+    placed = place_limb(
+        limb.name + suffix,
+        tuple(steps),
+        tip,
+        limb.ending,
+        attachment,
+        limb.length,
+        drive,
+        tuple(cones),
+        (limb.on, limb.to),
+    )
+    return placed._replace(limb=replace(placed.limb, on=on, to=to))
 
 
 def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlacement]:

@@ -18,6 +18,8 @@ from loopcal import geometry
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import (
     AXES,
+    BASE,
+    PLATFORM,
     Actuator,
     Address,
     Assembly,
@@ -93,11 +95,12 @@ def place_limb(
     length: float = 0.0,
     actuator: str | None = None,
     cones: tuple[Cone, ...] = (),
+    bodies: tuple[str, str] = (BASE, PLATFORM),
 ) -> PlacedLimb:
-    """Return a limb of its joints from base to tip, its tip and its attachment.
+    """Return a limb of its joints from one body to its tip, its tip and its attachment to another.
 
-    tip : (4, 4) in the last carried frame [m]; its link is called `tip`, or `base` without joints.
-    attachment : (4, 4) in the platform [m]; its link is called `platform`.
+    tip : (4, 4) in the last carried frame [m]; its link is called `tip`, without joints like the
+        first body. attachment : (4, 4) in the second body [m]; its link is called like that body.
     length, actuator, cones : of the rod of a `distance` ending [m].
     """
     back, links, rotations, placements = np.eye(4), [], {}, {}
@@ -106,11 +109,11 @@ def place_limb(
         links.append(Link(link, back @ step.place @ rotation_matrix(turn)))
         rotations[link], placements[link] = turn, step.place
         back = rotation_matrix(turn.T)
-    last = "tip" if steps else "base"
+    last, end = "tip" if steps else bodies[0], Link(bodies[1], attachment)
     links.append(Link(last, back @ tip))
-    rotations |= {last: np.eye(3), "platform": np.eye(3)}
-    placements |= {last: tip, "platform": attachment}
-    joints, end = tuple(step.joint for step in steps), Link("platform", attachment)
+    rotations |= {last: np.eye(3), end.name: np.eye(3)}
+    placements |= {last: tip, end.name: attachment}
+    joints = tuple(step.joint for step in steps)
     limb = Limb(name, tuple(links), joints, ending, end, length, actuator, cones)
     return PlacedLimb(limb, rotations, placements)
 
@@ -343,9 +346,11 @@ def offset_error(
     return single_error(name, dimension, nominal, tolerance, offset, positive=positive)
 
 
-def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = True) -> ErrorModel:
+def complete_errors(
+    limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = True, places_body: bool = False
+) -> ErrorModel:
     """Return the complete error model of a limb; without `offsets` the family names those of the
-    actuators.
+    actuators. Errors of an attachment that `places_body` are none: they move the frame of the body.
     """
     errors: list[ErrorModel] = []
 
@@ -366,7 +371,9 @@ def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = T
         add_offset(joint.actuator, joint.dimension)
     if limb.limb.ending != "rigid":
         add_displacements(limb.limb.links[-1].name, AXES[3:])
-    add_displacements("platform", AXES if limb.limb.ending == "rigid" else AXES[3:])
+    if not places_body:
+        end = limb.limb.attachment.name
+        add_displacements(end, AXES if limb.limb.ending == "rigid" else AXES[3:])
     add_offset(limb.limb.actuator, Dimension.LENGTH)
     if limb.limb.ending == "distance" and not limb.limb.actuator:
         errors.append(rod_length_error(limb, f"{limb.name}.length", spread.length))

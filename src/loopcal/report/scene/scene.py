@@ -20,6 +20,7 @@ import numpy as np
 
 from loopcal.apply.accuracy import AccuracyMap
 from loopcal.engine import State
+from loopcal.mechanism.assembly import BASE, PLATFORM
 from loopcal.mechanism.kinematics import compute_limb_frames, locate_anchors
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward
@@ -242,21 +243,22 @@ def _list_bodies(
 def _list_outlines(
     robot: Mechanism, foot: FloatArray, top: FloatArray
 ) -> Iterator[tuple[Role, FloatArray]]:
-    """Yield the points (n, k, 3) of base and platforms.
+    """Yield the points (n, k, 3) of base, platforms and other bodies.
 
-    The platform of a stage has the ends of its limbs, and the feet of the stages that it carries.
+    A body has the points at which limbs begin and end on it; the platform of a stage those of the
+    stages that it carries, too.
     """
-    if not robot.stages:
-        yield "base", foot
-        yield "platform", top
-        return
-    owner = np.repeat(
-        np.arange(len(robot.stages)), [len(s.robot.assembly.limbs) for s in robot.stages]
-    )
-    parent = np.array([stage.parent for stage in robot.stages])[owner]
-    yield "base", foot[:, parent == -1]
-    for i in range(len(robot.stages)):
-        yield "platform", np.concatenate([top[:, owner == i], foot[:, parent == i]], axis=1)
+    stages = robot.stages
+    counts = [len(stage.robot.assembly.limbs) for stage in stages] or [len(robot.assembly.limbs)]
+    parents = [stage.parent for stage in stages] or [-1]
+    points: dict[tuple[int, str], list[FloatArray]] = {}
+    for i, owner in enumerate(np.repeat(np.arange(len(counts)), counts).tolist()):
+        limb = robot.assembly.limbs[i]
+        for body, point in ((limb.on, foot[:, i]), (limb.to, top[:, i])):
+            key = (parents[owner], PLATFORM) if body == BASE else (owner, body)
+            points.setdefault(key, []).append(point)
+    for (owner, _), own in points.items():
+        yield "base" if owner < 0 else "platform", np.stack(own, axis=1)
 
 
 def _order_outline(points: FloatArray) -> IntArray:
