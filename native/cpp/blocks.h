@@ -117,6 +117,13 @@ inline void gather_platform(const loopcal::Strided &T, const int64_t *trial, con
     }
 }
 
+// The poses of all nodes, of the platform's T and those of the others.
+inline void gather_nodes(const Program &program, const loopcal::Strided &T, const loopcal::Strided *others,
+                         const int64_t *trial, const int64_t *pose, Lanes *out) {
+    gather_platform(T, trial, pose, out);
+    for (int i = 1; i < program.nodes; i++) gather_platform(others[i - 1], trial, pose, out + 12 * i);
+}
+
 // Write rotations (9) and positions (3) to the rows of T (rows, 4, 4).
 INLINE void write_platforms(const Lanes *from, const int64_t *row, int used, double *T) {
     Lanes whole[16] = {};

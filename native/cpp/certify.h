@@ -144,9 +144,9 @@ INLINE Mask reaches(const Begin &begin, double size, const Lanes *T, Lanes *dist
 // arrays : e, start, goal (t, n, 4, 4). sign : (t, n).
 inline int certify(const int64_t *structure, const double *numbers, const loopcal::Strided *arrays,
                    int64_t t, int64_t n, int8_t *sign) {
-    Arena memory(Arena::need<Group>((size_t)structure[0]));
+    ProgramMemory memory(structure);
     if (!memory.ok()) return loopcal::NO_MEMORY;
-    Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
+    Program program(structure, numbers, memory.groups, memory.order);
     Division division(t, n, false);
     Arena arena(PlacedUnit::need(program));
     if (!arena.ok()) return loopcal::NO_MEMORY;

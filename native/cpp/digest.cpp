@@ -90,7 +90,7 @@ struct Machine {
     std::vector<size_t> values, rows;  // of each group: joint values, numbers of its rows
 
     Machine(Random &random, bool free, int freedoms, const GroupShape *shapes) {
-        structure = {GROUPS, freedoms, 0, DRIVES, 0, free, 0, 1, 2, 3, 4, 5};
+        structure = {GROUPS, 1, freedoms, 0, DRIVES, 0, free, 0, 1, 2, 3, 4, 5};
         numbers = {0.4};
         int drive = 0;
         for (int g = 0; g < GROUPS; g++) {
@@ -107,7 +107,11 @@ struct Machine {
             if (shape.ending == 2) slots.insert(slots.end(), {joints, 7});
             int64_t count = (int64_t)slots.size() / 2;
             structure.insert(structure.end(), {LIMBS, joints, shape.ending, shape.rows, count,
-                                               (int64_t)solved.size(), displacements});
+                                               (int64_t)solved.size(), displacements, 0, freedoms});
+            for (int f = 0; f < freedoms; f++) structure.push_back(f);
+            for (int k = 0; k < LIMBS; k++) structure.insert(structure.end(), {-1, 0});
+            for (int k = 0; k < LIMBS; k++)
+                for (int f = 0; f < freedoms; f++) structure.push_back(f);
             displacements += LIMBS * count;
             for (int i = 0; i < shape.rows; i++) structure.push_back(i);
             for (int64_t j = 0; j < joints; j++) structure.push_back(shape.joints[j] == 'R');
@@ -128,8 +132,10 @@ struct Machine {
             values.push_back((size_t)(LIMBS * (joints + 1)));
             rows.push_back((size_t)(LIMBS * shape.rows * ((int64_t)solved.size() + freedoms + count + joints + 1)));
         }
-        structure[2] = displacements;
-        structure.push_back(0);  // may_stay_open
+        structure[3] = displacements;
+        structure.insert(structure.end(), {0, freedoms});  // may_stay_open, twists
+        for (int f = 0; f < freedoms; f++) structure.push_back(f);
+        structure.insert(structure.end(), {0, 0});
     }
 };
 

@@ -193,9 +193,9 @@ inline int fold_poses(const int64_t *structure, const double *numbers, const int
                       const loopcal::Strided *arrays, const loopcal::Strided *joints,
                       const loopcal::TwistRows *rows, const double *factor, double *out,
                       int8_t *is_finite, int64_t t, int64_t n) {
-    Arena memory(Arena::need<Group>((size_t)structure[0]));
+    ProgramMemory memory(structure);
     if (!memory.ok()) return 1;
-    Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
+    Program program(structure, numbers, memory.groups, memory.order);
     InputMap map{entries, arrays[3], arrays[4], arrays[5], arrays[6]};
     PoseRows in{program, map, arrays, joints, *rows, is_finite, t, n};
     int64_t m = rows->count, width = in.width(), size = width * width;

@@ -8,15 +8,17 @@ namespace INSTRUCTION_SET {
 
 // Where a limb keeps its frames; `joints` is the largest number of joints of a limb.
 struct Frames {
-    Lanes *axes, *origins, *before;
+    Lanes *axes, *origins, *before, *base;  // base : a pose of no rotation at the origin
 
     static size_t need(int joints) {
-        return Arena::need<Lanes>(3 * (joints + 1)) + Arena::need<Lanes>(3 * (joints + 2)) +
+        return Arena::need<Lanes>(12) + Arena::need<Lanes>(3 * (joints + 1)) + Arena::need<Lanes>(3 * (joints + 2)) +
                Arena::need<Lanes>(9 * (joints + 2));
     }
     Frames(Arena &arena, int joints)
         : axes(arena.take<Lanes>(3 * (joints + 1))), origins(arena.take<Lanes>(3 * (joints + 2))),
-          before(arena.take<Lanes>(9 * (joints + 2))) {}
+          before(arena.take<Lanes>(9 * (joints + 2))), base(arena.take<Lanes>(12)) {
+        for (int i = 0; i < 12; i++) base[i] = splat(i == 0 || i == 4 || i == 8 ? 1.0 : 0.0);
+    }
 };
 
 INLINE void widen(const Lanes *from, Lanes *to, int count) {
@@ -34,7 +36,8 @@ template <class Number, int ENDING> struct Limb {
     const double *nominal;  // links of this limb
     const Frames &frames;
     double size;
-    const Lanes *platform;  // rotation (9)
+    const Lanes *platform;  // rotation (9) of the body on which it ends
+    const Lanes *carrier;   // rotation (9) and position (3) of the body on which it begins, or null
     const Lanes *theta;     // joints + 1 values, `stride` apart
     int stride;
     Lanes tip[3], turned[9], arm[3], gap[3], distance, direction[3], moment[3];
@@ -42,15 +45,28 @@ template <class Number, int ENDING> struct Limb {
     const Number *link(int j) const { return placed + LINK * j; }
     const Number *pitch() const { return placed + LINK * (group.joints + 2); }
     const Number &length() const { return pitch()[group.joints]; }
+    // The rotation before link j, null for that of the base.
+    const Lanes *get_axes(int j) const {
+        return j == 0 ? carrier : j == group.joints + 1 ? platform : frames.before + 9 * j;
+    }
 
-    // T : rotation (9) and position (3) of the platform. limb : its number in the group.
+    // T : rotation (9) and position (3) of all nodes. limb : its number in the group.
     INLINE Limb(const Group &g, int limb, const Number *numbers, const Frames &f, double s,
-                const Lanes *T, const Lanes *values, int step, bool keeps_rotations)
+                const Lanes *nodes, const Lanes *values, int step, bool keeps_rotations)
         : group(g), placed(numbers), nominal(g.links + limb * (g.joints + 2) * 12), frames(f),
-          size(s), platform(T), theta(values), stride(step) {
+          size(s), theta(values), stride(step) {
+        int64_t on = g.ends[2 * limb], to = g.ends[2 * limb + 1];
+        const Lanes *T = platform = to < 0 ? f.base : nodes + 12 * to;
+        carrier = on < 0 ? nullptr : nodes + 12 * on;
         Lanes rotation[9], point[3], moved[3];
-        widen(link(0), rotation, 9);
-        widen(link(0) + 18, point, 3);
+        if (carrier) {
+            multiply_matrix(carrier, link(0), rotation);
+            multiply_vector(carrier, link(0) + 18, point);
+            for (int i = 0; i < 3; i++) point[i] = point[i] + carrier[9 + i];
+        } else {
+            widen(link(0), rotation, 9);
+            widen(link(0) + 18, point, 3);
+        }
         for (int i = 0; i < 3; i++) f.origins[i] = point[i];
         for (int j = 0; j < g.joints; j++) {
             Lanes *axis = f.axes + 3 * j, value = values[j * step];
@@ -156,6 +172,21 @@ template <class Number, int ENDING> struct Limb {
             shift(axis, out);
     }
 
+    // Column c of the freedoms that the limb touches.
+    INLINE void touch(int c, Lanes *out) const {
+        int f = (int)group.freedom[c];
+        if (c >= group.carried) return freedom(f, out);
+        Lanes axis[3] = {}, at[3];
+        axis[f % 3] = splat(1.0);
+        if (f < 3) {
+            for (int i = 0; i < 3; i++) at[i] = tip[i] - carrier[9 + i];
+            turn(axis, at, out);
+        } else {
+            shift(axis, out);
+        }
+        negate(out);
+    }
+
     INLINE void negate(Lanes *out) const {
         for (int i = 0; i < group.rows; i++) out[i] = -out[i];
     }
@@ -200,10 +231,10 @@ template <class Number, int ENDING> struct Limb {
             else
                 local[i] = Number{} + nominal[12 * j + 3 * i + axis - 3];
         }
-        if (j == 0)
-            widen(local, along, 3);
+        if (const Lanes *axes = get_axes(j))
+            multiply_vector(axes, local, along);
         else
-            multiply_vector(j == last ? platform : frames.before + 9 * j, local, along);
+            widen(local, along, 3);
         if (j != last)
             for (int i = 0; i < 3; i++) at[i] = tip[i] - frames.origins[3 * j + i];
         if (axis >= 3)

@@ -10,6 +10,7 @@ constexpr double OPEN = 1e-9;
 
 // Whether every limb ends in a distance and its rod or a prismatic joint is unknown.
 inline bool have_closed_form(const Program &program) {
+    if (program.nodes > 1) return false;
     for (int g = 0; g < program.groups; g++) {
         const Group &group = program.group[g];
         if (group.ending != DISTANCE || group.unknown != 1) return false;

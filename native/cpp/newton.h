@@ -22,12 +22,14 @@ struct NewtonWork {
     Frames frames;
     Lanes *reduced;  // of each limb: columns (unknown | freedoms | sigma | residual) of `rows`
     Lanes *low;      // columns (freedoms | residual) of the rows without joints
+    Lanes *front;    // what an elimination of a node factorizes
+    Lanes *twists;   // of all nodes
 
     static size_t reduced_of(const Program &program) {
         size_t count = 0;
         for (int g = 0; g < program.groups; g++) {
             const Group &group = program.group[g];
-            count += (size_t)group.limbs * group.rows * (group.unknown + program.freedoms + 2);
+            count += (size_t)group.limbs * group.rows * (group.unknown + group.touched + 2);
         }
         return count;
     }
@@ -53,12 +55,14 @@ class Equations {
   public:
     Equations(const Program &program, const NewtonWork &work)
         : program_(program), work_(work), redundant_(program.sigma && !program.free),
-          step_size_(6 + program.unknown_joints()), coordinate_size_(12 + program.joint_values()) {}
+          step_size_(6 * program.nodes + program.unknown_joints()),
+          coordinate_size_(12 * program.nodes + program.joint_values()) {}
 
     int step_size() const { return step_size_; }
     int coordinate_size() const { return coordinate_size_; }
 
     static int low_rows(const Program &program, int conditions) {
+        if (program.eliminations) return program.closed_rows() + conditions;
         int count = conditions;
         for (int g = 0; g < program.groups; g++) {
             const Group &group = program.group[g];
@@ -72,10 +76,13 @@ class Equations {
     template <class Number>
     void evaluate(const Number *placed, const Lanes *coordinates, const TaskRows *task,
                   Mask may_stay, Mask alive, Lanes *step, Measures &measures) const {
-        int m = program_.freedoms, rows = low_rows(program_, task ? task->conditions : 0);
+        int m = program_.twists, conditions = task ? task->conditions : 0;
+        int rows = low_rows(program_, conditions);
         Lanes inner{}, sign = splat(1.0), pivot = splat(1.0), *reduced = work_.reduced;
-        const Lanes *theta = coordinates + 12;
+        const Lanes *theta = coordinates + 12 * program_.nodes;
         int filled = 0;
+        if (program_.eliminations)  // a limb writes the columns of the nodes that it touches
+            for (int i = 0; i < rows * (m + 1); i++) work_.low[i] = Lanes{};
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
             for (int k = 0; k < group.limbs; k++) {
@@ -90,14 +97,15 @@ class Equations {
                                                 filled, inner, sign, pivot);
                 placed += group.placed();
                 theta += group.joints + 1;
-                reduced += group.rows * (group.unknown + m + 2);
+                reduced += group.rows * (group.unknown + group.touched + 2);
                 if (group.rows > group.unknown) filled += group.rows - group.unknown;
             }
         }
         Lanes *low = work_.low;
+        filled += program_.padding;
         if (task) {
-            for (int i = 0; i < task->conditions; i++, filled++) {
-                for (int f = 0; f < m; f++)
+            for (int i = 0; i < conditions; i++, filled++) {
+                for (int f = 0; f < program_.freedoms; f++)
                     low[f * rows + filled] = gather(task->slopes, 6 * i + program_.freedom[f]);
                 low[m * rows + filled] = gather(task->residual, i);
             }
@@ -116,19 +124,14 @@ class Equations {
             measures.length = Lanes{};
             return;
         }
-        sign = sign * triangularize(low, rows, m + 1, m);
-        for (int f = 0; f < m; f++) sign = sign * signum(low[f * rows + f]);
-        Lanes y[6], inverse[6], left{};
-        for (int f = 0; f < m; f++) inverse[f] = 1.0 / low[f * rows + f];
-        for (int f = m - 1; f >= 0; f--) {
-            Lanes known{};
-            for (int c = f + 1; c < m; c++) known = known + low[c * rows + f] * y[c];
-            y[f] = (-low[m * rows + f] - known) * inverse[f];
-        }
-        for (int i = 0; i < m; i++) left = left + low[m * rows + i] * low[m * rows + i];
-        for (int f = 0; f < 6; f++) step[f] = Lanes{};
-        for (int f = 0; f < m; f++) step[program_.freedom[f]] = y[f];
-        solve_joints(y, step + 6);
+        Lanes left{}, own[6], *y = program_.eliminations ? work_.twists : own;
+        if (program_.eliminations)
+            sign = sign * solve_nodes(rows, conditions, y, left);
+        else
+            sign = sign * solve_platform(rows, y, left);
+        for (int i = 0; i < 6 * program_.nodes; i++) step[i] = Lanes{};
+        for (int f = 0; f < m; f++) step[program_.place[f]] = y[f];
+        solve_joints(y, step + 6 * program_.nodes);
         Lanes length = measure_step(step);
         for (int i = 0; i < count; i++) step[i] = select(stays, Lanes{}, step[i]);
         measures.reducible = select(stays, norm, root(inner + left));
@@ -139,12 +142,13 @@ class Equations {
 
     // Coordinates a fraction of the step beyond.
     void move(const Lanes *from, const Lanes *step, Lanes fraction, Lanes *to) const {
-        Lanes twist[6], turn[9];
-        for (int i = 0; i < 6; i++) twist[i] = fraction * step[i];
-        exponential(twist, turn);
-        multiply_matrix(turn, from, to);
-        for (int i = 0; i < 3; i++) to[9 + i] = from[9 + i] + twist[3 + i];
-        from += 12, to += 12, step += 6;
+        for (int n = 0; n < program_.nodes; n++, from += 12, to += 12, step += 6) {
+            Lanes twist[6], turn[9];
+            for (int i = 0; i < 6; i++) twist[i] = fraction * step[i];
+            exponential(twist, turn);
+            multiply_matrix(turn, from, to);
+            for (int i = 0; i < 3; i++) to[9 + i] = from[9 + i] + twist[3 + i];
+        }
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
             for (int k = 0; k < group.limbs; k++) {
@@ -182,10 +186,11 @@ class Equations {
                           const Lanes *theta, Lanes *reduced, int rows, int filled, Lanes &inner,
                           Lanes &sign, Lanes &pivot) const {
         Limb<Number, ENDING> limb(group, k, placed, work_.frames, program_.size, T, theta, 1, false);
-        int r = group.rows, u = group.unknown, m = program_.freedoms;
+        int r = group.rows, u = group.unknown, m = group.touched;
+        const int64_t *touches = group.touches + k * m;
         Lanes *column = reduced;
         for (int j = 0; j < u; j++, column += r) limb.joint((int)group.solved[j], column);
-        for (int f = 0; f < m; f++, column += r) limb.freedom(program_.freedom[f], column);
+        for (int f = 0; f < m; f++, column += r) limb.touch(f, column);
         if (redundant_) {
             int j = 0;
             while (j < group.joints && group.actuator[j * group.limbs] < 0) j++;
@@ -213,19 +218,54 @@ class Equations {
             Lanes *low = work_.low + filled + i - u, scale = splat(1.0);
             if (redundant_) scale = magnitude(reduced[(u + m) * r + i]);
             for (int f = 0; f < m; f++)
-                low[f * rows] = redundant_ ? reduced[(u + f) * r + i] / scale : reduced[(u + f) * r + i];
-            low[m * rows] = redundant_ ? column[i] / scale : column[i];
+                low[touches[f] * rows] = redundant_ ? reduced[(u + f) * r + i] / scale : reduced[(u + f) * r + i];
+            low[program_.twists * rows] = redundant_ ? column[i] / scale : column[i];
         }
     }
 
-    // The steps of the joints that follow from the step y of the platform.
-    void solve_joints(const Lanes *y, Lanes *step) const {
+    // The twist y of the platform alone, what its rows remove of the residual, and their sign.
+    Lanes solve_platform(int rows, Lanes *y, Lanes &left) const {
         int m = program_.freedoms;
+        Lanes *low = work_.low, inverse[6];
+        Lanes sign = triangularize(low, rows, m + 1, m);
+        for (int f = 0; f < m; f++) sign = sign * signum(low[f * rows + f]);
+        for (int f = 0; f < m; f++) inverse[f] = 1.0 / low[f * rows + f];
+        for (int f = m - 1; f >= 0; f--) {
+            Lanes known{};
+            for (int c = f + 1; c < m; c++) known = known + low[c * rows + f] * y[c];
+            y[f] = (-low[m * rows + f] - known) * inverse[f];
+        }
+        for (int i = 0; i < m; i++) left = left + low[m * rows + i] * low[m * rows + i];
+        return sign;
+    }
+
+    // The same for all nodes, the last one eliminated first.
+    Lanes solve_nodes(int rows, int conditions, Lanes *y, Lanes &left) const {
+        Lanes *low = work_.low;
+        Lanes sign = eliminate_nodes(program_, low, rows, conditions, 1, work_.front);
+        const Lanes *right = low + program_.twists * rows;
+        for (int n = program_.eliminations - 1; n >= 0; n--) {
+            const Elimination &node = program_.elimination[n];
+            for (int f = node.count - 1; f >= 0; f--) {
+                int row = program_.find_row(n, f, rows, conditions);
+                Lanes known{};
+                for (int c = f + 1; c < node.columns; c++)
+                    known = known + low[node.column[c] * rows + row] * y[node.column[c]];
+                y[node.column[f]] = (-right[row] - known) / low[node.column[f] * rows + row];
+                left = left + right[row] * right[row];
+            }
+        }
+        return sign;
+    }
+
+    // The steps of the joints that follow from the steps y of the nodes.
+    void solve_joints(const Lanes *y, Lanes *step) const {
         const Lanes *reduced = work_.reduced;
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
-            int r = group.rows, u = group.unknown;
+            int r = group.rows, u = group.unknown, m = group.touched;
             for (int k = 0; k < group.limbs; k++) {
+                const int64_t *touches = group.touches + k * m;
                 const Lanes *right = reduced + (u + m + redundant_) * r;
                 for (int j = u - 1; j >= 0; j--) {
                     if (j >= r) {  // more joints than rows: nothing determines them
@@ -233,7 +273,7 @@ class Equations {
                         continue;
                     }
                     Lanes rest = right[j];
-                    for (int f = 0; f < m; f++) rest = rest + reduced[(u + f) * r + j] * y[f];
+                    for (int f = 0; f < m; f++) rest = rest + reduced[(u + f) * r + j] * y[touches[f]];
                     Lanes known{};
                     for (int c = j + 1; c < u; c++) known = known + reduced[c * r + j] * step[c];
                     step[j] = (-rest - known) / reduced[j * r + j];
@@ -248,6 +288,8 @@ class Equations {
     Lanes measure_step(const Lanes *step) const {
         Lanes length = measure_twist(step, program_.size);
         step += 6;
+        for (int n = 1; n < program_.nodes; n++, step += 6)
+            length = larger(length, measure_twist(step, program_.size));
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
             for (int k = 0; k < group.limbs; k++)

@@ -16,6 +16,10 @@ constexpr int ROD = 2 * LINK + 1;     // numbers of a placed limb that is a rod 
 struct Group {
     int limbs, joints, ending, rows, slots, unknown;
     int64_t first_column;      // of e
+    int carried, touched;      // freedoms of the bodies at which limbs begin, and of both ends
+    const int64_t *freedom;    // `touched` freedoms, those of the first bodies first
+    const int64_t *ends;       // (limbs, 2): the bodies at which they begin and end, -1 for the base
+    const int64_t *touches;    // (limbs, touched): columns of all freedoms
     const int64_t *row;        // rows of the ending that count
     const int64_t *turns;      // joints: 1 for R, 0 for P
     const int64_t *solved;     // `unknown` joints that closure determines
@@ -31,18 +35,33 @@ struct Group {
     int placed() const { return LINK * (joints + 2) + joints + 1; }  // numbers of a placed limb
 };
 
+// How one node is eliminated: `rows` of the closure rows that touch it, columns of which its own
+// `count` come first, then those of its neighbors.
+struct Elimination {
+    int count, rows, columns;
+    const int64_t *row, *column;
+};
+
 struct Program {
     int groups, freedoms, displacements, drives, free;
     int freedom[6];
+    int nodes, twists;         // the platform and other bodies, and the freedoms of all of them
+    const int64_t *place;      // (twists,): their places in the steps of all nodes, six each
+    int eliminations;          // 0 where the platform is the only node
+    int padding, task_place;   // rows of zeros behind those of closure; where the platform's rows
+                               // of a task come among those that eliminate it
+    Elimination *elimination;  // in their order, the platform last
     const double *sigma;  // (drives,), null without redundancy
     double size;
     Group *group;
     bool may_stay_open;  // whether a least-squares solution counts as closed
 
-    // `memory` for as many groups as whole[0] states
-    Program(const int64_t *whole, const double *real, Group *memory) : group(memory) {
+    // `memory` for as many groups as whole[0] states, `order` for as many nodes as whole[1] does
+    Program(const int64_t *whole, const double *real, Group *memory, Elimination *order)
+        : group(memory) {
         const int64_t *i = whole;
-        groups = (int)*i++, freedoms = (int)*i++, displacements = (int)*i++, drives = (int)*i++;
+        groups = (int)*i++, nodes = (int)*i++;
+        freedoms = (int)*i++, displacements = (int)*i++, drives = (int)*i++;
         bool has_sigma = *i++ != 0;
         free = (int)*i++;
         for (int f = 0; f < 6; f++) freedom[f] = (int)*i++;
@@ -53,6 +72,10 @@ struct Program {
             Group &o = group[g];
             o.limbs = (int)*i++, o.joints = (int)*i++, o.ending = (int)*i++, o.rows = (int)*i++;
             o.slots = (int)*i++, o.unknown = (int)*i++, o.first_column = *i++;
+            o.carried = (int)*i++, o.touched = (int)*i++;
+            o.freedom = i, i += o.touched;
+            o.ends = i, i += 2 * o.limbs;
+            o.touches = i, i += o.limbs * o.touched;
             o.row = i, i += o.rows;
             o.turns = i, i += o.joints;
             o.solved = i, i += o.unknown;
@@ -65,13 +88,53 @@ struct Program {
             o.pitch = real, real += o.limbs * o.joints;
             o.length = real, real += o.limbs;
         }
-        may_stay_open = *i != 0 || has_sigma;
+        may_stay_open = *i++ != 0 || has_sigma;
+        twists = (int)*i++;
+        place = i, i += twists;
+        padding = (int)*i++, task_place = (int)*i++;
+        eliminations = nodes > 1 ? nodes : 0;
+        elimination = order;
+        for (int n = 0; n < eliminations; n++) {
+            Elimination &o = order[n];
+            o.count = (int)*i++, o.rows = (int)*i++, o.columns = (int)*i++;
+            o.row = i, i += o.rows;
+            o.column = i, i += o.columns;
+        }
+    }
+
+    // The largest matrix that an elimination factorizes, with rows of a task and right sides.
+    size_t largest_elimination(int conditions, int sides) const {
+        size_t most = 1;
+        for (int n = 0; n < eliminations; n++) {
+            size_t rows = (size_t)elimination[n].rows + (n + 1 == eliminations ? conditions : 0);
+            size_t count = rows * (elimination[n].columns + sides);
+            if (count > most) most = count;
+        }
+        return most;
     }
 
     int placed() const {
         int count = 0;
         for (int g = 0; g < groups; g++) count += group[g].limbs * group[g].placed();
         return count;
+    }
+
+    // The row of a matrix, with `conditions` rows of a task at its end, that is row i of elimination n.
+    int find_row(int n, int i, int rows, int conditions) const {
+        const Elimination &node = elimination[n];
+        if (n + 1 < eliminations || i < task_place) return (int)node.row[i];
+        if (i < task_place + conditions) return rows - conditions + i - task_place;
+        return (int)node.row[i - conditions];
+    }
+
+    // Rows of closure without joints, and those of zeros of nodes that have too few.
+    int closed_rows() const {
+        int count = 0;
+        for (int g = 0; g < groups; g++)
+            if (group[g].rows > group[g].unknown)
+                count += group[g].limbs * (group[g].rows - group[g].unknown);
+        count += padding;
+        return eliminations || count > freedoms ? count : freedoms;
     }
 
     int joint_values() const {
@@ -85,6 +148,52 @@ struct Program {
         for (int g = 0; g < groups; g++) count += group[g].limbs * group[g].unknown;
         return count;
     }
+};
+
+// Eliminate the nodes of a matrix of `rows` and of the columns of all twists and `sides` right sides;
+// `conditions` rows behind those of closure are of the platform alone. The triangular rows of a node
+// are the first ones that its elimination names. Returns the sign of the determinant.
+inline Lanes eliminate_nodes(const Program &program, Lanes *matrix, int rows, int conditions,
+                             int sides, Lanes *front) {
+    Lanes sign = splat(1.0);
+    for (int n = 0; n < program.eliminations; n++) {
+        const Elimination &node = program.elimination[n];
+        int height = node.rows + (n + 1 == program.eliminations ? conditions : 0);
+        int width = node.columns + sides;
+        auto find_row = [&](int i) { return program.find_row(n, i, rows, conditions); };
+        auto find_column = [&](int c) {
+            return c < node.columns ? (int)node.column[c] : program.twists + c - node.columns;
+        };
+        for (int c = 0; c < width; c++) {
+            const Lanes *from = matrix + (size_t)find_column(c) * rows;
+            for (int i = 0; i < height; i++) front[c * height + i] = from[find_row(i)];
+        }
+        sign = sign * triangularize(front, height, width, node.count);
+        for (int f = 0; f < node.count; f++) sign = sign * signum(front[f * height + f]);
+        for (int c = 0; c < width; c++) {
+            Lanes *to = matrix + (size_t)find_column(c) * rows;
+            int last = c < node.count ? c + 1 : height;
+            for (int i = 0; i < last; i++) to[find_row(i)] = front[c * height + i];
+        }
+    }
+    return sign;
+}
+
+// The memory of a program's groups and nodes.
+class ProgramMemory {
+  public:
+    explicit ProgramMemory(const int64_t *structure)
+        : arena_(Arena::need<Group>((size_t)structure[0]) + Arena::need<Elimination>((size_t)structure[1])) {
+        if (!ok()) return;
+        groups = arena_.take<Group>((size_t)structure[0]);
+        order = arena_.take<Elimination>((size_t)structure[1]);
+    }
+    bool ok() const { return arena_.ok(); }
+    Group *groups = nullptr;
+    Elimination *order = nullptr;
+
+  private:
+    Arena arena_;
 };
 
 // placed = nominal . translation(d) . rotation(exp(w)) for every link of every limb, with lanes for

@@ -61,7 +61,7 @@ class RodEquations {
             apply_ = apply_ && group.ending == DISTANCE && !group.joints && !group.unknown;
             limbs += group.limbs;
         }
-        apply_ = apply_ && limbs == 6 && program.freedoms == 6;
+        apply_ = apply_ && limbs == 6 && program.freedoms == 6 && program.nodes == 1;
     }
 
     // Whether the mechanism has six freedoms and six limbs, each a rod of given length.

@@ -76,9 +76,9 @@ template <class Number, int ENDING> struct Wrenches {
     }
 
     INLINE void take_to_link(int j, const Lanes *vector, Lanes *out) const {
-        const Lanes *axes = j == limb.group.joints + 1 ? limb.platform : limb.frames.before + 9 * j;
+        const Lanes *axes = limb.get_axes(j);
         for (int i = 0; i < 3; i++)
-            out[i] = j ? axes[i] * vector[0] + axes[3 + i] * vector[1] + axes[6 + i] * vector[2] : vector[i];
+            out[i] = axes ? axes[i] * vector[0] + axes[3 + i] * vector[1] + axes[6 + i] * vector[2] : vector[i];
     }
 
     INLINE Lanes joint(int j) const {
@@ -134,9 +134,11 @@ class Differentiator {
     static size_t need(const Program &program, const InputMap &map) {
         Sizes size(program, map);
         return Frames::need(size.joints) + PlacedUnit::need(program) +
-               Arena::need<Lanes>(program.joint_values()) + Arena::need<Lanes>(12) +
-               Arena::need<Lanes>(size.triangle) + Arena::need<Lanes>(size.closed * (size.closed + 6)) +
-               2 * Arena::need<Lanes>(6 * size.closed) + Arena::need<Lanes>(size.values) +
+               Arena::need<Lanes>(program.joint_values()) + Arena::need<Lanes>(12 * program.nodes) +
+               Arena::need<Lanes>(size.triangle) +
+               Arena::need<Lanes>(size.closed * (size.closed + program.twists + 1)) +
+               Arena::need<Lanes>(program.largest_elimination(0, (int)size.closed)) +
+               Arena::need<Lanes>(12 * size.closed) + Arena::need<Lanes>(6 * size.closed) + Arena::need<Lanes>(size.values) +
                Arena::need<bool>(size.values) +
                Arena::need<Lanes>(6 * (size_t)map.parameters()) +
                Arena::need<Lanes>(6 * (size_t)program.drives);
@@ -148,10 +150,11 @@ class Differentiator {
           size_(program, map), frames_(arena, size_.joints) {
         placed_.prepare(program, division, arena);
         theta_ = arena.take<Lanes>(program.joint_values());
-        platform_ = arena.take<Lanes>(12);
+        nodes_ = arena.take<Lanes>(12 * program.nodes);
         triangle_ = arena.take<Lanes>(size_.triangle);
-        matrix_ = arena.take<Lanes>(size_.closed * (size_.closed + 6));
-        rows_ = arena.take<Lanes>(6 * size_.closed);
+        matrix_ = arena.take<Lanes>(size_.closed * (size_.closed + program.twists + 1));
+        front_ = arena.take<Lanes>(program.largest_elimination(0, (int)size_.closed));
+        rows_ = arena.take<Lanes>(12 * size_.closed);
         inverse_ = arena.take<Lanes>(6 * size_.closed);
         values_ = arena.take<Lanes>(size_.values);
         by_parameter = arena.take<Lanes>(6 * (size_t)map.parameters());
@@ -176,7 +179,7 @@ class Differentiator {
     void differentiate_located(int64_t unit) {
         placed_.place(unit, arrays_[0]);
         gather_joints(program_, joints_, arrays_[1], trial, pose, theta_);
-        gather_platform(arrays_[2], trial, pose, platform_);
+        gather_nodes(program_, arrays_[2], joints_ + program_.groups, trial, pose, nodes_);
         numbers_.locate_lanes(map_, trial, pose, !division_.by_trials);
         if (division_.by_trials)
             close_limbs(placed_.lanes());
@@ -198,12 +201,10 @@ class Differentiator {
                 size_t square = (size_t)group.rows * (group.rows + group.unknown);
                 if (group.joints > joints) joints = group.joints;
                 if (square > triangle) triangle = square;
-                closed += rows * group.limbs;
                 for (int k = 0; k < group.limbs; k++, entries += 1 + 4 * entries[0])
                     values += rows * (size_t)(entries[0] + group.joints + 1);
             }
-            size_t least = program.freedoms;
-            if (closed < least) closed = least;  // rows of zeros where there are too few
+            closed = program.closed_rows();  // rows of zeros where there are too few
         }
     };
 
@@ -211,7 +212,8 @@ class Differentiator {
         const int64_t *entries = map_.structure + 2;
         const Lanes *theta = theta_;
         Lanes *values = values_;
-        for (size_t i = 0; i < 6 * size_.closed; i++) rows_[i] = inverse_[i] = Lanes{};
+        for (size_t i = 0; i < 12 * size_.closed; i++) rows_[i] = Lanes{};
+        for (size_t i = 0; i < 6 * size_.closed; i++) inverse_[i] = Lanes{};
         size_t first = 0;
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
@@ -229,25 +231,32 @@ class Differentiator {
         }
     }
 
-    // Write the rows of a limb against the freedoms to rows_ (6 numbers each) and those against the
+    // Write the rows of a limb against the freedoms that it touches to rows_ (12 numbers each) and those against the
     // entries of the map and the driven joints to `values`, which moves on, as `first` does.
     template <class Number, int ENDING>
     void close_limb(const Group &group, int k, const Number *placed, const Lanes *theta,
                     const int64_t *entries, size_t &first, Lanes *&values) {
-        Limb<Number, ENDING> limb(group, k, placed, frames_, program_.size, platform_, theta, 1, true);
+        Limb<Number, ENDING> limb(group, k, placed, frames_, program_.size, nodes_, theta, 1, true);
         int r = group.rows, u = group.unknown;
         for (int j = 0; j < u; j++) limb.joint((int)group.solved[j], triangle_ + j * r);
         Lanes *unit = triangle_ + u * r;
         for (int i = 0; i < r * r; i++) unit[i] = splat(i % (r + 1) ? 0.0 : 1.0);
         if (u) triangularize(triangle_, r, u + r, u);
         for (int i = u; i < r; i++, first++) {
-            Lanes shares[6], at_center[3];
+            Lanes shares[6], at_center[3], at_carrier[3], arm[3];
             for (int c = 0; c < r; c++) shares[c] = unit[c * r + i];
             Wrenches<Number, ENDING> wrench(limb, shares);
             wrench.moment_at(limb.arm, at_center);
-            for (int f = 0; f < program_.freedoms; f++) {
-                int freedom = program_.freedom[f];
-                rows_[6 * first + f] = freedom < 3 ? at_center[freedom] : wrench.force[freedom - 3];
+            if (limb.carrier) {
+                for (int c = 0; c < 3; c++) arm[c] = limb.tip[c] - limb.carrier[9 + c];
+                wrench.moment_at(arm, at_carrier);
+            }
+            for (int f = 0; f < group.touched; f++) {
+                int freedom = (int)group.freedom[f];
+                if (f < group.carried)  // it moves the tip
+                    rows_[12 * first + f] = freedom < 3 ? -at_carrier[freedom] : -wrench.force[freedom - 3];
+                else
+                    rows_[12 * first + f] = freedom < 3 ? at_center[freedom] : wrench.force[freedom - 3];
             }
             int64_t column = -1;
             Lanes value{};
@@ -275,9 +284,10 @@ class Differentiator {
     // inverse_ (6, closed rows): inverse of the rows against the freedoms, or with redundant
     // actuators the least-squares one.
     void invert() {
+        if (program_.eliminations) return invert_nodes();
         int c = (int)size_.closed, m = program_.freedoms;
         for (int f = 0; f < m; f++)
-            for (int i = 0; i < c; i++) matrix_[f * c + i] = rows_[6 * i + f];
+            for (int i = 0; i < c; i++) matrix_[f * c + i] = rows_[12 * i + f];
         for (int i = 0; i < c * c; i++) matrix_[m * c + i] = splat(i % (c + 1) ? 0.0 : 1.0);
         if (program_.sigma) {
             for (int f = 0; f < m; f++)
@@ -291,6 +301,29 @@ class Differentiator {
                 for (int h = f + 1; h < m; h++)
                     known = known - matrix_[h * c + f] * inverse_[h * c + i];
                 inverse_[f * c + i] = known / matrix_[f * c + f];
+            }
+    }
+
+    // The rows of the platform of the inverse of all nodes, which is eliminated last.
+    void invert_nodes() {
+        int c = (int)size_.closed, M = program_.twists, row = 0;
+        for (int i = 0; i < c * M; i++) matrix_[i] = Lanes{};
+        for (int i = 0; i < c * c; i++) matrix_[M * c + i] = splat(i % (c + 1) ? 0.0 : 1.0);
+        for (int g = 0; g < program_.groups; g++) {
+            const Group &group = program_.group[g];
+            for (int k = 0; k < group.limbs; k++)
+                for (int i = group.unknown; i < group.rows; i++, row++)
+                    for (int f = 0; f < group.touched; f++)
+                        matrix_[group.touches[k * group.touched + f] * c + row] = rows_[12 * row + f];
+        }
+        eliminate_nodes(program_, matrix_, c, 0, c, front_);
+        const Elimination &last = program_.elimination[program_.eliminations - 1];
+        for (int i = 0; i < c; i++)
+            for (int f = last.count - 1; f >= 0; f--) {
+                Lanes known = matrix_[(M + i) * c + last.row[f]];
+                for (int h = f + 1; h < last.count; h++)
+                    known = known - matrix_[last.column[h] * c + last.row[f]] * inverse_[h * c + i];
+                inverse_[f * c + i] = known / matrix_[last.column[f] * c + last.row[f]];
             }
     }
 
@@ -351,7 +384,7 @@ class Differentiator {
     Frames frames_;
     PlacedUnit placed_;
     LaneMap numbers_;
-    Lanes *theta_, *platform_, *triangle_, *matrix_, *rows_, *inverse_, *values_;
+    Lanes *theta_, *nodes_, *triangle_, *matrix_, *front_, *rows_, *inverse_, *values_;
     bool *begins_;
 };
 
@@ -366,9 +399,9 @@ INLINE void write_lanes(const Lanes *from, int64_t count, const Differentiator &
 inline int differentiate(const int64_t *structure, const double *numbers, const int64_t *entries,
                          const loopcal::Strided *arrays, const loopcal::Strided *joints,
                          double *by_parameter, double *by_reading, int64_t t, int64_t n) {
-    Arena memory(Arena::need<Group>((size_t)structure[0]));
+    ProgramMemory memory(structure);
     if (!memory.ok()) return 1;
-    Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
+    Program program(structure, numbers, memory.groups, memory.order);
     InputMap map{entries, arrays[3], arrays[4], arrays[5], arrays[6]};
     Division division(t, n);
     Arena arena(Differentiator::need(program, map));

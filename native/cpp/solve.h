@@ -84,8 +84,8 @@ class Solver {
         block.unit = unit;
         block.placed = space_.unit + unit % space_.units;
         block.placed->place(unit, in_.e);
-        gather_platform(in_.T, block.trial, block.pose, block.now);
-        gather_joints(program_, in_.joints, in_.q, block.trial, block.pose, block.now + 12);
+        gather_nodes(program_, in_.T, in_.joints + program_.groups, block.trial, block.pose, block.now);
+        gather_joints(program_, in_.joints, in_.q, block.trial, block.pose, block.now + 12 * program_.nodes);
         for (int lane = 0; lane < W; lane++) block.alive[lane] = lane < block.used ? -1 : 0;
         block.share = splat(1.0);
         block.applied = splat(__builtin_inf());
@@ -204,7 +204,7 @@ class Solver {
         Mask settled = (now.reducible <= RESIDUAL * size) &
                        ((block.applied <= STEP * size) | (block.at_rounding > 2.0));
         Lanes zero = now.reducible * 0.0 + now.length * 0.0;  // NaN where one is not finite
-        for (int i = 0; i < 12; i++) zero = zero + block.now[i] * 0.0;  // some are in no equation
+        for (int i = 0; i < 12 * program_.nodes; i++) zero = zero + block.now[i] * 0.0;  // some are in no equation
         Mask broken = ~((zero == 0.0) & (now.pivot > SINGULAR));
         Mask end = settled | broken | (block.share < 1e-5), near{};
         if (in_.goal.data) {
@@ -270,7 +270,9 @@ class Solver {
         for (int lane = 0; lane < W; lane++)
             row[lane] = block.trial[lane] * division_.n + block.pose[lane];
         write_platforms(block.now, row, block.used, out_.T);
-        const Lanes *theta = block.now + 12;
+        for (int i = 1; i < program_.nodes; i++)
+            write_platforms(block.now + 12 * i, row, block.used, out_.joints[program_.groups + i - 1]);
+        const Lanes *theta = block.now + 12 * program_.nodes;
         for (int g = 0; g < program_.groups; g++) {
             int values = program_.group[g].limbs * (program_.group[g].joints + 1);
             for (int lane = 0; lane < W; lane++) to[lane] = out_.joints[g] + row[lane] * values;
@@ -300,9 +302,9 @@ class Solver {
 
 inline int solve(const int64_t *structure, const double *numbers, const SolveInput &input,
                  const SolveOutput &output) {
-    Arena memory(Arena::need<Group>((size_t)structure[0]));
+    ProgramMemory memory(structure);
     if (!memory.ok()) return loopcal::NO_MEMORY;
-    Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
+    Program program(structure, numbers, memory.groups, memory.order);
     Division division(input.t, input.n);
     int64_t blocks = 1, units = 1;
     if (input.task) {

@@ -146,9 +146,9 @@ inline int reach(const int64_t *structure, const double *numbers, const loopcal:
                  const int64_t *columns, const double *base, int64_t t, int64_t n,
                  const loopcal::ReachOutput *output) {
     const loopcal::ReachOutput &out = *output;
-    Arena memory(Arena::need<Group>((size_t)structure[0]));
+    ProgramMemory memory(structure);
     if (!memory.ok()) return loopcal::NO_MEMORY;
-    Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
+    Program program(structure, numbers, memory.groups, memory.order);
     Division division(t, n, false);
     // Newton's method begins at the start, with the lengths that lead to the goal
     loopcal::Strided lengths[6], goal{out.T, 16 * n, 16};

@@ -21,14 +21,14 @@ struct RowBlock {
 
 struct SolveInput {
     loopcal::Strided e, q, T, goal;
-    const loopcal::Strided *joints;
+    const loopcal::Strided *joints;  // of each group, then T of each node but the platform
     int64_t t, n, max_iterations;
     loopcal::Task task;
     void *context;
 };
 
 struct SolveOutput {
-    double *T, *const *joints, *residual;
+    double *T, *const *joints, *residual;  // joints as in SolveInput
     int64_t *iterations;
     int8_t *status, *sign;
 };
@@ -39,7 +39,7 @@ struct Workspace {
     PlacedUnit *unit = nullptr;
     int64_t *rows = nullptr, blocks, units;
     double *poses = nullptr;
-    Lanes *reduced = nullptr, *low = nullptr;
+    Lanes *reduced = nullptr, *low = nullptr, *front = nullptr, *twists = nullptr;
 
     static int most_joints(const Program &program) {
         int most = 0;
@@ -51,13 +51,17 @@ struct Workspace {
     Workspace(const Program &program, const Division &division, int most_conditions,
               int64_t block_count, int64_t unit_count)
         : blocks(block_count), units(unit_count), reduced_(NewtonWork::reduced_of(program)),
-          low_((size_t)Equations::low_rows(program, most_conditions) * (program.freedoms + 1)),
-          steps_(6 + (size_t)program.unknown_joints()),
-          values_(12 + (size_t)program.joint_values()), joints_(most_joints(program)),
+          low_((size_t)Equations::low_rows(program, most_conditions) * (program.twists + 1)),
+          front_(program.largest_elimination(most_conditions, 1)),
+          steps_(6 * (size_t)program.nodes + program.unknown_joints()),
+          values_(12 * (size_t)program.nodes + program.joint_values()), twists_(program.twists + 1),
+          joints_(most_joints(program)),
           arena_(need(program)) {
         if (!arena_.ok()) return;
         reduced = arena_.take<Lanes>(reduced_);
         low = arena_.take<Lanes>(low_);
+        front = arena_.take<Lanes>(front_);
+        twists = arena_.take<Lanes>(twists_);
         block = arena_.take<RowBlock>(blocks);
         unit = arena_.take<PlacedUnit>(units);
         rows = arena_.take<int64_t>(blocks * W);
@@ -73,18 +77,19 @@ struct Workspace {
 
     bool ok() const { return arena_.ok(); }
 
-    NewtonWork take_work() { return {Frames(arena_, joints_), reduced, low}; }
+    NewtonWork take_work() { return {Frames(arena_, joints_), reduced, low, front, twists}; }
 
   private:
     size_t need(const Program &program) const {
         return Frames::need(joints_) + Arena::need<Lanes>(reduced_) + Arena::need<Lanes>(low_) +
+               Arena::need<Lanes>(front_) + Arena::need<Lanes>(twists_) +
                Arena::need<RowBlock>(blocks) +
                Arena::need<PlacedUnit>(units) + Arena::need<int64_t>(blocks * W) +
                Arena::need<double>(12 * blocks * W) + units * PlacedUnit::need(program) +
                blocks * 2 * (Arena::need<Lanes>(values_) + Arena::need<Lanes>(steps_));
     }
 
-    size_t reduced_, low_, steps_, values_;
+    size_t reduced_, low_, front_, steps_, values_, twists_;
     int joints_;
     Arena arena_;
 };

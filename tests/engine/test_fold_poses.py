@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from loopcal.engine import State
 from tests.engine.cases import draw_twist_rows, make_pose_rows, take_pose_rows
 
-ROBOTS = ["hexapod-42", "ru-pus-prs", "five-bar", "cable-4"]
+ROBOTS = ["hexapod-42", "ru-pus-prs", "five-bar", "cable-4", "h4"]
 """Rods alone, limbs of every ending, three freedoms, and more actuators than freedoms."""
 
 

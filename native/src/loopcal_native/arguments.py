@@ -36,11 +36,21 @@ def require_arrays(
     require_joints(program, joints, shape)
 
 
+def list_joints(state: State) -> list[FloatArray]:
+    """Return the joints of all groups, then the poses of the nodes but the platform."""
+    return [as_reals(a) for a in (*state.joints, *state.others)]
+
+
 def require_joints(program: Program, joints: Sequence[FloatArray], shape: tuple[int, int]) -> None:
-    """Raise ValueError unless joints are those of all groups for t trials and n poses."""
-    require(len(joints) == len(program.groups), f"joints of {len(program.groups)} groups")
-    for group, values in zip(program.groups, joints, strict=True):
+    """Raise ValueError unless joints are those of all groups for t trials and n poses, and the
+    poses of nodes but the platform.
+    """
+    count = len(program.groups) + len(program.others)
+    require(len(joints) == count, f"joints of {len(program.groups)} groups, and poses of nodes")
+    for group, values in zip(program.groups, joints, strict=False):
         require_rows("joints", values, (len(group.limbs), len(group.joints) + 1), shape)
+    for T in joints[len(program.groups) :]:
+        require_rows("T", T, (4, 4), shape)
 
 
 def require_rows(
@@ -61,11 +71,11 @@ def flatten_inputs(
     inputs: ParameterMap,
     shape: tuple[int, int],
 ) -> tuple[IntArray, list[FloatArray], list[FloatArray]]:
-    """Return the entries of a map, e, q, T and the numbers of the map, and the joints of groups.
+    """Return the entries of a map, e, q, T and the numbers of the map, and `list_joints`.
 
     They must be kept while their addresses are in use.
     """
-    arrays, joints = [as_reals(a) for a in (e, q, state.T)], [as_reals(a) for a in state.joints]
+    arrays, joints = [as_reals(a) for a in (e, q, state.T)], list_joints(state)
     require_arrays(program, arrays, joints, shape)
     entries, numbers = flatten_map(program, inputs, shape)
     return entries, [*arrays, *numbers], joints

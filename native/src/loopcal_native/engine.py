@@ -23,12 +23,14 @@ from loopcal.engine import (
     TwistRows,
 )
 from loopcal.engine.numpy_engine.certificate import has_driven_rods
+from loopcal.engine.numpy_engine.sensitivity import differentiate as differentiate_nodes
 from loopcal.engine.numpy_engine.targets import reach_by
 from loopcal.typing import BoolArray, FloatArray
 from loopcal_native.arguments import (
     describe_all,
     flatten_inputs,
     list_addresses,
+    list_joints,
     require_arrays,
     require_joints,
     require_rows,
@@ -63,7 +65,7 @@ def make_engine(variant: str = "") -> Engine:
     own = NativeFunctions(sets[name])
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
     functions += own.differentiate, own.fold_poses, own.solve_triangles, own.compare_poses
-    return Engine(f"native:{name}", VERSION, *functions)
+    return Engine(f"native:{name}", VERSION, *functions, solves_nodes=True)
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class NativeFunctions:
         t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
         flat, shape = flatten_program(program, free), (t, n)
         arrays = [as_reals(e), as_reals(q), as_reals(start.T)]
-        joints = [as_reals(a) for a in start.joints]
+        joints = list_joints(start)
         require_arrays(program, arrays, joints, shape)
         if goal is not None:
             arrays.append(as_reals(goal.T))
@@ -120,7 +122,9 @@ class NativeFunctions:
             if calls is not None and outcome == TASK_FAILED:
                 raise calls.error
             require_done(outcome)
-        return State(T, tuple(out), status, residual, iterations, sign)
+        groups = len(program.groups)
+        parts = tuple(out[:groups]), status, residual, iterations, sign, tuple(out[groups:])
+        return State(T, *parts)
 
     def certify(
         self, program: Program, e: FloatArray, start: State, goal: State
@@ -195,10 +199,9 @@ class NativeFunctions:
         """Linearize closure at a state (t, n) and eliminate the passive joints."""
         t, n = shape = state.T.shape[:2]
         flat = flatten_program(program, free)
-        arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list(state.joints)
-        joints = [as_reals(a) for a in joints]
+        arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list_joints(state)
         require_arrays(program, arrays, joints, shape)
-        m, out = len(program.freedoms), []
+        m, out = len(program.unknown_twists), []
         for group, unknown in zip(program.groups, flat.unknown, strict=True):
             width = len(unknown) + m + len(group.slots) + len(group.joints) + 1
             out.append(np.empty((t, n, len(group.limbs), len(group.rows), width)))
@@ -225,9 +228,17 @@ class NativeFunctions:
         return ClosureBlocks(tuple(closure), tuple(passive), flat.unknown)
 
     def differentiate(
-        self, program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+        self,
+        program: Program,
+        e: FloatArray,
+        q: FloatArray,
+        state: State,
+        inputs: ParameterMap,
+        nodes: int = 1,
     ) -> tuple[FloatArray, FloatArray]:
-        """Differentiate the platform in parameters and readings."""
+        """Differentiate the platform in parameters and readings; NumPy does it for other nodes."""
+        if nodes > 1:
+            return differentiate_nodes(program, e, q, state, inputs, nodes)
         t, n = shape = state.T.shape[:2]
         flat = flatten_program(program, False)
         entries, arrays, joints = flatten_inputs(program, e, q, state, inputs, shape)

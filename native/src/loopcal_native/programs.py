@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine import LENGTH, PITCH, Group, MapPattern, Program
+from loopcal.engine import BASE, LENGTH, PITCH, PLATFORM, Group, MapPattern, Program
 from loopcal.typing import FloatArray, IntArray
 
 ENDINGS = {"rigid": 0, "ball": 1, "distance": 2}
@@ -40,7 +41,8 @@ def _flatten(program: Program, free: bool) -> FlatProgram:
     """Return a program as flat arrays, with the order of program.h."""
     freedoms = list(program.freedoms)
     require(len(freedoms) <= 6 and set(freedoms) <= set(range(6)), "freedoms of a twist")
-    whole = [len(program.groups), len(freedoms), program.n_displacements, program.n_joints]
+    whole = [len(program.groups), len(program.nodes)]
+    whole += [len(freedoms), program.n_displacements, program.n_joints]
     whole += [program.sigma is not None, free, *freedoms, *[0] * (6 - len(freedoms))]
     reals: list[FloatArray] = [np.array([program.size], float)]
     if program.sigma is not None:
@@ -50,12 +52,14 @@ def _flatten(program: Program, free: bool) -> FlatProgram:
     for group in program.groups:
         unknown.append(tuple(group.unknown_joints(free)))
         _require_inside(program, group)
-        whole += _list_structure(group, unknown[-1])
+        whole += _list_structure(program, group, unknown[-1])
         reals += [group.links[:, :, :3, :3].reshape(len(group.limbs), -1, 9)]
         origins = group.links[:, :, :3, 3]
         reals[-1] = np.concatenate([reals[-1], origins], axis=2)
         reals += [group.pitch, group.length]
-    whole.append(program.may_stay_open)
+    whole += [program.may_stay_open, len(program.unknown_twists)]
+    whole += [6 * node + f for node, f in program.unknown_twists]
+    whole += _list_eliminations(program, unknown)
     numbers = np.concatenate([np.asarray(a, np.float64).ravel() for a in reals])
     return FlatProgram(np.array(whole, np.int64), numbers, tuple(unknown))
 
@@ -107,14 +111,58 @@ def _list_entries(program: Program, pattern: MapPattern, functions: int) -> IntA
     return np.concatenate(of_limbs).astype(np.int64)
 
 
-def _list_structure(group: Group, unknown: tuple[int, ...]) -> list[int]:
+def _list_eliminations(program: Program, unknown: Sequence[tuple[int, ...]]) -> list[int]:
+    """Return rows and columns of the elimination of each node, as `Elimination` of program.h; the
+    rows have the order of the NumPy engine, so that determinants have equal signs.
+    """
+    columns: dict[int, list[int]] = {node: [] for node in range(len(program.nodes))}
+    for i, (node, _) in enumerate(program.unknown_twists):
+        columns[node].append(i)
+    fronts: list[tuple[tuple[int, ...], list[int]]] = []
+    first = 0
+    for group, joints in zip(program.groups, unknown, strict=True):
+        count, ends = (
+            max(len(group.rows) - len(joints), 0),
+            list(zip(group.on, group.to, strict=True)),
+        )
+        for pair in dict.fromkeys(ends):
+            own = [k for k, other in enumerate(ends) if other == pair]
+            rows = [first + count * k + i for k in own for i in range(count)]
+            fronts.append((tuple(node for node in pair if node != BASE), rows))
+        first += count * len(ends)
+    begin, alone, out = first, fronts.copy(), []
+    for node in program.elimination_order:
+        own = [front for front in fronts if node in front[0]]
+        near = sorted({other for nodes, _ in own for other in nodes} - {node})
+        rows = [row for _, of_front in own for row in of_front]
+        while len(rows) < len(columns[node]):
+            rows.append(first)
+            first += 1
+        used = [column for other in (node, *near) for column in columns[other]]
+        out += [len(columns[node]), len(rows), len(used), *rows, *used]
+        fronts = [front for front in fronts if node not in front[0]]
+        fronts.append((tuple(near), rows[len(columns[node]) :]))
+    task = sum(len(rows) for nodes, rows in alone if nodes == (PLATFORM,))
+    if not program.others:
+        return [0, 0]
+    return [first - begin, task, *out]
+
+
+def _list_structure(program: Program, group: Group, unknown: tuple[int, ...]) -> list[int]:
     """Return the integers of a group."""
     joints, links = len(group.joints), len(group.joints) + 2
     turned = {slot.element for slot in group.slots if slot.axis < 3}
     advancing = {slot.element for slot in group.slots if slot.axis == PITCH}
     first = group.columns.start or 0
     out = [len(group.limbs), joints, ENDINGS[group.ending], len(group.rows), len(group.slots)]
-    out += [len(unknown), first, *group.rows]
+    ends = (group.on[0], group.to[0])
+    begun, ended = ([] if node == BASE else list(program.nodes[node]) for node in ends)
+    place = {twist: i for i, twist in enumerate(program.unknown_twists)}
+    out += [len(unknown), first, len(begun), len(begun + ended), *begun, *ended]
+    out += [end for pair in zip(group.on, group.to, strict=True) for end in pair]
+    for on, to in zip(group.on, group.to, strict=True):
+        out += [place[on, f] for f in begun] + [place[to, f] for f in ended]
+    out += group.rows
     out += [letter == "R" for letter in group.joints]
     out += [*unknown, *group.actuator.ravel().tolist()]
     out += [value for slot in group.slots for value in (slot.element, slot.axis)]
@@ -134,6 +182,14 @@ def _require_inside(program: Program, group: Group) -> None:
     require(group.length.shape == (limbs,), "length (k,)")
     require(group.actuator.shape == (joints + 1, limbs), "actuator (J + 1, k)")
     require(bool((group.actuator < program.n_joints).all()), "actuators that are columns of q")
+    nodes = len(program.nodes)
+    for ends in (group.on, group.to):
+        require(
+            len(ends) == limbs and all(-1 <= end < nodes for end in ends), "bodies of its nodes"
+        )
+        freedoms = {() if end == BASE else (end > 0, program.nodes[end]) for end in ends}
+        require(len(freedoms) == 1, "bodies of one kind at which the limbs of a group begin or end")
+    require(all(set(f) <= set(range(6)) for f in program.nodes), "freedoms of a twist")
     rows = len(group.rows)
     inside = all(0 <= row < ROWS[group.ending] for row in group.rows)
     require(0 < rows <= ROWS[group.ending] and inside, "rows of the ending")

@@ -36,6 +36,8 @@ WRONG_CALLS = {
     "matrices of the start": (PROGRAM, E, Q, replace(HOME, T=HOME.T[..., :3, :])),
     "joints of the start": (PROGRAM, E, Q, replace(HOME, joints=(HOME.joints[0][..., :1],))),
     "groups of the start": (PROGRAM, E, Q, replace(HOME, joints=())),
+    "other nodes": (PROGRAM, E, Q, replace(HOME, others=(HOME.T,))),
+    "ends": (change_group(PROGRAM, to=(9,) * len(GROUP.to)), E, Q, HOME),
     "ending": (change_group(PROGRAM, ending="magnet"), E, Q, HOME),
     "rows": (change_group(PROGRAM, rows=(0, 3)), E, Q, HOME),
     "joints": (change_group(PROGRAM, joints="X"), E, Q, HOME),
@@ -256,6 +258,7 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
         case.home.residual,
         case.home.iterations,
         case.home.closure_sign,
+        tuple(disturb(rng, np.repeat(a, rows, axis=0), share / 10) for a in case.home.others),
     )
     e, q = disturb(rng, case.e, share), disturb(rng, case.q, share)
     state = native.solve(case.program, e, q, start)
@@ -277,7 +280,8 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     folded = TwistRows(np.zeros(1, int), *(disturb(rng, a[:, :1], share) for a in draw_rows(rows)))
     zeros = np.zeros((rows, *(inputs.pattern.parameters + 1,) * 2))
     native.fold_poses(zeros, case.program, e, q, state, inputs, [folded])
-    matrix = blocks.closure[0].E.reshape(rows, -1, blocks.closure[0].E.shape[-1])
+    largest = max((block.E for block in blocks.closure), key=np.size)
+    matrix = largest.reshape(rows, -1, largest.shape[-1])
     factor = native.fold(np.zeros((rows, *matrix.shape[2:] * 2)), matrix)
     assert np.isfinite(
         factor[
