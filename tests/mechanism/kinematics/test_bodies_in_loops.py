@@ -225,6 +225,35 @@ def test_passive_joints_beside_bodies_have_the_derivatives_of_forward_kinematics
         assert_allclose(exact.readings[0, :, :, i], slope, rtol=1e-6, atol=1e-6)
 
 
+TWINS = """closure: least-squares
+limbs:
+  - {name: twin, on: arm, tip: [150, 0, 0], attach: [100, 0, 0], copies: {count: 3},
+     ending: distance, length: 250, errors: [{of: rod, shift: [length]}]}
+"""
+
+
+def test_loops_with_bodies_close_in_the_least_squares_sense_with_exact_derivatives(
+    tmp_path: Path,
+) -> None:
+    closure, limbs = TWINS.split("\n", 1)
+    file = tmp_path / "robot.yaml"
+    text = f"{HEAD}{closure}\n{FORMS[OTHERS[0]].replace('limbs:', limbs.rstrip())}"
+    file.write_text(text, "utf-8")
+    robot = load_robot(file)
+    errors = 1e-4 * np.random.default_rng(0).standard_normal(len(robot.parameters))
+    machine = robot.with_values(robot.values + errors)
+    q = inverse(machine, np.array([[0.01, 0.02, 0.05], [-0.02, 0.01, -0.1]])).q
+    solution, exact, h = forward(machine, q), jacobian(machine, q), 1e-6
+    assert solution.converged.all()
+    assert (solution.residual > 1e-5).all()  # [m] rods of unequal lengths leave the loops open
+    for i in range(len(machine.parameters)):
+        step = h * np.eye(len(machine.parameters))[i]
+        ends = [forward(machine.with_values(machine.values + s * step), q) for s in (1, -1)]
+        slope = geometry.pose_difference(ends[0].T, ends[1].T) / (2 * h)
+        # 1e-6 squared of the differences, and rounding of 1e-15 m over 2e-6
+        assert_allclose(exact.parameters[..., i], slope, rtol=1e-6, atol=1e-7)
+
+
 def test_frame_of_a_body_is_no_unknown_of_the_complete_model(tmp_path: Path) -> None:
     change = "controlled: -> error_model: complete\ntolerances: {lengths: {sd: 0.1}}\ncontrolled:"
     names = load_form(tmp_path, OTHERS[0], change).parameters.names
