@@ -237,7 +237,7 @@ def report_machine(
     uncertainty, budget = state_uncertainty(study, fit.posterior), compute_error_budget(fit, data)
     noisy, without_noise = (validate(fit, rows).kinds[-1] for rows in (held_out, exact))
     return Report(
-        planned=study.spread * study.plan.errors.after.position,
+        planned=study.spread * study.plan.errors.after.position_rms,
         expected=study.spread * estimate_calibration_gain(fit, data).position_after,
         total=np.nan if budget is None else study.spread * budget.position.rms,
         stated=float(np.sqrt((uncertainty.position**2).mean())),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planned and random poses compared: errors at validation poses after calibration, and how many
-random poses are as good as planned ones.
+random poses are as good as planned ones. And the share of machines that end below the error that a
+plan states, from the fewest possible poses on.
 
 Machines are drawn from their tolerances and measured with noise, at planned poses and at poses
 drawn evenly from the workspace. They are calibrated by the default method and validated at other
@@ -17,16 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
+from loopcal.apply.accuracy import transport
+from loopcal.diagnose.error_frames import fit_frames
 from loopcal.estimate.identification import identify_trials
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
 from loopcal.measure.simulation import sample_truth, simulate_trials
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.planning.constraints import PlanOptions, Target
-from loopcal.planning.pose_groups import linearize_groups
+from loopcal.planning.pose_groups import find_group_motions, linearize_groups
 from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import PlanningProblem, prepare_problem
 
@@ -63,6 +68,20 @@ CASES = (
     Case("3-prs", "position", "position"),
     Case("linear-delta", "position", "position"),
 )
+
+
+SHARED = (
+    Case("hexapod-42", "full pose", "position"),
+    Case("hexapod-42", "three targets, unknown tracker frame", "position"),
+    Case("pentapod", "full pose", "position"),
+    Case("linear-delta", "position", "position"),
+    Case("linear-delta", "heights", "position"),
+)
+MULTIPLES, DRAWN, UNMEASURED = (1, 2, 4), 200, 1000
+"""Numbers of poses over the smallest possible one; machines, and poses where they are compared."""
+
+TARGETS = np.array([[0.06, 0.0, 0.01], [-0.03, 0.05, 0.01], [-0.03, -0.05, 0.02]])
+"""Places of three reflectors on the platform [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,14 +172,18 @@ def prepare_study(
 
 
 def instrument(case: Case, noise_factor: float = 1.0) -> Instrument:
-    """Return an instrument for full poses or positions, in a known frame."""
-    if case.measured == "position":
-        return Instrument(
-            (Sensor(Component(("x", "y", "z")), Gaussian(noise_factor * np.full(3, SIGMA_LENGTH))),)
-        )
-    return Instrument(
-        (Sensor(Pose(), Gaussian(noise_factor * np.array([SIGMA_ANGLE] * 3 + [SIGMA_LENGTH] * 3))),)
-    )
+    """Return an instrument for what is measured, in a known frame unless that is said."""
+    kinds: dict[str, Kind] = {
+        "full pose": Pose(),
+        "position": Component(("x", "y", "z")),
+        "heights": Component(("z",)),
+        "three targets, unknown tracker frame": Position(
+            targets=("a", "b", "c"), places=TARGETS, unknown=("frame",), frame="tracker"
+        ),
+    }
+    kind, sigmas = kinds[case.measured], {"length": SIGMA_LENGTH, "angle": SIGMA_ANGLE}
+    sigma = np.array([sigmas[column.dimension.value] for column in kind.noise_columns])
+    return Instrument((Sensor(kind, Gaussian(noise_factor * sigma)),))
 
 
 def measure_planned(study: Study, n: int) -> Errors:
@@ -172,7 +195,10 @@ def measure_planned(study: Study, n: int) -> Errors:
         study, plan.poses.coordinates, study.truth.reshape(-1, p), tool, SEED
     )
     expected = np.full(
-        seeds, float(study.target_error(plan.errors.after.position, plan.errors.after.orientation))
+        seeds,
+        float(
+            study.target_error(plan.errors.after.position_rms, plan.errors.after.orientation_rms)
+        ),
     )
     shape = (seeds, machines)
     return Errors(position.reshape(shape), orientation.reshape(shape), expected)
@@ -216,7 +242,7 @@ def predict_error(study: Study, problem: PlanningProblem, chosen: NDArray[np.int
     """Return the error of the target that the theory predicts for some groups."""
     errors = problem.predict_errors(chosen)
     assert errors is not None, "tolerances bound every error"
-    return float(study.target_error(errors.position, errors.orientation))
+    return float(study.target_error(errors.position_rms, errors.orientation_rms))
 
 
 def calibrate_machines(
@@ -238,6 +264,40 @@ def calibrate_machines(
     )
     squares = (gap**2).reshape(*gap.shape[:2], 2, 3).sum(axis=3).mean(axis=1)
     return np.sqrt(squares[:, 1]), np.sqrt(squares[:, 0])
+
+
+def count_below(case: Case) -> list[list]:
+    """Return for each number of poses what a plan states of position errors, and how many machines
+    end below it.
+
+    Machines are drawn from their tolerances, measured at the planned poses and calibrated. Their
+    errors are those at other poses of the workspace, in the frame of the plan.
+    """
+    robot = load_robot(case.robot)
+    options = PlanOptions(target=case.target, hold_out=0, n_candidates=CANDIDATES, seed=SEED)
+    problem = prepare_problem(robot, instrument(case), options)
+    members, q = problem.groups.members, problem.candidates.solution.q
+    unfixed = find_group_motions(problem.free, problem.instrument, q, members)
+    elsewhere = sample_workspace(robot, UNMEASURED, SEED + 2).solution
+    frames = fit_frames(robot, elsewhere.T, unfixed)
+    to_tool = transport(robot, elsewhere.T, "base", "tool")
+    truth = sample_truth(robot, DRAWN, SEED)
+    true, rows = forward_trials(robot, truth, elsewhere.q[None]).T, []
+    for n in (multiple * problem.min_groups for multiple in MULTIPLES):
+        plan = plan_poses(set_options(problem, n_poses=n))
+        data = simulate_trials(robot, truth, plan.poses.coordinates, problem.instrument, SEED)
+        values = identify_trials(robot, data).values
+        gap = geometry.pose_difference(forward_trials(robot, values, elsewhere.q[None]).T, true)
+        twists = (to_tool @ frames.remove(gap, elsewhere.T, gap)[..., None])[..., 0]
+        error = np.sqrt((twists[..., 3:] ** 2).sum(axis=2).mean(axis=1))
+        stated = plan.errors.after
+        share = float((error <= stated.position).mean())
+        reached = float(np.quantile(error, stated.share)) / stated.position
+        above = float((error > stated.position_rms).mean())
+        known = [1e6 * stated.position, 100.0 * share, reached, 1e6 * stated.position_rms]
+        of_rms = [100.0 * above, float(_rms(error)) / stated.position_rms]
+        rows.append([case.robot, case.measured, n, *known, *of_rms])
+    return rows
 
 
 def find_equal_number(numbers: tuple[int, ...], errors: list[float], error: float) -> float | None:
@@ -306,7 +366,7 @@ def compare_noise(case: Case) -> list:
         curve = [float(np.median(predict_random(study, n))) for n in RANDOM]
         row.append(
             find_equal_number(
-                RANDOM, curve, float(study.target_error(plan.position, plan.orientation))
+                RANDOM, curve, float(study.target_error(plan.position_rms, plan.orientation_rms))
             )
         )
     return row
@@ -330,6 +390,8 @@ QUICK = {
     "PLANNED": (16,),
     "RANDOM": (16, 40, 110),
     "NOISE_FACTORS": (1.0,),
+    "SHARED": SHARED[2:4],
+    "MULTIPLES": (1,),
 }
 
 
@@ -338,6 +400,9 @@ def check(tables: dict[str, Any]) -> None:
     for *_, position, other, _, _, better in tables["accuracy"]["rows"]:
         assert position < other
         assert better >= SEEDS / 2
+    for row in tables["shares"]["rows"]:
+        # of DRAWN machines, each with the probability 0.9
+        assert abs(row[4] - 90.0) < 100.0 * 4.0 * np.sqrt(0.9 * 0.1 / DRAWN), row
 
 
 def collect() -> dict:
@@ -393,6 +458,21 @@ def collect() -> dict:
                 ],
                 "formats": ["", "", "d", ".2f", ".2f", ".1f", ".1f", "d"],
                 "rows": accuracy,
+            },
+            "shares": {
+                "columns": [
+                    *(
+                        "robot",
+                        "measured",
+                        "poses",
+                        "stated for 9 of 10 [um]",
+                        "machines below [%]",
+                    ),
+                    *("9 of 10 machines / stated", "stated rms [um]", "machines above the rms [%]"),
+                    "rms of machines / stated",
+                ],
+                "formats": ["", "", "d", ".2f", ".1f", ".2f", ".2f", ".1f", ".2f"],
+                "rows": [row for case in SHARED for row in count_below(case)],
             },
             "saving": {
                 "columns": ["robot", "measured", "planned poses", *numbers, *ratios],

@@ -17,6 +17,7 @@ from loopcal.numerics.statistics import (
     compute_chi_square_tail,
     compute_component_tail,
     compute_median,
+    compute_weighted_quantile,
     estimate_variance_component,
     find_distinct,
 )
@@ -143,3 +144,23 @@ def test_masked_arrays_are_not_imported() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize("share", [0.7, 0.9, 0.95, 0.99])
+def test_quantile_of_a_weighted_sum_of_squares_is_that_of_known_distributions(share):
+    for count, tolerance in ((1, 0.02), (2, 0.006), (3, 0.003), (42, 3e-5)):
+        exact = compute_chi_square_quantile(count, 1.0 - share)
+        found = compute_weighted_quantile(np.full(count, 2e-12), share)
+        assert found == pytest.approx(2e-12 * exact, rel=tolerance)
+    # weights in pairs make a sum of exponential variables: P(> x) = sum a_i exp(-x / (2 w_i))
+    w = np.array([1.0, 0.3, 0.05, 1e-4])
+    ratio = w[:, None] / np.where(np.eye(4, dtype=bool), np.inf, w[:, None] - w)
+    a = np.where(np.eye(4, dtype=bool), 1.0, ratio).prod(axis=1)
+    x = compute_weighted_quantile(np.r_[w, w, 0.0], share)
+    tail = float(a @ np.exp(-x / (2.0 * w)))
+    assert tail == pytest.approx(1.0 - share, rel=0.02)
+
+
+def test_quantile_of_no_weight_is_zero():
+    assert compute_weighted_quantile(np.zeros(3), 0.9) == 0.0
+    assert compute_weighted_quantile(np.zeros(0), 0.9) == 0.0

@@ -205,16 +205,27 @@ def test_unreachable_target_is_refused_with_the_largest_possible_size(target, mo
 
 
 @pytest.mark.parametrize("right", [3, 4, 57, 999, 1000, 1001])
-def test_search_finds_the_smallest_size_in_few_evaluations(right):
+@pytest.mark.parametrize(
+    ("excess", "most"),
+    [
+        (lambda n, right: right / n, 14),  # information grows with the size
+        (lambda n, right: (right / n) ** 2, 24),
+        (lambda n, right: (right / n) ** 0.25, 24),  # and hardly grows, beside earlier knowledge
+        # the doublings, and twice the halvings of a thousand
+        (lambda n, right: 1.0 + 1e-9 if n < right else 1.0, 30),
+        (lambda n, right: 0.01 if n >= right else 1e9, 30),
+    ],
+)
+def test_search_finds_the_smallest_size_in_few_evaluations(right, excess, most):
     asked: list[int] = []
 
-    def meets(n: int) -> bool:
+    def measure(n: int) -> float:
         asked.append(n)
-        return n >= right
+        return excess(n, right)
 
-    assert search_size(meets, 3, 1000) == right
-    assert len(asked) == len(set(asked)) <= 20  # the doublings and the halvings of a thousand
-    assert search_size(meets, 1000, 1000) == max(right, 1000)
+    assert search_size(measure, 3, 1000) == right
+    assert len(asked) == len(set(asked)) <= most
+    assert search_size(measure, 1000, 1000) == max(right, 1000)
 
 
 def test_size_without_any_regular_design_does_not_meet_the_target():

@@ -255,8 +255,10 @@ class PlanOptions(PlanSettings):
         of uncertainty of the parameters.
     target : error to make small: "pose" (rotations times the robot's size), "position" or
         "orientation".
-    goal : expected error of `target` to reach [m, rad], root mean square over the workspace; the
-        plan then has the smallest number of poses that reaches it.
+    goal : error of `target` [m, rad], root mean square over the workspace, that the `share` of
+        machines is to stay below; the plan then has the smallest number of poses that reaches it.
+    share : of machines with errors by the tolerances, whose error after the calibration a plan
+        states: at least 0.7, so that the error is above the root mean square of all machines.
     hold_out : number of further poses for validation, drawn evenly; default one for four poses of
         the fit, and at least 5, which a verdict needs.
     frame : in which errors are stated: "fitted", after the best rigid fit of the base and platform
@@ -282,6 +284,8 @@ class PlanOptions(PlanSettings):
             lambda value: value in ("I", "D"),
             "I (mean predicted variance of poses) or D (volume of uncertainty of the parameters)",
         ),
+        # Of all sums of weighted squares, a single square is most often below its mean: in 68 %.
+        "share": Limit(lambda value: 0.7 <= value < 1.0, "a share of 0.7 or more and below 1"),
         "n_candidates": POSITIVE,
         "seed": NOT_NEGATIVE,
     }
@@ -289,6 +293,7 @@ class PlanOptions(PlanSettings):
     criterion: str = "I"
     target: Target = "pose"
     goal: float | None = None
+    share: float = 0.9
     hold_out: int | None = None
     frame: Literal["fitted", "base", "relative"] = "fitted"
     constraints: Constraints = field(default_factory=Constraints)

@@ -153,10 +153,6 @@ class Criterion:
         """Whether larger values are better."""
         return self.name == "D"
 
-    def meets(self, value: float, target: float) -> bool:
-        """Return whether a value of the criterion is at least as good as a target."""
-        return value >= target if self.is_d else value <= target
-
 
 def is_full_rank(singular_values: np.ndarray) -> bool:
     """Return whether a triangular factor with these descending singular values can be inverted.

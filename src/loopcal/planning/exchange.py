@@ -33,7 +33,6 @@ accept an exchange only if the new score is larger.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -273,6 +272,7 @@ PERTURBED = 0.15  # share of the groups that a perturbation replaces; at least t
 # least the second.
 AMONG, FEWEST = 6, 100
 CURVE_PERTURBATIONS = 10  # number of perturbations of each design of a curve
+SINGULAR_EXCESS = 1.0 + 1e-9  # excess of a size without a regular design: the next is a step larger
 BOUND_GAP = 3e-3  # gap of the relaxation where only the size is needed
 
 
@@ -474,23 +474,30 @@ def find_smallest_design(
     most: int | None = None,
     seed: int = 0,
     perturbations: int = CURVE_PERTURBATIONS,
+    evaluate: Callable[[IntArray], float] | None = None,
 ) -> tuple[Design, int]:
     """Return the smallest design found whose criterion is at least as good as a target, and the
     size below which no design can be.
 
     target : value of the criterion (for I a variance: the square of an rms standard deviation).
     most : largest number of groups; default: all that are allowed.
+    evaluate : from the groups (n,) of a design to what must meet the target in place of the
+        criterion, and is never better than it. Below the returned size no design is then as good
+        in the criterion as the design found.
     """
     count = len(problem.allowed)
     most = count if most is None else most if problem.repeats else min(most, count)
     problem.require_enough(most)
-    criterion, bounds, made = problem.criterion, dict[int, float](), dict[int, Design]()
+    bounds, made = dict[int, float](), dict[int, Design]()
 
-    def is_possible(n: int) -> bool:
-        bounds[n] = relax_design(problem, n, BOUND_GAP).bound
-        return criterion.meets(bounds[n], target)
+    def find_least(target: float, low: int, high: int) -> int:
+        def excess(n: int) -> float:
+            bounds[n] = relax_design(problem, n, BOUND_GAP).bound
+            return problem.compare(target, bounds[n])
 
-    def is_reached(n: int) -> bool:
+        return search_size(excess, low, high)
+
+    def make(n: int) -> float:
         smaller = [k for k in made if k < n]
         first = [made[max(smaller)].chosen] if smaller else []
         try:
@@ -498,32 +505,44 @@ def find_smallest_design(
         except EstimationError as error:
             if error.code != "plan.design-singular" or n == most:
                 raise
-            return False
-        return criterion.meets(made[n].value, target)
+            return SINGULAR_EXCESS
+        value = made[n].value if evaluate is None else evaluate(made[n].chosen)
+        return problem.compare(target, value)
 
-    at_least = search_size(is_possible, problem.n_needed, most)
-    numbers = {"size": most, "available": count, "criterion": criterion.name, "target": target}
+    at_least = find_least(target, problem.n_needed, most)
+    name = problem.criterion.name
+    numbers = {"size": most, "available": count, "criterion": name, "target": target}
     if at_least > most:
         best = bounds[most]
         raise EstimationError(report_finding("plan.target-impossible", best=best, **numbers))
-    n = search_size(is_reached, at_least, most)
+    n = search_size(make, at_least, most)
     if n > most:
         best = made[most].value
         raise EstimationError(report_finding("plan.target-not-reached", best=best, **numbers))
+    if evaluate is not None:
+        at_least = find_least(made[n].value, at_least, n)
     return made[n], at_least
 
 
-def search_size(meets: Callable[[int], bool], low: int, high: int) -> int:
-    """Return the smallest size from low to high that meets a target, else high + 1.
+def search_size(excess: Callable[[int], float], low: int, high: int) -> int:
+    """Return the smallest size from low to high whose excess is 1 or less, else high + 1.
 
-    Steps double until a size meets it; larger sizes are assumed to do so, too.
+    excess : variance of a size over the target. The next size is that which meets the target where
+        information grows with the size. Until one meets it, steps at least double and sizes at most
+        do; then every other step halves the interval. Larger sizes are assumed to meet it, too.
     """
-    size, step = low, 1
-    while not meets(size):
-        if size == high:
-            return high + 1
-        low, size, step = size + 1, min(size + step, high), 2 * step
-    return bisect_left(range(size), True, low, key=meets)
+    failed, met, size, step, halve = low - 1, high + 1, low, 1, False
+    while failed + 1 < met:
+        times = excess(size)
+        failed, met = (failed, size) if times <= 1.0 else (size, met)
+        guess = np.ceil(size * times)
+        if met > high:
+            guess, step = min(max(guess, size + step), 2 * size), 2 * step
+        elif halve:
+            guess = (failed + met) // 2
+        halve = met <= high and not halve
+        size = int(min(max(guess, failed + 1), met - 1))
+    return met
 
 
 # Coordinate exchange.

@@ -242,7 +242,7 @@ class Plan(DrawnResult):
 
     def _report_errors(self, counted: str) -> Finding:
         """Return the expected errors: before, with random poses, and after."""
-        given, target, size = self.errors, self.options.target, self.robot.size
+        given, target = self.errors, self.options.target
         shown = {
             name: None if errors is None else errors.to_quantities(self.robot)
             for name, errors in (
@@ -251,15 +251,16 @@ class Plan(DrawnResult):
                 ("after", given.after),
             )
         }
-        share = None
+        reduction = None
         if given.random is not None:
-            share = 1.0 - given.after.select(target, size) / given.random.select(target, size)
+            reduction = 1.0 - given.after.select(target) / given.random.select(target)
         return report_finding(
             "plan.expected-errors",
             **shown,
             counted=counted,
             target=target,
-            reduction=share,
+            reduction=reduction,
+            share=given.after.share,
             **given.frame.data,
         )
 
@@ -339,7 +340,7 @@ def plan_poses(problem: PlanningProblem, progress: Progress = report_no_progress
     # cost some more poses.
     for _ in range(EXTENSIONS):
         result = _plan_number(problem, n * k, progress)
-        if result.errors.after.select(options.target, problem.prediction.size) <= options.goal:
+        if result.errors.after.select(options.target) <= options.goal:
             return replace(result, curve=replace(curve, enough=n))
         n += max(n // 20, 1)
     raise EstimationError(

@@ -31,6 +31,7 @@ EXCLUDED_BY_PLANE_LINE = {
     **dict.fromkeys(("like", "kinds", "components", "orientation", "sigma_angle"), _HELD),
     **dict.fromkeys(("criterion", "n_candidates", "allowed"), _CHOSEN),
     "hold_out": "where every point is fitted",
+    "share": "which states no error over the workspace",
     "measured": "which plans without earlier measurements",
     "unknown_frames": "whose surfaces are unknown in every group",
     "targets": "which checks the tool",
@@ -47,7 +48,12 @@ def plan(
         type=opt.Count("PLANNED_POSES"),
     ),
     accuracy: tuple[float, Literal["position", "orientation"]] | None = opt.option(
-        "Instead of --poses: expected error to reach, such as 20um or 10urad.", type=opt.GOAL
+        "Instead of --poses: error over the workspace (rms) that machines are to end below, such "
+        "as 20um or 10urad.",
+        type=opt.GOAL,
+    ),
+    share: float = opt.option(
+        "Share of machines that end below the stated errors.", of=OPTIONS, type=opt.OPEN_SHARE
     ),
     criterion: str = opt.option(
         "What the plan minimizes: the mean predicted variance of poses (I), or the uncertainty of "
@@ -86,7 +92,7 @@ def plan(
         of=OPTIONS,
         type=opt.Count("CANDIDATES", 10),
     ),
-    curve: bool = opt.flag("Also compute the expected errors by the number of poses."),
+    curve: bool = opt.flag("Also compute the errors by the number of poses."),
     frame: Literal["fitted", "base", "relative"] = opt.frame(
         OPTIONS, "fitted, base, or relative (to home)"
     ),
@@ -102,7 +108,7 @@ def plan(
 
     Examples:
       loopcal plan hexapod-42 -o plan --poses 30 --sigma-position 5um --sigma-angle 10urad
-      loopcal plan hexapod-42 -o plan --accuracy 20um --kind position
+      loopcal plan hexapod-42 -o plan --accuracy 20um --share 0.95 --kind position
       loopcal plan 3-prs -o plan --measure x,y,z,phi,theta --max-tilt 20deg --curve
       loopcal plan hexapod-42 -o plan --kind position --seen-from 1.5m,-0.8m,0.6m --cone 60deg
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
@@ -153,6 +159,7 @@ def plan(
             criterion=criterion,
             target=target,
             goal=goal,
+            share=share,
             hold_out=hold_out,
             frame=frame,
             constraints=constraints,

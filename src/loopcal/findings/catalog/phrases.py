@@ -185,13 +185,20 @@ def violations(data: Data) -> str:
     return "; ".join([*words, "..."][: len(reasons)])
 
 
-def compared_errors(data: Data) -> str:
-    """Return expected errors before and after calibration, and with random poses."""
-    cases = (
-        ("before", "before calibration"),
-        ("random", f"with as many random {data['counted']}"),
-        ("after", "with this plan"),
+def machines(data: Data) -> str:
+    """Return a share of machines, such as `9 of 10 machines`."""
+    tenths = 10.0 * data["share"]
+    is_whole = abs(tenths - round(tenths)) < EQUAL
+    return (
+        f"{tenths:.0f} of 10 machines"
+        if is_whole
+        else fill_template("{share:percent} of machines", **data)
     )
+
+
+def compared_errors(data: Data) -> str:
+    """Return expected errors before calibration and with random poses."""
+    cases = (("before", "before calibration"), ("random", f"with as many random {data['counted']}"))
     return ", ".join(
         f"{list_names(data[name]) or 'none'} {words}"
         for name, words in cases

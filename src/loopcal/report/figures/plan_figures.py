@@ -157,15 +157,16 @@ def _make_box(alpha: float) -> dict[str, Any]:
 
 
 def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
-    """Draw expected errors by the number of poses, with the bound that no choice of so many
-    candidates can beat.
+    """Draw errors by the number of poses: what the share of machines ends below, the root mean
+    square of all machines, and the bound of that which no choice of so many candidates can beat.
     """
     unit = find_unit(robot.units[DIMENSIONS[curve.target]])
     figure = start_figure(6.4, 4.4)
     axes: Any = figure.add_subplot(1, 1, 1)
     for errors, line, color, label in (
-        (curve.values, "o-", CALIBRATION, f"planned {curve.counted}"),
-        (curve.bounds, "--", BOUND, f"no choice of {curve.counted} is better"),
+        (curve.values, "o-", CALIBRATION, f"{100.0 * curve.share:g} % of machines end below"),
+        (curve.rms, ".-", REFERENCE, "rms of all machines"),
+        (curve.bounds, "--", BOUND, f"no choice of {curve.counted} has a smaller rms"),
     ):
         axes.plot(curve.numbers, errors / unit.factor_to_si, line, color=color, label=label)
     if curve.goal is not None:
@@ -173,7 +174,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
         axes.axhline(goal, color=VALIDATION, lw=1.0, label=f"goal: {goal:.3g} {unit.symbol}")
     scale_logarithmically(axes.xaxis)
     scale_logarithmically(axes.yaxis)
-    words = f"expected {curve.target} error (rms)"
+    words = f"{curve.target} error over the workspace (rms)"
     words += ", rotations times robot size" if curve.target == "pose" else ""
     label_axes(axes, f"{curve.counted} for calibration [1]", f"{words} [{unit.symbol}]")
     axes.legend(frameon=False, fontsize=SMALL)
