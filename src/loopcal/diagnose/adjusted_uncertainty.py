@@ -209,11 +209,14 @@ def _add_correlation(
     """Return a fit with what correlated errors add to the covariance by independent ones."""
     rows = patterns.rows
     errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
-    independent = np.zeros_like(errors.covariance)
+    independent = np.diag(np.full(len(errors.covariance), fit.residual_test.sigma_scale**2))
+    k = len(independent) - len(fit.nuisance)
+    independent[:k, :k] = 0.0
     for part in (part for part in fit.posterior.parts if part.source == NOISE):
         scaled = part.root / fit.tolerance[:, None]
-        by_noise = np.linalg.lstsq(rows.root / fit.tolerance[:, None], scaled, rcond=None)[0]
-        independent += by_noise @ by_noise.T
+        directions = rows.root[: len(scaled), :k] / fit.tolerance[:, None]
+        by_noise = np.linalg.lstsq(directions, scaled, rcond=None)[0]
+        independent[:k, :k] += by_noise @ by_noise.T
     # what correlated errors cause beyond independent ones, where that is more
     covariance = errors.covariance
     more = take_root(covariance - independent, np.diag(covariance + independent))
@@ -230,10 +233,11 @@ def _add_correlation(
 
 
 def _measure_growth(parts: Sequence[tuple[FloatArray, float]], root: FloatArray) -> float:
-    """Return the factor by which a covariance of root (p, k) [SI] increases the standard
+    """Return the factor by which a covariance of root (p + U, k) [SI] increases the standard
     uncertainty, the larger one of the parts: position and orientation.
     """
-    shares = [float(((E @ root) ** 2).sum()) / stated for E, stated in parts if stated > 0.0]
+    added = [(float(((E @ root[: E.shape[1]]) ** 2).sum()), stated) for E, stated in parts]
+    shares = [square / stated for square, stated in added if stated > 0.0]
     return float(np.sqrt(1.0 + max(shares, default=0.0)))
 
 

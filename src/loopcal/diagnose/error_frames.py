@@ -183,6 +183,8 @@ def choose_error_frame(
             nothing = np.zeros((MOTIONS, posterior.discrepancy.errors.count))
             by_parameters = np.concatenate([by_parameters, nothing], axis=1)
         by_frames = np.diag(np.repeat([1.0, 0.0], 6))
+        if instrument.by_motions is not None:
+            by_frames = _as_base_motion(of_frame, instrument.by_motions)
         own_errors = _as_base_motion(of_frame, instrument.own)
         followed = FollowedMotion(by_frames, by_parameters, own_errors)
         return refer_errors(robot, frame, reference, motions, followed)

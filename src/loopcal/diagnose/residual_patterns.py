@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization
@@ -52,9 +53,10 @@ class ResidualRows:
 
     basis: FloatArray  # (R, q) orthonormal, what is estimated
     residual: FloatArray  # (R,) of the least-squares fit
-    gain: FloatArray  # (R, k) change of the k directions of the fit by an error of each row
-    # (p, k) these directions [SI]: an error e of the rows changes the estimate by root gain' e,
-    # up to its sign
+    # (R, k) change of the k directions of the fit, and of the setup, by an error of each row
+    gain: FloatArray
+    # (p + U, k) these directions [SI]: an error e of the rows changes the estimate, and the setup
+    # at a known machine, by root gain' e, up to its sign
     root: FloatArray
     # kind, row, column: (R,) number of the kind, of its row, and of its residual
     kind: IntArray
@@ -192,11 +194,15 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     machine = by_direction[:, determined] / d.singular_values[0][determined]
     basis = span_columns(np.concatenate([rows[:, : -p - 1], machine], axis=1))
     residual = rows[:, -1] - basis @ (basis.T @ rows[:, -1])
+    machine_gain = by_direction[:, used] / linear.information[used]
+    machine_root = linear.fit.tolerance[:, None] * d.directions[0][:, used]
+    setup = linear.linearization.nuisance
+    setup_root = np.zeros((0, 0)) if setup is None else setup.elimination.joint_root()[0]
     return ResidualRows(
         basis=basis,
         residual=residual,
-        gain=by_direction[:, used] / linear.information[used],
-        root=linear.fit.tolerance[:, None] * d.directions[0][:, used],
+        gain=np.concatenate([machine_gain, rows[:, : -p - 1]], axis=1),
+        root=np.asarray(block_diag(machine_root, setup_root)),
         kind=stacked.kind,
         row=stacked.row,
         column=stacked.column,

@@ -83,7 +83,12 @@ from loopcal.estimate.result import (
     report_unknown_bias,
     report_used_poses,
 )
-from loopcal.estimate.unfixed_motions import FrameRows, describe_frames, find_frame_knowledge
+from loopcal.estimate.unfixed_motions import (
+    FrameRows,
+    UnfixedMotions,
+    describe_frames,
+    find_frame_knowledge,
+)
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators
@@ -390,7 +395,9 @@ def identify(
 
 def _examine_estimate(
     problem: Problem, weighted: Problem, fit: Descent
-) -> tuple[PoseEstimates | None, tuple[Residuals, ...], Linearization | None, FloatArray | None]:
+) -> tuple[
+    PoseEstimates | None, tuple[Residuals, ...], Linearization | None, UnfixedMotions | None
+]:
     """Solve and evaluate the rows of a fit once more, where its last step ended.
 
     Poses and residuals are those of the rows without weights of a loss, at the setup parameters of
@@ -427,7 +434,7 @@ def _assemble(
     test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, is_weighted, converged)
     sources = find_variance_sources(d, penalty, test, method, free)
     test = replace(test, intervals=bool(np.isfinite(sources.noise)))
-    estimates, residuals, linearization, unfixed = _examine_estimate(problem, weighted, fit)
+    estimates, residuals, linearization, motions = _examine_estimate(problem, weighted, fit)
     conflict, on_prior = run_prior_tests(free, fit, method)
     plain, values = d.plain(), free.values(fit.deviation)[0]
     corrected, setup = robot.with_values(values), weighted.nuisance
@@ -442,7 +449,7 @@ def _assemble(
         nuisance = estimate_nuisance(
             setup, linearization, robot, d, variance, sources.noise, baseline
         )
-    frames = describe_frames(weighted, data, unfixed, options.prior, linearization, sources.noise)
+    frames = describe_frames(weighted, data, motions, options.prior, linearization, sources.noise)
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
     excluded = tuple(options.excluded_poses)

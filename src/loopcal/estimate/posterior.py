@@ -8,7 +8,7 @@ docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
@@ -22,6 +22,7 @@ from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
+from loopcal.measure.kinds.setup_parameters import POSITION_AXES, ROTATION_AXES, linearize_frame
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import find_distinct
@@ -34,6 +35,7 @@ PREFIX, DISCREPANCY_PREFIX = "posterior_", "discrepancy_"
 
 SHOWN_NOISE, SHOWN_READINGS = "posterior_shown_noise", "posterior_reading_sigma"
 INFORMATION = ("information_rows", "information_deviations", "information_noise")
+BY_MOTIONS = "frames_by_motions"
 """Names of arrays of a run folder."""
 
 NOISE = "noise"
@@ -255,11 +257,14 @@ class InstrumentFrame(NamedTuple):
     ----------
     T : (4, 4) T_base_frame [m]. by_parameters : (6, p) [per SI]. own : (6, 6); both are zero for a
         frame that is stated.
+    by_motions : (6, 12) by motions of the frames of base and platform, as of `frame_twists`; None
+        for a frame that is stated, and in run folders of earlier versions.
     """
 
     T: FloatArray
     by_parameters: FloatArray
     own: FloatArray
+    by_motions: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,14 +288,33 @@ class FrameKnowledge:
         names = ", ".join(self.instruments) or "none"
         return f"<FrameKnowledge: {self.unfixed.shape[1]} unfixed motions; instruments: {names}>"
 
+    def add_errors(
+        self, names: Sequence[str], values: FloatArray, errors: FloatArray
+    ) -> FrameKnowledge:
+        """Return frames with further errors of the setup at a known machine: columns `errors` (U,
+        k) [SI] of setup parameters of these names and values (U,).
+        """
+        changed = {}
+        for name, frame in self.instruments.items():
+            axes = (*ROTATION_AXES, *POSITION_AXES)
+            places = [names.index(f"{name}.{a}") for a in axes if f"{name}.{a}" in names]
+            if len(places) == len(axes):
+                twists = linearize_frame(values[places]) @ errors[places]
+                R = np.linalg.qr(np.concatenate([frame.own, twists], axis=1).T, mode="r")
+                changed[name] = frame._replace(own=np.asarray(R.T))
+        return replace(self, instruments={**self.instruments, **changed})
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder, which `frames_from_arrays` reads."""
         frames, count = self.instruments.values(), len(self.instruments)
         p = next((frame.by_parameters.shape[1] for frame in frames), 0)
         shapes = {"T": (4, 4), "by_parameters": (6, p), "own": (6, 6)}
+        nothing = np.full((6, 12), np.nan)
+        motions = [nothing if f.by_motions is None else f.by_motions for f in frames]
         return {
             "frames_unfixed": self.unfixed,
             "frames_readings": self.readings,
+            BY_MOTIONS: np.reshape(motions, (count, 6, 12)),
             **{
                 f"frames_{name}": np.reshape([getattr(f, name) for f in frames], (count, *shape))
                 for name, shape in shapes.items()
@@ -305,7 +329,9 @@ def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> FrameKnowledge | Non
     if any(f"frames_{name}" not in arrays for name in names):
         return None
     unfixed, readings, labels, *stacked = (arrays[f"frames_{name}"] for name in names)
-    instruments = map(InstrumentFrame, *stacked)
+    nothing = np.full((len(labels), 6, 12), np.nan)
+    motions = [m if np.isfinite(m).all() else None for m in arrays.get(BY_MOTIONS, nothing)]
+    instruments = map(InstrumentFrame, *stacked, motions)
     frames = dict(zip(map(str, labels.tolist()), instruments, strict=True))
     return FrameKnowledge(unfixed, readings, frames)
 

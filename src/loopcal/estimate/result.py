@@ -658,7 +658,8 @@ class FitFigures:
 def add_covariance(
     fit: Identification, root: FloatArray, degrees: float, finding: Finding
 ) -> Identification:
-    """Return a fit whose parameters have the additional covariance root root', root (p, k) [SI].
+    """Return a fit whose parameters have the additional covariance root root', root (p, k) [SI], or
+    (p + U, k) where the same errors also move the setup at a known machine.
 
     Estimates do not change. Directions of infinite variance stay infinite, and a fit without
     intervals (NaN) stays without. The setup parameters follow the machine by their slope. `degrees`
@@ -666,12 +667,16 @@ def add_covariance(
     ones of every interval. The finding says why it is added; its code is the source of the new part
     of `posterior.parts`.
     """
-    root = np.asarray(root, dtype=np.float64)
+    root, own = np.split(np.asarray(root, dtype=np.float64), [len(fit.tolerance)])
+    posterior = add_to_posterior(fit.posterior, CovariancePart(finding.code, root, degrees))
+    if len(own) and posterior.frames is not None:
+        frames = posterior.frames.add_errors(fit.nuisance.names, fit.nuisance.estimate, own)
+        posterior = replace(posterior, frames=frames)
     return replace(
         fit,
         covariance=fit.covariance + root @ root.T,
-        posterior=add_to_posterior(fit.posterior, CovariancePart(finding.code, root, degrees)),
-        nuisance=_add_to_nuisance(fit.nuisance, root / fit.tolerance[:, None]),
+        posterior=posterior,
+        nuisance=_add_to_nuisance(fit.nuisance, root / fit.tolerance[:, None], own),
         findings=(*fit.findings, finding),
     )
 
@@ -710,15 +715,19 @@ def _diagonalize(spread: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
     return u, s**2, vt.T * inverse
 
 
-def _add_to_nuisance(nuisance: NuisanceEstimate, root: FloatArray) -> NuisanceEstimate:
-    """Return setup parameters that follow an added error of the machine, root (p, k) [tolerances].
+def _add_to_nuisance(
+    nuisance: NuisanceEstimate, root: FloatArray, own: FloatArray
+) -> NuisanceEstimate:
+    """Return setup parameters that follow an added error of the machine, root (p, k) [tolerances],
+    and have one of their `own` (U, k) [SI], or (0, k).
 
     Infinite standard deviations stay infinite, and NaN stays NaN.
     """
     if not len(nuisance):
         return nuisance
     moved: BoolArray = nuisance.table.free
-    added = np.where(moved, ((nuisance.slope @ root) ** 2).sum(axis=1), 0.0)
+    change = nuisance.slope @ root + (own if len(own) else 0.0)
+    added = np.where(moved, (change**2).sum(axis=1), 0.0)
     return replace(nuisance, sd=np.sqrt(nuisance.sd**2 + added))
 
 

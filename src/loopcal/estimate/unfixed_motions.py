@@ -11,7 +11,7 @@ tolerance adds its row; tolerances of the machine do not. See docs/theory/gauge.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -61,6 +61,15 @@ def frame_twists(T: FloatArray, size: float) -> FloatArray:
     """
     unit = np.array([1.0 / size] * 3 + [1.0] * 3)
     return geometry.differentiate_by_frames(T) * np.r_[unit, unit]
+
+
+class UnfixedMotions(NamedTuple):
+    """Motions (12, k) of frames that change no measured value, orthonormal, and the derivative (U,
+    12) by which the setup parameters follow any motion; None without setup parameters.
+    """
+
+    motions: FloatArray
+    followed: FloatArray | None
 
 
 class FrameRows:
@@ -113,21 +122,23 @@ class FrameRows:
         node_rows = divide_among_nodes(whitened, members, tree)
         self._factor = fold_node_rows(self._factor, self._factors, node_rows)
 
-    def find_unfixed(self) -> FloatArray | None:
-        """Return an orthonormal basis (12, k) of the motions of frames that change no measured
-        value; None where a pose that a row needs was not reached.
+    def find_unfixed(self) -> UnfixedMotions | None:
+        """Return the motions of frames that change no measured value; None where a pose that a row
+        needs was not reached.
         """
         if self._is_lost:
             return None
         factor, elimination = self._factor, self._problem.nuisance
+        by_setup = None
         if elimination is not None and self._factors is not None and self._nuisance is not None:
-            factor = engine.fold(factor, elimination.eliminate(self._factors, self._nuisance)[1])
-        return unfixed_motions(factor, self._effect)
+            eliminated, rest = elimination.eliminate(self._factors, self._nuisance)
+            factor, by_setup = engine.fold(factor, rest), eliminated.elimination.slope[0]
+        return UnfixedMotions(unfixed_motions(factor, self._effect), by_setup)
 
 
 def find_unfixed_motions(
     problem: Problem, deviation: FloatArray, start: Start
-) -> FloatArray | None:
+) -> UnfixedMotions | None:
     """Return the result of `FrameRows` at deviation (1, p) of one machine."""
     located = problem.poses.locate(deviation, start)
     if located is None:
@@ -159,14 +170,14 @@ def find_frame_knowledge(
     """Return how the measurements of one machine determine frames, at deviation (1, p); see
     `describe_frames`.
     """
-    unfixed = find_unfixed_motions(problem, deviation, start)
-    return describe_frames(problem, data, unfixed, prior, linearization, noise)
+    found = find_unfixed_motions(problem, deviation, start)
+    return describe_frames(problem, data, found, prior, linearization, noise)
 
 
 def describe_frames(
     problem: Problem,
     data: Measurements,
-    unfixed: FloatArray | None,
+    found: UnfixedMotions | None,
     prior: Prior | None = None,
     linearization: Linearization | None = None,
     noise: float = 1.0,
@@ -179,14 +190,15 @@ def describe_frames(
     """
     readings = data.readings[choose_evenly(len(data.readings), MOST_READINGS)]
     readings = readings[np.isfinite(readings).all(axis=1)]
-    if unfixed is None:
+    if found is None:
         return FrameKnowledge(np.zeros((MOTIONS, 0)), readings)
+    unfixed = found.motions
     if prior is not None and prior.unfixed is not None:
         unfixed = intersect_spaces(unfixed, prior.unfixed, SAME_MOTION)
     is_known = np.isfinite(noise)  # not that of a fit that did not converge
     eliminated = None if linearization is None or not is_known else linearization.nuisance
     local = None if problem.nuisance is None else problem.nuisance.local
-    frames = _describe_instruments(problem.free, data, local, eliminated, noise)
+    frames = _describe_instruments(problem.free, data, local, eliminated, noise, found.followed)
     if np.linalg.norm(unfixed[:6]) > UNFIXED:
         # a stated frame is that of the base, which something else leaves open, such as an anchor
         frames = {name: frame for name, frame in frames.items() if frame.own.any()}
@@ -199,6 +211,7 @@ def _describe_instruments(
     local: NuisanceParameters | None,
     eliminated: EliminatedNuisance | None,
     noise: float,
+    followed: FloatArray | None,
 ) -> dict[str, InstrumentFrame]:
     """Return the frames in which the kinds of measurements measure.
 
@@ -212,7 +225,7 @@ def _describe_instruments(
         elif local is not None and eliminated is not None:
             axes = (*setup.ROTATION_AXES, *setup.POSITION_AXES)
             places = np.array([local.table.index(f"{name}.{axis}") for axis in axes])
-            frame = _describe_unknown(stated, places, eliminated, free, noise)
+            frame = _describe_unknown(stated, places, eliminated, free, noise, followed)
             if np.isfinite(frame.own).all() and np.isfinite(frame.by_parameters).all():
                 frames[name] = frame
     return frames
@@ -240,6 +253,7 @@ def _describe_unknown(
     eliminated: EliminatedNuisance,
     free: FreeParameters,
     noise: float,
+    followed: FloatArray | None,
 ) -> InstrumentFrame:
     """Return a frame whose six parameters have these places among the setup parameters."""
     values = eliminated.best[0, places]
@@ -259,4 +273,5 @@ def _describe_unknown(
         own[:, : len(triangle)] = triangle.T
     slope = elimination.slope[0, places] / free.tolerance
     T = setup.place_frame(stated, values)
-    return InstrumentFrame(T, L @ slope, np.sqrt(noise) * (L @ own))
+    by_motions = None if followed is None else L @ followed[places]
+    return InstrumentFrame(T, L @ slope, np.sqrt(noise) * (L @ own), by_motions)
