@@ -23,7 +23,7 @@ from evidence.assumptions.machines import (
     measure_machine,
 )
 from loopcal.apply.accuracy import pose_uncertainty
-from loopcal.diagnose.error_causes import CAUSE
+from loopcal.diagnose.residual_patterns import CAUSE
 from loopcal.findings import Severity
 from loopcal.geometry import exp_so3
 from loopcal.mechanism.solutions import forward

@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom, kstest
 from scipy.stats import f as f_distribution
+from scipy.stats import kstest
 
+from loopcal.diagnose.error_causes import explain_residuals
 from loopcal.diagnose.residual_patterns import (
     ResidualRows,
     collect_residual_rows,
-    find_patterns,
+    estimate_sizes,
     list_effects,
 )
 from loopcal.diagnose.residual_patterns import test_correlation as compute_correlation
@@ -46,7 +47,7 @@ CLEAN = [
 @pytest.mark.parametrize("fits", [15, pytest.param(40, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize(("robot", "kind", "n", "method"), CLEAN)
 def test_independent_errors_give_uniform_probabilities(robot, kind, n, method, fits):
-    p_values, found = [], 0
+    p_values = []
     m = {"component": 3, "pose": 6, "tracker": 9}[kind]
     for seed in range(fits):
         context = {"time": 60.0 * np.arange(n), "temperature": 20.0 + np.sin(np.arange(n) / 5.0)}
@@ -56,9 +57,6 @@ def test_independent_errors_give_uniform_probabilities(robot, kind, n, method, f
         p_values.append(
             [compute_tail(rows, e) for e in effects[:2]] + [compute_correlation(rows)[1]]
         )
-        patterns = find_patterns(rows, data, ROBOTS[robot])
-        found += bool(patterns.effects) or patterns.is_correlated
-    assert found <= binom.isf(1e-3, fits, 0.05)
     for column in np.array(p_values).T:
         assert kstest(column, "uniform").pvalue > 1e-3
 
@@ -124,20 +122,23 @@ def test_each_dependence_is_found_and_named(source):
         errors[:, :2] += 400.0 * ((q - q.mean()) ** 2 / np.ptp(q) ** 2)[:, None]
     if source == "correlation":
         errors = draw_errors(n, 3, seed, 0.9)
-    rows, data = collect(
-        "linear-delta", "component", errors, seed, session=session, context=context
-    )
-    patterns = find_patterns(rows, data, ROBOTS["linear-delta"])
+    _, data = measure("linear-delta", "component", errors, seed, session=session, context=context)
+    fit = identify(ROBOTS["linear-delta"], data)
+    explained = explain_residuals(linearize_fit(fit, data))
     if source == "correlation":
-        assert patterns.is_correlated or patterns.effects
+        assert explained.causes[0].source == "walk"
         return
-    assert patterns.effects[0].effect.source == source
+    first = explained.causes[0]
+    assert first.source == source
     if source == "reading":
-        assert patterns.effects[0].effect.name == "q2"
+        assert first.name == "q2"
     if source in ("order", "time"):
+        assert first.effect is not None
+        assert explained.rows is not None
+        sizes = estimate_sizes(explained.rows, first, first.effect)
         # from the first to the last row: 4 times these sizes [sigma]
-        found = dict(zip("xyz", patterns.effects[0].sizes / 5e-6, strict=True))
-        errors_of = dict(zip("xyz", patterns.effects[0].errors / 5e-6, strict=True))
+        found = dict(zip("xyz", sizes.sizes / 5e-6, strict=True))
+        errors_of = dict(zip("xyz", sizes.errors / 5e-6, strict=True))
         for name, true in zip("xyz", 4.0 * truth_of, strict=True):
             assert abs(found[name] - true) < 4.0 * errors_of[name]
             assert errors_of[name] < 3.0
@@ -147,8 +148,9 @@ def test_a_frame_of_each_session_explains_what_sessions_share():
     session = np.array([f"s{i // 8}" for i in range(24)])
     shift = np.tile(np.random.default_rng(4).normal(0.0, 20.0, (3, 3)), (1, 3))
     errors = draw_errors(24, 9, 4) + np.repeat(shift, 8, axis=0)
-    rows, data = collect("hexapod-42", "tracker", errors, 4, session=session)
-    assert not find_patterns(rows, data, ROBOTS["hexapod-42"]).effects
+    _, data = measure("hexapod-42", "tracker", errors, 4, session=session)
+    fit = identify(ROBOTS["hexapod-42"], data)
+    assert not explain_residuals(linearize_fit(fit, data)).causes
 
 
 def test_rows_that_are_absent_are_left_out():

@@ -29,17 +29,22 @@ from loopcal.apply.verdict import (
 )
 from loopcal.apply.volume_accuracy import VolumeAccuracy, as_volume, bound_errors
 from loopcal.checks import check_choice
-from loopcal.diagnose.adjusted_uncertainty import SHARED, add_shared_errors, adjust_uncertainty
+from loopcal.diagnose.adjusted_uncertainty import (
+    SHARED,
+    add_shared_errors,
+    adjust_uncertainty,
+    is_explainable,
+)
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.drive_errors import BACKLASH, DRIVES, find_drive_errors
-from loopcal.diagnose.error_causes import CAUSE
+from loopcal.diagnose.drive_errors import measure_drive_errors
+from loopcal.diagnose.error_causes import explain_residuals
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
-from loopcal.diagnose.residual_patterns import POSE
+from loopcal.diagnose.residual_patterns import CAUSE, POSE
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.determinable_setup import (
@@ -52,6 +57,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.information import count_equations, has_equations_to_spare
 from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.posterior import DISCREPANCY
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.result import Identification
@@ -165,7 +171,8 @@ def calibrate(
     by_region = _fit_by_region(fit, kept, fitting, count) if split.share else None
     if by_region is not None:
         split, plain, change = by_region
-        fit, again, explain = _explain_residuals(plain, split)
+        shown = min(f.data["p_value"] for f in fit.findings if f.code == DISCREPANCY)
+        fit, again, explain = _explain_residuals(plain, split, shown)
     if again is not split:
         refit, _, change = _fit(fit.initial, again.fitted, fitting, count, held_out)
         if refit.converged:
@@ -188,24 +195,22 @@ def _fit_by_region(
 
 
 def _explain_residuals(
-    fit: Identification, split: DataSplit
+    fit: Identification, split: DataSplit, slow_p_value: float = 1.0
 ) -> tuple[Identification, DataSplit, Callable[[Identification], Identification]]:
     """Return the fit with the uncertainty that its residuals show; the data with noise that
     includes errors of drives or poses where these cause them, else as they are; and how a fit of
-    these data states the causes.
+    these data states the causes. `slow_p_value` : see `adjust_uncertainty`.
     """
-    linear = linearize_fit(fit, split.fitted) if fit.converged else None
-    drives = None if linear is None else find_drive_errors(linear)
-    failed = fit.residual_test.exceeds_sigma
-    fit = adjust_uncertainty(fit, split.fitted, linear, is_doubted=drives is not None)
+    linear, drives, explained = None, None, None
+    if is_explainable(fit):
+        linear = linearize_fit(fit, split.fitted)
+        explained = explain_residuals(linear)
+        drives = measure_drive_errors(linear, explained)
+    fit = adjust_uncertainty(fit, split.fitted, linear, explained, slow_p_value)
     findings = [f for f in fit.findings if f.code == CAUSE]
-    named = {f.data["cause"] for f in findings}
     for found in [f for f in fit.findings if f.code == SHARED and f.data["cause"] == POSE]:
         findings.append(found)
         split = split.change(partial(add_shared_errors, finding=found))
-    is_of_drives = named & {DRIVES, BACKLASH} if named else not failed
-    if not is_of_drives:
-        drives = None
     if drives is not None:
         split = split.change(drives.add_to_readings)
 

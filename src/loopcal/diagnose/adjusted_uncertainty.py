@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.diagnose.error_causes import Cause, find_causes
+from loopcal.diagnose.error_causes import explain_residuals
 from loopcal.diagnose.error_frames import (
     FITTED,
     MOST_POSES,
@@ -34,25 +34,27 @@ from loopcal.diagnose.residual_patterns import (
     POSE,
     READING,
     SESSION,
+    SMOOTH,
     TARGET,
     TEMPERATURE,
     TIME,
     WALK,
+    Cause,
     EffectSizes,
-    ResidualPatterns,
+    ExplainedResiduals,
     ResidualRows,
     collect_residual_rows,
     estimate_correlated_errors,
     estimate_sizes,
-    find_patterns,
+    has_time,
     test_correlation,
     test_effect,
 )
+from loopcal.diagnose.residual_patterns import LEVEL as CORRELATED
 from loopcal.diagnose.residual_patterns import MOST_POSES as EVEN_CHOICE
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.posterior import NOISE
-from loopcal.estimate.residual_test import DOUBT as DOUBTFUL
 from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
@@ -63,7 +65,7 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
 # Probability without an effect, from which slow errors of the poses explain what shows it.
-LEFT_OVER = FALSE_ALARMS["residual patterns"]
+LEFT_OVER = FALSE_ALARMS["causes of residuals"]
 SHARED = "residuals.shared-errors"  # code of the finding
 # Code of the finding that independent errors would mean that sigma is too large.
 TOO_SMALL = "noise.residuals-too-small"
@@ -82,67 +84,75 @@ def adjust_uncertainty(
     fit: Identification,
     data: Measurements,
     linear: FitLinearization | None = None,
-    *,
-    is_doubted: bool = False,
+    explained: ExplainedResiduals | None = None,
+    slow_p_value: float = 1.0,
 ) -> Identification:
     """Return a fit whose covariance allows for what the residuals of its data show, and says why.
     Estimates stay, and no variance becomes smaller. A fit that did not converge, has no intervals,
-    or has weights by a loss is returned as it is. `linear` : see `linearize_fit`. `is_doubted` :
-    whether another test found that noise alone does not explain the residuals.
+    or has weights by a loss is returned as it is. `linear` : see `linearize_fit`. `explained` : the
+    causes of the residuals, where these are known. `slow_p_value` : the probability without slow
+    errors of the poses, where other measurements have shown them.
     """
-    if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
+    if not is_explainable(fit):
         return fit
     linear = linearize_fit(fit, data, linear)
-    data, rows = linear.data, collect_residual_rows(linear)
+    data = linear.data
+    if explained is None:
+        explained = explain_residuals(linear)
     if linear.solution.linearized is None or fit.poses is not None:
         T = locate_measured_poses(fit, data).T
     else:  # readings are exact, and the linearization has kept the poses
         poses = linear.solution.linearized
         T = poses.T[0, poses.is_reached[0]]
-    slow = find_slow_errors(linear, T)
-    if rows is not None:
-        is_doubted |= fit.residual_test.exact_p_value < DOUBTFUL
-        fit = _add_patterns(fit, linear, rows, slow, is_doubted=is_doubted)
+    named = [cause.p_value for cause in explained.causes if cause.source == SMOOTH]
+    slow = find_slow_errors(linear, T, min([slow_p_value, *named]))
+    if explained.rows is not None:
+        fit = _add_patterns(fit, linear, explained, slow)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 
+def is_explainable(fit: Identification) -> bool:
+    """Return whether the residuals of a fit can say what causes them."""
+    return fit.converged and fit.residual_test.intervals and fit.options.loss is None
+
+
 def _add_patterns(
-    fit: Identification, linear: FitLinearization, rows: ResidualRows, slow: SlowErrors | None, *,
-    is_doubted: bool,
-) -> Identification:  # fmt: skip
-    """Return a fit whose covariance allows for the patterns of its residuals, or for their causes
-    where these are known. What slow errors of the poses explain counts once, with these: a
-    dependence on a reading, and the order of rows that follows the places.
+    fit: Identification,
+    linear: FitLinearization,
+    explained: ExplainedResiduals,
+    slow: SlowErrors | None,
+) -> Identification:
+    """Return a fit whose covariance allows for the causes of its residuals, and for the correlation
+    of neighbors. What slow errors of the poses explain counts once, with these: a dependence on a
+    reading, and the order of rows that follows the places.
     """
-    data = linear.data
-    patterns = find_patterns(rows, data, fit.robot)
-    if not (patterns.effects or patterns.is_correlated or is_doubted):
-        return fit
-    causes = find_causes(linear, rows)
+    rows, causes, data = explained.rows, explained.causes, linear.data
+    assert rows is not None
     if causes:
         fit = replace(fit, findings=(*fit.findings, *(cause.finding for cause in causes)))
-    effects = [e for e in patterns.effects if e.effect.source in CODES]
-    if causes:
-        effects = [
-            estimate_sizes(rows, cause.effect, cause.p_value)
-            for cause in causes
-            if cause.effect is not None and cause.effect.source in CODES
-        ]
+    effects = [
+        estimate_sizes(rows, cause, cause.effect)
+        for cause in causes
+        if cause.effect is not None and cause.source in CODES
+    ]
     shared = [c for c in causes if c.source in (POSE, TARGET, WALK)]
-    rest, is_correlated = rows, patterns.is_correlated
+    rest = rows
     if slow is not None and slow.is_slow:
         rest = exclude_slow_errors(linear, rows, slow)
         effects = [
             e
             for e in effects
-            if e.effect.source != READING and test_effect(rest, e.effect) < LEFT_OVER
+            if e.cause.source != READING and test_effect(rest, e.effect) < LEFT_OVER
         ]
         shared = [c for c in shared if c.effect and test_effect(rest, c.effect) < LEFT_OVER]
-        is_correlated &= test_correlation(rest)[1] < LEFT_OVER
     # errors that groups of rows share make neighbors alike; a walk begins at zero, and correlated
     # errors anywhere, so that what both add contains either
-    is_shared = {SESSION, BLOCK, POSE, TARGET} & {cause.source for cause in causes}
-    is_correlated &= not is_shared
+    is_shared = bool({SESSION, BLOCK, POSE, TARGET} & {cause.source for cause in causes})
+    left = rest
+    for effect in effects:
+        left = left.with_effects(effect.effect.columns)
+    p_value = test_correlation(left)[1]
+    is_correlated = p_value < CORRELATED and not is_shared
     if not (effects or shared or is_correlated):
         return fit
     # orientation and position (3 n, p) of evenly chosen measured poses, frames fitted, by the
@@ -168,7 +178,7 @@ def _add_patterns(
         finding = _report_shared(cause, _measure_growth(tool, root))
         fit = add_covariance(fit, root, cause.size.degrees, finding)
     if is_correlated:
-        fit = _add_correlation(fit, patterns, tool)
+        fit = _add_correlation(fit, left, p_value, data, tool)
     return _without_doubt_of_sigma(fit)
 
 
@@ -186,7 +196,7 @@ def _report_shared(cause: Cause, ratio: float) -> Finding:
         sizes=tuple(Quantity(sigma * sd / u.factor_to_si, u.symbol) for sd, u in shown),
         ratio=ratio,
         p_value=cause.p_value,
-        severity=choose_severity(cause.p_value),
+        severity=cause.severity,
     )
 
 
@@ -204,10 +214,13 @@ def add_shared_errors(data: Measurements, finding: Finding) -> Measurements:
 
 
 def _add_correlation(
-    fit: Identification, patterns: ResidualPatterns, tool: Sequence[tuple[FloatArray, float]]
+    fit: Identification,
+    rows: ResidualRows,
+    p_value: float,
+    data: Measurements,
+    tool: Sequence[tuple[FloatArray, float]],
 ) -> Identification:
     """Return a fit with what correlated errors add to the covariance by independent ones."""
-    rows = patterns.rows
     errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
     independent = np.diag(np.full(len(errors.covariance), fit.residual_test.sigma_scale**2))
     k = len(independent) - len(fit.nuisance)
@@ -224,10 +237,10 @@ def _add_correlation(
     finding = report_finding(
         "residuals.correlated",
         correlation=errors.correlation,
-        order=patterns.order,
+        order=TIME if has_time(data) else ORDER,
         ratio=_measure_growth(tool, root),
-        p_value=patterns.p_value,
-        severity=choose_severity(patterns.p_value),
+        p_value=p_value,
+        severity=choose_severity(p_value),
     )
     return add_covariance(fit, root, errors.degrees, finding)
 
@@ -269,8 +282,8 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
         size=size,
         error=error,
         ratio=ratio,
-        p_value=effect.p_value,
-        severity=choose_severity(effect.p_value),
+        p_value=effect.cause.p_value,
+        severity=effect.cause.severity,
     )
 
 

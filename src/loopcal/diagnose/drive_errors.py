@@ -17,32 +17,28 @@ import numpy as np
 
 from loopcal.diagnose.residual_patterns import (
     READING,
+    Cause,
     Effect,
+    ExplainedResiduals,
     ResidualRows,
-    collect_residual_rows,
     order_by_time,
     scale_to_range,
     span_columns,
     test_effect,
 )
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import evaluate_rows
-from loopcal.estimate.residual_test import choose_severity, count_sigma_degrees
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.numerics.statistics import compute_single_level, find_distinct
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-LEVEL = FALSE_ALARMS["errors of drives"]
-"""Probability that independent errors of the instrument show errors of the drives."""
-
 DOUBTED = 0.1
-"""The same where residuals contradict the stated noise: then either that is wrong, or the drives
-have errors, and their pattern decides.
+"""Probability of an effect of travel by noise, beside effects of the readings, above which travel
+is not its cause.
 """
 
 FEWEST_VALUES = 2
@@ -72,37 +68,35 @@ class DriveErrors:
         return replace(fit, posterior=posterior, findings=(*fit.findings, *self.findings))
 
 
-def find_drive_errors(linear: FitLinearization) -> DriveErrors | None:
-    """Return the errors of the drives that the residuals of a fit with exact readings show; None
-    where they show none, or cannot.
-    """
-    fit, poses = linear.fit, linear.solution.linearized
+def can_show_drives(linear: FitLinearization, rows: ResidualRows) -> bool:
+    """Return whether rows of a fit with exact readings can show errors of the drives."""
+    fit = linear.fit
     test = fit.residual_test  # with unknown sigmas, kinds of different noise show a pattern, too
     is_tested = fit.converged and test.intervals and test.noise == "given"
-    if not is_tested or poses is None or {fit.options.loss, fit.options.prior} != {None}:
+    is_plain = {fit.options.loss, fit.options.prior} == {None}
+    return is_tested and is_plain and len(rows.residual) >= FEWEST_VALUES * linear.data.n_poses
+
+
+def measure_drive_errors(
+    linear: FitLinearization, explained: ExplainedResiduals
+) -> DriveErrors | None:
+    """Return the errors of the drives that are among the causes of the residuals of a fit; None
+    where they are not.
+    """
+    rows, robot = explained.rows, linear.fit.robot
+    causes = {c.source: c for c in explained.causes if c.source in (DRIVES, BACKLASH)}
+    if rows is None or not causes:
         return None
-    rows = collect_residual_rows(linear)
-    if rows is None or len(rows.residual) < FEWEST_VALUES * linear.data.n_poses:
-        return None
-    rows = rows.take_poses(linear.data)
-    effects = list_drive_effects(linear, rows)
-    if not effects:
-        return None
-    drives, travel, along = effects
     unit = list_units(linear)
-    level = DOUBTED if test.exceeds_sigma else compute_single_level(LEVEL, 2)
-    rows, backlash, findings = _find_backlash(linear, rows, travel, along, level)
-    known = count_sigma_degrees(test.noise, fit.options.sigma_uncertainty)
-    spectrum, sigma = rows.remainder.find_spectrum(drives.scaled), np.zeros_like(unit)
-    p_value = spectrum.compute_tail(known)
-    if p_value < level:
-        component = spectrum.estimate(known)
-        sigma = np.sqrt(component.variance) * drives.unit[0] * unit
+    sigma, backlash, findings = np.zeros_like(unit), np.zeros_like(unit), []
+    if (cause := causes.get(BACKLASH)) is not None:
+        backlash, findings = _measure_backlash(linear, rows.take_poses(linear.data), cause)
+    if (cause := causes.get(DRIVES)) is not None and cause.effect and cause.size:
+        sigma = np.sqrt(cause.size.variance) * cause.effect.unit[0] * unit
         largest = int(np.argmax(sigma))
-        size = fit.robot.to_quantity(float(sigma[largest]), fit.robot.actuators[largest].dimension)
-        severity = choose_severity(p_value)
+        size = robot.to_quantity(float(sigma[largest]), robot.actuators[largest].dimension)
         found = report_finding(
-            "residuals.drive-errors", size=size, p_value=p_value, severity=severity
+            "residuals.drive-errors", size=size, p_value=cause.p_value, severity=cause.severity
         )
         findings.append(found)
     return DriveErrors(np.hypot(sigma, backlash), tuple(findings)) if findings else None
@@ -151,24 +145,24 @@ def list_drive_effects(linear: FitLinearization, rows: ResidualRows) -> list[Eff
     return [Effect(k, "", c, label * c.shape[1]) for k, c in (*listed.items(), (READING, along))]
 
 
-def _find_backlash(
-    linear: FitLinearization, rows: ResidualRows, travel: Effect, along: Effect, level: float
-) -> tuple[ResidualRows, FloatArray, list[Finding]]:
-    """Return rows as if the fit had also estimated the backlash that they show, half of it (a,)
-    [SI] for each actuator, and the finding. `travel`, `along` : effects of direction and reading.
-    """
-    robot, unit, effect = linear.fit.robot, list_units(linear), travel.columns
+def _measure_backlash(
+    linear: FitLinearization, rows: ResidualRows, cause: Cause
+) -> tuple[FloatArray, list[Finding]]:
+    """Return half the backlash (a,) [SI] of each actuator that rows show, and the finding."""
+    robot, unit = linear.fit.robot, list_units(linear)
+    _, travel, along = list_drive_effects(linear, rows)
     # the direction of travel goes with the reading: a pose at an end was reached towards it
-    known = rows.with_effects(along.columns)
-    p_value = test_effect(known, travel)
-    if not p_value < level or span_columns(known.project(effect)).shape[1] < len(unit):
-        return rows, np.zeros(len(unit)), []
+    known, effect = rows.with_effects(along.columns), travel.columns
+    if test_effect(known, travel) > DOUBTED:
+        return np.zeros(len(unit)), []
+    if span_columns(known.project(effect)).shape[1] < len(unit):
+        return np.zeros(len(unit)), []
     half, *_ = np.linalg.lstsq(known.project(effect), known.residual, rcond=None)
     largest = int(np.argmax(np.abs(half)))
     actuator = robot.actuators[largest]
     size = robot.to_quantity(2.0 * float(abs(half[largest]) * unit[largest]), actuator.dimension)
     finding = report_finding(
-        "residuals.backlash", name=actuator.name, size=size, p_value=p_value,
-        severity=choose_severity(p_value),
+        "residuals.backlash", name=actuator.name, size=size, p_value=cause.p_value,
+        severity=cause.severity,
     )  # fmt: skip
-    return rows.with_effects(effect), np.abs(half) * unit, [finding]
+    return np.abs(half) * unit, [finding]

@@ -6,7 +6,8 @@ with columns Z of unit variance. What nothing estimated explains of the residual
 sigma^2 (1 + tau^2 K_h); its likelihood over that of noise alone, averaged over log tau, is
 the evidence of h, and with equal probabilities before the data it gives those after them. A noise
 that is larger than stated is K = 1: without it, any other cause would explain too large residuals
-of any kind. Few wrong poses are errors of any size in the rows of k of n poses, for each choice of
+of any kind. What parameters and setup leave almost nothing of is no cause that residuals can show.
+Few wrong poses are errors of any size in the rows of k of n poses, for each choice of
 k of them. The most probable cause is taken into the covariance, and the others are compared again,
 until noise alone explains the rest, or rows are wrong, which pull the fit. See
 docs/theory/residual-patterns.md.
@@ -16,24 +17,30 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.drive_errors import list_drive_effects
+from loopcal.diagnose.drive_errors import can_show_drives, list_drive_effects
 from loopcal.diagnose.residual_patterns import (
+    Cause,
     Effect,
+    ExplainedResiduals,
     ResidualRows,
+    collect_residual_rows,
     list_effects,
     list_shared_errors,
 )
 from loopcal.estimate.fit_linearization import FitLinearization
-from loopcal.estimate.residual_test import FEWEST_DEGREES, count_sigma_degrees
-from loopcal.findings import Finding, report_finding
+from loopcal.estimate.residual_test import (
+    DOUBT,
+    FEWEST_DEGREES,
+    choose_severity,
+    count_sigma_degrees,
+)
+from loopcal.estimate.smooth_errors import describe_smooth_errors
 from loopcal.numerics.statistics import (
     UNSEEN,
     Remainder,
-    VarianceComponent,
     compute_any_probability,
     compute_f_tail,
     estimate_variance_component,
@@ -41,76 +48,86 @@ from loopcal.numerics.statistics import (
 from loopcal.typing import IntArray
 
 NOISE, LARGER, OUTLIERS = "noise", "larger-noise", "outliers"
-CAUSE = "residuals.cause"  # code of the finding
-EXCLUDED = 0.05  # probability of noise alone below which a cause is named
+# Probability of noise alone below which a cause is named: as measured, this happens to
+# `FALSE_ALARMS["causes of residuals"]` of clean data.
+EXCLUDED = 0.08
+LEAST_LEFT = 0.02  # share of the squares of an effect that must be left for it to be compared
 OUTLYING = 0.1  # largest share of the poses that may be wrong
 MOST_CAUSES, MOST_WRONG = 3, 30  # causes that are named, and wrong poses that are compared
 
 
-class Cause(NamedTuple):
-    """What probably causes the residuals."""
-
-    source: str  # such as "pose", "session", "drives" or "outliers"
-    name: str  # of the actuator or temperature, else empty
-    probability: float
-    second: str  # the next probable source
-    second_probability: float
-    effect: Effect | None  # None for outliers and a larger noise
-    size: VarianceComponent | None  # of the effect, in columns of unit variance
-    p_value: float  # (Sidak) of such an effect by noise alone, in any of those that are compared
-
-    @property
-    def finding(self) -> Finding:
-        """The comparison as a finding."""
-        names = ("name", "probability", "second", "second_probability")
-        data = {name: getattr(self, name) for name in names}
-        return report_finding(CAUSE, cause=self.source, **data)
-
-
-def find_causes(linear: FitLinearization, rows: ResidualRows) -> tuple[Cause, ...]:
+def explain_residuals(linear: FitLinearization, *, is_doubted: bool = False) -> ExplainedResiduals:
     """Return the causes of the residuals of a fit, the most probable first; none where noise alone
-    may explain them.
+    may explain them. `is_doubted` : whether another test found that it does not, so that wrong
+    poses are among the causes from the beginning.
     """
-    fit, data = linear.fit, linear.data
+    fit, data, rows = linear.fit, linear.data, collect_residual_rows(linear)
+    if rows is None:
+        return ExplainedResiduals(None)
+    is_doubted |= fit.residual_test.exact_p_value < DOUBT
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
+    poses = linear.solution.linearized
+    assert poses is not None  # readings are exact where rows can be told apart
+    T, tool = poses.T[0], fit.robot.tool[:3, 3]
+    of_place = describe_smooth_errors(T, tool, fit.robot.size, most=1, by_rotation=False)
+    place = of_place.normalize(T)[:, 3:]
 
     def list_all(rows: ResidualRows) -> list[Effect]:
         """Return the effects of rows that these can show."""
-        effects = [*list_effects(rows, data, fit.robot), *list_shared_errors(rows, data, fit.robot)]
+        shared = list_shared_errors(rows, data, place)
+        effects = [*list_effects(rows, data, fit.robot), *shared]
         return [effect for effect in effects if effect.columns.any()]
 
     few = rows.take_poses(data)
-    effects = list_all(few) + list_drive_effects(linear, few)[:2]
-    causes = compare_causes(few.remainder, effects, few.locate_poses(data), known)
-    if few is rows or not causes:
-        return causes
-    whole = {(effect.source, effect.name): effect for effect in list_all(rows)}
-    return tuple(c._replace(effect=whole.get((c.source, c.name), c.effect)) for c in causes)
+    effects = list_all(few)
+    if can_show_drives(linear, rows):
+        effects += list_drive_effects(linear, few)[:2]
+    located = few.locate_poses(data)
+    causes = compare_causes(few.remainder, effects, located, known, is_doubted=is_doubted)
+    doubt = fit.residual_test.exact_p_value
+    levels = [doubt, *[1.0] * len(causes)]  # the first explains what the noise does not
+    causes = tuple(
+        c._replace(severity=choose_severity(min(c.p_value, level)))
+        for c, level in zip(causes, levels, strict=False)
+    )
+    if few is not rows and causes:
+        whole = {(effect.source, effect.name): effect for effect in list_all(rows)}
+        causes = tuple(c._replace(effect=whole.get((c.source, c.name), c.effect)) for c in causes)
+    return ExplainedResiduals(rows, causes)
 
 
 def compare_causes(
-    remainder: Remainder, effects: Sequence[Effect], pose: IntArray, known: float
-) -> tuple[Cause, ...]:
+    remainder: Remainder, effects: Sequence[Effect], pose: IntArray, known: float,
+    *, is_doubted: bool = False,
+) -> tuple[Cause, ...]:  # fmt: skip
     """Return the causes among effects and wrong poses; `pose` (R,) of each row. `known` degrees of
-    freedom say that the noise has unit variance.
+    freedom say that the noise has unit variance. Where it `is_doubted` by another test, the most
+    probable of all is a cause, and otherwise only once noise alone is excluded.
     """
     causes: list[Cause] = []
     listed = list(effects)
     alike = Counter(effect.source for effect in effects)
     while len(causes) < MOST_CAUSES and remainder.degrees >= FEWEST_DEGREES:
         spectra = [remainder.find_spectrum(effect.scaled) for effect in listed]
-        seen = [i for i, spectrum in enumerate(spectra) if len(spectrum.y)]
+        seen = [
+            i
+            for i, (effect, spectrum) in enumerate(zip(listed, spectra, strict=True))
+            if spectrum.weights.sum() > LEAST_LEFT * (effect.scaled**2).sum()
+        ]
         listed, spectra = [listed[i] for i in seen], [spectra[i] for i in seen]
         sizes = [spectrum.estimate(known) for spectrum in spectra]
         logs = [
             size.evidence - np.log(alike[e.source]) for size, e in zip(sizes, listed, strict=True)
         ]
-        wrong = measure_wrong_poses(remainder, pose, known)
         larger = _estimate_larger_noise(remainder, known) if known else -np.inf
+        others = float(np.logaddexp.reduce([larger, *logs]))
+        if not is_doubted and others < np.log(1.0 / EXCLUDED - 1.0):
+            break
+        wrong = measure_wrong_poses(remainder, pose, known)
         share = np.array([0.0, wrong, larger, *logs])
         share = np.exp(share - share.max())
         share /= share.sum()
-        if share[0] > EXCLUDED:
+        if share[0] > (EXCLUDED if causes or not is_doubted else share[1:].max()):
             break
         sources = [NOISE, OUTLIERS, LARGER, *(effect.source for effect in listed)]
         total = {name: float(share[[s == name for s in sources]].sum()) for name in sources}

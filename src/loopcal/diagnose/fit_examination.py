@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
 from loopcal.diagnose.cluster_covariance import ClusterCheck, check_clusters
-from loopcal.diagnose.error_causes import CAUSE, OUTLIERS, find_causes
+from loopcal.diagnose.error_causes import OUTLIERS, explain_residuals
 from loopcal.diagnose.error_frames import (
     FITTED,
     compute_mean_squares,
@@ -22,7 +22,7 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
-from loopcal.diagnose.residual_patterns import collect_residual_rows
+from loopcal.diagnose.residual_patterns import CAUSE
 from loopcal.diagnose.value_comparison import compare_with_truth
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import linearize_fit
@@ -230,8 +230,8 @@ def examine_fit(
         linear = linearize_fit(fit, data)
     known = [f for f in fit.findings if f.code == CAUSE]
     if outliers.suspects and not known and linear is not None:
-        rows = collect_residual_rows(linear)
-        causes = () if rows is None else tuple(c.finding for c in find_causes(linear, rows))
+        explained = explain_residuals(linear, is_doubted=True)
+        causes = tuple(cause.finding for cause in explained.causes)
     found = [f.data["cause"] for f in (*known, *causes)]
     shown = outliers
     if outliers.suspects and found and OUTLIERS not in found:

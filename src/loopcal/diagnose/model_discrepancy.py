@@ -121,9 +121,12 @@ class SlowErrors(NamedTuple):
         return np.hstack([e.directions * np.sqrt(e.size.variance) for e in ordered])
 
 
-def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | None:
+def find_slow_errors(
+    linear: FitLinearization, T: FloatArray, named: float = 1.0
+) -> SlowErrors | None:
     """Return the slow errors that the residuals of a fit with intervals show at its measured poses
-    T (n, 4, 4) [m]; None without any, or where nothing can be tested.
+    T (n, 4, 4) [m]; None without any, or where nothing can be tested. `named` : the probability of
+    residuals as these by noise, where errors of the place are known to cause them.
     """
     fit, tool = linear.fit, linear.fit.robot.tool[:3, 3]
     # deviations from nominal show errors, too, but only as far as the tolerances are right
@@ -149,13 +152,14 @@ def find_slow_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | No
     short = project(SHORT_KERNELS[:1], measured, FINE_CENTERS) if measured.size else []
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     lengths = (*tested, *short)
-    level = compute_single_level(LEVEL, len(lengths))
+    level = compute_single_level(LEVEL, len(lengths)) if named == 1.0 else 1.0
     slow = [detect_slow_errors(rows, groups, known, level) for rows in lengths]
     if not any(slow):
         return find_rough_errors(linear, T)
     found = min((each for each in slow if each), key=lambda each: min(e.p_value for e in each))
     tests = len(lengths) * len(groups)
-    found = [e._replace(p_value=compute_any_probability(e.p_value, tests)) for e in found]
+    p_values = [min(named, compute_any_probability(e.p_value, tests)) for e in found]
+    found = [e._replace(p_value=p) for e, p in zip(found, p_values, strict=True)]
     fine = [*project(KERNELS, measured, FINE_CENTERS), *short]
     fine += project(SHORT_KERNELS[1:], measured, FINE_CENTERS)
     divided = [SlowErrors(rows, divide_by_direction(rows, found, groups, known)) for rows in fine]

@@ -23,21 +23,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import Linearization, PoseSolution
 from loopcal.estimate.problem import Problem
-from loopcal.estimate.smooth_errors import correlate
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure.kinds.kind import Kind, list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import (
     Remainder,
+    VarianceComponent,
     choose_evenly,
-    compute_any_probability,
     compute_f_tail,
     find_distinct,
 )
@@ -184,6 +183,8 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     """
     if linear.problem.is_uncertain:
         return None
+    from scipy.linalg import block_diag
+
     stacked = collect_rows(linear.data, linear.problem, linear.solution, linear.linearization)
     if stacked is None:
         return None
@@ -210,6 +211,12 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     )
 
 
+def has_time(data: Measurements) -> bool:
+    """Return whether all rows state the time at which they were measured."""
+    listed = [o.context.get(TIME) for o in data.observations if len(o)]
+    return all(time is not None and np.isfinite(time).all() for time in listed)
+
+
 def order_rows(rows: Observations) -> IntArray:
     """Return the place (r,) of each row in the order of measurement: by time where all rows state
     it, else as in the file.
@@ -231,8 +238,8 @@ ORDER, TIME, TEMPERATURE, READING = "order", "time", "temperature", "reading"
 SESSION, BLOCK, POSE, TARGET, WALK = "session", "block", "pose", "target", "walk"
 SMOOTH = "smooth"
 RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH}  # whose sizes are drawn
-# Poses that show an effect well enough, evenly chosen of more; centers of slow errors.
-MOST_POSES, CENTERS = 100, 30
+CAUSE = "residuals.cause"  # code of the finding on the cause of residuals
+MOST_POSES = 100  # poses that show an effect well enough, evenly chosen of more
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +278,35 @@ class Effect:
         return self.acting * self.unit
 
 
+class Cause(NamedTuple):
+    """What probably causes the residuals."""
+
+    source: str  # such as "pose", "session", "drives" or "outliers"
+    name: str  # of the actuator or temperature, else empty
+    probability: float
+    second: str  # the next probable source
+    second_probability: float
+    effect: Effect | None  # None for outliers and a larger noise
+    size: VarianceComponent | None  # of the effect, in columns of unit variance
+    p_value: float  # (Sidak) of such an effect by noise alone, in any of those that are compared
+    # severity of findings on it: it is beyond doubt where noise of the stated size is
+    severity: Severity = Severity.INFO
+
+    @property
+    def finding(self) -> Finding:
+        """The comparison as a finding."""
+        names = ("name", "probability", "second", "second_probability")
+        data = {name: getattr(self, name) for name in names}
+        return report_finding(CAUSE, cause=self.source, **data)
+
+
+class ExplainedResiduals(NamedTuple):
+    """The rows of a fit, None where they cannot be told apart, and the causes of its residuals."""
+
+    rows: ResidualRows | None
+    causes: tuple[Cause, ...] = ()
+
+
 def list_effects(
     rows: ResidualRows, data: Measurements, robot: Mechanism, *, with_poses: bool = True
 ) -> tuple[Effect, ...]:
@@ -282,9 +318,9 @@ def list_effects(
     """
     observations = [o for o in data.observations if len(o)]
     place = [order_rows(o).astype(float) for o in observations]
-    has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
-    along = [o.context[TIME] for o in observations] if has_time else place
-    listed = [(TIME if has_time else ORDER, "", [scale_to_range(x)[:, None] for x in along])]
+    is_timed = has_time(data)
+    along = [o.context[TIME] for o in observations] if is_timed else place
+    listed = [(TIME if is_timed else ORDER, "", [scale_to_range(x)[:, None] for x in along])]
     for name in dict.fromkeys(name for o in observations for name in o.context if name != TIME):
         missing = [np.full(len(o), np.nan) for o in observations]
         values = [o.context.get(name, x) for o, x in zip(observations, missing, strict=True)]
@@ -307,18 +343,18 @@ def list_effects(
 
 
 def list_shared_errors(
-    rows: ResidualRows, data: Measurements, robot: Mechanism
+    rows: ResidualRows, data: Measurements, place: FloatArray
 ) -> tuple[Effect, ...]:
     """Return effects whose sizes are drawn, beside those of `list_effects`: an error of each
-    target, steps of a walk in the order of the rows, and errors that change slowly with the
-    readings.
+    target, steps of a walk in the order of the rows, and linear and quadratic errors of the place
+    (n, 3) of each pose, about 0, such as by sag.
     """
     observations = [o for o in data.observations if len(o)]
     poses = [o.rows.reshape(len(o), -1)[:, 0] for o in observations]
-    x = np.column_stack([2.0 * scale_to_range(column) for column in data.readings.T])
-    centers = x[choose_evenly(len(x), CENTERS)]
-    size, axes = np.linalg.eigh(correlate(centers, centers))
-    root = correlate(x, centers) @ (axes[:, size > EXPLAINED] / np.sqrt(size[size > EXPLAINED]))
+    x = np.column_stack([np.ones(len(place)), place])
+    products = np.column_stack([x[:, i] * x[:, j] for i in range(4) for j in range(i, 4)])
+    # orthonormal over the poses, the constant first
+    root = span_columns(products - products.mean(axis=0)) * np.sqrt(len(place))
     steps = [choose_evenly(len(o), MOST_POSES)[1:] for o in observations]
     listed = [
         (SMOOTH, [root[i] for i in poses]),
@@ -379,8 +415,8 @@ def scale_to_range(values: FloatArray) -> FloatArray:
     return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
 
 
-# Probability that independent errors show any pattern, over all tests of a fit (Sidak).
-LEVEL = FALSE_ALARMS["residual patterns"]
+# Probability that neighbors are alike by independent errors.
+LEVEL = FALSE_ALARMS["correlation of neighbors"]
 # Share of an effect that the parameters must leave in the residuals: with less, an effect that they
 # show is more than ten times as large as they are. Of readings where a probe touched a bed, the
 # rest is the noise of the probe itself.
@@ -392,51 +428,13 @@ FEWEST_LEFT = 3.0
 class EffectSizes(NamedTuple):
     """The sizes of a significant effect, and how they act on the residuals."""
 
-    effect: Effect  # what the residuals depend on
-    # probability (Sidak) that independent errors show an effect as large in any test of a fit
-    p_value: float
+    cause: Cause  # what the residuals depend on
+    effect: Effect  # of it
     # sizes, errors: (c,) [SI] estimates and standard deviations
     sizes: FloatArray
     errors: FloatArray
     moments: FloatArray  # (c, c) [SI] expected products of the sizes
     degrees: float = np.inf  # degrees of freedom of their size
-
-
-class ResidualPatterns(NamedTuple):
-    """What the residuals of a fit show."""
-
-    effects: tuple[EffectSizes, ...]  # that are significant, the first found first
-    p_value: float  # of the correlation of neighbors for independent errors, in any of the tests
-    is_correlated: bool  # whether it is significant
-    order: str  # "time" or "order", that of the rows
-    rows: ResidualRows  # the residuals, as if the fit had estimated the effects
-
-
-def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> ResidualPatterns:
-    """Test the residuals against every effect, then against correlation in the order of rows.
-
-    The most significant effect is estimated, and the others are tested again without it, until none
-    is significant.
-    """
-    listed = list_effects(rows, data, robot, with_poses=data.n_poses <= MOST_POSES)
-    order = TIME if any(effect.source == TIME for effect in listed) else ORDER
-    effects, p_value = list(listed), test_correlation(rows)[1]
-    p_values = [test_effect(rows, effect) for effect in effects]
-    tests = int(np.isfinite([*p_values, p_value]).sum())
-    significant: list[EffectSizes] = []
-    while np.isfinite(p_values).any():
-        best = int(np.nanargmin(p_values))
-        p_any = compute_any_probability(p_values[best], tests)
-        if not p_any < LEVEL:
-            break
-        effect = effects.pop(best)
-        significant.append(estimate_sizes(rows, effect, p_any))
-        rows = rows.with_effects(effect.columns)
-        p_values = [test_effect(rows, effect) for effect in effects]
-    if significant:
-        p_value = test_correlation(rows)[1]
-    p_any = compute_any_probability(p_value, tests)
-    return ResidualPatterns(tuple(significant), p_any, p_any < LEVEL, order, rows)
 
 
 def test_effect(rows: ResidualRows, effect: Effect) -> float:
@@ -458,8 +456,8 @@ def test_effect(rows: ResidualRows, effect: Effect) -> float:
     return float(compute_f_tail(q, left, explained / q / ((rows.square - explained) / left)))
 
 
-def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> EffectSizes:
-    """Return the sizes of an effect, by least squares where residuals show them.
+def estimate_sizes(rows: ResidualRows, cause: Cause, effect: Effect) -> EffectSizes:
+    """Return the sizes of the effect of a cause, by least squares where residuals show them.
 
     Sizes that the residuals hardly show, because they are like a parameter of the machine, get the
     variance that the others have: g ~ N(0, tau^2) in units of the noise, tau^2 by its moments.
@@ -485,9 +483,9 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
     if effect.whole is not None:  # the mean of all sizes moves the estimate, and no residual
         component = rows.remainder.find_spectrum(effect.scaled).estimate()
         moments = np.diag(component.variance * effect.unit**2)
-        return EffectSizes(effect, p_value, sizes, errors, moments, component.degrees)
+        return EffectSizes(cause, effect, sizes, errors, moments, component.degrees)
     moments = back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back
-    return EffectSizes(effect, p_value, sizes, errors, moments)
+    return EffectSizes(cause, effect, sizes, errors, moments)
 
 
 def test_correlation(rows: ResidualRows) -> tuple[float, float]:

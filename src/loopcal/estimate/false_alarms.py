@@ -9,9 +9,9 @@ FALSE_ALARMS: Mapping[str, float] = {
     "tolerances": 0.003,
     "tolerance components": 0.009,  # as measured; they are chosen by odds, see `PRIOR_ODDS`
     "outliers": 0.01,
-    "residual patterns": 0.008,  # drift, sessions, readings, correlation
+    "causes of residuals": 0.009,  # as measured; chosen by odds, see `error_causes.EXCLUDED`
+    "correlation of neighbors": 0.002,
     "model discrepancy": 0.004,
-    "errors of drives": 0.003,
     "common errors": 0.003,
     "motion of frames": 0.002,
     "heavy tails": 0.001,

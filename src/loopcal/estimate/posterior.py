@@ -300,8 +300,9 @@ class FrameKnowledge:
             places = [names.index(f"{name}.{a}") for a in axes if f"{name}.{a}" in names]
             if len(places) == len(axes):
                 twists = linearize_frame(values[places]) @ errors[places]
-                R = np.linalg.qr(np.concatenate([frame.own, twists], axis=1).T, mode="r")
-                changed[name] = frame._replace(own=np.asarray(R.T))
+                both = np.concatenate([frame.own, twists], axis=1)
+                R = np.asarray(np.linalg.qr(both.T, mode="r"))
+                changed[name] = frame._replace(own=R.T)
         return replace(self, instruments={**self.instruments, **changed})
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -88,7 +88,7 @@ class SmoothErrors:
         of some that are more than a length apart, over which errors are hardly correlated, or of
         the `fewest` that are farthest apart.
         """
-        x = self._normalize(T)
+        x = self.normalize(T)
         apart = _spread(x, len(x), 1.0)
         centers = x[apart if len(apart) >= fewest else _spread(x, fewest)]
         return np.argmin(((x[:, None] - centers) ** 2).sum(axis=2), axis=1)
@@ -127,9 +127,9 @@ class SmoothErrors:
 
     def _correlate(self, T: FloatArray) -> FloatArray:
         """Return the correlations (.., k) of errors at poses with those at the centers."""
-        return correlate(self._normalize(T), self.centers)
+        return correlate(self.normalize(T), self.centers)
 
-    def _normalize(self, T: FloatArray) -> FloatArray:
+    def normalize(self, T: FloatArray) -> FloatArray:
         """Return normalized coordinates (.., 6) of poses."""
         return (_coordinates(T, self.tool, self.rotation) - self.origin) / self.length
 
