@@ -13,15 +13,15 @@ STATED_LEVELS = {
     "prior.components-inflated": FALSE_ALARMS["tolerance components"],
     "prior.tolerances": FALSE_ALARMS["tolerances"],
     "residuals.common-errors": FALSE_ALARMS["common errors"],
-    "residuals.drive-errors": FALSE_ALARMS["errors of drives"],
+    "residuals.causes": FALSE_ALARMS["causes of residuals"],
+    "residuals.correlated": FALSE_ALARMS["correlation of neighbors"],
     "residuals.heavy-tailed": FALSE_ALARMS["heavy tails"],
     "residuals.model-discrepancy": FALSE_ALARMS["model discrepancy"],
-    "residuals.patterns": FALSE_ALARMS["residual patterns"],
 }
 """Stated probabilities of alarms where every assumption holds, by group of codes; together 5 %."""
 
-PATTERNS = ("drift", "trend", "sessions-differ", "depend-on", "correlated", "shared")
-"""Beginnings of the codes of the residuals that share one level."""
+CAUSES = ("drift", "trend", "sessions-differ", "depend-on", "shared", "drive-errors", "backlash")
+"""Beginnings of the codes of the residuals that share one level: causes of these."""
 
 
 def name_group(code: str) -> str:
@@ -29,6 +29,6 @@ def name_group(code: str) -> str:
     subject, name = code.split(".", 1)
     if subject == "outliers":
         return "outliers"
-    if subject == "residuals" and name.startswith(PATTERNS):
-        return "residuals.patterns"
+    if subject == "residuals" and name.startswith(CAUSES):
+        return "residuals.causes"
     return next((group for group in STATED_LEVELS if code.startswith(group)), code)

@@ -117,7 +117,7 @@ def test_study_sees_an_alarm_where_it_is_due_and_none_where_it_is_not():
 
 def test_codes_of_one_level_form_one_group():
     assert name_group("outliers.pose") == name_group("outliers.some") == "outliers"
-    assert name_group("residuals.depend-on-reading") == "residuals.patterns"
+    assert name_group("residuals.depend-on-reading") == "residuals.causes"
     assert name_group("residuals.correlated") in STATED_LEVELS
     assert name_group("fit.beyond-tolerance") == "fit.beyond-tolerance"
 
