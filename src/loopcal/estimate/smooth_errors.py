@@ -95,7 +95,7 @@ class SmoothErrors:
 
     def recentered(self, T: FloatArray, most: int = FINE_CENTERS) -> SmoothErrors:
         """Return the errors with up to `most` of the poses T (n, 4, 4) as centers."""
-        x = self._normalize(T)
+        x = self.normalize(T)
         centers = x[_spread(x, most)]
         triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
         whitening = np.asarray(np.linalg.inv(triangle).T, dtype=np.float64)
