@@ -167,7 +167,7 @@ def test_a_run_keeps_its_map_and_the_command_line_uses_it(tmp_path, capsys):
     lines += [",".join(f"{1e3 * x:.6f}" for x in row) for row in targets]
     (tmp_path / "targets.csv").write_text("\n".join(lines) + "\n")
     words = ["compensate", str(tmp_path / "run"), str(tmp_path / "targets.csv"), "--residual-map"]
-    # the residuals exceed the stated noise: the run failed, and the exit code says so
-    assert main([*words, "--force", "-o", str(tmp_path / "out.csv")]) == 2
+    # slow errors explain the residuals above the stated noise: no failure
+    assert main([*words, "-o", str(tmp_path / "out.csv")]) == 0
     assert "held-out regions" in " ".join(capsys.readouterr().out.split())
     assert (tmp_path / "out.csv").exists()

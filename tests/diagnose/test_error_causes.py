@@ -17,6 +17,7 @@ from loopcal.estimate.identification import identify
 from loopcal.numerics.statistics import Remainder
 from loopcal.units import Dimension
 from tests.diagnose.correlated_data import LENGTH, ROBOTS, draw_errors, measure
+from tests.diagnose.test_model_discrepancy import repeat_poses
 
 RNG = np.random.default_rng
 
@@ -165,3 +166,10 @@ def test_many_poses_are_compared_by_an_even_choice_and_widen_the_uncertainty_as_
     # chi-square has multiplied the variance by 1 + 9, and 9 for each of three targets are added;
     # 130 poses know the size to 5 %, of which the frame and the drives take some
     assert found.data["ratio"] == pytest.approx(np.sqrt(1.0 + 27.0 / 10.0), rel=0.15)
+
+
+def test_an_error_that_repeats_share_is_no_walk_and_no_slow_error():
+    for seed in (1, 2, 3):
+        data = repeat_poses(seed, 60e-6)  # twelve poses, three times each, one after the other
+        linear = linearize_fit(identify(ROBOTS["linear-delta"], data), data)
+        assert [cause.source for cause in explain_residuals(linear).causes] == ["rough"]

@@ -33,6 +33,7 @@ from loopcal.diagnose.residual_patterns import (
     ORDER,
     POSE,
     READING,
+    ROUGH,
     SESSION,
     SMOOTH,
     TARGET,
@@ -147,7 +148,7 @@ def _add_patterns(
         shared = [c for c in shared if c.effect and test_effect(rest, c.effect) < LEFT_OVER]
     # errors that groups of rows share make neighbors alike; a walk begins at zero, and correlated
     # errors anywhere, so that what both add contains either
-    is_shared = bool({SESSION, BLOCK, POSE, TARGET} & {cause.source for cause in causes})
+    is_shared = bool({SESSION, BLOCK, POSE, TARGET, ROUGH} & {cause.source for cause in causes})
     left = rest
     for effect in effects:
         left = left.with_effects(effect.effect.columns)

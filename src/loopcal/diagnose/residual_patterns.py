@@ -236,8 +236,8 @@ def order_by_time(time: FloatArray | None, count: int) -> IntArray:
 # What residuals may depend on.
 ORDER, TIME, TEMPERATURE, READING = "order", "time", "temperature", "reading"
 SESSION, BLOCK, POSE, TARGET, WALK = "session", "block", "pose", "target", "walk"
-SMOOTH = "smooth"
-RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH}  # whose sizes are drawn
+SMOOTH, ROUGH = "smooth", "rough"
+RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH, ROUGH}  # whose sizes are drawn
 CAUSE = "residuals.cause"  # code of the finding on the cause of residuals
 MOST_POSES = 100  # poses that show an effect well enough, evenly chosen of more
 
@@ -347,7 +347,8 @@ def list_shared_errors(
 ) -> tuple[Effect, ...]:
     """Return effects whose sizes are drawn, beside those of `list_effects`: an error of each
     target, steps of a walk in the order of the rows, and linear and quadratic errors of the place
-    (n, 3) of each pose, about 0, such as by sag.
+    (n, 3) of each pose, about 0, such as by sag; where poses are repeated, an error of each of
+    these, which its repeats share.
     """
     observations = [o for o in data.observations if len(o)]
     poses = [o.rows.reshape(len(o), -1)[:, 0] for o in observations]
@@ -360,6 +361,10 @@ def list_shared_errors(
         (SMOOTH, [root[i] for i in poses]),
         (WALK, [order_rows(o)[:, None] >= i for o, i in zip(observations, steps, strict=True)]),
     ]
+    repeated = np.flatnonzero(np.bincount(data.repeats) > 1)
+    if repeated.size:
+        chosen = repeated[choose_evenly(len(repeated), MOST_POSES)]
+        listed.append((ROUGH, [data.repeats[i, None] == chosen for i in poses]))
     effects = [build_effect(rows, observations, s, "", f) for s, f in listed]
     of_targets, labels = [], [label for o in observations for label in _label_columns(o.kind)]
     for number, o in enumerate(observations):

@@ -247,6 +247,7 @@ CAUSES = {
     "temperature": "a dependence on a temperature",
     "reading": "a dependence on a reading",
     "smooth": "a model error that varies slowly with the pose",
+    "rough": "an error of each pose that its repeats share",
     "drives": "errors of the drives at single poses",
     "backlash": "backlash",
 }
