@@ -27,9 +27,10 @@ def runs(tmp_path_factory) -> Path:
     (folder / "targets.csv").write_text("x [mm],y [mm],z [mm]\n10,20,30\n")
     words = f"simulate linear-delta --kind position --draw-errors -o {folder}/data.csv --seed 3"
     assert main(words.split()) == 0
-    words = f"calibrate linear-delta {folder}/data.csv --hold-out 0.25 --limit-position"
-    assert main(f"{words} 0.1um -o {folder}/missed".split()) == 2
-    assert main(f"{words} 1mm -o {folder}/good".split()) == 0
+    words = f"calibrate linear-delta {folder}/data.csv --hold-out"
+    # few fitted poses, so that the errors exceed the noise: below it, a limit stays open
+    assert main(f"{words} 0.9 --limit-position 0.1um -o {folder}/missed".split()) == 2
+    assert main(f"{words} 0.25 --limit-position 1mm -o {folder}/good".split()) == 0
     text = (folder / "data.csv").read_text().replace("10 um", "0.1 um")
     (folder / "optimistic.csv").write_text(text)
     words = f"calibrate linear-delta {folder}/optimistic.csv --hold-out 0.25"

@@ -26,7 +26,7 @@ NAMES = """
     StatedValue StepControl SurfaceOptions TruncatedSVD TruncationGCV Tukey Uniform Dask Processes
     Ray Serial Autocollimation Bearing Closure Component Direction Distance Inclination JointSensor
     Line Locked Plane Pose Position Separation Sphere Observations Trials InstrumentRecord
-    Exported Format Imported TargetKind
+    Exported Format Imported TargetKind Volume
 """
 SETTINGS = frozenset(NAMES.split())
 """Public classes that a user passes in, which are no results."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.diagnose.error_causes import explain_residuals
+from loopcal.diagnose.error_causes import OUTLIERS, explain_residuals
 from loopcal.diagnose.error_frames import (
     FITTED,
     MOST_POSES,
@@ -106,7 +106,9 @@ def adjust_uncertainty(
         poses = linear.solution.linearized
         T = poses.T[0, poses.is_reached[0]]
     named = [cause.p_value for cause in explained.causes if cause.source == SMOOTH]
-    slow = find_slow_errors(linear, T, min([slow_p_value, *named]))
+    slow = None
+    if not any(cause.source == OUTLIERS for cause in explained.causes[:1]):  # like any error
+        slow = find_slow_errors(linear, T, min([slow_p_value, *named]))
     if explained.rows is not None:
         fit = _add_patterns(fit, linear, explained, slow)
     return fit if slow is None else add_slow_errors(fit, slow)

@@ -74,6 +74,7 @@ def can_show_drives(linear: FitLinearization, rows: ResidualRows) -> bool:
     test = fit.residual_test  # with unknown sigmas, kinds of different noise show a pattern, too
     is_tested = fit.converged and test.intervals and test.noise == "given"
     is_plain = {fit.options.loss, fit.options.prior} == {None}
+    is_plain &= linear.solution.linearized is not None  # the poses were kept
     return is_tested and is_plain and len(rows.residual) >= FEWEST_VALUES * linear.data.n_poses
 
 

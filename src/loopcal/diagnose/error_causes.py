@@ -38,6 +38,7 @@ from loopcal.estimate.residual_test import (
     count_sigma_degrees,
 )
 from loopcal.estimate.smooth_errors import describe_smooth_errors
+from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import (
     UNSEEN,
     Remainder,
@@ -51,6 +52,7 @@ NOISE, LARGER, OUTLIERS = "noise", "larger-noise", "outliers"
 # Probability of noise alone below which a cause is named: as measured, this happens to
 # `FALSE_ALARMS["causes of residuals"]` of clean data.
 EXCLUDED = 0.08
+PROBABLE = 0.6  # probability of a cause that is named where another test contradicts noise alone
 LEAST_LEFT = 0.02  # share of the squares of an effect that must be left for it to be compared
 OUTLYING = 0.1  # largest share of the poses that may be wrong
 MOST_CAUSES, MOST_WRONG = 3, 30  # causes that are named, and wrong poses that are compared
@@ -67,8 +69,8 @@ def explain_residuals(linear: FitLinearization, *, is_doubted: bool = False) -> 
     is_doubted |= fit.residual_test.exact_p_value < DOUBT
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     poses = linear.solution.linearized
-    assert poses is not None  # readings are exact where rows can be told apart
-    T, tool = poses.T[0], fit.robot.tool[:3, 3]
+    T = forward(fit.robot, data.readings).T if poses is None else poses.T[0]
+    tool = fit.robot.tool[:3, 3]
     of_place = describe_smooth_errors(T, tool, fit.robot.size, most=1, by_rotation=False)
     place = of_place.normalize(T)[:, 3:]
 
@@ -101,8 +103,8 @@ def compare_causes(
     *, is_doubted: bool = False,
 ) -> tuple[Cause, ...]:  # fmt: skip
     """Return the causes among effects and wrong poses; `pose` (R,) of each row. `known` degrees of
-    freedom say that the noise has unit variance. Where it `is_doubted` by another test, the most
-    probable of all is a cause, and otherwise only once noise alone is excluded.
+    freedom say that the noise has unit variance. Where it `is_doubted` by another test, a
+    probable first cause is named, and otherwise only once noise alone is excluded.
     """
     causes: list[Cause] = []
     listed = list(effects)
@@ -127,11 +129,12 @@ def compare_causes(
         share = np.array([0.0, wrong, larger, *logs])
         share = np.exp(share - share.max())
         share /= share.sum()
-        if share[0] > (EXCLUDED if causes or not is_doubted else share[1:].max()):
-            break
         sources = [NOISE, OUTLIERS, LARGER, *(effect.source for effect in listed)]
         total = {name: float(share[[s == name for s in sources]].sum()) for name in sources}
         first, second, *_ = sorted(total, key=lambda name: -total[name])
+        is_probable = is_doubted and not causes and first != NOISE and total[first] >= PROBABLE
+        if share[0] > EXCLUDED and not is_probable:
+            break
         stated = (total[first], second, total[second])
         best = int(np.argmax(np.where([s == first for s in sources], share, -1.0)))
         if first in (OUTLIERS, LARGER):

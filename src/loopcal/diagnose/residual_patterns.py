@@ -183,8 +183,6 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     """
     if linear.problem.is_uncertain:
         return None
-    from scipy.linalg import block_diag
-
     stacked = collect_rows(linear.data, linear.problem, linear.solution, linear.linearization)
     if stacked is None:
         return None
@@ -199,11 +197,12 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     machine_root = linear.fit.tolerance[:, None] * d.directions[0][:, used]
     setup = linear.linearization.nuisance
     setup_root = np.zeros((0, 0)) if setup is None else setup.elimination.joint_root()[0]
+    n, k = len(setup_root), machine_root.shape[1]
     return ResidualRows(
         basis=basis,
         residual=residual,
         gain=np.concatenate([machine_gain, rows[:, : -p - 1]], axis=1),
-        root=np.asarray(block_diag(machine_root, setup_root)),
+        root=np.block([[machine_root, np.zeros((p, n))], [np.zeros((n, k)), setup_root]]),
         kind=stacked.kind,
         row=stacked.row,
         column=stacked.column,
