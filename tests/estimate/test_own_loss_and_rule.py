@@ -13,7 +13,7 @@ from loopcal.estimate.fit_descent import compute_loss_variance
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber, Tukey
 from loopcal.estimate.penalties import LeastSquares
-from tests.estimate.test_machine_change import DELTA, measure
+from tests.estimate.test_machine_changes import ROBOTS, measure_delta
 from tests.findings.expectations import list_codes
 
 
@@ -106,7 +106,8 @@ def test_variance_is_that_of_the_true_errors(loss, ratio, tails) -> None:
 
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])
 def test_intervals_allow_for_a_sigma_that_is_too_small(loss) -> None:
-    wrong, right = (identify(DELTA, measure(DELTA, 3, ratio), LeastSquares(), loss=loss)
+    delta = ROBOTS["linear-delta"]
+    wrong, right = (identify(delta, measure_delta(delta, 3, ratio), LeastSquares(), loss=loss)
                     for ratio in (2.5, 1.0))  # fmt: skip
     assert "noise.loss-contradicted" in list_codes(wrong.findings)
     assert "noise.loss-contradicted" not in list_codes(right.findings)

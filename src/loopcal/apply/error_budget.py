@@ -30,7 +30,7 @@ from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.errors import MechanismError
 from loopcal.estimate.fit_linearization import FitLinearization, fold_sources, linearize_fit
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.posterior import DISCREPANCY, NOISE, TOLERANCES
+from loopcal.estimate.posterior import DISCREPANCY, INFLATION, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
@@ -72,7 +72,7 @@ SOURCE_WORDS = {
     "residuals.shared-errors": "shared errors",
     "residuals.depend-on-temperature": "temperature",
     "residuals.depend-on-reading": "dependence on a reading",
-    "prior.inflation": "factor on the tolerances",
+    INFLATION: "factor on the tolerances",
     "noise.setup-as-stated": "stated setup parameters and common errors",
 }
 

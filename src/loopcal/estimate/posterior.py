@@ -157,6 +157,9 @@ def fold_information(
     return DataInformation(rows, d.projections[0][is_used], variance, degrees)
 
 
+INFLATION = "prior.inflation"
+"""Source of what tolerances that the data contradict add, and code of its finding."""
+
 DISCREPANCY = "residuals.model-discrepancy"
 """Source of the part of the covariance that the discrepancy causes, and code of its finding."""
 

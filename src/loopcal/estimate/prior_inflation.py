@@ -37,7 +37,7 @@ from loopcal.estimate.descent import Descent
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.penalties import MAP, Method
-from loopcal.estimate.posterior import TOLERANCES, CovariancePart, find_variance_sources
+from loopcal.estimate.posterior import INFLATION, TOLERANCES, CovariancePart, find_variance_sources
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.tolerance_components import (
     LARGEST_FACTOR,
@@ -403,7 +403,7 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     errors += _estimate_component_errors(fit, method, factor)
     scale = result.tolerance[:, None]
     component_rows = tuple(component.to_row(result.names) for component in method.components)
-    finding = report_finding("prior.inflation", factor=factor, parts=component_rows)
+    finding = report_finding(INFLATION, factor=factor, parts=component_rows)
     change = np.stack([error[0] for error in errors], axis=1)
     inflated = add_covariance(result, scale * change, np.inf, finding)
     uncertain = [

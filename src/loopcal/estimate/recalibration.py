@@ -20,7 +20,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import check_types, identify
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.posterior import Posterior, combine_degrees
+from loopcal.estimate.posterior import INFLATION, Posterior, combine_degrees
 from loopcal.estimate.prior import Prior, limb_parameters, prior_from
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -144,7 +144,9 @@ def assess_change(
     code, changes = "prior.change-not-observable", None
     if not later.converged:
         code = "prior.change-not-converged"
-    elif earlier.information is not None:
+    elif earlier.information is None:
+        code = "prior.change-not-stored"
+    else:
         changes = compare_information(earlier, later.posterior)
         changes = changes.select([changes.names.index(name) for name in names])
     if changes is None or not changes.degrees:
@@ -370,9 +372,7 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
             ErrorPart(changed @ added.root, added.degrees)
             for added in posterior.parts
             # how far tolerances pull the estimate is no error of what the data say
-            if added.is_added
-            and added.source != "prior.inflation"
-            and np.isfinite(added.root).all()
+            if added.is_added and added.source != INFLATION and np.isfinite(added.root).all()
         ]
     root = np.linalg.cholesky(np.sum([error.root @ error.root.T for error in errors], axis=0))
 
