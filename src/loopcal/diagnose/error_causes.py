@@ -52,7 +52,6 @@ NOISE, LARGER, OUTLIERS = "noise", "larger-noise", "outliers"
 # Probability of noise alone below which a cause is named: as measured, this happens to
 # `FALSE_ALARMS["causes of residuals"]` of clean data.
 EXCLUDED = 0.08
-PROBABLE = 0.6  # probability of a cause that is named where another test contradicts noise alone
 LEAST_LEFT = 0.02  # share of the squares of an effect that must be left for it to be compared
 OUTLYING = 0.1  # largest share of the poses that may be wrong
 MOST_CAUSES, MOST_WRONG = 3, 30  # causes that are named, and wrong poses that are compared
@@ -103,8 +102,8 @@ def compare_causes(
     *, is_doubted: bool = False,
 ) -> tuple[Cause, ...]:  # fmt: skip
     """Return the causes among effects and wrong poses; `pose` (R,) of each row. `known` degrees of
-    freedom say that the noise has unit variance. Where it `is_doubted` by another test, a
-    probable first cause is named, and otherwise only once noise alone is excluded.
+    freedom say that the noise has unit variance. Where it `is_doubted` by another test, the
+    most probable of all is the first cause, and otherwise one is named once noise is excluded.
     """
     causes: list[Cause] = []
     listed = list(effects)
@@ -132,8 +131,7 @@ def compare_causes(
         sources = [NOISE, OUTLIERS, LARGER, *(effect.source for effect in listed)]
         total = {name: float(share[[s == name for s in sources]].sum()) for name in sources}
         first, second, *_ = sorted(total, key=lambda name: -total[name])
-        is_probable = is_doubted and not causes and first != NOISE and total[first] >= PROBABLE
-        if share[0] > EXCLUDED and not is_probable:
+        if share[0] > EXCLUDED and (causes or not is_doubted or first == NOISE):
             break
         stated = (total[first], second, total[second])
         best = int(np.argmax(np.where([s == first for s in sources], share, -1.0)))

@@ -306,14 +306,12 @@ class ExplainedResiduals(NamedTuple):
     causes: tuple[Cause, ...] = ()
 
 
-def list_effects(
-    rows: ResidualRows, data: Measurements, robot: Mechanism, *, with_poses: bool = True
-) -> tuple[Effect, ...]:
+def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
     """Return the effects that measurements without excluded poses can have.
 
     Linear in time, or in the order of measurement where the rows state no time, linear in each
     temperature, and quadratic in each actuator reading; an error of each session, of each block
-    where blocks are large, and, `with_poses`, of each pose where several targets share it.
+    where blocks are large, and of each pose where several targets share it.
     """
     observations = [o for o in data.observations if len(o)]
     place = [order_rows(o).astype(float) for o in observations]
@@ -331,7 +329,7 @@ def list_effects(
     if is_finer and 2 * blocks <= data.n_poses:
         listed.append((BLOCK, "", [indicate_groups(data.block[i]) for i in poses]))
     members = [columns for o in observations for columns in list_components(o.kind).values()]
-    if with_poses and max(map(len, members)) > 1:
+    if max(map(len, members)) > 1:
         chosen = choose_evenly(data.n_poses, MOST_POSES)
         listed.append((POSE, "", [(i[:, None] == chosen).astype(float) for i in poses]))
     for i, actuator in enumerate(robot.actuators):
