@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -177,13 +178,13 @@ def test_a_limit_is_judged_by_the_drawn_errors() -> None:
         (lambda: Volume({"x": (0.0, 0.1)}, {"x": [0.0]}), "one range"),
         (lambda: Volume(values={"x": []}), "no value of x"),
         (lambda: Volume(values={"x": [np.nan]}), "values of x"),
-        (lambda: Volume(values={"x": 0.01}), "values of x"),
+        (lambda: Volume(values={"x": cast("Any", 0.01)}), "values of x"),
         (lambda: Volume(radius=-1.0), "above 0"),
         (lambda: Volume(radius=np.inf), "above 0"),
         (lambda: Volume({"theta": (0.0, 0.1)}), "'x', 'y', 'z'"),
         (lambda: Volume(BOX, radius=0.01), "two of x, y, z"),
         (lambda: Volume(values={"x": [0.0, 0.01]}, radius=0.01), "one value as center"),
-        (lambda: Volume(values={"x": np.linspace(0, 0.01, 5000)}), "more than 4,096"),
+        (lambda: Volume(values={"x": np.linspace(0, 0.01, 5000).tolist()}), "more than 4,096"),
         (lambda: [[0.0, 0.0]], "x, y, z"),
         (lambda: [[0.0, 0.0, np.nan]], "points of the volume"),
         (list, "points of the volume"),

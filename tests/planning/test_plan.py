@@ -169,10 +169,17 @@ def test_larger_share_of_machines_has_larger_errors_and_needs_more_poses():
         PlanOptions(goal=20 * UM, target="position", n_candidates=30),
     )
     curves = [find_sample_size(set_options(made, share=share)) for share in (0.7, 0.99)]
-    assert curves[0].enough < curves[1].enough
-    at_twelve = [set_options(made, share=s).predict_errors(np.arange(12)) for s in (0.7, 0.9, 0.99)]
-    lengths = [errors.position for errors in at_twelve]
-    assert at_twelve[0].position_rms < lengths[0] < lengths[1] < lengths[2]
+    few, many = (curve.enough for curve in curves)
+    assert few is not None
+    assert many is not None
+    assert few < many
+    lengths, rms = [], []
+    for share in (0.7, 0.9, 0.99):
+        errors = set_options(made, share=share).predict_errors(np.arange(12))
+        assert errors is not None
+        lengths.append(errors.position)
+        rms.append(errors.position_rms)
+    assert rms[0] < lengths[0] < lengths[1] < lengths[2]
     with pytest.raises(lc.DataError, match=r"share is 0\.5; it must be a share of 0\.7 or more"):
         PlanOptions(share=0.5)
 
