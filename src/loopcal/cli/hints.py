@@ -52,15 +52,13 @@ def word_hint(finding: Finding, hint: str | None) -> str | None:
 
     code, data = finding.code, finding.data
     is_useless = (
-        (code in ("files.limb-branches", "files.no-limbs") and not data["platforms"])
-        or (code == "prior.rows-reused" and not data["others"])  # no row would be left
+        (code == "prior.rows-reused" and not data["others"])  # no row would be left
         or (code == "prior.machine-changed" and data["subject"] != MACHINE)  # free already
     )
     if hint is None or is_useless:
         return None
-    links = data.get("links") or data.get("platforms")
-    if "--platform LINK" in hint and links:
-        return hint.replace("--platform LINK", name_options("--platform", links[:1]))
+    if "--platform LINK" in hint and data.get("links"):
+        return hint.replace("--platform LINK", name_options("--platform", data["links"][:1]))
     if code in ("workflow.next-check-outliers", "outliers.all-poses"):
         poses = [str(label).removeprefix("pose ") for label in data["poses"]]
         return f"use {name_options('--drop', poses)}, or --loss huber"

@@ -29,6 +29,7 @@ class GraphJoint:
         nothing can be shifted there.
     shifts : axes of these frames along which a shift changes the mechanism.
     limits : allowed values [rad or m], or None.
+    drive : the motor that moves it, empty where it is passive. Joints of one drive have one value.
     """
 
     name: str
@@ -42,6 +43,12 @@ class GraphJoint:
     origin_b: str = ""
     shifts: str = "xyz"
     limits: tuple[float, float] | None = None
+    drive: str = ""
+
+    @property
+    def bodies(self) -> tuple[str, str]:
+        """Return both bodies."""
+        return self.body_a, self.body_b
 
     @property
     def is_pin(self) -> bool:
@@ -68,6 +75,16 @@ class GraphJoint:
     def orient(self, body: str) -> GraphJoint:
         """Return the joint from one of its bodies."""
         return self if body == self.body_a else self.reverse()
+
+    def follow(self, drive: str, sign: float, offset: float) -> GraphJoint:
+        """Return the joint as one of a drive, whose value is sign * value of the drive + offset."""
+        T_b = self.move(np.array(-offset))
+        return replace(
+            self,
+            drive=drive,
+            axis=sign * self.axis,
+            T_b=self.T_b @ geometry.invert_pose(self.T_a) @ T_b,
+        )
 
     def get_other_body(self, body: str) -> str:
         """Return the body at the other end."""

@@ -50,7 +50,7 @@ class JointGraph:
     """A mechanism.
 
     base : the root body. tree : joints, each after the one that carries its first body.
-    closing : joints that close loops. motors : names of driven joints, all in the tree.
+    closing : joints that close loops. motors : names of drives; their joints are all in the tree.
     """
 
     base: str
@@ -76,7 +76,16 @@ class JointGraph:
     @cached_property
     def is_driven(self) -> BoolArray:
         """Which joints of the tree are driven (j,)."""
-        return np.array([name in self.motors for name in self.names], dtype=bool)
+        return np.array([bool(joint.drive) for joint in self.tree], dtype=bool)
+
+    @cached_property
+    def shared(self) -> FloatArray:
+        """Rows (s, j) that are zero where all joints of a drive have one value."""
+        drives = [joint.drive for joint in self.tree]
+        pairs = [(drives.index(drive), i) for i, drive in enumerate(drives) if drive]
+        pairs = [(first, i) for first, i in pairs if first < i]
+        unit = np.eye(len(drives))
+        return np.reshape([unit[i] - unit[first] for first, i in pairs], (-1, len(drives)))
 
     @cached_property
     def turns(self) -> BoolArray:
@@ -169,7 +178,8 @@ class JointGraph:
         Lengths are divided by `size`, and a slide's value is counted in it.
         """
         placement = self.place(q)
-        residual, rows = [np.zeros((len(q), 0))], [np.zeros((len(q), 0, len(self.tree)))]
+        residual = [q / self._columns @ self.shared.T]
+        rows = [np.tile(self.shared, (len(q), 1, 1))]
         for joint in self.closing:
             r, J = self._linearize_joint(placement, joint)
             residual.append(r)
@@ -244,15 +254,6 @@ class JointGraph:
         placement = self.place(q[None])
         point = (self.get_place(placement, body) @ frame)[:, :3, 3]
         return np.concatenate(self.differentiate(placement, body, point), axis=1)[0]
-
-    def without(self, bodies: frozenset[str]) -> JointGraph:
-        """Return the mechanism without bodies that carry no others, and without their joints."""
-        ends = lambda joint: bodies & {joint.body_a, joint.body_b}  # noqa: E731
-        return replace(
-            self,
-            tree=tuple(joint for joint in self.tree if not ends(joint)),
-            closing=tuple(joint for joint in self.closing if not ends(joint)),
-        )
 
 
 # Poses at which the loops of a mechanism close, and which of them is a good home.
@@ -354,7 +355,9 @@ def list_nearby(graph: JointGraph, home: FloatArray) -> FloatArray:
     shifts = [np.zeros(len(home))]
     for seed in range(NEAR):
         rng = np.random.default_rng(seed)
-        shifts.append(rng.uniform(-NEAR_RANGE, NEAR_RANGE, len(home)) * sizes)
+        values = dict(zip(graph.motors, rng.uniform(-1, 1, len(graph.motors)), strict=True))
+        moved = np.array([values.get(joint.drive, 0.0) for joint in graph.tree])
+        shifts.append(NEAR_RANGE * moved * sizes)
     near = graph.close(home + np.stack(shifts), graph.is_driven)
     near[0] = home
     return near[np.isfinite(near).all(axis=1)]
@@ -386,7 +389,7 @@ def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
 def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
     """Return how many closure equations repeat others at a pose (j,)."""
     rows = graph.linearize(q[None])[1][0]
-    rank = sum({"R": 5, "P": 5, "S": 3}[joint.kind] for joint in graph.closing)
+    rank = len(graph.shared) + sum({"R": 5, "P": 5, "S": 3}[j.kind] for j in graph.closing)
     s = np.linalg.svd(rows, compute_uv=False) if rows.size else np.zeros(0)
     return rank - int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum())
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limbs of a mechanism of bodies and joints: paths from base to platform that share nothing else.
+"""A mechanism of bodies and joints as limbs from body to body, in stages from base to platform.
 
-Other bodies that branch from the limbs cannot be expressed, with one exception: where they only
-keep the platform from turning (the parallelograms of a delta), the freedoms of the platform express
-the same, and one path for each motor is left.
+Bodies with three or more joints are nodes, base and platform among them; the joints between two
+nodes are a limb.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -48,7 +48,7 @@ class Block:
     @property
     def is_serial(self) -> bool:
         """Return whether the block is a joint in no loop."""
-        return not self.graph.closing
+        return len(self.graph.joints) == 1
 
 
 def list_blocks(graph: JointGraph) -> tuple[Block, ...]:
@@ -57,7 +57,7 @@ def list_blocks(graph: JointGraph) -> tuple[Block, ...]:
     group = {joint: joint for joint in graph.joints}
     for closing in graph.closing:
         loop = {closing}
-        for end in (closing.body_a, closing.body_b):  # joints to the base that both have drop out
+        for end in closing.bodies:  # joints to the base that both have drop out
             body = end
             while body in carrier:
                 loop ^= {carrier[body]}
@@ -72,90 +72,147 @@ def list_blocks(graph: JointGraph) -> tuple[Block, ...]:
 
 
 def find_blocks(graph: JointGraph, platform: str) -> tuple[Block, ...]:
-    """Return the blocks from the base to a platform, with the platform of each."""
+    """Return the blocks from the base to a platform, with the platform of each; those between two
+    that one drive moves are one block.
+    """
     carrying = {body: block for block in list_blocks(graph) for body in block.graph.bodies[1:]}
     path: list[Block] = []
     body = platform
     while body != graph.base:
-        path.append(Block(carrying[body].graph, body))
+        path.insert(0, Block(carrying[body].graph, body))
         body = carrying[body].graph.base
-    return tuple(reversed(path))
+    for drive in graph.motors:
+        moved = [i for i, block in enumerate(path) if drive in block.graph.motors]
+        if len(moved) > 1:
+            first, last = moved[0], moved[-1]
+            joints = {joint for block in path[first : last + 1] for joint in block.graph.joints}
+            joined = replace(select_joints(graph, joints), base=path[first].graph.base)
+            path[first : last + 1] = [Block(joined, path[last].platform)]
+    return tuple(path)
 
 
 def select_joints(graph: JointGraph, joints: Collection[GraphJoint]) -> JointGraph:
     """Return the mechanism with some of its joints only."""
     tree = tuple(joint for joint in graph.tree if joint in joints)
-    names = {joint.name for joint in tree}
+    drives = {joint.drive for joint in tree}
     return JointGraph(
         graph.base,
         tree,
         tuple(joint for joint in graph.closing if joint in joints),
-        tuple(name for name in graph.motors if name in names),
+        tuple(name for name in graph.motors if name in drives),
     )
 
 
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""
 
-Path = tuple[GraphJoint, ...]
+
+@dataclass(frozen=True, eq=False)
+class GraphLimb:
+    """Joints from the body `on` to the body `to`, each from the body before it."""
+
+    on: str
+    to: str
+    joints: tuple[GraphJoint, ...]
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Return the motors that move its joints."""
+        return tuple(joint.drive for joint in self.joints if joint.drive)
+
+    def reverse(self) -> GraphLimb:
+        """Return the limb from its other end."""
+        joints = tuple(joint.reverse() for joint in reversed(self.joints))
+        return GraphLimb(self.to, self.on, joints)
 
 
 @dataclass(frozen=True, eq=False)
 class LimbPaths:
     """A mechanism as limbs.
 
-    graph : its base carries the limbs. home : joint values (j,). platform : its body.
-    limbs : joints of each limb, each from the body before it. freedoms : of the platform, in base
-        axes. motions : what motors and passive joints can do at home.
-    replaced : joints that the freedoms express.
+    graph : its base carries the limbs. home : joint values (j,). platform : its body. limbs : all
+        joints but those of dead ends. freedoms : of the bodies, in base axes. motions : what motors
+        and passive joints can do at home.
     """
 
     graph: JointGraph
     home: FloatArray
     platform: str
-    limbs: tuple[Path, ...]
+    limbs: tuple[GraphLimb, ...]
     freedoms: tuple[str, ...]
     motions: Freedoms
-    replaced: tuple[str, ...] = ()
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """Return the bodies beside base and platform that limbs join."""
+        ends = dict.fromkeys(end for limb in self.limbs for end in (limb.on, limb.to))
+        return tuple(body for body in ends if body not in (self.graph.base, self.platform))
+
+    def locate(self, body: str) -> FloatArray:
+        """Return the place (4, 4) of a body at home."""
+        return self.graph.get_place(self.graph.place(self.home[None]), body)[0]
 
 
-def find_limbs(block: Block) -> tuple[tuple[Path, ...] | None, bool]:
-    """Return the limbs of a block, None where one branches, and whether they are all of it; others
-    need `is_translating`.
+def find_limbs(graph: JointGraph, platform: str) -> tuple[GraphLimb, ...]:
+    """Return limbs between base, platform and all bodies with three or more joints, without dead
+    ends; the limbs of the first motor first. A ball joint is at the end of its limb.
     """
-    complete = find_complete_limbs(block.graph, block.platform)
-    if complete is not None:
-        return complete, True
-    return _find_driven_limbs(block.graph, block.platform), False
+    ends, joints = (graph.base, platform), list(graph.joints)
+    while True:
+        count = Counter(body for joint in joints for body in joint.bodies)
+        kept = [j for j in joints if all(count[b] > 1 or b in ends for b in j.bodies)]
+        if len(kept) == len(joints):
+            break
+        joints = kept
+    inner = [body for body in graph.bodies if count[body] > 2 and body not in ends]
+    while True:
+        limbs = list(_walk_limbs(joints, (graph.base, *inner, platform)))
+        circle = next((limb for limb in limbs if limb.on == limb.to), None)
+        if circle is None:
+            break
+        inner.append(circle.joints[len(circle.joints) // 2].body_a)
+    order = graph.motors.index
+    last = len(graph.motors)  # passive limbs
+    return tuple(sorted(limbs, key=lambda limb: min(map(order, limb.drives), default=last)))
 
 
-def place_limbs(
-    block: Block,
-    home: FloatArray,
-    limbs: tuple[Path, ...],
-    is_complete: bool,
-    T_body_frame: FloatArray,
-) -> LimbPaths:
+def _walk_limbs(joints: Sequence[GraphJoint], nodes: Sequence[str]) -> Iterator[GraphLimb]:
+    """Yield the limbs of joints between bodies; each begins at the earlier one of its nodes, but a
+    limb with a ball joint at its beginning only.
+    """
+    left = list(joints)
+    for node in nodes:
+        for first in [joint for joint in left if node in joint.bodies]:
+            if first not in left:
+                continue  # a circle has passed it
+            path, joint, body = [], first, node
+            while True:
+                left.remove(joint)
+                path.append(joint.orient(body))
+                body = path[-1].body_b
+                if body in nodes:
+                    break
+                joint = next(other for other in left if body in other.bodies)
+            limb = GraphLimb(node, body, tuple(path))
+            is_turned = node != nodes[0] and path[0].kind == "S" != path[-1].kind
+            yield limb.reverse() if is_turned else limb
+
+
+def place_limbs(block: Block, home: FloatArray, T_body_frame: FloatArray) -> LimbPaths:
     """Return the limbs of a block at its home pose (j,), for a frame (4, 4) of its platform.
 
-    Loops of complete limbs are closed in all components of twist that one of their joints can have.
+    Loops are closed in all components of twist that one of their joints can have.
     """
     graph, platform = block.graph, block.platform
-    freedoms = list_freedoms(graph, home, platform, T_body_frame, is_complete)
-    drives = {motor: i for i, motor in enumerate(graph.motors)}
-    last = len(drives)  # passive limbs
-    limbs = tuple(sorted(limbs, key=lambda limb: min(drives.get(j.name, last) for j in limb)))
-    used = {joint.name for limb in limbs for joint in limb}
-    used |= {joint.origin_b for limb in limbs for joint in limb}
-    replaced = tuple(joint.name for joint in graph.joints if joint.name not in used)
+    freedoms = list_freedoms(graph, home, platform, T_body_frame, of_joints=True)
     motions = find_freedoms(graph, home, platform)
-    limbs = _keep_shifts_in_plane(graph, home, limbs, freedoms)
-    return LimbPaths(graph, home, platform, limbs, freedoms, motions, replaced)
+    limbs = _keep_shifts_in_plane(graph, home, find_limbs(graph, platform), freedoms)
+    return LimbPaths(graph, home, platform, limbs, freedoms, motions)
 
 
 def _keep_shifts_in_plane(
-    graph: JointGraph, home: FloatArray, limbs: tuple[Path, ...], freedoms: tuple[str, ...]
-) -> tuple[Path, ...]:
+    graph: JointGraph, home: FloatArray, limbs: tuple[GraphLimb, ...], freedoms: tuple[str, ...]
+) -> tuple[GraphLimb, ...]:
     """Return limbs without the shifts normal to their plane, which no equation of it contains."""
     normals = [AXES[i + 3] for i in range(3) if AXES[i] in freedoms]
     if len(normals) != 1 or normals[0] in freedoms:
@@ -168,16 +225,7 @@ def _keep_shifts_in_plane(
         across = [a for a in joint.shifts if abs(normal @ R[:, "xyz".index(a)]) < 1 - MOTION]
         return replace(joint, shifts="".join(across))
 
-    return tuple(tuple(map(keep, limb)) for limb in limbs)
-
-
-def is_translating(block: Block, home: FloatArray) -> bool:
-    """Return whether motors set all freedoms of a platform that does not turn near a home pose."""
-    motion = find_freedoms(block.graph, home, block.platform)
-    if motion.mobility != len(block.graph.motors):
-        return False
-    freedoms = list_freedoms(block.graph, home, block.platform, np.eye(4))
-    return len(freedoms) == motion.mobility and not any(name.startswith("r") for name in freedoms)
+    return tuple(replace(limb, joints=tuple(map(keep, limb.joints))) for limb in limbs)
 
 
 def list_freedoms(
@@ -216,72 +264,6 @@ def _list_joint_twists(
         slides = joint.kind == "P"
         twists.append(np.concatenate([0.0 * axes, axes] if slides else [axes, arms]))
     return twists
-
-
-def find_complete_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | None:
-    """Return limbs that contain every body and joint; None where there are none."""
-    left, limbs = list(graph.joints), []
-    for first in [joint for joint in graph.joints if graph.base in (joint.body_a, joint.body_b)]:
-        body, path = graph.base, [first]
-        while (body := path[-1].get_other_body(body)) != platform:
-            onward = [j for j in graph.joints if j is not path[-1] and body in (j.body_a, j.body_b)]
-            if len(onward) != 1 or body == graph.base:
-                return None
-            path.append(onward[0])
-        left = [joint for joint in left if joint not in path]
-        limbs.append(_orient_path(path, graph.base))
-    return tuple(limbs) if limbs and not left else None
-
-
-def _find_driven_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | None:
-    """Return the shortest path through each motor on the base; None where two of them meet."""
-    limbs, taken = [], {graph.base}
-    for first in [joint for joint in graph.tree if joint.name in graph.motors]:
-        path = _find_shortest_path(graph, first, platform)
-        if path is None:
-            return None
-        bodies = {_get_end(path[: i + 1], graph.base) for i in range(len(path) - 1)}
-        if taken & bodies:
-            return None
-        taken |= bodies
-        limbs.append(_orient_path(path, graph.base))
-    return tuple(limbs)
-
-
-def _find_shortest_path(graph: JointGraph, first: GraphJoint, platform: str) -> Path | None:
-    """Return the shortest path that begins with a joint on the base; None where there is none."""
-    if first.body_a != graph.base:
-        return None
-    queue: list[Path] = [(first,)]
-    visited = {graph.base, first.body_b}
-    while queue:
-        path = queue.pop(0)
-        body = _get_end(path, graph.base)
-        if body == platform:
-            return path
-        for joint in graph.joints:
-            if body in (joint.body_a, joint.body_b):
-                after = joint.get_other_body(body)
-                if after not in visited:
-                    visited.add(after)
-                    queue.append((*path, joint))
-    return None
-
-
-def _orient_path(path: Sequence[GraphJoint], body: str) -> Path:
-    """Return the joints of a limb, each from the body before it."""
-    oriented = []
-    for joint in path:
-        oriented.append(joint.orient(body))
-        body = joint.get_other_body(body)
-    return tuple(oriented)
-
-
-def _get_end(path: Sequence[GraphJoint], body: str) -> str:
-    """Return the body at the end of a path."""
-    for joint in path:
-        body = joint.get_other_body(body)
-    return body
 
 
 # A mechanism of bodies and joints as a chain of stages, from the base to the platform.
@@ -357,12 +339,6 @@ class StagePaths:
             return self.stages[0].paths.freedoms
         return list_freedoms(self.graph, self.home, self.platform, self.stages[-1].frame)
 
-    @property
-    def replaced(self) -> tuple[str, ...]:
-        """Return the joints that the freedoms of stages express."""
-        closed = [stage for stage in self.stages if isinstance(stage, ClosedStage)]
-        return tuple(name for stage in closed for name in stage.paths.replaced)
-
 
 def find_stage_paths(
     whole: JointGraph,
@@ -388,29 +364,22 @@ def find_stage_paths(
             raise MechanismError(finding)
     if all(block.is_serial for block in blocks):
         blocks = (Block(graph, platform),)
-    turned = [_turn_base(block) for block in blocks]
-    homes, limbs = find_homes(graph), []
-    for i, (block, _) in enumerate(turned):
-        limbs.append(find_limbs(block))
-        paths, is_complete = limbs[i]
-        if paths is not None and not is_complete:
-            homes = tuple(q for q in homes if is_translating(block, _select(graph, q, block)))
-        if paths is None or not homes:
-            raise MechanismError(_describe_branch(whole, block, platform))
+    homes = find_homes(graph)
     moving = [find_freedoms(graph, q, platform) for q in homes]
     share = FIRM_DRAWN if is_drawn_pose(graph, homes[0]) else FIRM
     limit = share * max(freedoms.firmness for freedoms in moving)
     pairs = zip(homes, moving, strict=True)
     home, motions = next(pair for pair in pairs if pair[1].firmness >= limit)
+    if motions.mobility == 0:
+        raise MechanismError(report_finding("files.no-motion", platform=platform))
     stages: list[ClosedStage | SerialStage] = []
-    for (block, mount), (paths, is_complete) in zip(turned, limbs, strict=True):
-        assert paths is not None
+    for block, mount in map(_turn_base, blocks):
         frame = locate_frame(block.platform)
         values = _select(graph, home, block)
         if block.is_serial and len(blocks) > 1:
             stages.append(SerialStage(block.graph.tree[0], float(values[0]), frame))
         else:
-            closed = place_limbs(block, values, paths, is_complete, frame)
+            closed = place_limbs(block, values, frame)
             stages.append(ClosedStage(closed, mount, _align_frame(closed, frame)))
     names = {joint.name for joint in kept.joints}
     dangling = tuple(joint.name for joint in whole.joints if joint.name not in names)
@@ -419,9 +388,8 @@ def find_stage_paths(
 
 
 def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
-    """Return the bodies at the ends of the mechanism that limbs join to what carries them: of a
-    loop the ones with most limbs, and not those that fewer joints than motors carry, where others
-    have more.
+    """Return the bodies at the ends of the mechanism: of a loop the ones with most joints, and not
+    those that fewer joints than motors carry, where others have more.
     """
     driven = [block for block in list_blocks(graph) if block.graph.motors]
     carrying = {
@@ -436,16 +404,17 @@ def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
 
 def _list_ends(graph: JointGraph) -> tuple[str, ...]:
     """Return the bodies of a block that can be its platform."""
-    counts, carried = {}, {}
-    for body in graph.bodies[1:]:
-        limbs = find_complete_limbs(graph, body)
-        if limbs is not None:
-            carried[body] = min(len(limb) for limb in limbs)
-            counts[body] = len(limbs)
-    needed = min(max(carried.values(), default=0), len(graph.motors))
-    counts = {body: count for body, count in counts.items() if carried[body] >= needed}
-    most = max(counts.values(), default=0)
-    return tuple(body for body, count in counts.items() if count == most)
+    counts = Counter(body for joint in graph.joints for body in joint.bodies)
+    carried, left = {graph.base: 0}, list(graph.joints)
+    while left:  # joints from the base to each body, along the shortest way
+        reached = [joint for joint in left if {*joint.bodies} & {*carried}]
+        count = max(carried.values()) + 1
+        carried |= {b: count for joint in reached for b in joint.bodies if b not in carried}
+        left = [joint for joint in left if joint not in reached]
+    del counts[graph.base]
+    most = [body for body, count in counts.items() if count == max(counts.values())]
+    needed = min(max(carried[body] for body in most), len(graph.motors))
+    return tuple(body for body in most if carried[body] >= needed)
 
 
 def _repair_blocks(
@@ -509,25 +478,12 @@ def _align_frame(paths: LimbPaths, T_body_frame: FloatArray) -> FloatArray:
     robot file states no others.
     """
     turns = [name in paths.freedoms for name in AXES[:3]]
-    place = paths.graph.get_place(paths.graph.place(paths.home[None]), paths.platform)[0]
+    place = paths.locate(paths.platform)
     angles = geometry.matrix_to_euler((place @ T_body_frame)[:3, :3], "xyz")
     if not any(turns) or np.abs(angles[np.logical_not(turns)]).max(initial=0.0) < ALONG:
         return T_body_frame
     R = geometry.euler_to_matrix(np.where(turns, angles, 0.0), "xyz")
     return geometry.make_pose(place[:3, :3].T @ R, T_body_frame[:3, 3])
-
-
-def _describe_branch(whole: JointGraph, block: Block, platform: str) -> object:
-    """Return the refusal, with the joints of the first body at which a limb branches."""
-    others = tuple(body for body in list_possible_platforms(whole) if body != platform)
-    graph = block.graph
-    for body in graph.bodies:
-        names = tuple(joint.name for joint in graph.joints if body in (joint.body_a, joint.body_b))
-        if body not in (graph.base, block.platform) and len(names) > 2:
-            return report_finding(
-                "files.limb-branches", joints=names, body=body, platform=platform, platforms=others
-            )
-    return report_finding("files.no-limbs", platform=platform, platforms=others)
 
 
 # From links, joints and welded frames to a mechanism: rigid bodies, pins, a tree and its
@@ -595,8 +551,9 @@ def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, .
                 report_finding("files.closure-within-body", closure=joint.name, body=joint.body_a)
             )
     _refuse_repeated(joints)
-    tree, closing = _span_tree(base, _merge_pins(base, list(joints), motors), motors)
-    lost = next((joint.name for joint in closing if joint.name in motors), None)
+    joints = [replace(j, drive=j.name) if j.name in motors else j for j in joints]
+    tree, closing = _span_tree(base, _merge_pins(base, list(joints)))
+    lost = next((joint.name for joint in closing if joint.drive), None)
     if lost is not None:
         raise MechanismError(report_finding("files.motors-in-loop", motor=lost))
     return JointGraph(base, tree, closing, motors)
@@ -607,7 +564,7 @@ def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:
     turning = [joint for joint in joints if joint.kind != "P"]
     for i, joint in enumerate(turning):
         for other in turning[:i]:
-            if {joint.body_a, joint.body_b} != {other.body_a, other.body_b}:
+            if {*joint.bodies} != {*other.bodies}:
                 continue
             same = other.orient(joint.body_a)
             gaps = (joint.T_a[:3, 3] - same.T_a[:3, 3], joint.T_b[:3, 3] - same.T_b[:3, 3])
@@ -622,18 +579,16 @@ def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:
                 raise MechanismError(finding)
 
 
-def _merge_pins(
-    base: str, joints: list[GraphJoint], motors: tuple[str, ...]
-) -> tuple[GraphJoint, ...]:
+def _merge_pins(base: str, joints: list[GraphJoint]) -> tuple[GraphJoint, ...]:
     """Return the joints, in which two about one axis that hold a body without other joints are one
     pin.
     """
-    for body in dict.fromkeys(name for j in joints for name in (j.body_a, j.body_b)):
-        ends = [joint for joint in joints if body in (joint.body_a, joint.body_b)]
+    for body in dict.fromkeys(name for j in joints for name in j.bodies):
+        ends = [joint for joint in joints if body in joint.bodies]
         if body == base or len(ends) != 2 or not _are_coaxial(body, *ends):
             continue
         first, second = ends
-        if {first.name, second.name} & {*motors} or not (first.origin_a and second.origin_a):
+        if first.drive or second.drive or not (first.origin_a and second.origin_a):
             continue
         pin = replace(
             first, body_b=second.body_a, T_b=second.T_a, origin_b=second.origin_a, limits=None
@@ -652,16 +607,16 @@ def _are_coaxial(body: str, first: GraphJoint, second: GraphJoint) -> bool:
 
 
 def _span_tree(
-    base: str, joints: Sequence[GraphJoint], motors: tuple[str, ...]
+    base: str, joints: Sequence[GraphJoint]
 ) -> tuple[tuple[GraphJoint, ...], tuple[GraphJoint, ...]]:
     """Return the joints of a tree, each after the one that carries it, and the other joints."""
 
     def rank(joint: GraphJoint) -> int:
-        if joint.name in motors:
+        if joint.drive:
             return 0
         return 3 if joint.is_pin else "PR S".index(joint.kind) + 1
 
-    group = {base: base} | {name: name for j in joints for name in (j.body_a, j.body_b)}
+    group = {base: base} | {name: name for j in joints for name in j.bodies}
     chosen, closing = [], []
     for joint in sorted(joints, key=rank):
         group_a, group_b = group[joint.body_a], group[joint.body_b]
@@ -671,7 +626,7 @@ def _span_tree(
     tree: list[GraphJoint] = []
     bodies = {base}
     while chosen:
-        ready = [joint for joint in chosen if {joint.body_a, joint.body_b} & bodies]
+        ready = [joint for joint in chosen if {*joint.bodies} & bodies]
         if not ready:
             break  # joints of bodies that nothing joins to the base
         for joint in ready:

@@ -10,7 +10,7 @@ the text stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from loopcal.io.formats.program_format import (
 from loopcal.io.formats.urdf import tree as urdf_tree
 from loopcal.io.formats.urdf.closures import UrdfMechanism, read_mechanism
 from loopcal.io.formats.urdf.tree import Urdf, UrdfJoint
-from loopcal.mechanism.assembly import BASE
+from loopcal.mechanism.assembly import BASE, PLATFORM
 from loopcal.mechanism.families.limb_records import Prismatic, Revolute, matrix_from_place
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.stages import PlacedStages
@@ -49,6 +49,7 @@ from loopcal.mechanism.joint_graph.loops import (
 )
 from loopcal.mechanism.joint_graph.paths import (
     ClosedStage,
+    GraphLimb,
     LimbPaths,
     SerialStage,
     StagePaths,
@@ -174,9 +175,7 @@ REMARKS = {
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
-    """Read a URDF and its closures; FileError where it is not valid, its loops do not close, or
-    its limbs branch.
-    """
+    """Read a URDF and its closures; FileError where it is not valid, or its loops do not close."""
     urdf = urdf_tree.read(path)
     closures: Path | None = options.closures or path.with_suffix(".yaml")
     assert closures is not None
@@ -277,8 +276,6 @@ def _name_links(mechanism: UrdfMechanism, finding: Finding) -> Finding:
         key: choose_link(mechanism, value) if key in bodies else value
         for key, value in finding.data.items()
     }
-    if "platforms" in data:
-        data["platforms"] = tuple(choose_link(mechanism, body) for body in data["platforms"])
     return replace(finding, data=data)
 
 
@@ -337,8 +334,6 @@ def _report_structure(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -
         yield report_finding("files.motors-left-out", motors=paths.outside, frame=frame)
     if paths.dangling:
         yield report_finding("files.joints-dangling", joints=paths.dangling)
-    if paths.replaced:
-        yield report_finding("files.joints-replaced", joints=paths.replaced)
     if motions.mobility != len(graph.motors):
         yield report_finding(
             "files.motors-differ",
@@ -348,9 +343,10 @@ def _report_structure(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -
         )
 
 
-# The content of a robot file: of the family limbs for one stage, of the family stages for several,
-# whose serial joints have the names of the URDF; closed loops have the name of the link that
-# carries what follows. Its frame is the platform of the stage, for the last the platform frame.
+# The content of a robot file: of the family limbs for one stage, whose bodies have the names of
+# links, of the family stages for several, whose serial joints have the names of the URDF; closed
+# loops have the name of the link that carries what follows. Its frame is the platform of the
+# stage, for the last the platform frame.
 
 ZERO = 1e-15
 """Numbers below this are rounding and written as 0 [m, rad]."""
@@ -362,25 +358,26 @@ Content = dict[str, Any]
 
 
 def describe_limb(
-    paths: LimbPaths, limb: tuple[GraphJoint, ...], T_body_frame: FloatArray
+    paths: LimbPaths, limb: GraphLimb, bodies: Mapping[str, str], T_body_frame: FloatArray
 ) -> tuple[Content, list[Content]]:
     """Return one limb of the robot file, and the entries of `parameters:` that it needs.
 
-    It ends in a point where its last joint is a ball joint, and on a platform that does not turn.
+    `bodies` are the names of bodies in the robot file, `T_body_frame` (4, 4) is the frame of the
+    platform. The limb ends in a point where its last joint is a ball joint.
     """
-    turns = any(name.startswith("r") for name in paths.freedoms)
-    name, last = limb[0].name, limb[-1]
+    name, last = limb.joints[0].name, limb.joints[-1]
+    on, to = (bodies[body] for body in (limb.on, limb.to))
     chain: list[Content] = []
     errors: list[Content] = []
     parameters: list[Content] = []
     pending: FloatArray = np.eye(4)
     before: GraphJoint | None = None
-    ends_in_point = last.kind == "S" or not turns
+    ends_in_point = last.kind == "S"
     tip: FloatArray = np.eye(4)
-    for joint in limb:
+    for joint in limb.joints:
         place = pending @ joint.T_a
         is_tip = joint is last and ends_in_point
-        element = "tip" if is_tip else joint.name
+        element = ("tip" if chain else on) if is_tip else joint.name
         if before is not None and before.origin_b:
             parameters += _list_far_shifts(name, before, element, place)
         if joint.origin_a:
@@ -390,13 +387,17 @@ def describe_limb(
         else:
             chain.append(_describe_limb_joint(paths, joint, place))
         pending, before = geometry.invert_pose(joint.T_b), joint
-    attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)
+    attach: FloatArray = geometry.invert_pose(
+        pending @ (T_body_frame if to == PLATFORM else np.eye(4))
+    )
     if last.origin_b:
-        errors.append(_describe_shifts("platform", last.origin_b, last.shifts))
-    if not ends_in_point and not last.origin_b:
-        tip, attach = pending @ T_body_frame, np.eye(4)
+        errors.append(_describe_shifts(to, last.origin_b, last.shifts))
+    elif not ends_in_point:
+        tip, attach = geometry.invert_pose(attach), np.eye(4)
     return {
         "name": name,
+        **({} if on == BASE else {"on": on}),
+        **({} if to == PLATFORM else {"to": to}),
         "chain": chain,
         "ending": "ball" if ends_in_point else "rigid",
         "tip": describe_pose(tip),
@@ -445,7 +446,7 @@ def _describe_limb_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray)
         roll, pitch, yaw = geometry.matrix_to_euler(R, "xyz")
         return {**content, "start": _clear((yaw, pitch, roll))}
     start = get_value(paths.graph, paths.home, joint)
-    motor = {"actuated": joint.name} if joint.name in paths.graph.motors else {}
+    motor = {"actuated": joint.drive} if joint.drive else {}
     return {**content, "axis": _clear(joint.axis), "start": start, **motor}
 
 
@@ -464,7 +465,7 @@ def describe_robot(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> C
     ending = {"tool": describe_pose(tool)} if is_turned else {}
     if choose_family(paths) == "limbs":
         assert isinstance(paths.stages[0], ClosedStage)
-        return _describe_limbs(urdf, paths.stages[0]) | ending
+        return _describe_limbs(mechanism, paths.stages[0]) | ending
     carriers = [np.eye(4), *(geometry.invert_pose(stage.frame) for stage in paths.stages[:-1])]
     named = zip(list_stage_names(mechanism, paths), paths.stages, strict=True)
     stages = [
@@ -473,7 +474,7 @@ def describe_robot(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> C
             **(
                 {"joint": _describe_joint(urdf, stage, before)}
                 if isinstance(stage, SerialStage)
-                else _describe_loop(urdf, stage, before)
+                else _describe_loop(mechanism, stage, before)
             ),
         }
         for (name, stage), before in zip(named, carriers, strict=True)
@@ -493,13 +494,21 @@ def choose_link(mechanism: UrdfMechanism, body: str) -> str:
 
 def list_stage_names(mechanism: UrdfMechanism, paths: StagePaths) -> tuple[str, ...]:
     """Return names of the stages: of a joint its own, of a loop that of the link it carries."""
+    return _make_unique(
+        stage.joint.name
+        if isinstance(stage, SerialStage)
+        else choose_link(mechanism, stage.platform)
+        for stage in paths.stages
+    )
+
+
+def _make_unique(stated: Iterable[str], taken: tuple[str, ...] = (BASE,)) -> tuple[str, ...]:
+    """Return names without points and colons that differ from each other and from those taken."""
     names: list[str] = []
-    for stage in paths.stages:
-        is_serial = isinstance(stage, SerialStage)
-        stated = stage.joint.name if is_serial else choose_link(mechanism, stage.platform)
-        plain = stated.replace(".", "_").replace(":", "_")
+    for name in stated:
+        plain = name.replace(".", "_").replace(":", "_")
         tries = (f"{plain}{suffix}" for suffix in ("", *(f"_{i}" for i in range(2, 1000))))
-        names.append(next(name for name in tries if name not in (BASE, *names)))
+        names.append(next(name for name in tries if name not in (*taken, *names)))
     return tuple(names)
 
 
@@ -512,24 +521,33 @@ def _choose_coordinates(
     return list(choose_coordinates(home, motions))
 
 
-def _describe_limbs(urdf: Urdf, stage: ClosedStage) -> Content:
+def _describe_limbs(mechanism: UrdfMechanism, stage: ClosedStage) -> Content:
     """Return the keys of the family limbs."""
     paths, T_body_frame = stage.paths, stage.frame
-    graph = paths.graph
-    home = graph.get_place(graph.place(paths.home[None]), paths.platform)[0] @ T_body_frame
-    limbs = [describe_limb(paths, limb, T_body_frame) for limb in paths.limbs]
+    graph, joints = paths.graph, mechanism.urdf.joints
+    links = (choose_link(mechanism, body) for body in paths.bodies)
+    inner = _make_unique(links, (BASE, PLATFORM))
+    bodies = dict(zip(paths.bodies, inner, strict=True))
+    homes = [
+        {"name": name, "home": describe_pose(paths.locate(body))} for body, name in bodies.items()
+    ]
+    bodies |= {graph.base: BASE, paths.platform: PLATFORM}
+    limbs = [describe_limb(paths, limb, bodies, T_body_frame) for limb in paths.limbs]
     parameters = [entry for _, entries in limbs for entry in entries]
     return {
         "freedoms": list(paths.freedoms),
         "controlled": _choose_coordinates(graph, paths.home, paths.platform, T_body_frame),
-        "actuators": {name: _describe_drive(urdf.joints[name]) for name in graph.motors},
+        "actuators": {name: _describe_drive(joints[name]) for name in graph.motors},
+        **({"bodies": homes} if homes else {}),
         "limbs": [limb for limb, _ in limbs],
         **({"parameters": parameters} if parameters else {}),
-        "home": describe_pose(home),
+        "home": describe_pose(paths.locate(paths.platform) @ T_body_frame),
     }
 
 
-def _describe_loop(urdf: Urdf, stage: ClosedStage, T_frame_body: FloatArray) -> Content:
+def _describe_loop(
+    mechanism: UrdfMechanism, stage: ClosedStage, T_frame_body: FloatArray
+) -> Content:
     """Return a stage with closed loops.
 
     T_frame_body (4, 4) is the body that carries it in the platform of the stage before.
@@ -537,7 +555,7 @@ def _describe_loop(urdf: Urdf, stage: ClosedStage, T_frame_body: FloatArray) -> 
     mount = T_frame_body @ stage.mount
     is_moved = not np.array_equal(mount, np.eye(4))
     moved = {"mount": describe_pose(mount)} if is_moved else {}
-    return {**moved, "family": "limbs", **_describe_limbs(urdf, stage)}
+    return {**moved, "family": "limbs", **_describe_limbs(mechanism, stage)}
 
 
 def _describe_joint(urdf: Urdf, stage: SerialStage, T_frame_body: FloatArray) -> Content:
@@ -548,9 +566,9 @@ def _describe_joint(urdf: Urdf, stage: SerialStage, T_frame_body: FloatArray) ->
         "at": describe_pose(T_frame_body @ joint.T_a),
         "axis": _clear(joint.axis),
         **({} if np.array_equal(tip, np.eye(4)) else {"tip": describe_pose(tip)}),
-        "drive": joint.name,
+        "drive": joint.drive,
         "start": stage.start,
-        **_describe_stroke(urdf.joints[joint.name]),
+        **_describe_stroke(urdf.joints[joint.drive]),
         "errors": [*joint.shifts, "offset"],
     }
 
