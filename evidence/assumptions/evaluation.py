@@ -20,7 +20,6 @@ from evidence.assumptions.levels import name_group
 from evidence.assumptions.simulation import Array, BoolArray, Simulation, simulate_case
 from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty, check_heavy_tails
-from loopcal.diagnose.cluster_covariance import check_clusters
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify, identify_trials
@@ -88,8 +87,7 @@ def evaluate_fit(
     if is_examined and fit.converged:
         outliers = find_outliers(fit, data)
         tails = check_heavy_tails(fit, data, outliers.suspects, linear)
-        clusters = check_clusters(fit, data, linear=linear)
-        findings = (*outliers.findings, *tails.findings, clusters.finding)
+        findings = (*outliers.findings, *tails.findings)
         examination = {finding.code: finding.severity for finding in findings}
     truth = simulation.trials.truth[i][fit.free_parameters.places]
     predicted = forward(fit.robot, simulation.q)

@@ -12,13 +12,12 @@ STATED_LEVELS = {
     "outliers": FALSE_ALARMS["outliers"],
     "prior.components-inflated": FALSE_ALARMS["tolerance components"],
     "prior.tolerances": FALSE_ALARMS["tolerances"],
-    "residuals.common-errors": FALSE_ALARMS["common errors"],
     "residuals.causes": FALSE_ALARMS["causes of residuals"],
     "residuals.correlated": FALSE_ALARMS["correlation of neighbors"],
     "residuals.heavy-tailed": FALSE_ALARMS["heavy tails"],
     "residuals.model-discrepancy": FALSE_ALARMS["model discrepancy"],
 }
-"""Stated probabilities of alarms where every assumption holds, by group of codes; together 5 %."""
+"""Stated probabilities of alarms where every assumption holds, by group of codes."""
 
 CAUSES = ("drift", "trend", "sessions-differ", "depend-on", "shared", "drive-errors", "backlash")
 """Beginnings of the codes of the residuals that share one level: causes of these."""

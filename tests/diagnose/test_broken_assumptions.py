@@ -122,8 +122,8 @@ def test_codes_of_one_level_form_one_group():
     assert name_group("fit.beyond-tolerance") == "fit.beyond-tolerance"
 
 
-def test_false_alarms_of_all_tests_are_5_percent():
-    assert sum(FALSE_ALARMS.values()) == pytest.approx(0.05)
+def test_false_alarms_of_all_tests_stay_below_5_percent():
+    assert 0.0 < sum(FALSE_ALARMS.values()) < 0.05
     assert set(STATED_LEVELS.values()) <= set(FALSE_ALARMS.values()) | {0.5 * FALSE_ALARMS["noise"]}
 
 

@@ -62,7 +62,6 @@ DEPENDENT = {
     "residuals.depend-on-temperature",
     "residuals.depend-on-reading",
     "residuals.correlated",
-    "residuals.common-errors",
     "residuals.model-discrepancy",
 }
 # Finding that a calibration is not expected to improve on the tolerances.

@@ -10,41 +10,28 @@ fit, whose rows have variance sigma^2, the cluster-robust covariance is
 The factor (I - H_gg)^(-1/2) is the small-sample correction CR2 of Bell and McCaffrey (2002): for
 independent errors the expectation of C_robust is exactly C. Its scatter is that of a chi-square
 whose degrees of freedom have the moments of the quadratic form (Satterthwaite; Pustejovsky and
-Tipton, 2018). What the residuals or a prior have added to C (`add_covariance`) belongs to the
-stated covariance with which C_robust is compared. See docs/theory/uncertainty.md.
+Tipton, 2018). See docs/theory/resampling.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.error_frames import (
-    FITTED,
-    MOST_POSES,
-    linearize_tool_errors,
-    locate_measured_poses,
-)
 from loopcal.diagnose.outliers import TESTABLE
-from loopcal.estimate.false_alarms import FALSE_ALARMS
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.identification import prepare_fitted_data
+from loopcal.diagnose.residual_patterns import number_days
+from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.observation_rows import linked_blocks
-from loopcal.estimate.posterior import Posterior
-from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.elimination import find_connected_groups, fold_at
 from loopcal.numerics.statistics import choose_evenly, compute_chi_square_tail
-from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Clusters that a cluster-robust variance needs. The variance of a mean has one degree of freedom
 # less, and with fewer than 4 its distribution is not known well enough (Tipton, 2015).
 FEWEST_CLUSTERS = 5
-NIGHT = 6 * 3600.0  # time without a measurement [s] after which another day begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +54,7 @@ def divide_into_clusters(data: Measurements) -> tuple[Clusters, ...]:
     divisions = [Clusters(unit, blocks, count)]
     time, days = data.context.get("time"), np.zeros((0, 2), dtype=np.int64)  # pose and day
     if time is not None and not np.isnan(time).any():
-        order = np.argsort(time, kind="stable")
-        day = np.concatenate([[0], np.cumsum(np.diff(time[order]) > NIGHT)])
-        days = np.column_stack([order, day])
+        days = np.column_stack([np.arange(data.n_poses), number_days(time)])
     for name, pairs in (("session", _pose_sessions(data)), ("day", days)):
         if len(pairs):
             links = np.column_stack([blocks[pairs[:, 0]], count + pairs[:, 1]])
@@ -100,13 +85,6 @@ def _pose_sessions(data: Measurements) -> IntArray:
     return np.column_stack([pose, np.unique(name, return_inverse=True)[1]])
 
 
-LIMIT = 1.5  # ratio of standard uncertainties above which the stated ones are too small
-# Probability, for independent errors, of a ratio as large as that of position or orientation,
-# below which the ratio is reported.
-SIGNIFICANCE = 0.5 * FALSE_ALARMS["common errors"]
-# Share of the variance of poses by noise that residuals must be able to judge. The rest lies in
-# directions that one cluster alone determines.
-JUDGED = 0.5
 # Degrees of freedom below which the distribution of a ratio is not known well (Tipton, 2015), and
 # its own standard deviation exceeds 35 %.
 FEWEST_DEGREES = 4.0
@@ -126,50 +104,6 @@ class Ratio(NamedTuple):
 
 
 NO_RATIO = Ratio(np.nan, np.nan, np.nan, np.nan)
-
-
-@dataclass(frozen=True, eq=False)
-class ClusterCheck:
-    """The cluster-robust covariance of a fit against the stated one."""
-
-    finding: Finding  # the result
-    unit: str = ""  # what is taken as independent: "day", "session", "block", "pose", or nothing
-    clusters: int = 0  # their number
-    # position, orientation: for the measured poses, in the directions that the data determine
-    position: Ratio = NO_RATIO
-    orientation: Ratio = NO_RATIO
-    parameter: tuple[str, float] = ("", np.nan)  # the one with the largest ratio, and that ratio
-
-    FIELDS: ClassVar[tuple[Field, ...]] = fields(
-        *("unit", "clusters", "position", "orientation"),
-        parameter=lambda check: dict(zip(("name", "ratio"), check.parameter, strict=True)),
-        finding="finding",
-    )
-
-
-def check_clusters(
-    fit: Identification,
-    data: Measurements,
-    frame: str = FITTED,
-    linear: FitLinearization | None = None,
-) -> ClusterCheck:
-    """Compare the stated uncertainty with one that allows common errors within clusters of poses,
-    the largest independent units of which there are enough.
-
-    frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means relative
-        to the home pose.
-    """
-    data = prepare_fitted_data(fit, data)
-    units = divide_into_clusters(data)
-    if not units:
-        few = report_finding("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)
-        return ClusterCheck(few)
-    if not fit.residual_test.intervals:
-        return ClusterCheck(report_finding("residuals.clusters-without-intervals"))
-    linear = linearize_fit(fit, data, linear)
-    checks = (_compare(linear, clusters, frame) for clusters in units)
-    judged = (check for check in checks if check is not None)
-    return next(judged, ClusterCheck(report_finding("residuals.clusters-not-judged")))
 
 
 class RobustSpread(NamedTuple):
@@ -196,9 +130,9 @@ class RobustSpread(NamedTuple):
         """(G, h) rows that a residual can judge."""
         return self.correction > 0.0
 
-    def compare(self, effect: FloatArray, added: float = 0.0) -> Ratio:
+    def compare(self, effect: FloatArray) -> Ratio:
         """Return the ratio for quantities whose change is effect (m, p) times the deviation in
-        tolerances. `added` : sum of the variances that they have beyond C.
+        tolerances.
         """
         root = effect @ self.root
         total = float((root**2).sum())
@@ -213,7 +147,7 @@ class RobustSpread(NamedTuple):
         if not mean > 0.0:
             return NO_RATIO
         excess = self.times * (observed - mean)
-        ratio = float(np.sqrt(max(total + excess, 0.0) / (total + added)))
+        ratio = float(np.sqrt(max(total + excess, 0.0) / total))
         # degrees of freedom 2 mean^2 / variance of Q = e' K e, whose variance is 2 tr (K K): with
         # D the corrections, Z the columns and F_g = D_g rows_g' rows_g D_g, the blocks of two
         # clusters give tr (F_g Z_g Z_h' F_h Z_h Z_g'), and those of one |rows_g' rows_g|^2
@@ -227,20 +161,6 @@ class RobustSpread(NamedTuple):
         degrees = mean**2 / trace if trace > 0.0 else np.inf
         p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
         return Ratio(ratio, degrees, mean / float((rows**2).sum()), p_value)
-
-    def parameter_ratios(self, added: FloatArray | float = 0.0) -> FloatArray:
-        """Return the ratio (p,) of each parameter; NaN without a standard deviation. `added` (p,) :
-        variances beyond C.
-        """
-        own = (self.root**2).sum(axis=1)
-        observed = ((self.scores @ self.root.T) ** 2).sum(axis=0)
-        expected = np.zeros(len(own))
-        for tested_rows in self.scaled_rows * self.is_tested[:, None, :]:
-            expected += ((self.root @ tested_rows) ** 2).sum(axis=1)
-        robust = own + self.times * (observed - expected)
-        nothing = np.full(len(own), np.nan)
-        square = np.divide(robust, own + added, out=nothing, where=own > 0.0)
-        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
 def compute_robust_spread(linear: FitLinearization, clusters: Clusters) -> RobustSpread:
@@ -287,43 +207,3 @@ def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:
     number[choose_evenly(clusters.count, MOST_CLUSTERS)] = np.arange(MOST_CLUSTERS)
     times = clusters.count / MOST_CLUSTERS
     return replace(clusters, member=number[clusters.member], count=MOST_CLUSTERS), times
-
-
-def _compare(linear: FitLinearization, clusters: Clusters, frame: str) -> ClusterCheck | None:
-    """Return the comparison for clusters; None where residuals cannot judge the poses."""
-    fit, posterior = linear.fit, linear.fit.posterior
-    spread = compute_robust_spread(linear, clusters)
-    solution = locate_measured_poses(fit, linear.data, MOST_POSES)
-    errors = linearize_tool_errors(posterior, solution, frame)
-    root = _find_added_root(posterior.without_discrepancy) / posterior.unit[:, None]
-    # variances of the poses beyond C, and their changes by deviations in tolerances
-    beside = np.concatenate([errors.by_parameters @ root, errors.by_discrepancy], axis=2) ** 2
-    D = errors.by_parameters * (fit.tolerance / posterior.unit)
-    angle, position = (
-        spread.compare(D[:, rows].reshape(-1, D.shape[-1]), float(beside[:, rows].sum()))
-        for rows in (slice(0, 3), slice(3, 6))
-    )
-    sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
-    sizes = [r for r in sizes if r.share >= JUDGED and r.degrees >= FEWEST_DEGREES]
-    if not sizes:
-        return None
-    added = _find_added_root(fit.posterior) / fit.tolerance[:, None]
-    ratios = spread.parameter_ratios((added**2).sum(axis=1))
-    largest = int(np.nanargmax(ratios))
-    parameter = (fit.names[largest], float(ratios[largest]))
-    beyond = [r for r in sizes if r.ratio > LIMIT and r.p_value < SIGNIFICANCE]
-    finding = report_finding(
-        "residuals.common-errors" if beyond else "residuals.common-errors-small",
-        unit=clusters.unit,
-        count=clusters.count,
-        ratio=max(r.ratio for r in beyond or sizes),
-        parameter=parameter[0],
-        parameter_ratio=parameter[1],
-    )
-    return ClusterCheck(finding, clusters.unit, clusters.count, position, angle, parameter)
-
-
-def _find_added_root(posterior: Posterior) -> FloatArray:
-    """Return the root (p, k) [SI] of what was added to the covariance of a fit."""
-    roots = [part.root for part in posterior.parts if part.is_added]
-    return np.concatenate([np.zeros((len(posterior.unit), 0)), *roots], axis=1)

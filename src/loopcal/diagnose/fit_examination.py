@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
-from loopcal.diagnose.cluster_covariance import ClusterCheck, check_clusters
 from loopcal.diagnose.error_causes import OUTLIERS, explain_residuals
 from loopcal.diagnose.error_frames import (
     FITTED,
@@ -30,7 +29,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
@@ -164,7 +163,6 @@ class FitExamination(Result):
     Attributes
     ----------
     outliers : poses that do not fit the others. lack_of_fit : the test against repeated poses.
-    clusters : the uncertainty that allows for common errors of a day, session or pose.
     correlated : groups of strongly correlated parameters. gain : expected errors before and after.
     tails : the test of the other residuals for heavy tails. causes : of the outliers, where the fit
         names none.
@@ -172,14 +170,13 @@ class FitExamination(Result):
 
     outliers: OutlierCheck
     lack_of_fit: LackOfFit
-    clusters: ClusterCheck
     correlated: tuple[CorrelatedGroup, ...]
     gain: CalibrationGain
     tails: HeavyTails
     causes: tuple[Finding, ...] = ()
 
     FIELDS: ClassVar[tuple[Field, ...]] = fields(
-        *("outliers", "lack_of_fit", "clusters", "correlated"),
+        *("outliers", "lack_of_fit", "correlated"),
         worth="gain",
         heavy_tails="tails",
         findings="findings",
@@ -202,9 +199,6 @@ class FitExamination(Result):
             findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
         lack = self.lack_of_fit
         findings += [f for f in lack.findings if lack.groups or f.code == "residuals.no-repeats"]
-        is_of_outliers = bool(self.outliers.suspects) and self.clusters.unit == "pose"
-        if not (is_of_outliers and self.clusters.finding.severity is Severity.WARNING):
-            findings.append(self.clusters.finding)  # the rows of a wrong pose share its error
         return (*findings, *(group.finding for group in self.correlated))
 
 
@@ -224,7 +218,7 @@ def examine_fit(
     frame : in which expected errors are stated, see `choose_error_frame`.
     """
     outliers, causes = find_outliers(fit, data, progress=progress), ()
-    progress(0, 1, "testing for common errors and heavy tails")
+    progress(0, 1, "testing for heavy tails")
     linear = None
     if fit.converged and fit.residual_test.intervals:
         linear = linearize_fit(fit, data)
@@ -243,7 +237,6 @@ def examine_fit(
     return FitExamination(
         shown,
         check_lack_of_fit(fit, data),
-        check_clusters(fit, data, frame, linear),
         find_correlated_groups(fit),
         estimate_calibration_gain(fit, data, frame),
         check_heavy_tails(fit, data, outliers.suspects, linear),

@@ -232,6 +232,17 @@ def order_by_time(time: FloatArray | None, count: int) -> IntArray:
     return np.argsort(time, kind="stable")
 
 
+NIGHT = 6 * 3600.0  # time without a measurement [s] after which another day begins
+
+
+def number_days(time: FloatArray) -> IntArray:
+    """Return the number of the day of each row (n,), a run of times [s] without a `NIGHT`."""
+    order = np.argsort(time, kind="stable")
+    day = np.empty(len(time), np.int64)
+    day[order] = np.cumsum(np.diff(time[order], prepend=time[order[:1]]) > NIGHT)
+    return day
+
+
 # What residuals may depend on.
 ORDER, TIME, TEMPERATURE, READING = "order", "time", "temperature", "reading"
 SESSION, BLOCK, POSE, TARGET, WALK = "session", "block", "pose", "target", "walk"
@@ -310,8 +321,9 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
     """Return the effects that measurements without excluded poses can have.
 
     Linear in time, or in the order of measurement where the rows state no time, linear in each
-    temperature, and quadratic in each actuator reading; an error of each session, of each block
-    where blocks are large, and of each pose where several targets share it.
+    temperature, and quadratic in each actuator reading; an error of each session, or day where
+    none is named, of each block where blocks are large, and of each pose where several targets
+    share it.
     """
     observations = [o for o in data.observations if len(o)]
     place = [order_rows(o).astype(float) for o in observations]
@@ -323,7 +335,10 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
         values = [o.context.get(name, x) for o, x in zip(observations, missing, strict=True)]
         listed.append((TEMPERATURE, name, [scale_to_range(x)[:, None] for x in values]))
     poses = [o.rows.reshape(len(o), -1)[:, 0] for o in observations]
-    listed.append((SESSION, "", [indicate_groups(o.session) for o in observations]))
+    sessions = [o.session for o in observations]
+    if is_timed and not any(np.concatenate(sessions)):
+        sessions = [number_days(o.context[TIME]) for o in observations]
+    listed.append((SESSION, "", [indicate_groups(session) for session in sessions]))
     blocks = len(find_distinct(data.block))
     is_finer = blocks > len({session for o in observations for session in o.session.tolist()})
     if is_finer and 2 * blocks <= data.n_poses:

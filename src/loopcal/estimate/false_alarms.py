@@ -12,11 +12,10 @@ FALSE_ALARMS: Mapping[str, float] = {
     "causes of residuals": 0.009,  # as measured; chosen by odds, see `error_causes.EXCLUDED`
     "correlation of neighbors": 0.002,
     "model discrepancy": 0.004,
-    "common errors": 0.003,
     "motion of frames": 0.002,
     "heavy tails": 0.001,
     "held-out rows": 0.001,
 }
 """Probability that each test of a calibration rejects where every assumption holds. Together they
-are 5 %, and `compute_single_level` divides each one among the tests of its kind.
+are below 5 %, and `compute_single_level` divides each one among the tests of its kind.
 """

@@ -104,14 +104,14 @@ workflow.undetermined-combinations validation.setup-moved
 prior.machine-changed prior.agree-too-well prior.tolerances-inflated
 prior.tolerances-too-narrow prior.components-inflated fit.beyond-tolerance
 model.no-expected-gain model.nothing-gained
-residuals.lack-of-fit residuals.repeatability-larger residuals.common-errors
+residuals.lack-of-fit residuals.repeatability-larger
 residuals.heavy-tailed
 noise.doubtful noise.no-degrees-of-freedom workflow.undetermined-scale
 setup.two-solutions setup.fixed
 noise.consistent noise.estimated outliers.none outliers.one-degree workflow.frame-freedoms
 prior.machine-unchanged model.simpler-suffices model.all-needed model.expected-gain
 residuals.start-not-calibrated residuals.start-within-noise residuals.start-is-best
-residuals.common-errors-small prior.undetectable prior.inflation
+prior.undetectable prior.inflation
 """
 """Codes of findings, most important first. Codes that are absent here come after these."""
 
