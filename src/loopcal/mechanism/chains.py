@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from loopcal import geometry
 from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
 from loopcal.mechanism.actuation import Derivatives
-from loopcal.mechanism.limb_rows import follow_limb, measure_rod
+from loopcal.mechanism.limb_rows import follow_limb, measure_rod, place_links, sum_displacements
 from loopcal.mechanism.model import Mechanism, ParameterUnits, Stage
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
@@ -27,8 +26,13 @@ from loopcal.mechanism.platform_coordinates import (
     pose_from_coordinates,
     read_coordinates,
 )
-from loopcal.mechanism.states import Status, driven_values
-from loopcal.mechanism.transmission import joint_slopes, readings_from_joints
+from loopcal.mechanism.states import Status, driven_values, make_start, without_poses
+from loopcal.mechanism.transmission import (
+    apply_weights,
+    find_reversed,
+    find_triangles,
+    select_weights,
+)
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -213,6 +217,9 @@ def judge_stage_modes(
     is_other, judged = np.zeros(state.T.shape[1], bool), []
     states, begins = split_stage_states(robot, state), split_stage_states(robot, begin)
     for stage, own, first in zip(robot.stages, states, begins, strict=True):
+        if stage.robot.is_serial:
+            judged.append(own)
+            continue
         machine = stage.robot.with_values(robot.values[stage.parameters])
         part, is_part_other = judge(machine, own, first)
         judged.append(part)
@@ -368,7 +375,7 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
     if not is_exact:  # loops of redundant actuators, among others, may stay open
         return center, radius
     e, _ = robot.slots(values)
-    for group, joints in zip(robot.program.groups, robot.home_state.joints, strict=True):
+    for group in robot.program.groups:
         displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
         for k in range(len(group.limbs)):
             if (group.on[k], group.to[k]) != (BASE, PLATFORM):
@@ -376,20 +383,18 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
             slides = "P" in group.joints or bool(group.pitch[k].any()) or group.actuator[-1, k] >= 0
             if slides or any(slot.axis == PITCH for slot in group.slots):
                 continue  # a joint changes the distance of its neighbors
-            own = displacements[:, k]
-            start = np.broadcast_to(joints[:1, :1, k], (len(own), 1, joints.shape[-1]))
-            frames, attachment = follow_limb(group, k, own, start)
-            points = np.stack([frame[:, 0, :3, 3] for frame in frames], axis=1)
-            length = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(axis=1)
-            length = length + np.linalg.norm(attachment[:, 0, :3, 3], axis=-1)
-            length = length + measure_rod(group, k, own)
+            move, _ = sum_displacements(group, k, displacements[:, k])
+            links = group.links[k]
+            origins = links[:, :3, 3] + np.matmul(links[:, :3, :3], move[..., 3:, None])[..., 0]
+            length = np.linalg.norm(origins[:, 1:], axis=-1).sum(axis=1)
+            length = length + measure_rod(group, k, displacements[:, k])
             shorter = length < radius
-            center = np.where(shorter[:, None], points[:, 0], center)
+            center = np.where(shorter[:, None], origins[:, 0], center)
             radius = np.where(shorter, length, radius)
     return center, radius
 
 
-# Inverse kinematics by the forward one: Newton's method on the readings, c(T(q)) = c*.
+# Inverse kinematics by the forward one: Newton's method on the driven joints, c(T(u)) = c*.
 
 STEPS = 60
 """Newton steps of a row."""
@@ -409,112 +414,263 @@ PROGRESS, PROGRESS_STEPS = 0.5, 10
 
 In this time the longest steps turn a joint by 5 rad. Steps close to a stretched arm gain less.
 """
+NEXT, LAST = (1, 2, 0), (2, 0, 1)
+"""Components of a cross product: a x b = a[NEXT] b[LAST] - a[LAST] b[NEXT]."""
 PATH_STEPS = 8
 """Steps of the path from the start's pose to a target."""
 
 
-ForwardSolver = Callable[..., State]
-"""Solves forward kinematics, as `forward_trials` does."""
+LoopSolver = Callable[..., State]
+"""Closes loops at driven joints or sums u (t | 1, n, u), as `close_at_joints` does."""
+LoopDerivative = Callable[..., FloatArray]
+"""Differentiates the pose of loops by joints or sums, as `differentiate_by_drives` does."""
 Proposal = Callable[[FloatArray, FloatArray, State], State]
 """Returns states near targets (R, c), whose readings are only almost right, from the values and a
-start; states are (1, R) or (R, 1), like the start.
+start; states are (R, 1), like the start.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class _Iterate:
-    """Readings q (R, a) of R rows, their state, distance from the target (R,) [m], Newton step (R,
-    a), and sign of det(C D) (R,).
+    """R rows: their driven joints u, the states (R, 1) of the stages with loops, and the rest.
+
+    u : (R, u) values of joints, of a stage with open sums these sums [m, rad].
+    T : (R, 4, 4) end platform [m]. D : (R, 6, u) its twists by the drives, NaN with open loops.
+    gap : (R,) distance from the target [m].
+    step : (R, u) Newton step. sign : (R,) of det(C D), 1 with more drives than coordinates.
+    status, count : (R,) of the iteration.
     """
 
-    q: FloatArray
-    state: State
+    u: FloatArray
+    loops: tuple[State, ...]
+    T: FloatArray
+    D: FloatArray
     gap: FloatArray
     step: FloatArray
     sign: FloatArray
+    status: NDArray[np.int8]
+    count: IntArray
+
+    def take(self, rows: IntArray) -> _Iterate:
+        """Return some rows."""
+        return map_arrays(lambda a: a[rows], self)
+
+    def put(self, rows: IntArray, new: _Iterate) -> _Iterate:
+        """Return the same rows with some replaced."""
+
+        def replaced(old: np.ndarray, part: np.ndarray) -> np.ndarray:
+            out = np.array(old)
+            out[rows] = part
+            return out
+
+        return map_arrays(replaced, self, new)
+
+
+class _SerialJoints(NamedTuple):
+    """The joints of the serial stages of a chain, between displaced links.
+
+    places : the joints of each stage. column : (E,) the place of each among the drives.
+    turn, advance : (1 | R, E) radians and metres of motion per unit of the joint; that of a stage
+        without joints does not move.
+    before, after : (1 | R, E, 4, 4) links on both sides; after the last joint of a stage only.
+    """
+
+    places: tuple[range, ...]
+    column: IntArray
+    turn: FloatArray
+    advance: FloatArray
+    before: FloatArray
+    after: FloatArray
+
+    def move(self, u: FloatArray) -> FloatArray:
+        """Return the motions (R, E, 4, 4) from before the links to behind them."""
+        value = u[:, self.column]
+        angle = self.turn * value
+        M = np.zeros((*value.shape, 4, 4))
+        M[..., 0, 0] = M[..., 1, 1] = np.cos(angle)
+        M[..., 1, 0] = np.sin(angle)
+        M[..., 0, 1] = -M[..., 1, 0]
+        M[..., 2, 2] = M[..., 3, 3] = 1.0
+        M[..., 2, 3] = self.advance * value
+        return self.before @ M @ self.after
+
+
+def _place_serial_joints(stages: Sequence[Stage], e: Sequence[FloatArray]) -> _SerialJoints:
+    """Return the joints of the serial stages for the displacements (t, d) of each stage."""
+    serial = [stage for stage in stages if stage.robot.is_serial]
+    counts = [max(len(stage.robot.program.groups[0].joints), 1) for stage in serial]
+    shape = len(e[0]), sum(counts)
+    before, after = np.zeros((2, *shape, 4, 4)) + np.eye(4)
+    turn, advance = np.zeros((2, *shape))
+    column, places = np.zeros(shape[1], int), list[range]()
+    last = 0
+    for own, displacements in zip(stages, e, strict=True):
+        first = last
+        if own.robot.is_serial:
+            (group,) = own.robot.program.groups
+            J = len(group.joints)
+            last = first + max(J, 1)
+            links, pitch = place_links(group, 0, displacements)
+            place = slice(first, first + J)
+            before[:, place] = links[:, :J]
+            after[:, last - 1] = links[:, J] @ geometry.invert_pose(links[:, -1])
+            turn[:, place] = [letter == "R" for letter in group.joints]
+            advance[:, place] = np.where(turn[:, place] > 0.0, pitch, 1.0)
+            column[place] = own.actuators.start + group.actuator[:J, 0]
+        places.append(range(first, last))
+    return _SerialJoints(tuple(places), column, turn, advance, before, after)
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """R rows of a robot: the parameter values of each, and their targets.
+    """R rows of a robot: what the parameter values make of it, and their targets.
 
-    values : (1, p) of all rows, or (R, p). target : (R, c) controlled coordinates.
+    A robot of one stage is a chain of itself.
+
+    values : (1 | R, p). target : (R, c) controlled coordinates. e, weights, terms : displacements,
+        weights of open sums, and transmissions of each stage, (1 | R, ..).
+    sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
+    units : (u,) lengths that a unit of each drive counts for: the robot's size for an angle.
     """
 
     robot: Mechanism
+    stages: tuple[Stage, ...]
     values: FloatArray
     target: FloatArray
-    solve: ForwardSolver
-    differentiate: PoseDerivative
-
-    @property
-    def axis(self) -> int:
-        """Axis of the rows in a state: of poses where all have the same values, else of trials."""
-        return 1 if len(self.values) == 1 else 0
+    e: tuple[FloatArray, ...]
+    weights: tuple[FloatArray | None, ...]
+    terms: tuple[FloatArray, ...]
+    sign: FloatArray
+    serial: _SerialJoints
+    units: FloatArray
+    moving: IntArray
+    close: LoopSolver
+    differentiate: LoopDerivative
 
     def select(self, rows: IntArray) -> _Rows:
         """Return some rows."""
-        values = self.values if self.axis else self.values[rows]
-        return replace(self, values=values, target=self.target[rows])
 
-    def take(self, now: _Iterate, rows: IntArray) -> _Iterate:
-        """Return some rows of an iterate."""
-        state = map_arrays(partial(np.take, indices=rows, axis=self.axis), now.state)
-        return _Iterate(now.q[rows], state, now.gap[rows], now.step[rows], now.sign[rows])
+        def chosen(a: np.ndarray) -> np.ndarray:
+            return a if len(a) == 1 else a[rows]
 
-    def put(self, now: _Iterate, rows: IntArray, new: _Iterate) -> _Iterate:
-        """Return an iterate with some rows replaced."""
-        place = (slice(None), rows) if self.axis else (rows,)
+        chosen_arrays = {
+            name: map_arrays(chosen, getattr(self, name))
+            for name in ("values", "e", "weights", "terms")
+        }
+        serial = self.serial._replace(
+            **{name: chosen(getattr(self.serial, name)) for name in self.serial._fields[2:]}
+        )
+        own = self.target[rows], self.sign[rows]
+        return replace(self, target=own[0], sign=own[1], serial=serial, **chosen_arrays)
 
-        def replaced(old: np.ndarray, part: np.ndarray) -> np.ndarray:
-            out = np.array(old)
-            out[place] = part
-            return out
-
-        state = map_arrays(replaced, now.state, new.state)
-        arrays = [np.array(a) for a in (now.q, now.gap, now.step, now.sign)]
-        for array, part in zip(arrays, (new.q, new.gap, new.step, new.sign), strict=True):
-            array[rows] = part
-        q, gap, step, sign = arrays
-        return _Iterate(q, state, gap, step, sign)
-
-    def evaluate(self, q: FloatArray, begin: State) -> _Iterate:
-        """Return the iterate at readings q (R, a); its gap is infinite where a loop stays open."""
-        robot, shown = self.robot, np.expand_dims(q, 1 - self.axis)
-        state = self.solve(robot, self.values, shown, begin, follow=False)
-        ok = (state.status == CONVERGED).ravel()
-        none = ParameterUnits(robot.slots, np.zeros(0, np.int64), np.zeros(0))
-        D = self.differentiate(robot, self.values, shown, state, none).readings
-        T = state.T.reshape(-1, 4, 4)
-        residual, columns = compare_coordinates(T, self.target, robot.controlled, robot.size)
-        moving = find_carrying_actuators(robot)
-        slope = np.matmul(columns, D.reshape(-1, 6, q.shape[1])[..., moving])
-        ok &= np.isfinite(slope).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
-        slope[~ok], residual[~ok] = np.eye(len(moving)), 0.0
-        step = np.zeros_like(q)
-        step[:, moving] = -np.matmul(np.linalg.pinv(slope), residual[..., None])[..., 0]
-        gap = np.where(ok, np.linalg.norm(residual, axis=1), np.inf)
-        sign = np.where(ok, np.sign(np.linalg.det(slope)), 0.0)
-        # no joint moves farther than the longest step: in radians, or sizes of the robot
-        joints = (joint for limb in robot.assembly.limbs for joint in limb.joints)
-        turning = {joint.actuator for joint in joints if joint.kind == "R"}
-        turns = [not turning.isdisjoint(a.driven_joints) for a in robot.actuators]
-        _, tau = robot.slots(self.values)
-        slopes = np.broadcast_to(joint_slopes(shown, tau, robot.slots.frequency), shown.shape)
-        length = np.abs(step * slopes.reshape(q.shape)) / np.where(turns, 1.0, robot.size)
-        longest = np.maximum(length.max(axis=1, initial=0.0), LONGEST_STEP)
-        return _Iterate(q, state, gap, step * (LONGEST_STEP / longest)[:, None], sign)
-
-    def iterate(self, q: FloatArray, begin: State, on_path: bool = False) -> _Iterate:
-        """Return the last iterates from readings q (R, a); a row has arrived if its gap is small.
-
-        The status of a row that has not arrived says why.
+    def evaluate(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
+        """Return the iterate at driven joints u (R, u); its gap is infinite where a loop stays
+        open.
         """
-        size, R = self.robot.size, len(q)
+        R = len(u)
+        loops, ok = [], np.isfinite(u).all(axis=1)
+        for i, start in zip(self._list_loops(), begin, strict=True):
+            stage, own = self.stages[i], u[:, None, self.stages[i].actuators]
+            part = self.close(
+                stage.robot, self.e[i], own, start, follow=False, weights=self.weights[i]
+            )
+            ok &= part.status[:, 0] == CONVERGED
+            loops.append(part)
+        with np.errstate(invalid="ignore"):
+            T, D = self._move(u, loops)
+        D[~ok] = np.nan
+        none = np.zeros(R)
+        status = none.astype(np.int8)
+        return self.aim(
+            _Iterate(u, tuple(loops), T, D, none, none[:, None], none, status, none.astype(int))
+        )
+
+    def aim(self, now: _Iterate) -> _Iterate:
+        """Return an iterate with the distance from the target and the step towards it."""
+        with np.errstate(invalid="ignore"):
+            residual, columns = compare_coordinates(
+                now.T, self.target, self.robot.controlled, self.robot.size
+            )
+            slope = np.matmul(columns, now.D)[..., self.moving] / self.units[self.moving]
+        ok = np.isfinite(slope).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
+        if not ok.all():
+            slope[~ok], residual[~ok] = np.eye(*slope.shape[1:]), 0.0
+        step, sign = np.zeros_like(now.u), np.ones(len(ok))
+        if slope.shape[1] == slope.shape[2]:
+            sign = np.sign(np.linalg.det(slope))
+        is_square = slope.shape[1] == slope.shape[2] and bool(sign.all())
+        inverse = np.linalg.inv(slope) if is_square else np.linalg.pinv(slope)
+        step[:, self.moving] = -np.matmul(inverse, residual[..., None])[..., 0]
+        # no joint moves farther than the longest step: in radians, or sizes of the robot
+        size = self.robot.size
+        longest = np.maximum(np.abs(step).max(axis=1, initial=0.0) / size, LONGEST_STEP)
+        return replace(
+            now,
+            gap=np.where(ok, np.linalg.norm(residual, axis=1), np.inf),
+            step=step * (LONGEST_STEP / longest)[:, None] / self.units,
+            sign=np.where(ok, sign, 0.0),
+        )
+
+    def _list_loops(self) -> list[int]:
+        """Return the stages with loops."""
+        return [i for i, stage in enumerate(self.stages) if not stage.robot.is_serial]
+
+    def _move(self, u: FloatArray, loops: Sequence[State]) -> tuple[FloatArray, FloatArray]:
+        """Return the end platform (R, 4, 4) and its twists by the drives (R, 6, u)."""
+        X = self.serial.move(u)
+        ends: list[FloatArray] = []
+        F = np.empty((len(u), 4, 4, len(self.serial.column)))  # frames whose z axes are the joints
+        D = np.zeros((len(u), 6, u.shape[1]))
+        pieces, parts = [], iter(loops)
+        for i, stage in enumerate(self.stages):
+            T = stage.mount if stage.parent < 0 else ends[stage.parent] @ stage.mount
+            if stage.robot.is_serial:
+                for k in self.serial.places[i]:
+                    F[..., k] = T @ self.serial.before[:, k]
+                    T = T @ X[:, k]
+            else:
+                part = next(parts)
+                base, T = T, T @ part.T[:, 0]
+                pieces.append((i, base, T, part))
+            ends.append(T)
+        T = np.broadcast_to(ends[-1], (len(u), 4, 4))
+        for i, base, own, part in pieces:
+            place = self.stages[i].actuators
+            by_drive = self.differentiate(
+                self.stages[i].robot, self.e[i], u[:, None, place], part, self.weights[i]
+            )[:, 0]
+            arm = np.matmul(np.swapaxes(base[..., :3, :3], -1, -2), (T - own)[:, :3, 3:])[..., 0]
+            D[..., place] = geometry.transport_matrix(arm, base[..., :3, :3]) @ by_drive
+        axis, arm = F[:, :3, 2], T[:, :3, 3, None] - F[:, :3, 3]
+        turn, across = self.serial.turn[:, None] * axis, axis[:, NEXT] * arm[:, LAST]
+        moved = self.serial.turn[:, None] * (across - axis[:, LAST] * arm[:, NEXT])
+        moved += self.serial.advance[:, None] * axis
+        D[..., self.serial.column] += np.concatenate([turn, moved], axis=1)
+        return T, D
+
+    def is_in_other_mode(self, now: _Iterate) -> BoolArray:
+        """Return the rows (R,) beyond a singularity, of which an open start knows none, or beyond
+        the dead center of a triangle drive.
+        """
+        beyond = (now.sign != self.sign) & (self.sign != 0.0)
+        for stage, tau in zip(self.stages, self.terms, strict=True):
+            triangles = find_triangles(tau)
+            if len(triangles):
+                u, weights = now.u[:, None, stage.actuators], select_weights(tau)
+                if weights is not None and not stage.robot.has_open_sums:
+                    u = apply_weights(weights, u)
+                beyond |= find_reversed(u, tau, triangles)[:, 0].any(axis=1)
+        return beyond
+
+    def iterate(self, start: _Iterate, on_path: bool = False) -> _Iterate:
+        """Return the last iterates from a start; a row has arrived if its gap is small.
+
+        The status of a row that has not arrived in its mode says why.
+        """
+        size, R = self.robot.size, len(start.u)
         close = (CLOSE_ON_PATH if on_path else CLOSE) * size
-        done = now = self.evaluate(q, begin)
-        rows, alive, share, steps = self, np.arange(R), np.ones(R), np.zeros(R, np.int64)
-        status = np.full(R, EXHAUSTED, np.int8)
+        done = now = start
+        rows, alive, share = self, np.arange(R), np.ones(R)
         before = now.gap
         for count in range(STEPS + 1):
             arrived = now.gap <= close
@@ -524,40 +680,52 @@ class _Rows:
                 end |= now.gap > PROGRESS * before
                 before = now.gap
             if end.any() or count == STEPS:
-                status[alive[end]] = np.where(broken, NOT_FINITE, STALLED)[end]
-                status[alive[arrived]] = CONVERGED
-                steps[alive] = count
-                done = self.put(done, alive, now)
+                status = np.where(end, np.int8(STALLED), np.int8(EXHAUSTED))
+                status[broken], status[arrived] = NOT_FINITE, CONVERGED
+                now = replace(now, status=status, count=np.full(len(end), count))
+                done = now if len(alive) == R else done.put(alive, now)
                 keep = np.flatnonzero(~end)
                 if not len(keep) or count == STEPS:
                     break
-                rows, now = rows.select(keep), rows.take(now, keep)
+                rows, now = rows.select(keep), now.take(keep)
                 alive, share, before = alive[keep], share[keep], before[keep]
-            trial = rows.evaluate(now.q + share[:, None] * now.step, now.state)
+            trial = rows.evaluate(now.u + share[:, None] * now.step, now.loops)
             better = trial.gap <= np.maximum((1 - 1e-4 * share) * now.gap, close)
             share = np.where(better, np.minimum(1.0, 4 * share), 0.25 * share)
             if better.all():
                 now = trial
             elif better.any():
                 chosen = np.flatnonzero(better)
-                now = rows.put(now, chosen, rows.take(trial, chosen))
-        shape = done.state.status.shape
-        state = replace(
-            done.state,
-            status=status.reshape(shape),
-            residual=done.gap.reshape(shape),
-            iterations=steps.reshape(shape),
-        )
-        return replace(done, state=state)
+                now = now.put(chosen, trial.take(chosen))
+        is_other = (done.status == CONVERGED) & self.is_in_other_mode(done)
+        return replace(done, status=np.where(is_other, np.int8(Status.OTHER_MODE), done.status))
+
+    def list_states(self, now: _Iterate) -> list[State]:
+        """Return the states (R, 1) of all stages at an iterate."""
+        X, parts, states = self.serial.move(now.u), iter(now.loops), []
+        for i, stage in enumerate(self.stages):
+            if stage.robot.is_serial:
+                T = np.broadcast_to(np.eye(4), (len(now.u), 4, 4))
+                for k in self.serial.places[i]:
+                    T = T @ X[:, k]
+                (group,) = stage.robot.program.groups
+                joints = np.zeros((len(T), 1, 1, len(group.actuator)))
+                drives = group.actuator[: len(group.joints), 0]
+                joints[:, 0, 0, : len(drives)] = now.u[:, stage.actuators][:, drives]
+                start = make_start(T[:, None], (joints,))
+                states.append(replace(start, closure_sign=np.ones_like(start.status)))
+            else:
+                states.append(next(parts))
+        return states
 
 
-def solve_readings(
+def solve_by_drives(
     robot: Mechanism,
     values: FloatArray,
     target: FloatArray,
     begin: State,
-    solve: ForwardSolver,
-    differentiate: PoseDerivative,
+    close: LoopSolver,
+    differentiate: LoopDerivative,
     propose: Proposal | None = None,
     follow: bool = True,
 ) -> State:
@@ -568,103 +736,132 @@ def solve_readings(
     """
     t, n = max(len(values), len(target)), target.shape[1]
     if not n:
-        return map_arrays(lambda a: np.zeros((t, 0, *a.shape[2:]), a.dtype), begin)
+        return without_poses(begin, t)
     wanted = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
     own = values if len(values) == 1 else np.repeat(values, n, axis=0)
-    rows = _Rows(robot, own, wanted, solve, differentiate)
-    shape = (1, t * n) if rows.axis else (t * n, 1)
+    rows = _make_rows(robot, own, wanted, close, differentiate)
     first = map_arrays(
-        lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])).reshape(*shape, *a.shape[2:]), begin
+        lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])).reshape(t * n, 1, *a.shape[2:]), begin
     )
-    _, tau = robot.slots(own)
-    joints = driven_values(robot.program, first)
-    q = readings_from_joints(joints, tau, robot.slots.frequency).reshape(t * n, -1)
-    start = rows.evaluate(q, first)
+    start = _begin(rows, first)
+    rows = replace(rows, sign=start.sign)
     last = _solve_within_reach(rows, start, first, propose, follow)
-    status = last.state.status.ravel()
-    status = np.where(
-        (status == CONVERGED) & _is_in_other_mode(last, start.sign),
-        np.int8(Status.OTHER_MODE),
-        status,
+    status = np.where(np.isfinite(wanted).all(axis=1), last.status, np.int8(NOT_FINITE))
+    states = rows.list_states(last)
+    state = join_stage_states(robot, states) if robot.stages else states[0]
+    left = np.linalg.norm(
+        compare_coordinates(last.T, wanted, robot.controlled, robot.size)[0], axis=1
     )
-    status = np.where(np.isfinite(wanted).all(axis=1), status, np.int8(NOT_FINITE))
-    T = last.state.T.reshape(-1, 4, 4)
-    left = np.linalg.norm(compare_coordinates(T, wanted, robot.controlled, robot.size)[0], axis=1)
     state = replace(
-        last.state,
-        status=status.reshape(shape),
-        residual=np.where(status == CONVERGED, 0.0, left).reshape(shape),
+        state,
+        status=status[:, None],
+        residual=np.where(status == CONVERGED, 0.0, left)[:, None],
+        iterations=last.count[:, None],
     )
     return map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
+
+
+def _make_rows(
+    robot: Mechanism,
+    values: FloatArray,
+    target: FloatArray,
+    close: LoopSolver,
+    differentiate: LoopDerivative,
+) -> _Rows:
+    """Return rows with values (1 | R, p) and targets (R, c)."""
+    stages = robot.stages
+    if not stages:
+        whole = slice(len(robot.parameters)), slice(0, len(robot.actuators)), slice(None)
+        stages = (Stage(robot.name, -1, np.eye(4), robot, *whole),)
+    slots = [stage.robot.slots(values[:, stage.parameters]) for stage in stages]
+    e = tuple(own for own, _ in slots)
+    weights = tuple(
+        select_weights(tau) if stage.robot.has_open_sums else None
+        for stage, (_, tau) in zip(stages, slots, strict=True)
+    )
+    turns: list[bool] = []
+    for stage in stages:
+        assembly = stage.robot.assembly
+        joints = (joint for limb in assembly.limbs for joint in limb.joints)
+        turning = {joint.actuator for joint in joints if joint.kind == "R"}
+        drives = [(name,) for name in assembly.driven_joints]
+        if stage.robot.has_open_sums:
+            drives = [actuator.driven_joints for actuator in assembly.actuators]
+        turns += [not turning.isdisjoint(names) for names in drives]
+    return _Rows(
+        robot,
+        stages,
+        values,
+        target,
+        e,
+        weights,
+        tuple(tau for _, tau in slots),
+        np.zeros(len(target)),
+        _place_serial_joints(stages, e),
+        np.where(turns, robot.size, 1.0),
+        find_carrying_actuators(robot),
+        close,
+        differentiate,
+    )
+
+
+def _begin(rows: _Rows, first: State) -> _Iterate:
+    """Return the iterates of a state (R, 1)."""
+    u, loops, robot = [], [], rows.robot
+    states = split_stage_states(robot, first) if robot.stages else [first]
+    for stage, own, weights in zip(rows.stages, states, rows.weights, strict=True):
+        joints = driven_values(stage.robot.program, own)
+        u.append(joints if weights is None else apply_weights(weights, joints))
+        if not stage.robot.is_serial:
+            loops.append(own)
+    return rows.evaluate(np.concatenate(u, axis=2)[:, 0], tuple(loops))
 
 
 def _solve_within_reach(
     rows: _Rows, start: _Iterate, first: State, propose: Proposal | None, follow: bool
 ) -> _Iterate:
-    """Return the last iterates of rows from their start, whose forward solution began at `first`;
-    rows with a target beyond what the links span stay at the start.
+    """Return the last iterates of rows from their start, the state `first`; rows with a target
+    beyond what the links span stay at the start.
     """
     is_near = measure_target_excess(rows.robot, rows.values, rows.target) <= 0.0
-    stalled = np.full_like(start.state.status, STALLED)
-    solved = replace(start, state=replace(start.state, status=stalled))
+    solved = replace(start, status=np.full_like(start.status, STALLED))
     near = np.flatnonzero(is_near)
     if not len(near):
         return solved
-    own, begin = rows.select(near), rows.take(replace(start, state=first), near)
-    direct = own.iterate(*_begin_near_targets(own, begin.q, begin.state, propose))
-    solved = rows.put(solved, near, direct)
-    wrong = near[_is_wrong(rows.take(solved, near), start.sign[near])]
+    own, begin = rows.select(near), start.take(near)
+    if propose is not None:
+        begin = _begin_near_targets(own, begin, map_arrays(lambda a: a[near], first), propose)
+    solved = solved.put(near, own.iterate(begin))
+    wrong = near[solved.status[near] != CONVERGED]
     if not (follow and len(wrong)):
         return solved
-    return rows.put(solved, wrong, _follow_path(rows.select(wrong), rows.take(start, wrong)))
+    return solved.put(wrong, _follow_path(rows.select(wrong), start.take(wrong)))
 
 
-def _begin_near_targets(
-    rows: _Rows, q: FloatArray, first: State, propose: Proposal | None
-) -> tuple[FloatArray, State]:
-    """Return readings (R, a) and states at which rows begin: the proposed ones, or the first."""
-    if propose is None:
-        return q, first
-    robot = rows.robot
+def _begin_near_targets(rows: _Rows, start: _Iterate, first: State, propose: Proposal) -> _Iterate:
+    """Return the iterates at which rows begin: the proposed ones, or the first."""
     near = propose(rows.values, rows.target, first)
-    good = (near.status == CONVERGED).ravel()
-    _, tau = robot.slots(rows.values)
-    joints = driven_values(robot.program, near)
-    own = readings_from_joints(joints, tau, robot.slots.frequency).reshape(q.shape)
+    good = np.flatnonzero(near.status[:, 0] == CONVERGED)
+    if not len(good):
+        return start
     # the start selects the side of the singularities
     near = replace(near, closure_sign=first.closure_sign)
-
-    def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
-        chosen = good.reshape(new.shape[:2])
-        return np.where(chosen.reshape(*chosen.shape, *[1] * (new.ndim - 2)), new, old)
-
-    return np.where(good[:, None], own, q), map_arrays(choose, near, first)
-
-
-def _is_wrong(solved: _Iterate, sign: FloatArray) -> BoolArray:
-    """Return the rows (R,) that failed, or are in another mode than the start with this sign."""
-    return (solved.state.status.ravel() != CONVERGED) | _is_in_other_mode(solved, sign)
-
-
-def _is_in_other_mode(solved: _Iterate, sign: FloatArray) -> BoolArray:
-    """Return the rows (R,) whose sign is not that of the start; a start that is open has none."""
-    return (solved.sign != sign) & (sign != 0.0)
+    own = _begin(rows.select(good), map_arrays(lambda a: a[good], near))
+    return start.put(good, own)
 
 
 def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:
     """Return the last iterates of rows solved along the straight path of poses from their start."""
-    robot, now = rows.robot, start
-    T = start.state.T.reshape(-1, 4, 4)
-    goal = pose_from_coordinates(rows.target, robot.controlled, T)
-    twist = geometry.pose_difference(goal, T)
-    alive = np.arange(len(T))
+    controlled, now = rows.robot.controlled, start
+    goal = pose_from_coordinates(rows.target, controlled, start.T)
+    twist = geometry.pose_difference(goal, start.T)
+    alive = np.arange(len(goal))
     for i in range(1, PATH_STEPS + 1):
-        via = geometry.apply_twist(T[alive], (i / PATH_STEPS) * twist[alive])
-        target = read_coordinates(via, robot.controlled)
-        part, begin = rows.select(alive), rows.take(now, alive)
-        moved = replace(part, target=target).iterate(begin.q, begin.state, i < PATH_STEPS)
-        now = rows.put(now, alive, moved)
-        alive = alive[~_is_wrong(moved, start.sign[alive])]
+        via = geometry.apply_twist(start.T[alive], (i / PATH_STEPS) * twist[alive])
+        part = replace(rows.select(alive), target=read_coordinates(via, controlled))
+        moved = part.iterate(part.aim(now.take(alive)), i < PATH_STEPS)
+        now = now.put(alive, moved)
+        alive = alive[moved.status == CONVERGED]
         if not len(alive):
             break
     return now

@@ -25,7 +25,7 @@ from loopcal.mechanism.chains import (
     ChainState,
     each_stage,
     locate_stage_bases,
-    solve_readings,
+    solve_by_drives,
     solve_serial,
     solve_stages,
 )
@@ -36,7 +36,7 @@ from loopcal.mechanism.platform_coordinates import (
     pose_from_coordinates,
     read_coordinates,
 )
-from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.sensitivity import differentiate_by_drives
 from loopcal.mechanism.states import (
     Status,
     driven_values,
@@ -308,8 +308,8 @@ def close_at_coordinates(
     if not target.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(target)))
     if robot.stages:
-        functions = forward_trials, differentiate_pose
-        return solve_readings(robot, values, target, begin, *functions, follow=follow)
+        functions = close_at_joints, differentiate_by_drives
+        return solve_by_drives(robot, values, target, begin, *functions, follow=follow)
     if needs_readings(robot.program):
         return _inverse_by_readings(robot, values, target, begin, follow)
     return _close_with_free_actuators(robot, values, target, begin, start, max_iterations)
@@ -365,9 +365,10 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
     equations than freedoms. It changes only at a singularity.
     """
     if robot.stages:
-        stages = each_stage(robot, values, state)
-        signs = [compute_closure_sign(stage.robot, own, part) for stage, own, part in stages]
-        return np.multiply.reduce(signs).astype(np.int8)
+        whole = np.ones(state.status.shape, np.int8)
+        for stage, own, part in each_stage(robot, values, state):
+            whole = whole * compute_closure_sign(stage.robot, own, part)
+        return whole
     if robot.is_serial:
         return np.ones(state.status.shape, np.int8)
     if not is_square(robot):
@@ -409,13 +410,13 @@ def _inverse_by_readings(
         t, n = max(len(values), len(begin.T)), begin.T.shape[1]
         whole = map_arrays(lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])), begin)
         begin = replace(whole, closure_sign=compute_closure_sign(robot, values, whole))
-    return solve_readings(
+    return solve_by_drives(
         robot,
         values,
         target,
         begin,
-        forward_trials,
-        differentiate_pose,
+        close_at_joints,
+        differentiate_by_drives,
         partial(_propose_state, robot),
         follow,
     )

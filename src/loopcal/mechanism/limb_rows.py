@@ -231,6 +231,30 @@ def follow_limb(
 
     displacements : (t, s) of this limb. joints : (t, n, J + 1) its joint values.
     """
+    links, pitch = place_links(group, k, displacements)
+    placed = links[:, None]
+    frames = [placed[:, :, 0]]
+    for j, letter in enumerate(group.joints):
+        motion = move_joint(letter, joints[..., j], pitch[:, None, j])
+        frames.append(frames[-1] @ motion @ placed[:, :, j + 1])
+    return frames, placed[:, :, -1]
+
+
+def place_links(group: Group, k: int, displacements: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the displaced links (t, J + 2, 4, 4) of limb k, the attachment last, and the pitches
+    (t, J) of its joints, for its displacements (t, s).
+    """
+    move, pitch = sum_displacements(group, k, displacements)
+    displaced = geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
+    return group.links[k] @ displaced, pitch
+
+
+def sum_displacements(
+    group: Group, k: int, displacements: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return how the links of limb k move, (t, J + 2, 6) rotations and translations in their own
+    frames, the attachment last, and the pitches (t, J) of its joints, for displacements (t, s).
+    """
     move = np.zeros((len(displacements), len(group.joints) + 2, 6))
     pitch = np.broadcast_to(group.pitch[k], (len(displacements), len(group.joints))).copy()
     for slot, value in zip(group.slots, displacements.T, strict=True):
@@ -238,13 +262,7 @@ def follow_limb(
             pitch[:, slot.element] += value
         elif slot.axis != LENGTH:
             move[:, slot.element, slot.axis] += value
-    displaced = geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
-    placed = (group.links[k] @ displaced)[:, None]
-    frames = [placed[:, :, 0]]
-    for j, letter in enumerate(group.joints):
-        motion = move_joint(letter, joints[..., j], pitch[:, None, j])
-        frames.append(frames[-1] @ motion @ placed[:, :, j + 1])
-    return frames, placed[:, :, -1]
+    return move, pitch
 
 
 def measure_rod(group: Group, k: int, displacements: FloatArray) -> FloatArray:

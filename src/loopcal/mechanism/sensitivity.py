@@ -13,6 +13,7 @@ Failed rows have NaN.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from loopcal.mechanism.actuation import (
     DrivenJoints,
     differentiate_driven_joints,
     differentiate_joints_by_readings,
+    differentiate_lengths,
     differentiate_open_sums,
     drive_joints,
 )
@@ -82,6 +84,32 @@ def differentiate_pose(
         for derivative in derivatives:
             derivative[lost] = np.nan
     return Derivatives(*derivatives)
+
+
+def differentiate_by_drives(
+    robot: Mechanism, e: FloatArray, u: FloatArray, state: State, weights: FloatArray | None
+) -> FloatArray:
+    """Return the twists (t, n, 6, u) per unit of driven joints u (t, n, u), or of their sums with
+    `weights` (t | 1, u, J), of a robot without stages at displacements e (t | 1, d).
+    """
+    if weights is not None:
+        by_freedoms = np.matmul(weights[:, None], differentiate_lengths(robot.program, e, state))
+        out = np.zeros((*u.shape[:2], 6, u.shape[2]))
+        out[:, :, list(robot.program.freedoms)] = np.linalg.pinv(by_freedoms)
+        return out
+    is_open = robot.program.may_stay_open
+    differentiate = differentiate_open if is_open else engine.differentiate
+    return differentiate(robot.program, e, u, state, _map_drives(u.shape[2]))[1]
+
+
+@cache
+def _map_drives(count: int) -> engine.ParameterMap:
+    """Return the map of no parameters, and of readings that are the values of driven joints."""
+    pattern = engine.MapPattern(0, np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64))
+    none = np.zeros((1, 0))
+    return engine.ParameterMap(
+        pattern, none, none, np.zeros((1, 1, count, 0)), np.ones((1, 1, count))
+    )
 
 
 def fold_pose_rows(

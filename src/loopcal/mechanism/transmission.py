@@ -26,7 +26,7 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Sums of joint values: s = W joints, with a weight for each reading and driven joint.
 
@@ -383,6 +383,15 @@ def _differentiate_triangles(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of lengths by angles (t, n, k) and by movable terms (t, n, k, 8)."""
     return differentiate_length(joints[..., triangles], _select_triangles(tau, triangles))
+
+
+def find_reversed(joints: FloatArray, tau: FloatArray, triangles: IntArray) -> BoolArray:
+    """Return which angles (t, n, k) of triangle drives lie beyond a dead center, on the side that
+    their readings do not lead to.
+    """
+    triangle = _select_triangles(tau, triangles)
+    _, _, gamma = _describe(triangle)
+    return np.sin(joints[..., triangles] - gamma) * triangle[..., 8] < 0.0
 
 
 def split_readings(q: FloatArray, a: int) -> tuple[FloatArray, FloatArray]:
