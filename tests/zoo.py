@@ -28,7 +28,8 @@ from loopcal.mechanism.assembly import (
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.families.records import PoseRecord, Workspace
+from loopcal.mechanism.families.placement import PoseRecord
+from loopcal.mechanism.families.records import Workspace
 from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension

@@ -28,7 +28,7 @@ name: plotter
 units: {length: mm, angle: deg}
 freedoms: [x, y]
 controlled: [x, y]
-actuators:
+drives:
   left: &drive
     reads: length
     stroke: [-200, 200]

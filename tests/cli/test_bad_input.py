@@ -8,12 +8,8 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.mechanism.families.records import (
-    AngleTolerance,
-    LengthTolerance,
-    Workspace,
-    standard_deviation,
-)
+from loopcal.mechanism.families.placement import AngleTolerance, LengthTolerance, standard_deviation
+from loopcal.mechanism.families.records import Workspace
 
 ROBOT = find_robot_file("hexapod-42").read_text()
 PROFILE = Path("examples/exports/cmm-spheres.yaml").read_text("utf-8")

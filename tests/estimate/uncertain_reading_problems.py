@@ -16,7 +16,7 @@ from loopcal.measure.simulation import simulate
 from loopcal.mechanism.assembly import LinearMap
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.families.records import PoseRecord as HomePose
+from loopcal.mechanism.families.placement import PoseRecord as HomePose
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import ParameterTable

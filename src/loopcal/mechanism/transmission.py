@@ -167,6 +167,7 @@ TERMS = ("offset", "gain", "curve", "sin1", "cos1", "sin2", "cos2", "backlash")
 
 Each has the joint's unit, per power of the reading's unit; of a triangle drive, that of its length.
 """
+HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 ALL_TERMS = (*TERMS, *TRIANGLE_TERMS)
 """Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 18)."""
 SIDE = ALL_TERMS.index("side")

@@ -13,7 +13,7 @@ from loopcal.errors import DataError, MechanismError
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.families.records import PoseRecord
+from loopcal.mechanism.families.placement import PoseRecord
 from loopcal.mechanism.modes import find_assembly_modes, find_working_modes
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import forward, inverse

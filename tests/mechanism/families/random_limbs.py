@@ -11,7 +11,7 @@ from loopcal.engine import State
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limb_records import JointRecord, LimbRecord, Prismatic, Revolute
 from loopcal.mechanism.families.limbs import Limbs
-from loopcal.mechanism.families.records import Point, PoseRecord
+from loopcal.mechanism.families.placement import Point, PoseRecord
 from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import select_poses

@@ -10,18 +10,13 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.mechanism.compilation import build
-from loopcal.mechanism.families.limb_records import (
-    Copies,
-    LengthDrive,
-    LimbRecord,
-    MapEntry,
-    NamedLength,
-    Prismatic,
-    Shifts,
-)
+from loopcal.mechanism.families.drives import LengthDrive
+from loopcal.mechanism.families.limb_records import Copies, LimbRecord, Prismatic, Shifts
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.families.records import PoseRecord, Workspace
+from loopcal.mechanism.families.named_parameters import MapEntry, NamedLength
+from loopcal.mechanism.families.placement import PoseRecord
+from loopcal.mechanism.families.records import Workspace
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward, inverse
@@ -90,7 +85,7 @@ def build_equal_deltas() -> tuple[Mechanism, Mechanism]:
     six = Limbs(
         name="six",
         controlled=("x", "y", "z"),
-        actuators={
+        drives={
             "q": LengthDrive(reads="length", gain=-1.0, offset=STOP + DROP, unknown=("offset",))
         },
         limbs=limbs,

@@ -17,7 +17,8 @@ from loopcal import geometry as rigid
 from loopcal.errors import MechanismError
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough, GoughCones, Screw
-from loopcal.mechanism.families.records import LengthTolerance, PoseRecord, Workspace
+from loopcal.mechanism.families.placement import LengthTolerance, PoseRecord
+from loopcal.mechanism.families.records import Workspace
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward, inverse

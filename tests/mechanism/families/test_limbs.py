@@ -14,25 +14,21 @@ from numpy.testing import assert_allclose
 from loopcal.errors import LoopcalError, MechanismError
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
 from loopcal.mechanism.compilation import build
+from loopcal.mechanism.families.drives import AngleDrive, LengthDrive, SpoolDrive
 from loopcal.mechanism.families.limb_records import (
-    AngleDrive,
     Copies,
-    LengthDrive,
     LimbRecord,
-    MapEntry,
-    NamedAngle,
-    NamedLength,
     Prismatic,
     Revolute,
     RodCone,
     Shifts,
-    SpoolDrive,
     Tilts,
     Universal,
 )
 from loopcal.mechanism.families.limbs import Limbs
+from loopcal.mechanism.families.named_parameters import MapEntry, NamedAngle, NamedLength
+from loopcal.mechanism.families.placement import LengthTolerance, PoseRecord
 from loopcal.mechanism.families.prs import ThreePrs
-from loopcal.mechanism.families.records import LengthTolerance, PoseRecord
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward, inverse
@@ -160,7 +156,7 @@ SLIDER = Limbs(  # two rods from driven slides to a point in the plane
     name="slider",
     freedoms=("x", "y"),
     controlled=("x", "y"),
-    actuators={"q": LengthDrive("length", unknown=("offset",))},
+    drives={"q": LengthDrive(reads="length", unknown=("offset",))},
     limbs=(
         LimbRecord(
             "rod",
@@ -192,13 +188,13 @@ def test_copies_of_a_limb_are_rotated_and_numbered() -> None:
 def test_spool_length_includes_radius_and_buildup() -> None:
     """length = offset + r q + b q^2 / (4 pi)."""
     spool = SpoolDrive(
-        "angle",
+        reads="angle",
         radius=0.02,
         buildup=0.001,
         offset=0.05,
         unknown=("offset", "radius", "buildup", "backlash"),
     )
-    machine = build(replace(SLIDER, actuators={"q": spool}).expand())
+    machine = build(replace(SLIDER, drives={"q": spool}).expand())
     plain = build(SLIDER.expand())
     xy = np.array([[-0.02, -0.08], [-0.06, -0.01]])
     angle, slide = inverse(machine, xy).q, inverse(plain, xy).q
@@ -281,20 +277,20 @@ INVALID_RECORDS = {
     ),
     "end on a limb": (change_limb(to="elbow"), "limb 'rod1' names 'elbow', which is not a body"),
     "idle drive": (
-        replace(SLIDER, actuators={**SLIDER.actuators, "z": LengthDrive("length")}),
+        replace(SLIDER, drives={**SLIDER.drives, "z": LengthDrive(reads="length")}),
         "'z' drives no joint",
     ),
     "wrong drive": (
-        replace(SLIDER, actuators={"q": AngleDrive("angle")}),
+        replace(SLIDER, drives={"q": AngleDrive(reads="angle")}),
         "drives a joint that slides; state reads: length",
     ),
     "no such term": (
-        replace(SLIDER, actuators={"q": LengthDrive("length", unknown=("radius",))}),
-        "no term 'radius'; allowed are offset, gain, backlash",
+        replace(SLIDER, drives={"q": LengthDrive(reads="length", unknown=("radius",))}),
+        "no term 'radius'; allowed are offset, gain, curve, backlash",
     ),
     "no period": (
-        replace(SLIDER, actuators={"q": LengthDrive("length", unknown=("sin1",))}),
-        "unknown sin1, but no period",
+        replace(SLIDER, drives={"q": LengthDrive(reads="length", unknown=("sin1",))}),
+        "states sin1, but no period",
     ),
     "no such element": (
         change_limb(errors=(Shifts("hinge", ("x",)),)),

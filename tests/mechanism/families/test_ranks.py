@@ -86,7 +86,7 @@ CASES = {
     # turns; a move would shift the universal joint on the platform, which has no parameter.
     "tracker, 25": Ranks(RU_PUS_PRS, 0.0, (25, 24), {"full": (20, 22, 17), "5-dof": (19, 22, 17)}),
     "tracker, 27": Ranks(
-        replace(RU_PUS_PRS, parameters="twenty-seven"), 0.0, (26,), {"full": (20, 23, 17)}
+        replace(RU_PUS_PRS, parameter_set="twenty-seven"), 0.0, (26,), {"full": (20, 23, 17)}
     ),
     # PUS 9, PRS 11, and the post's three revolute joints 3 * 3 + 6 = 15
     "tracker, perfect balls, moved": Ranks(

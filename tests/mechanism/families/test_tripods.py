@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from loopcal.engine.numpy_engine.closure import place_links
 from loopcal.errors import MechanismError
 from loopcal.mechanism.compilation import build
+from loopcal.mechanism.families.placement import PoseRecord
 from loopcal.mechanism.families.prs import LEFT_OUT, RuPusPrs, ThreePrs
-from loopcal.mechanism.families.records import PoseRecord, Workspace
+from loopcal.mechanism.families.records import Workspace
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from tests.mechanism.families.ranks import (
@@ -63,7 +64,7 @@ def rotation_about_z(angle: float) -> Array:
 MODELS = {
     "3-PRS": (THREE_PRS, "three_prs"),
     "RU-PUS-PRS, 25": (RU_PUS_PRS, "ru_pus_prs"),
-    "RU-PUS-PRS, 27": (replace(RU_PUS_PRS, parameters="twenty-seven"), "ru_pus_prs"),
+    "RU-PUS-PRS, 27": (replace(RU_PUS_PRS, parameter_set="twenty-seven"), "ru_pus_prs"),
 }
 
 
@@ -202,7 +203,7 @@ def test_null_vector_of_the_3_prs_without_torsion_rotates_three_balls() -> None:
 
 
 def test_fourteen_parameters_a_chain_have_the_rank_of_eleven() -> None:
-    machine = build_cached_robot(replace(THREE_PRS, parameters="fourteen"))
+    machine = build_cached_robot(replace(THREE_PRS, parameter_set="fourteen"))
     names = machine.parameters.names
     assert len(names) == 42
     solution = solve_random_poses(machine)

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from loopcal import geometry
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.families.records import PoseRecord
+from loopcal.mechanism.families.placement import PoseRecord
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace

@@ -60,7 +60,7 @@ from loopcal.io.data.columns import (
     name_measured,
     refuse_unknown_columns,
 )
-from loopcal.mechanism.families.records import PoseRecord
+from loopcal.mechanism.families.placement import PoseRecord
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
 from loopcal.typing import BoolArray, FloatArray, IntArray

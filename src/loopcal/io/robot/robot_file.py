@@ -45,7 +45,8 @@ from loopcal.io.data.columns import find_column_fault
 from loopcal.mechanism.assembly import Assembly
 from loopcal.mechanism.compilation import build, find_impossible_values
 from loopcal.mechanism.families import FAMILIES
-from loopcal.mechanism.families.records import RecordError, RobotRecord, match_parameter_names
+from loopcal.mechanism.families.placement import RecordError
+from loopcal.mechanism.families.records import RobotRecord, match_parameter_names
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit, to_si
@@ -213,7 +214,7 @@ def build_robot(file: YamlFile) -> Mechanism:
         robot = build(_assemble(record, file), symbols, origin)
         for actuator in robot.actuators:  # measurement files have them as columns
             if fault := find_column_fault(actuator.name, "actuator"):
-                raise file.error(fault, ("actuators", actuator.name))
+                raise file.error(fault, _find_drives(file, ("drives", actuator.name)))
         for i, limb in enumerate(robot.assembly.limbs):
             for joint in limb.joints:
                 if fault := find_column_fault(f"{limb.name}.{joint.name}", "joint"):
@@ -321,6 +322,12 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
     return str(family)
 
 
+def _find_drives(file: YamlFile, location: Location) -> Location:
+    """Return a location in a file that states its drives under their older key."""
+    older = location[:1] == ("drives",) and "drives" not in file.content
+    return ("actuators", *location[1:]) if older else location
+
+
 def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     """Return the assembly of a record; an unknown name in a list of parameters, and a common error
     that cannot be, are refused at their line.
@@ -328,7 +335,7 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     try:
         expanded = record.expand()
     except RecordError as error:
-        raise file.error(str(error), error.location) from None
+        raise file.error(str(error), _find_drives(file, error.location)) from None
     parameters = expanded.parameters
     names = [parameter.name for parameter in parameters]
     for key in ("fixed", "stored_parameters"):

@@ -17,18 +17,15 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone, Joint
-from loopcal.mechanism.families.records import (
+from loopcal.mechanism.families.placement import (
     EZ,
     AngleTolerance,
     ErrorModel,
-    ErrorTolerances,
     JointPlacement,
     LengthTolerance,
+    LinkTolerances,
     PlacedLimb,
     Point,
-    RobotRecord,
-    check_spherical,
-    complete_errors,
     offset_error,
     place_limb,
     place_limb_with_ball,
@@ -37,8 +34,8 @@ from loopcal.mechanism.families.records import (
     rotation_matrix,
     standard_deviation,
     translate,
-    values_per_leg,
 )
+from loopcal.mechanism.families.records import RobotRecord, check_spherical, values_per_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
@@ -219,7 +216,7 @@ class Gough(RobotRecord):
         carry.
         """
         self._check()
-        legs, actuators, errors = [], [], ErrorModel()
+        legs, own, errors = list[PlacedLimb](), list[Actuator](), ErrorModel()
         for i, length in enumerate(values_per_leg(self.lengths, 6, "lengths")):
             if not length >= 0.0:
                 raise MechanismError(
@@ -227,17 +224,20 @@ class Gough(RobotRecord):
                     "zero; a length must be positive, or zero where readings are whole lengths"
                 )
             leg, motor = self._leg(i, length), f"q{i + 1}"
-            legs.append(leg.limb)
+            legs.append(leg)
             # a rod has its length in the ending, a chain in the offset of its sliding joint
             terms = {} if self.legs == "rod" else {"offset": length}
-            actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
+            own.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
             errors += self._errors(leg, motor, length)
+        links, angles = self.tolerances.links, self.tolerances.angles
+        is_complete = self.error_model == "complete"
         return self.assemble(
             legs,
-            actuators,
             errors,
             freedoms=AXES,
             controlled=("x", "y", "z", "roll", "pitch", "yaw"),
+            own=own,
+            complete=LinkTolerances(links, angles).deviations if is_complete else None,
         )
 
     def _check(self) -> None:
@@ -292,16 +292,12 @@ class Gough(RobotRecord):
         )
 
     def _errors(self, leg: PlacedLimb, motor: str, length: float) -> ErrorModel:
-        """Return two centers (or the errors of every link) and a length, the same in both forms."""
-        sd, name = self.tolerances, f"{leg.name}.length"
+        """Return two centers and a length, the same in both forms; of the complete model, whose
+        links have errors of their own, the length.
+        """
+        sd, name, errors = self.tolerances, f"{leg.name}.length", ErrorModel()
         length_sd = standard_deviation(sd.length, "the leg lengths")
-        if self.error_model == "complete":
-            spread = ErrorTolerances(
-                standard_deviation(sd.links, "the links"),
-                standard_deviation(sd.angles, "the link angles"),
-            )
-            errors = complete_errors(leg, spread, offsets=False)
-        else:
+        if self.error_model == "ideal":
             base_sd = standard_deviation(sd.base, "the base centers")
             platform_sd = standard_deviation(sd.platform, "the platform centers")
             errors = point_errors(leg, leg.elements[0], base_sd, "base")

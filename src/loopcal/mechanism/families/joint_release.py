@@ -29,7 +29,7 @@ from loopcal.mechanism.families.limb_records import (
     axis_vector,
 )
 from loopcal.mechanism.families.limbs import Limbs
-from loopcal.mechanism.families.records import frame_from_axis
+from loopcal.mechanism.families.placement import frame_from_axis
 from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.over_constraint import (

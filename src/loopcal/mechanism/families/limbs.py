@@ -9,266 +9,59 @@ repeats. How to write such a file: docs/robots.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.geometry import invert_pose
 from loopcal.mechanism.assembly import (
-    AXES,
     BASE,
     MOST_COPIES,
     MOST_LIMBS,
     PLATFORM,
-    Actuator,
-    Address,
     Assembly,
     Cone,
     Joint,
     Limb,
-    LinearMap,
     refuse_more,
 )
 from loopcal.mechanism.families.limb_records import (
-    AngleDrive,
     BodyRecord,
     Copies,
     Cylindrical,
-    Drive,
     JointRecord,
-    LengthDrive,
     LimbRecord,
     LimbsFile,
-    MapEntry,
-    NamedAngle,
-    NamedLength,
-    NamedParameter,
     Prismatic,
     Revolute,
     Shifts,
-    SpoolDrive,
     Tilts,
-    TriangleDrive,
     Universal,
     axis_vector,
-    check_sums,
-    complete_triangle,
-    has_sums,
-    is_of_triangle,
-    is_weight,
-    list_readings,
     matrix_from_place,
-    place_triangle,
-    triangle_errors,
-    weight_errors,
 )
-from loopcal.mechanism.families.records import (
+from loopcal.mechanism.families.placement import (
     EX,
     EY,
     EZ,
-    AngleTolerance,
     ErrorModel,
-    ErrorTolerances,
     JointPlacement,
-    LengthTolerance,
     PlacedLimb,
-    RatioTolerance,
-    RobotRecord,
-    complete_errors,
     displacement_error,
     join_errors,
     map_displacement,
     map_slide_tilt,
-    offset_error,
     place_limb,
     rod_length_error,
     rotate_about,
     single_error,
     standard_deviation,
 )
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.mechanism.limb_rows import move_joint
 from loopcal.typing import FloatArray
-from loopcal.units import ARTICLES, Dimension
-
-# Parameters of `limbs` files: unknown terms of drives, and units of named parameters.
-
-HARMONICS = ("sin1", "cos1", "sin2", "cos2")
-CURVE_OF_BUILDUP = 1 / (4 * np.pi)
-"""Term `curve` per unit of build-up: radius + buildup * reading / (2 pi), integrated over the
-reading.
-"""
-
-POSITIVE = ("length", "lead", "gain")
-"""What named parameters are mapped onto that keeps its sign: rods, screws and scales."""
-
-Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
-Term = tuple[Dimension, float, Tolerance, str, float]
-"""Dimension, nominal value, tolerance, transmission term, and change of that term per unit."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedDrive:
-    """A drive and the joint that it moves; of several joints, the first.
-
-    turns : whether the joint is rotary. rotation : (3, 3) R_placed_joint, whose third column is
-    the joint's axis. start : value of the joint near home [rad or m]. weights : of the driven
-    joints in a sum, by name.
-    """
-
-    drive: Drive
-    turns: bool
-    rotation: FloatArray
-    start: float = 0.0
-    weights: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def dimension(self) -> Dimension:
-        """Dimension of what the transmission gives: the joint, or the length of a triangle."""
-        is_angle = self.turns and not isinstance(self.drive, TriangleDrive)
-        return Dimension.ANGLE if is_angle else Dimension.LENGTH
-
-
-def check_motion(name: str, drive: Drive, turns: bool) -> None:
-    """Refuse a drive whose transmission does not give what its joint does; raises
-    MechanismError.
-    """
-    if turns == isinstance(drive, AngleDrive | TriangleDrive):
-        return
-    motion, allowed = (
-        ("turns", "reads: angle without a radius, or a triangle")
-        if turns
-        else ("slides", "reads: length, or reads: angle with a radius")
-    )
-    raise MechanismError(f"actuator {name!r} drives a joint that {motion}; state {allowed}")
-
-
-def build_actuator(name: str, placed: PlacedDrive) -> Actuator:
-    """Return the actuator of a drive; raises MechanismError for an impossible triangle."""
-    drive = placed.drive
-    if isinstance(drive, SpoolDrive):
-        terms = {"gain": drive.radius, "curve": CURVE_OF_BUILDUP * drive.buildup}
-    else:
-        terms = {"gain": drive.gain}
-    if isinstance(drive, TriangleDrive):
-        terms |= place_triangle(name, drive, placed.rotation, placed.start)
-    reads_length = isinstance(drive, LengthDrive | TriangleDrive)
-    dimension = Dimension.LENGTH if reads_length else Dimension.ANGLE
-    terms = {"offset": drive.offset, **terms}
-    period, sigma = drive.period, drive.sigma
-    return Actuator(name, dimension, drive.stroke, terms, period, sigma, placed.weights)
-
-
-def drive_errors(name: str, placed: PlacedDrive) -> ErrorModel:
-    """Return the unknown terms of a drive, `q1.offset` and so on; raises MechanismError for
-    impossible ones.
-    """
-    drive = placed.drive
-    known = _list_terms(drive, placed.dimension)
-    errors = []
-    if isinstance(drive, TriangleDrive):
-        errors.append(triangle_errors(name, drive, placed.rotation, tuple(known)))
-    errors += [weight_errors(name, drive, placed.weights, tuple(known))]
-    for term in drive.unknown:
-        if is_of_triangle(drive, term) or is_weight(placed.weights, term):
-            continue
-        if term not in known:
-            raise MechanismError(
-                f"actuator {name!r} has no term {term!r}; allowed are {', '.join(known)}"
-            )
-        if term in HARMONICS and not drive.period:
-            raise MechanismError(
-                f"actuator {name!r} has an unknown {term}, but no period; state the reading's "
-                "period"
-            )
-        dimension, nominal, tolerance, axis, coefficient = known[term]
-        parameter, address = f"{name}.{term}", Address(name, "transmission", axis)
-        sd = standard_deviation(tolerance, parameter)
-        entry = LinearMap(parameter, address, coefficient)
-        is_scale = axis == "gain"
-        errors.append(single_error(parameter, dimension, nominal, sd, entry, positive=is_scale))
-    return join_errors(errors)
-
-
-def _list_terms(drive: Drive, joint_dimension: Dimension) -> Mapping[str, Term]:
-    """Return the terms of a drive by name."""
-    tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
-    length, curve = Dimension.LENGTH, CURVE_OF_BUILDUP
-    terms: dict[str, Term] = {"offset": (joint_dimension, drive.offset, tolerance, "offset", 1.0)}
-    if isinstance(drive, SpoolDrive):
-        terms["radius"] = (length, drive.radius, drive.radii, "gain", 1.0)
-        terms["buildup"] = (length, drive.buildup, drive.buildups, "curve", curve)
-    else:
-        terms["gain"] = (Dimension.RATIO, drive.gain, drive.ratio, "gain", 1.0)
-    for term in ("backlash", *HARMONICS):
-        terms[term] = (joint_dimension, 0.0, tolerance, term, 1.0)
-    return terms
-
-
-def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
-    """Return the dimension and the nominal value [SI] of a named parameter."""
-    if isinstance(named, NamedLength):
-        return Dimension.LENGTH, named.length
-    if isinstance(named, NamedAngle):
-        return Dimension.ANGLE, named.angle
-    return Dimension.RATIO, named.ratio
-
-
-def is_always_positive(named: NamedParameter) -> bool:
-    """Return whether only values above zero of a named parameter exist, if its nominal value is."""
-    is_stated = isinstance(named, NamedLength) and named.positive
-    nominal = get_quantity(named)[1]
-    if is_stated and not nominal > 0.0:
-        raise MechanismError(
-            f"parameter {named.name!r} is stated to be positive, but its nominal value is "
-            f"{nominal * 1e3:g} mm; correct the value, or leave out 'positive'"
-        )
-    return is_stated or any(entry.axis in POSITIVE for entry in named.maps)
-
-
-def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
-    """Return the engine's axis of a map entry and the change of it per unit of the parameter: a
-    file states a lead per turn, the engine a pitch per radian.
-    """
-    if entry.axis == "pitch":
-        raise MechanismError(
-            f"parameter {name!r} is mapped onto 'pitch'; use lead, the advance in one turn"
-        )
-    coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
-    if entry.axis == "lead":
-        return "pitch", coefficient * (1 / (2 * np.pi))
-    return entry.axis, coefficient
-
-
-def check_units(named: NamedParameter, entry: MapEntry, drive: PlacedDrive | None) -> None:
-    """Refuse a map between unlike units, onto the drive that the entry names; a ratio is a slope
-    for an angle.
-    """
-    (dimension, _), axis = get_quantity(named), entry.axis
-    if drive is None or axis not in ("offset", "backlash", "gain", "curve"):
-        needed = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
-    elif axis in ("gain", "curve"):  # per unit of the reading
-        needed = Dimension.LENGTH if isinstance(drive.drive, SpoolDrive) else Dimension.RATIO
-    else:
-        needed = drive.dimension
-    what = f"parameter {named.name!r} is {ARTICLES[dimension]}"
-    onto = f"{entry.axis} of {entry.limb!r} {ARTICLES[needed]}"
-    if entry.arm is not None:
-        if dimension is Dimension.LENGTH:
-            raise MechanismError(
-                f"{what} with an arm; leave the arm out, which turns an angle into a length"
-            )
-        if needed is not Dimension.LENGTH:
-            raise MechanismError(f"{what} with an arm and {onto}; leave the arm out")
-        return
-    slope = dimension is Dimension.RATIO and needed is Dimension.ANGLE
-    if dimension is needed or slope:
-        return
-    if needed is Dimension.LENGTH:
-        raise MechanismError(
-            f"{what} and {onto}; state an `arm:` [length per radian], or the parameter as a length"
-        )
-    raise MechanismError(f"{what} and {onto}; state it as {ARTICLES[needed]}")
+from loopcal.units import Dimension
 
 
 @dataclass(frozen=True)
@@ -278,10 +71,8 @@ class Limbs(LimbsFile, RobotRecord):
     Attributes
     ----------
     freedoms : of the platform, in base axes. controlled : coordinates in which it is commanded.
-    actuators : drives by name; a drive that is not listed reads the joint value. In a limb with
-        copies, `q` means q1, q2, ..
-    bodies : those beside base and platform. limbs : from body to body. error_model, parameters :
-        see the module. tolerances : of the complete model. closure : how over-constrained loops
+    bodies : those beside base and platform. limbs : from body to body. error_model : see the
+        module. tolerances : of the complete model. closure : how over-constrained loops
         close.
     """
 
@@ -301,140 +92,28 @@ class Limbs(LimbsFile, RobotRecord):
                 )
         refuse_more(MOST_LIMBS, sum(counts), f"{self.name} has", "limbs")
         named = {body.name: body for body in self.bodies}
-        members = {limb.name: tuple(_copies(limb, named)) for limb in self.limbs}
-        copies = [member for group in members.values() for member in group]
-        drives = self._place_drives(copies)
+        copies = [copy for limb in self.limbs for copy in _copies(limb, named)]
+        placed = [limb for _, limb in copies]
         errors = join_errors(
-            (
-                *(
-                    _shifts(member.placed, entry)
-                    if isinstance(entry, Shifts)
-                    else _tilts(member.placed, entry)
-                    for member in copies
-                    for entry in member.record.errors
-                ),
-                *(drive_errors(name, drive) for name, drive in drives.items()),
-                *(_named(named, members, drives) for named in self.parameters),
-            )
+            _shifts(limb, entry) if isinstance(entry, Shifts) else _tilts(limb, entry)
+            for record, limb in copies
+            for entry in record.errors
         )
-        if self.error_model == "complete":
-            errors = self._complete(copies, drives).without_effects_of(errors) + errors
-        idle = [
-            name
-            for name in self.actuators
-            if name not in drives and not any(d.rstrip("0123456789") == name for d in drives)
-        ]
-        if idle:
-            raise MechanismError(
-                f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or "
-                "leave it out" + (f"; joints are driven by {', '.join(drives)}" if drives else "")
-            )
         assembly = self.assemble(
-            (member.placed.limb for member in copies),
-            (build_actuator(name, drive) for name, drive in drives.items()),
+            placed,
             errors,
             freedoms=self.freedoms,
             controlled=self.controlled,
+            complete=self.tolerances.deviations if self.error_model == "complete" else None,
         )
-        bodies = _place_bodies(self, [member.placed.limb for member in copies])
+        bodies = _place_bodies(self, [limb.limb for limb in placed])
         return replace(assembly, closure=self.closure, bodies=bodies)
 
-    def _place_drives(self, copies: list[_Member]) -> dict[str, PlacedDrive]:
-        """Return the drives by name, in the order of the readings, with their joints."""
-        # a drive that several limbs name is one drive
-        joints: dict[str, _DrivenJoint] = {}
-        for member in copies:
-            for joint in _list_driven_joints(member):
-                joints.setdefault(joint.name, joint)
-        drives: dict[str, PlacedDrive] = {}
-        if not has_sums(self.actuators):
-            for name, joint in joints.items():
-                plain = AngleDrive("angle") if joint.turns else LengthDrive("length")
-                drive = self.actuators.get(name) or self.actuators.get(joint.stated) or plain
-                check_motion(name, drive, joint.turns)
-                drives[name] = PlacedDrive(drive, joint.turns, joint.rotation, joint.start)
-            return drives
-        stated = {name: joint.stated for name, joint in joints.items()}
-        turning = {name: joint.turns for name, joint in joints.items()}
-        readings = list_readings(self.actuators, stated)
-        limb_of = {name: joint.limb for name, joint in joints.items()}
-        check_sums({name: weights for name, (_, weights) in readings.items()}, turning, limb_of)
-        for name, (key, weights) in readings.items():
-            drive, turns = self.actuators[key], turning[next(iter(weights))]
-            check_motion(name, drive, turns)
-            own = {} if tuple(weights) == (name,) and weights[name] == 1.0 else weights
-            drives[name] = PlacedDrive(drive, turns, np.eye(3), 0.0, own)
-        return drives
 
-    def _complete(self, copies: list[_Member], drives: Drives) -> ErrorModel:
-        """Return all errors of all limbs, and of every drive once its offset and its triangle."""
-        spread = ErrorTolerances(
-            standard_deviation(self.tolerances.lengths, "the lengths"),
-            standard_deviation(self.tolerances.angles, "the angles"),
-        )
-        # the first rigid limb of a body places its frame, so that errors of its end are none
-        rigid = [m.placed.limb for m in copies[::-1] if m.record.ending == "rigid"]
-        places = {limb.to: limb.name for limb in rigid if limb.to != PLATFORM}
-        errors = [
-            complete_errors(m.placed, spread, False, places.get(m.placed.limb.to) == m.placed.name)
-            for m in copies
-        ]
-        for name, placed in drives.items():
-            dimension, offset = placed.dimension, placed.drive.offset
-            sd = spread.angle if dimension is Dimension.ANGLE else spread.length
-            errors.append(offset_error(f"{name}.offset", name, dimension, offset, sd))
-            if isinstance(placed.drive, TriangleDrive):
-                lengths = self.tolerances.lengths
-                errors.append(complete_triangle(name, placed.drive, placed.rotation, lengths))
-        return join_errors(errors)
-
-
-@dataclass(frozen=True)
-class _Member:
-    """One copy of a limb, with the number appended to its names."""
-
-    record: LimbRecord
-    placed: PlacedLimb
-    suffix: str
-
-
-@dataclass(frozen=True, eq=False)
-class _DrivenJoint:
-    """A joint or rod under the name of its drive.
-
-    stated : this name as the file states it, without the number of a copy. limb : its limb.
-    turns, rotation, start : as in `PlacedDrive`.
-    """
-
-    name: str
-    stated: str
-    limb: str
-    turns: bool
-    rotation: FloatArray
-    start: float
-
-
-def _list_driven_joints(member: _Member) -> Iterator[_DrivenJoint]:
-    """Yield the driven joints of a limb, the rod last."""
-    limb, rotations = member.placed.limb, member.placed.rotations
-    for j in limb.joints:
-        if j.actuator:
-            stated = j.actuator.removesuffix(member.suffix)
-            turns = j.kind == "R"
-            yield _DrivenJoint(j.actuator, stated, limb.name, turns, rotations[j.name], j.start)
-    if limb.actuator:
-        stated = limb.actuator.removesuffix(member.suffix)
-        yield _DrivenJoint(limb.actuator, stated, limb.name, False, np.eye(3), 0.0)
-
-
-Members = Mapping[str, tuple[_Member, ...]]
-"""The copies of each limb of the file."""
-Drives = Mapping[str, PlacedDrive]
-"""Drives by name, with the joints that they move."""
-
-
-def _copies(limb: LimbRecord, bodies: Mapping[str, BodyRecord]) -> Iterator[_Member]:
-    """Yield the copies of a limb."""
+def _copies(
+    limb: LimbRecord, bodies: Mapping[str, BodyRecord]
+) -> Iterator[tuple[LimbRecord, PlacedLimb]]:
+    """Yield the copies of a limb, each with its record."""
     count = 0 if limb.copies is None else limb.copies.count
     for end in {limb.on, limb.to}.intersection(bodies):
         copies = bodies[end].copies
@@ -446,7 +125,7 @@ def _copies(limb: LimbRecord, bodies: Mapping[str, BodyRecord]) -> Iterator[_Mem
     turns = _list_turns(limb.copies)
     for number, turn in enumerate(turns, 1):
         suffix = str(number) if limb.copies else ""
-        yield _Member(limb, _place_copy(limb, suffix, turn, bodies), suffix)
+        yield limb, _place_copy(limb, suffix, turn, bodies)
 
 
 def _list_turns(copies: Copies | None) -> list[FloatArray]:
@@ -584,7 +263,7 @@ def _place_copy(
         tuple(cones),
         (limb.on, limb.to),
     )
-    return placed._replace(limb=replace(placed.limb, on=on, to=to))
+    return placed._replace(limb=replace(placed.limb, on=on, to=to), stem=limb.name)
 
 
 def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlacement]:
@@ -622,7 +301,7 @@ def _shifts(limb: PlacedLimb, entry: Shifts) -> ErrorModel:
             name = label if entry.name else f"{limb.name}.length"
             errors.append(rod_length_error(limb, name, sd))
             continue
-        element = _find_element(limb, entry.of)
+        element = limb.find_element(entry.of)
         place = limb.placements[element]
         nominal = (place[:3, :3].T @ place[:3, 3])["xyz".index(axis)]
         errors.append(displacement_error(f"{label}.{axis}", limb, element, axis, sd, nominal))
@@ -633,7 +312,7 @@ def _tilts(limb: PlacedLimb, entry: Tilts) -> ErrorModel:
     """Return the unknown angles of a limb."""
     sd = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}")
     element, tilt = (
-        _find_element(limb, entry.of),
+        limb.find_element(entry.of),
         map_slide_tilt if entry.alone else map_displacement,
     )
     names = {axis: f"{limb.name}.{entry.name or entry.of}.{axis}" for axis in entry.tilt}
@@ -641,45 +320,3 @@ def _tilts(limb: PlacedLimb, entry: Tilts) -> ErrorModel:
         single_error(name, Dimension.ANGLE, 0.0, sd, *tilt(name, limb, element, axis))
         for axis, name in names.items()
     )
-
-
-def _find_element(limb: PlacedLimb, name: str) -> str:
-    """Return the link of a limb by name; a joint of several axes means its first."""
-    for candidate in (name, f"{name}.1", f"{name}.turn"):
-        if candidate in limb.elements:
-            return candidate
-    raise MechanismError(f"limb {limb.name!r} has no {name!r}; it has {', '.join(limb.elements)}")
-
-
-def _named(named: NamedParameter, members: Members, drives: Drives) -> ErrorModel:
-    """Return a named parameter with its maps."""
-    dimension, nominal = get_quantity(named)
-    sd = standard_deviation(named.tolerance, named.name)
-    maps = [m for entry in named.maps for m in _map_entry(named, entry, members, drives)]
-    is_positive = is_always_positive(named)
-    return single_error(named.name, dimension, nominal, sd, *maps, positive=is_positive)
-
-
-def _map_entry(
-    named: NamedParameter, entry: MapEntry, members: Members, drives: Drives
-) -> Iterator[LinearMap]:
-    """Yield the maps of one entry, for every copy that it means."""
-    name, (axis, coefficient) = named.name, find_engine_axis(named.name, entry)
-    check_units(named, entry, drives.get(entry.limb))
-    # a limb and a drive may have one name; only a limb has links with axes
-    if entry.limb in drives and axis not in AXES:
-        yield LinearMap(name, Address(entry.limb, entry.element, axis), coefficient)
-        return
-    copies = [member for group in members.values() for member in group]
-    chosen = members.get(entry.limb) or [m for m in copies if m.placed.name == entry.limb]
-    if not chosen:
-        raise MechanismError(
-            f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there; known are "
-            f"{', '.join((*members, *sorted(drives)))}"
-        )
-    for limb in (member.placed for member in chosen):
-        if axis in AXES:
-            element = _find_element(limb, entry.element)
-            yield from map_displacement(name, limb, element, axis, coefficient)
-        else:
-            yield LinearMap(name, Address(limb.name, entry.element, axis), coefficient)

@@ -17,17 +17,20 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.geometry import stack_matrix
-from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, LinearMap, Link
-from loopcal.mechanism.families.records import (
+from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, LinearMap
+from loopcal.mechanism.families.placement import (
+    EZ,
     AngleTolerance,
     ErrorModel,
+    JointPlacement,
     LengthTolerance,
-    RobotRecord,
+    PlacedLimb,
+    place_limb,
     single_error,
     standard_deviation,
     translate,
-    values_per_leg,
 )
+from loopcal.mechanism.families.records import RobotRecord, values_per_leg
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
@@ -118,18 +121,17 @@ class LinearDelta(RobotRecord):
             for name in ("radius", "angles", "arms", "stops")
         }
         errors = single_error("radius", Dimension.LENGTH, self.radius, sd["radius"], positive=True)
-        limbs, actuators = [], []
+        limbs, own = list[PlacedLimb](), list[Actuator]()
         for k, (angle, arm, stop) in enumerate(zip(self.angles, arms, stops, strict=True), start=1):
             limb, motor = f"arm{k}", f"q{k}"
             # above the nozzle: the other side is the mirrored working mode
             rise = float(np.sqrt(arm**2 - self.radius**2))
             carriage = Joint("carriage", "P", motor, start=self.home.z + rise)
             foot = translate(self.radius * np.cos(angle), self.radius * np.sin(angle))
-            links = (Link("tower", foot), Link("hinge", np.eye(4)))
-            end = Link("nozzle", np.eye(4))
-            limbs.append(Limb(limb, links, (carriage,), "distance", end, arm))
+            steps = (JointPlacement(carriage, foot, EZ),)
+            limbs.append(place_limb(limb, steps, np.eye(4), "distance", np.eye(4), arm))
             terms = {"offset": stop + rise, "gain": -1.0 if self.readings == "drop" else 1.0}
-            actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
+            own.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
             names = (f"tower{k}.angle", f"arm{k}.length", f"tower{k}.stop")
             parameters = (
                 Parameter(names[0], Dimension.ANGLE, angle, sd["angles"], free=k < 3),
@@ -137,8 +139,8 @@ class LinearDelta(RobotRecord):
                 Parameter(names[2], Dimension.LENGTH, stop, sd["stops"]),
             )
             rod = LinearMap(names[1], Address(limb, "rod", "length"))
-            x, y = (Address(limb, "tower", axis) for axis in "xy")
+            x, y = (Address(limb, "carriage", axis) for axis in "xy")
             tower = TowerMap(("radius", *names), (x, y, Address(motor, "transmission", "offset")))
             errors += ErrorModel(parameters, (rod,), (tower,))
         axes = ("x", "y", "z")
-        return self.assemble(limbs, actuators, errors, freedoms=axes, controlled=axes)
+        return self.assemble(limbs, errors, freedoms=axes, controlled=axes, own=own)

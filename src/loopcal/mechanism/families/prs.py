@@ -19,19 +19,15 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Joint
-from loopcal.mechanism.families.records import (
+from loopcal.mechanism.families.placement import (
     EX,
     EY,
     EZ,
-    AngleTolerance,
     ErrorModel,
     ErrorTolerances,
     JointPlacement,
-    LengthTolerance,
+    LinkTolerances,
     PlacedLimb,
-    RobotRecord,
-    check_spherical,
-    complete_errors,
     displacement_error,
     join_errors,
     map_slide_tilt,
@@ -41,27 +37,11 @@ from loopcal.mechanism.families.records import (
     rod_length_error,
     rotate_about,
     single_error,
-    standard_deviation,
     translate,
 )
+from loopcal.mechanism.families.records import RobotRecord, check_spherical
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Length
-
-
-@dataclass(frozen=True)
-class TripodTolerances:
-    """Tolerances of all lengths (centers, offsets, rods) and of all angles."""
-
-    lengths: LengthTolerance | None = None
-    angles: AngleTolerance | None = None
-
-    @property
-    def deviations(self) -> ErrorTolerances:
-        """Standard deviations [m, rad]."""
-        return ErrorTolerances(
-            standard_deviation(self.lengths, "the lengths"),
-            standard_deviation(self.angles, "the angles"),
-        )
 
 
 class ChainFrames(NamedTuple):
@@ -198,6 +178,10 @@ LEFT_OUT = ("thOz", "thU1z")
 """Parameters of the twenty-seven that the twenty-five leave out."""
 
 
+SETS = {**RobotRecord.OLDER_KEYS, "parameters": (str, "parameter_set")}
+"""Older keys of both families: a set of parameters by its name."""
+
+
 @dataclass(frozen=True)
 class RuPusPrs(RobotRecord):
     """The file of an RU-PUS-PRS tracker.
@@ -206,14 +190,15 @@ class RuPusPrs(RobotRecord):
     ----------
     platform_radius, base_radius, rod, post : a, b, l and r [m]. stroke : allowed readings (low,
         high) [m].
-    error_model : `ideal`, the named parameters, or `complete`. parameters : with `ideal`, the set
-        (see the module).
+    error_model : `ideal`, the named parameters, or `complete`. parameter_set : with `ideal`, the
+        set (see the module); `parameters:` with the name of a set means the same.
     spherical : joints at the rods' ends as perfect `point`s, or with `complete` as `axes` with
         errors of their own.
     tolerances : of lengths and angles.
     """
 
     family = "ru-pus-prs"
+    OLDER_KEYS = SETS
 
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
@@ -221,9 +206,9 @@ class RuPusPrs(RobotRecord):
     post: Length = 0.0
     stroke: tuple[Length, Length] | None = None
     error_model: Literal["ideal", "complete"] = "ideal"
-    parameters: Literal["twenty-five", "twenty-seven"] = "twenty-five"
+    parameter_set: Literal["twenty-five", "twenty-seven"] = "twenty-five"
     spherical: Literal["point", "axes"] = "point"
-    tolerances: TripodTolerances = field(default_factory=TripodTolerances)
+    tolerances: LinkTolerances = field(default_factory=LinkTolerances)
 
     def expand(self) -> Assembly:
         """Return three limbs under a free platform."""
@@ -237,20 +222,20 @@ class RuPusPrs(RobotRecord):
             build_prs_limb("chain2", "q2", second, "x", axes),
             self._post(),
         )
-        if self.error_model == "complete":
-            errors = join_errors(complete_errors(limb, spread) for limb in limbs)
-        else:
+        is_complete, errors = self.error_model == "complete", ErrorModel()
+        if not is_complete:
             errors = (
                 carriage_errors(limbs[0], 1, first, spread)
                 + carriage_errors(limbs[1], 2, second, spread, joint="yz")
                 + self._post_errors(limbs[2], spread)
             )
         return self.assemble(
-            (limb.limb for limb in limbs),
-            (Actuator(q, Dimension.LENGTH, self.stroke) for q in ("q1", "q2")),
+            limbs,
             errors,
             freedoms=AXES,
             controlled=("phi", "theta"),
+            own=(Actuator(q, Dimension.LENGTH, self.stroke) for q in ("q1", "q2")),
+            complete=spread if is_complete else None,
         )
 
     def _post(self) -> PlacedLimb:
@@ -264,7 +249,7 @@ class RuPusPrs(RobotRecord):
 
     def _post_errors(self, post: PlacedLimb, spread: ErrorTolerances) -> ErrorModel:
         """Return r and the angles of the post."""
-        left_out = LEFT_OUT if self.parameters == "twenty-five" else ()
+        left_out = LEFT_OUT if self.parameter_set == "twenty-five" else ()
         return displacement_error(
             "r", post, "universal1", "z", spread.length, self.post, positive=True
         ) + join_errors(
@@ -285,22 +270,24 @@ class ThreePrs(RobotRecord):
     ----------
     platform_radius, base_radius, rod : a, b and l [m]. stroke : allowed readings (low, high) [m].
     error_model : `ideal`, the named parameters, or `complete`.
-    parameters : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`.
+    parameter_set : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`;
+        `parameters:` with the name of a set means the same.
     spherical : upper joints as perfect `point`s, or with `complete` as three `axes` with errors of
         their own.
     tolerances : of lengths and angles.
     """
 
     family = "3-prs"
+    OLDER_KEYS = SETS
 
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
     rod: Length = 0.0
     stroke: tuple[Length, Length] | None = None
     error_model: Literal["ideal", "complete"] = "ideal"
-    parameters: Literal["eleven", "fourteen"] = "eleven"
+    parameter_set: Literal["eleven", "fourteen"] = "eleven"
     spherical: Literal["point", "axes"] = "point"
-    tolerances: TripodTolerances = field(default_factory=TripodTolerances)
+    tolerances: LinkTolerances = field(default_factory=LinkTolerances)
 
     def expand(self) -> Assembly:
         """Return three PRS limbs under a free platform."""
@@ -312,21 +299,21 @@ class ThreePrs(RobotRecord):
             frames = ChainFrames(turn @ base, turn @ platform, self.rod, self.home.matrix)
             axes = self.spherical == "axes"
             limb = build_prs_limb(f"chain{number}", f"q{number}", frames, "y", axes)
-            limbs.append(limb.limb)
-            errors += self._errors(limb, number, frames)
+            limbs.append(limb)
+            if self.error_model == "ideal":
+                errors += self._errors(limb, number, frames)
         return self.assemble(
             limbs,
-            (Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)),
             errors,
             freedoms=AXES,
             controlled=("z", "phi", "theta"),
+            own=(Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)),
+            complete=self.tolerances.deviations if self.error_model == "complete" else None,
         )
 
     def _errors(self, limb: PlacedLimb, number: int, frames: ChainFrames) -> ErrorModel:
-        """Return the error model of one chain."""
+        """Return the named parameters of one chain."""
         spread = self.tolerances.deviations
-        if self.error_model == "complete":
-            return complete_errors(limb, spread)
-        if self.parameters == "eleven":
+        if self.parameter_set == "eleven":
             return carriage_errors(limb, number, frames, spread, joint="xz")
         return carriage_errors(limb, number, frames, spread, foot="xyz", guide="xyz", joint="xyz")

@@ -8,7 +8,7 @@ How to write such a file: docs/robots.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
@@ -26,27 +26,31 @@ from loopcal.mechanism.assembly import (
     LinearMap,
     SharedMap,
 )
+from loopcal.mechanism.families.drives import (
+    Drive,
+    NamedTriangleDrive,
+    drive_errors,
+    place_drives,
+    refuse_idle_drives,
+)
 from loopcal.mechanism.families.limb_records import (
     ORIGIN,
     Axis,
-    Freedom,
-    LinkTolerances,
-    NamedTriangleDrive,
     Place,
     axis_vector,
     matrix_from_place,
 )
-from loopcal.mechanism.families.limbs import PlacedDrive, build_actuator, drive_errors
-from loopcal.mechanism.families.records import (
+from loopcal.mechanism.families.named_parameters import Freedom
+from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
     JointPlacement,
     LengthTolerance,
+    LinkTolerances,
     PlacedLimb,
     PoseRecord,
     RatioTolerance,
     RecordError,
-    RobotRecord,
     displacement_error,
     get_axis_dimension,
     join_errors,
@@ -54,7 +58,9 @@ from loopcal.mechanism.families.records import (
     place_limb,
     single_error,
     standard_deviation,
+    strip_number,
 )
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.parameters import CommonError
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
@@ -341,6 +347,12 @@ class PlacedStages(Stages):
 
     def expand(self) -> Assembly:
         """Return the assembly of all stages; raises StageError where they do not fit together."""
+        if self.parameters:
+            raise RecordError(
+                f"{self.name} states `parameters:` of a whole chain; state them in a stage that "
+                "has a `family:`",
+                "parameters",
+            )
         if self.home != PoseRecord():
             raise MechanismError(
                 f"{self.name} states `home:`, but the home of a chain is that of its stages; state "
@@ -352,6 +364,8 @@ class PlacedStages(Stages):
             AttachedStage(stage.name, on, stage.mount.matrix, self._expand_stage(i))
             for i, (stage, on) in enumerate(zip(self.stages, parents, strict=True))
         )
+        actuators = [a.name for stage in attached for a in stage.assembly.actuators]
+        refuse_idle_drives(self.drives, actuators, map(strip_number, actuators))
         assembly = join_stages(
             self.name,
             attached,
@@ -371,7 +385,7 @@ class PlacedStages(Stages):
                 length=stage.joint.length or self.tolerances.lengths,
                 angle=stage.joint.angle or self.tolerances.angles,
             )
-            return expand_joint(stage.name, joint)
+            return expand_joint(stage.name, joint, self.drives)
         if robot is None:
             raise StageError(
                 f"stage {stage.name!r} is neither a joint nor a robot; write 'joint:', or "
@@ -385,13 +399,25 @@ class PlacedStages(Stages):
                 i,
             )
         try:
-            return robot.assembly()
+            own = robot.assembly()
+            drives = _select_drives(self.drives, [actuator.name for actuator in own.actuators])
+            return replace(robot, drives={**drives, **robot.drives}).assembly() if drives else own
         except MechanismError as error:
             raise StageError(f"stage {stage.name!r}: {error}", i) from None
 
 
-def expand_joint(name: str, record: SerialRotation | SerialSlide) -> Assembly:
-    """Return the assembly of a serial joint: one rigid limb with one driven joint."""
+def _select_drives(drives: Mapping[str, Drive], names: Sequence[str]) -> dict[str, Drive]:
+    """Return those of the stated drives that mean one of these actuators."""
+    meant = {*names, *map(strip_number, names)}
+    return {name: drive for name, drive in drives.items() if name in meant}
+
+
+def expand_joint(
+    name: str, record: SerialRotation | SerialSlide, drives: Mapping[str, Drive]
+) -> Assembly:
+    """Return the assembly of a serial joint: one rigid limb with one driven joint. drives : what
+    the file states of it.
+    """
     triangle = record.drive if isinstance(record.drive, NamedTriangleDrive) else None
     drive = (triangle.name if triangle else record.drive) or name
     assert isinstance(drive, str)
@@ -401,15 +427,19 @@ def expand_joint(name: str, record: SerialRotation | SerialSlide) -> Assembly:
     joint = Joint(LINK, record.kind, drive, start=record.gain * record.start)
     step = JointPlacement(joint, matrix_from_place(record.at), axis_vector(record.axis))
     limb = place_limb(LIMB, (step,), matrix_from_place(record.tip), "rigid", np.eye(4))
-    actuator = Actuator(drive, dimension, record.stroke, {"gain": record.gain}, sigma=record.sigma)
-    drive_model = ErrorModel()
-    if triangle is not None:
-        placed = PlacedDrive(triangle, True, limb.rotations[LINK], record.start)
-        actuator, drive_model = build_actuator(drive, placed), drive_errors(drive, placed)
+    own = Actuator(drive, dimension, record.stroke, {"gain": record.gain}, sigma=record.sigma)
+    stated = _select_drives(drives, [drive])
+    if triangle is not None and stated:
+        raise RecordError(
+            f"the drive {drive!r} is stated twice, at its joint and under `drives:`; leave one out",
+            "drives",
+            drive,
+        )
+    placed = place_drives([limb], {drive: triangle} if triangle else stated, [own])[drive]
     errors = join_errors(
         (
             *(_joint_error(record, limb, drive, error) for error in record.errors),
-            drive_model,
+            drive_errors(placed),
             *(
                 displacement_error(
                     f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis)
@@ -419,7 +449,7 @@ def expand_joint(name: str, record: SerialRotation | SerialSlide) -> Assembly:
         )
     )
     return Assembly(
-        name, (limb.limb,), (actuator,), AXES, (), np.eye(4), errors.parameters, errors.maps
+        name, (limb.limb,), (placed.actuator,), AXES, (), np.eye(4), errors.parameters, errors.maps
     )
 
 

@@ -1,0 +1,733 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives of robot files: what the reading of an actuator makes of its joint, in all families.
+
+A family places its limbs and names the drives of their joints. What `drives:` of the file states of
+them is read, checked and made an actuator with its unknowns here. Formula and terms:
+mechanism/transmission.py. How to write it: docs/robots.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from loopcal.errors import suggest_names
+from loopcal.mechanism.assembly import AXES, Actuator, Address, LinearMap
+from loopcal.mechanism.families.placement import (
+    AngleTolerance,
+    ErrorModel,
+    ErrorTolerances,
+    LengthTolerance,
+    PlacedLimb,
+    Point,
+    RatioTolerance,
+    RecordError,
+    join_errors,
+    offset_error,
+    single_error,
+    standard_deviation,
+)
+from loopcal.mechanism.transmission import (
+    HARMONICS,
+    TRIANGLE_TERMS,
+    compute_range,
+    count_independent,
+    find_side,
+)
+from loopcal.typing import FloatArray
+from loopcal.units import Angle, Dimension, Length, Ratio
+
+# Records. Those that differ in a dimension only are classes of their own, because the reader of
+# files takes the unit of a number from its annotation.
+
+
+ON_AXIS = 1e-9
+"""Distance of an anchor from the axis, as a share of the larger one, that is no lever."""
+DEAD = 1e-6
+"""Sine of the angle from a dead point, below which the actuator does not turn the joint."""
+POINTS, SKEW = ("foot", "head"), "skew"
+
+
+class DriveError(RecordError):
+    """An impossible drive; `name` is the one under which a file states it."""
+
+    def __init__(self, sentence: str, name: str) -> None:
+        super().__init__(sentence, "drives", name)
+
+
+@dataclass(frozen=True)
+class Skew:
+    """Rotation vector that tilts the axis of a joint in the frame of its two anchors."""
+
+    rx: Angle = 0.0
+    ry: Angle = 0.0
+    rz: Angle = 0.0
+
+
+@dataclass(frozen=True)
+class Triangle:
+    """The two anchors of a linear actuator beside a revolute joint, and the skew of its axis.
+
+    foot : on what carries the joint. head : on what the joint turns, with the joint at zero.
+    """
+
+    foot: Point
+    head: Point
+    skew: Skew = field(default_factory=Skew)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsLength:
+    """A drive whose reading is a length; `period` is the reading per turn of the harmonics, `sigma`
+    its standard deviation.
+    """
+
+    reads: Literal["length"]
+    stroke: tuple[Length, Length] | None = None
+    period: Length = 0.0
+    sigma: Length | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsAngle:
+    """A drive whose reading is an angle; keys as those of a length."""
+
+    reads: Literal["angle"]
+    stroke: tuple[Angle, Angle] | None = None
+    period: Angle = 0.0
+    sigma: Angle | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivesLength:
+    """The known terms of a drive of a slide or rod, and what of it is to be identified.
+
+    joint value = offset + scale * reading + curve * (reading / reach)^2 + harmonics of the period +
+    backlash * direction / 2, where reach is the end of the stroke that is farther from zero.
+    `unknown` names terms to identify, with the tolerance `length`.
+    """
+
+    offset: Length = 0.0
+    curve: Length = 0.0
+    backlash: Length = 0.0
+    sin1: Length = 0.0
+    cos1: Length = 0.0
+    sin2: Length = 0.0
+    cos2: Length = 0.0
+    unknown: tuple[str, ...] = ()
+    length: LengthTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivesAngle:
+    """The known terms of a drive of a rotary joint; keys as those of a slide."""
+
+    offset: Angle = 0.0
+    curve: Angle = 0.0
+    backlash: Angle = 0.0
+    sin1: Angle = 0.0
+    cos1: Angle = 0.0
+    sin2: Angle = 0.0
+    cos2: Angle = 0.0
+    unknown: tuple[str, ...] = ()
+    angle: AngleTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gain:
+    """The scale of a drive whose reading has the unit of its joint, with its tolerance `ratio`."""
+
+    gain: Ratio = 1.0
+    ratio: RatioTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sum:
+    """What several joints give together: with a `sum`, the name of a driven joint -> weight, the
+    transmission gives the sum of weight * joint value; unknown weights (weight.m, or weight for
+    all) have the tolerance `weights`.
+    """
+
+    sum: Mapping[str, Ratio] = field(default_factory=dict)
+    weights: RatioTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LengthDrive(Sum, Gain, GivesLength, ReadsLength):
+    """A drive of a slide or rod whose reading is a length."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngleDrive(Sum, Gain, GivesAngle, ReadsAngle):
+    """A drive of a rotary joint whose reading is an angle."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpoolDrive(Sum, GivesLength, ReadsAngle):
+    """A drive whose reading is an angle and moves a length.
+
+    joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + .. `radius` is the
+    length paid out per radian of the reading (spool radius with gears and tackle), negative if a
+    growing reading shortens; `buildup` is its growth in one turn of the reading. Their tolerances
+    are `radii` and `buildups`.
+    """
+
+    radius: Length
+    buildup: Length = 0.0
+    radii: LengthTolerance | None = None
+    buildups: LengthTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScrewDrive(Sum, GivesLength, ReadsAngle):
+    """A screw whose reading is its angle: it moves by `lead` in one turn, negative for a left-hand
+    one, with the tolerance `leads`.
+    """
+
+    lead: Length
+    leads: LengthTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriangleDrive(Gain, GivesLength, ReadsLength):
+    """A linear actuator that turns a revolute joint through two anchors.
+
+    The distance of the anchors is what a length drive gives. `unknown` may also name dimensions of
+    the triangle (foot.x, head.z, skew.rx; or foot, head and skew for all of one), with the
+    tolerances `length` and `angle`.
+    """
+
+    reads: Literal["length"] = "length"
+    triangle: Triangle
+    angle: AngleTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedTriangleDrive(TriangleDrive):
+    """A triangle drive of a serial joint, with the name of its actuator."""
+
+    name: str = ""
+
+
+Drive = LengthDrive | AngleDrive | SpoolDrive | ScrewDrive | TriangleDrive
+
+
+# Drives at their joints: actuators, and their unknowns.
+
+CURVE_OF_BUILDUP = 1 / (4 * np.pi)
+"""Term `curve` per unit of build-up: radius + buildup * reading / (2 pi), integrated over the
+reading.
+"""
+
+Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
+Term = tuple[Dimension, float, Tolerance, str, float]
+"""Dimension, nominal value, tolerance, transmission term, and change of that term per unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenJoint:
+    """A joint or rod under the name of its drive.
+
+    stated : this name as the file states it, without the number of a copy. limb : its limb.
+    turns : whether it is rotary. rotation : (3, 3) R_placed_joint, whose third column is its axis.
+    start : its value near home [rad or m].
+    """
+
+    name: str
+    stated: str
+    limb: str
+    turns: bool
+    rotation: FloatArray
+    start: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedDrive:
+    """A drive and the joint that it moves; of several joints, the first.
+
+    turns, rotation, start : as in `DrivenJoint`. own : the actuator of the family, which gives the
+    joint from what the drive gives: offset + gain * that; it states what the drive does not.
+    weights : of the driven joints in a sum, by name.
+    """
+
+    drive: Drive
+    turns: bool
+    rotation: FloatArray
+    start: float
+    own: Actuator
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def dimension(self) -> Dimension:
+        """Dimension of what the transmission gives: the joint, or the length of a triangle."""
+        is_angle = self.turns and not isinstance(self.drive, TriangleDrive)
+        return Dimension.ANGLE if is_angle else Dimension.LENGTH
+
+    @property
+    def stroke(self) -> tuple[float, float] | None:
+        """Allowed readings, the family's if the drive states none and has readings like them."""
+        return self.drive.stroke or (self.own.stroke if self._is_like_own else None)
+
+    @property
+    def sense(self) -> float:
+        """What the joint value changes per unit of what the drive gives."""
+        return self.own.terms.get("gain", 1.0)
+
+    @property
+    def reading(self) -> Dimension:
+        """Dimension of the reading."""
+        return Dimension(self.drive.reads)
+
+    @property
+    def _is_like_own(self) -> bool:
+        return self.own.dimension is self.reading
+
+    @property
+    def actuator(self) -> Actuator:
+        """The actuator; raises MechanismError for an impossible triangle."""
+        drive, name = self.drive, self.own.name
+        terms = {"offset": self.own.terms.get("offset", 0.0)}
+        for _, value, _, term, coefficient in self.list_terms().values():
+            if value or term == "gain":
+                terms[term] = terms.get(term, 0.0) + self.sense * coefficient * value
+        if isinstance(drive, TriangleDrive):
+            terms |= place_triangle(name, drive, self.rotation, self.start)
+        sigma = drive.sigma or (self.own.sigma if self._is_like_own else None)
+        return Actuator(name, self.reading, self.stroke, terms, drive.period, sigma, self.weights)
+
+    def list_terms(self) -> Mapping[str, Term]:
+        """Return the terms of the drive by the names that a file gives them."""
+        drive, ratio, length = self.drive, Dimension.RATIO, Dimension.LENGTH
+        tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
+        own = self.dimension
+        terms: dict[str, Term] = {"offset": (own, drive.offset, tolerance, "offset", 1.0)}
+        if isinstance(drive, SpoolDrive):
+            terms["radius"] = (length, drive.radius, drive.radii, "gain", 1.0)
+            terms["buildup"] = (length, drive.buildup, drive.buildups, "curve", CURVE_OF_BUILDUP)
+        elif isinstance(drive, ScrewDrive):
+            terms["lead"] = (length, drive.lead, drive.leads, "gain", 1 / (2 * np.pi))
+        else:
+            terms["gain"] = (ratio, drive.gain, drive.ratio, "gain", 1.0)
+        reach = max(map(abs, self.stroke or (0.0,)))
+        for term in ("curve", "backlash", *HARMONICS):
+            coefficient = 1.0
+            if term == "curve":  # without a stroke it is refused where it is stated
+                coefficient = 1 / reach**2 if 0.0 < reach < np.inf else np.nan
+            terms[term] = (own, getattr(drive, term), tolerance, term, coefficient)
+        return terms
+
+
+def list_driven_joints(limb: PlacedLimb) -> Iterator[DrivenJoint]:
+    """Yield the driven joints of a limb, the rod last."""
+    placed, suffix = limb.limb, limb.name.removeprefix(limb.stem)
+    for j in placed.joints:
+        if j.actuator:
+            stated, turn = j.actuator.removesuffix(suffix), limb.rotations[j.name]
+            yield DrivenJoint(j.actuator, stated, placed.name, j.kind == "R", turn, j.start)
+    if placed.actuator:
+        stated = placed.actuator.removesuffix(suffix)
+        yield DrivenJoint(placed.actuator, stated, placed.name, False, np.eye(3), 0.0)
+
+
+def place_drives(
+    limbs: Iterable[PlacedLimb], stated: Mapping[str, Drive], own: Iterable[Actuator] = ()
+) -> dict[str, PlacedDrive]:
+    """Return the drives by name, in the order of the readings, with their joints.
+
+    A drive that several limbs name is one drive. stated : the drives of the file; one that is not
+    listed reads the joint itself. own : what the family knows of its drives.
+    Raises MechanismError: a drive without a joint, or of another kind than its joint.
+    """
+    joints: dict[str, DrivenJoint] = {}
+    for joint in (joint for limb in limbs for joint in list_driven_joints(limb)):
+        joints.setdefault(joint.name, joint)
+    known, drives = {actuator.name: actuator for actuator in own}, dict[str, PlacedDrive]()
+
+    def place(name: str, drive: Drive | None, joint: DrivenJoint) -> PlacedDrive:
+        plain = AngleDrive(reads="angle") if joint.turns else LengthDrive(reads="length")
+        drive = drive or plain
+        check_motion(name, drive, joint.turns)
+        base = known.get(name) or Actuator(name, Dimension(drive.reads))
+        return _check_terms(PlacedDrive(drive, joint.turns, joint.rotation, joint.start, base))
+
+    if has_sums(stated):
+        named = {name: joint.stated for name, joint in joints.items()}
+        turning = {name: joint.turns for name, joint in joints.items()}
+        readings = list_readings(stated, named)
+        limb_of = {name: joint.limb for name, joint in joints.items()}
+        check_sums({name: weights for name, (_, weights) in readings.items()}, turning, limb_of)
+        for name, (key, weights) in readings.items():
+            own_joint = tuple(weights) == (name,) and weights[name] == 1.0
+            placed = place(name, stated[key], joints[next(iter(weights))])
+            drives[name] = replace(placed, weights={} if own_joint else weights)
+    else:
+        for name, joint in joints.items():
+            drives[name] = place(name, stated.get(name) or stated.get(joint.stated), joint)
+    refuse_idle_drives(stated, drives, {joint.stated for joint in joints.values()})
+    return drives
+
+
+def refuse_idle_drives(
+    stated: Iterable[str], used: Iterable[str], groups: Iterable[str] = ()
+) -> None:
+    """Refuse a stated drive that is none of those used, nor a name of several; raises
+    RecordError.
+    """
+    used, known = tuple(used), {*used, *groups}
+    for name in stated:
+        if name not in known:
+            raise DriveError(
+                f"actuator {name!r} drives no joint{suggest_names(name, sorted(known))}; write "
+                f"'actuated: {name}' at one, or leave it out"
+                + (f"; joints are driven by {', '.join(used)}" if used else ""),
+                name,
+            )
+
+
+def _check_terms(placed: PlacedDrive) -> PlacedDrive:
+    """Return a drive; refuse a term that is stated or unknown and cannot be."""
+    drive, name = placed.drive, placed.own.name
+    stated = {term for term in ("curve", *HARMONICS) if getattr(drive, term)} | {*drive.unknown}
+    for term in HARMONICS:
+        if term in stated and not drive.period:
+            raise DriveError(
+                f"actuator {name!r} states {term}, but no period; state the reading's period", name
+            )
+    if "curve" in stated and not np.isfinite(placed.list_terms()["curve"][-1]):
+        raise DriveError(
+            f"actuator {name!r} states a curve, the deviation at the far end of its stroke, but no "
+            "stroke; state the stroke",
+            name,
+        )
+    return placed
+
+
+def drive_errors(placed: PlacedDrive) -> ErrorModel:
+    """Return the unknown terms of a drive, `q1.offset` and so on; raises MechanismError for
+    impossible ones.
+    """
+    drive, name, known = placed.drive, placed.own.name, placed.list_terms()
+    errors = [weight_errors(name, drive, placed.weights, tuple(known))]
+    if isinstance(drive, TriangleDrive):
+        errors.insert(0, triangle_errors(name, drive, placed.rotation, tuple(known)))
+    for term in drive.unknown:
+        if is_of_triangle(drive, term) or is_weight(placed.weights, term):
+            continue
+        if term not in known:
+            raise DriveError(
+                f"actuator {name!r} has no term {term!r}{suggest_names(term, list(known))}; "
+                f"allowed are {', '.join(known)}",
+                name,
+            )
+        errors.append(_term_error(placed, term))
+    return join_errors(errors)
+
+
+def _term_error(placed: PlacedDrive, term: str) -> ErrorModel:
+    """Return a term of a drive as a parameter."""
+    name = placed.own.name
+    dimension, nominal, tolerance, axis, coefficient = placed.list_terms()[term]
+    parameter, address = f"{name}.{term}", Address(name, "transmission", axis)
+    sd = standard_deviation(tolerance, parameter)
+    entry = LinearMap(parameter, address, placed.sense * coefficient)
+    is_scale = axis == "gain"
+    return single_error(parameter, dimension, nominal, sd, entry, positive=is_scale)
+
+
+def check_motion(name: str, drive: Drive, turns: bool) -> None:
+    """Refuse a drive whose transmission does not give what its joint does; raises
+    MechanismError.
+    """
+    if turns == isinstance(drive, AngleDrive | TriangleDrive):
+        return
+    motion, allowed = (
+        ("turns", "reads: angle without a radius, or a triangle")
+        if turns
+        else ("slides", "reads: length, or reads: angle with a radius")
+    )
+    raise DriveError(f"actuator {name!r} drives a joint that {motion}; state {allowed}", name)
+
+
+def complete_drives(drives: Mapping[str, PlacedDrive], spread: ErrorTolerances) -> ErrorModel:
+    """Return the offset of every drive and the dimensions of its triangle as parameters."""
+    errors = []
+    for name, placed in drives.items():
+        tolerance = spread.select(placed.dimension)
+        errors.append(
+            offset_error(f"{name}.offset", name, placed.dimension, placed.drive.offset, tolerance)
+        )
+        if isinstance(placed.drive, TriangleDrive):
+            lengths = LengthTolerance(sd=spread.length) if spread.length else None
+            errors.append(complete_triangle(name, placed.drive, placed.rotation, lengths))
+    return join_errors(errors)
+
+
+# Triangles: a linear actuator between two anchors beside a rotary joint.
+
+
+def place_triangle(
+    name: str, drive: TriangleDrive, rotation: FloatArray, start: float
+) -> Mapping[str, float]:
+    """Return the terms of a triangle in the joint's own frame, by name.
+
+    rotation : (3, 3) R_placed_joint, whose third column is the joint's axis. start : angle of the
+        joint near home [rad], which selects the side.
+    Raises MechanismError: an anchor on the axis, a start at a dead point, or a stroke that no angle
+        reaches.
+    """
+    triangle = drive.triangle
+    points = np.array([triangle.foot, triangle.head]) @ rotation
+    skew = rotation.T @ [triangle.skew.rx, triangle.skew.ry, triangle.skew.rz]
+    terms = np.array([*points.ravel(), *skew[:2], 1.0, 0.0])
+    low, high = (float(end) for end in compute_range(terms))
+    # b of l^2 = a - b cos(theta - gamma) is twice the product of both levers
+    if not high**2 - low**2 > 4 * ON_AXIS * float((points**2).sum(axis=1).max()):
+        raise DriveError(
+            f"the triangle of actuator {name!r} is degenerate: an anchor is on the axis of the "
+            "joint, so that the length is the same at every angle; state anchors beside the axis",
+            name,
+        )
+    sine, middle = find_side(start, terms)
+    if abs(sine) < DEAD:
+        raise DriveError(
+            f"actuator {name!r} does not turn its joint at {np.rad2deg(start):g} deg, a dead point "
+            "of its triangle, where both anchors and the axis are in one plane; state another "
+            "`start:` of the joint, or other anchors",
+            name,
+        )
+    terms[-2:] = np.sign(sine), middle
+    for reading in drive.stroke or ():
+        length = drive.offset + drive.gain * reading
+        if np.isfinite(length) and not low <= length <= high:
+            raise DriveError(
+                f"the stroke of actuator {name!r} contains the length {length * 1e3:.6g} mm, which "
+                f"no angle of its joint reaches: the anchors are {low * 1e3:.6g} to "
+                f"{high * 1e3:.6g} mm apart; correct the stroke or the anchors",
+                name,
+            )
+    return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))
+
+
+def triangle_errors(
+    name: str, drive: TriangleDrive, rotation: FloatArray, other: tuple[str, ...]
+) -> ErrorModel:
+    """Return the unknown dimensions of a triangle, `q1.foot.x` and so on; `other` are the other
+    terms of the drive. Raises MechanismError: a dimension that a triangle does not have, or a skew
+    about its axis.
+    """
+    known = (
+        *(f"{point}.{axis}" for point in POINTS for axis in AXES[3:]),
+        *(f"{SKEW}.{axis}" for axis in AXES[:3]),
+    )
+    errors = []
+    for term in _expand_unknowns(drive, rotation):
+        if term not in known:
+            allowed = (*other, *POINTS, SKEW, *known)
+            raise DriveError(
+                f"actuator {name!r} has no term {term!r}{suggest_names(term, allowed)}; allowed "
+                f"are {', '.join(allowed)}",
+                name,
+            )
+        part, _, axis = term.partition(".")
+        direction = np.eye(3)[AXES.index(axis) % 3]
+        components = rotation.T @ direction
+        is_skew, parameter = part == SKEW, f"{name}.{term}"
+        if is_skew and np.linalg.norm(components[:2]) < ON_AXIS:
+            raise DriveError(
+                f"{parameter} rotates the triangle about the joint's own axis, which changes no "
+                "length; leave it out",
+                name,
+            )
+        stated = getattr(drive.triangle, part)
+        nominal = getattr(stated, axis) if is_skew else stated[AXES.index(axis) % 3]
+        tolerance = drive.angle if is_skew else drive.length
+        maps = tuple(
+            LinearMap(parameter, Address(name, "transmission", f"{part}.{own}"), float(share))
+            for own, share in zip("xy" if is_skew else "xyz", components, strict=False)
+            if abs(share) > 1e-12
+        )
+        dimension = Dimension.ANGLE if is_skew else Dimension.LENGTH
+        sd = standard_deviation(tolerance, parameter)
+        errors.append(single_error(parameter, dimension, nominal, sd, *maps))
+    return join_errors(errors)
+
+
+def complete_triangle(
+    name: str, drive: TriangleDrive, rotation: FloatArray, tolerance: LengthTolerance | None
+) -> ErrorModel:
+    """Return the dimensions of a triangle that, with its offset, have the effects of all others.
+
+    These are two coordinates of the foot across the axis of the joint, and the one of the head that
+    changes its lever most: see docs/theory/triangle-drives.md. Arguments are as above.
+    """
+    across = rotation[:, :2]
+    foot = sorted(np.argsort(-np.linalg.norm(across, axis=1), kind="stable")[:2].tolist())
+    head = int(np.argmax(np.abs(across @ (across.T @ drive.triangle.head))))
+    unknown = (*(f"foot.{AXES[3 + i]}" for i in foot), f"head.{AXES[3 + head]}")
+    return triangle_errors(name, replace(drive, unknown=unknown, length=tolerance), rotation, ())
+
+
+def is_of_triangle(drive: object, term: str) -> bool:
+    """Return whether an unknown of a drive is a dimension of its triangle."""
+    return isinstance(drive, TriangleDrive) and term.partition(".")[0] in (*POINTS, SKEW)
+
+
+def _expand_unknowns(drive: TriangleDrive, rotation: FloatArray) -> Iterator[str]:
+    """Yield the unknown dimensions, `foot` as foot.x, foot.y, foot.z.
+
+    A whole skew is that about the two axes across that of the joint, if it is along one.
+    """
+    for term in drive.unknown:
+        if term in POINTS:
+            yield from (f"{term}.{axis}" for axis in AXES[3:])
+        elif term == SKEW:
+            across = np.linalg.norm(rotation[:, :2], axis=1) > ON_AXIS
+            yield from (
+                f"{SKEW}.{a}" for a, is_across in zip(AXES[:3], across, strict=True) if is_across
+            )
+        elif is_of_triangle(drive, term):
+            yield term
+
+
+# Drives of `limbs` files whose readings are sums of joint values: `sum: {m: 1, n: 2}`.
+
+WEIGHT = "weight"
+
+
+def has_sums(actuators: Mapping[str, object]) -> bool:
+    """Return whether a drive of a file is a sum."""
+    return any(getattr(drive, "sum", None) for drive in actuators.values())
+
+
+def list_readings(
+    actuators: Mapping[str, object], joints: Mapping[str, str]
+) -> dict[str, tuple[str, Mapping[str, float]]]:
+    """Return the readings of a file with sums: name -> (key in the file, weights of joints), of
+    driven joints by name, each with the name that the file states.
+
+    Raises DriveError: a triangle drive, or a drive that is no sum and moves no joint.
+    """
+    readings: dict[str, tuple[str, Mapping[str, float]]] = {}
+    for key, drive in actuators.items():
+        weights: Mapping[str, float] | None = getattr(drive, "sum", None)
+        if weights is None:
+            raise DriveError(
+                f"actuator {key!r} is a triangle drive beside sums; let it drive a stage of its "
+                "own in a file of the family stages",
+                key,
+            )
+        if weights:
+            readings[key] = key, weights
+            continue
+        own = [name for name, stated in joints.items() if key in (name, stated)]
+        if not own:
+            raise DriveError(
+                f"actuator {key!r} drives no joint and states no `sum:`; write 'actuated: {key}' "
+                f"at a joint, or the sum that it reads of {', '.join(joints)}",
+                key,
+            )
+        readings |= {name: (key, {name: 1.0}) for name in own}
+    return readings
+
+
+def check_sums(
+    sums: Mapping[str, Mapping[str, float]], turning: Mapping[str, bool], known: Mapping[str, str]
+) -> None:
+    """Refuse sums, readings by name with the weights of their joints, that are no readings of the
+    driven joints. turning : whether each of them is rotary. known : driven joint -> its limb.
+    """
+    for name, weights in sums.items():
+        _check_sum(name, weights, turning)
+    read = {joint for weights in sums.values() for joint, w in weights.items() if w != 0.0}
+    unread = [joint for joint in turning if joint not in read]
+    if unread:
+        raise DriveError(
+            f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so no reading states "
+            f"it; add it to a `sum:`, or list {unread[0]!r} among the actuators",
+            next(iter(sums)),
+        )
+    W = np.array([[weights.get(joint, 0.0) for joint in turning] for weights in sums.values()])
+    a, joints = W.shape
+    if a > joints:
+        raise DriveError(
+            f"{a} readings ({', '.join(sums)}) are sums of {joints} joints "
+            f"({', '.join(turning)}); leave out readings",
+            list(sums)[-1],
+        )
+    for i in range(a):
+        if count_independent(W[: i + 1]) <= i:
+            name = list(sums)[i]
+            raise DriveError(
+                f"the weights of the sums are singular: that of actuator {name!r} follows from "
+                f"those of {', '.join(list(sums)[:i])}, so it states nothing new; correct a weight",
+                name,
+            )
+
+
+def _check_sum(name: str, weights: Mapping[str, float], turning: Mapping[str, bool]) -> None:
+    """Refuse a sum of unknown joints, of unlike joints, or without a weight."""
+    for joint, weight in weights.items():
+        if joint not in turning:
+            raise DriveError(
+                f"the sum of actuator {name!r} names {joint!r}, which no limb states under "
+                f"'actuated:'{suggest_names(joint, list(turning))}; allowed are "
+                f"{', '.join(turning)}",
+                name,
+            )
+        if not np.isfinite(weight):
+            raise DriveError(
+                f"the weight of {joint!r} in the sum of actuator {name!r} is {weight:g}; state a "
+                "finite number",
+                name,
+            )
+    if not any(weights.values()):
+        raise DriveError(
+            f"all weights in the sum of actuator {name!r} are zero, so its reading states nothing; "
+            "give a weight other than 0",
+            name,
+        )
+    angles = [joint for joint in weights if turning[joint]]
+    lengths = [joint for joint in weights if not turning[joint]]
+    if angles and lengths:
+        raise DriveError(
+            f"actuator {name!r} is a sum of the angle {angles[0]!r} and the length {lengths[0]!r}; "
+            "sum joints of one kind, and describe a screw with the `lead:` of its joint",
+            name,
+        )
+
+
+def is_weight(weights: Mapping[str, float], term: str) -> bool:
+    """Return whether an unknown of a drive is a weight of its sum."""
+    return bool(weights) and term.partition(".")[0] == WEIGHT
+
+
+def weight_errors(
+    name: str, drive: object, weights: Mapping[str, float], other: tuple[str, ...]
+) -> ErrorModel:
+    """Return the unknown weights of a sum, `q1.weight.m` and so on; `other` are the other terms of
+    the drive.
+    """
+    unknown: tuple[str, ...] = getattr(drive, "unknown", ())
+    tolerance: RatioTolerance | None = getattr(drive, "weights", None)
+    joints: list[str] = []
+    for term in unknown:
+        if is_weight(weights, term):  # `weight` means all of a sum
+            joints += weights if term == WEIGHT else [term.partition(".")[2]]
+    errors = []
+    for joint in joints:
+        if joint not in weights:
+            allowed = (*other, WEIGHT, *(f"{WEIGHT}.{known}" for known in weights))
+            raise DriveError(
+                f"actuator {name!r} has no term {WEIGHT + '.' + joint!r}; allowed are "
+                f"{', '.join(allowed)}",
+                name,
+            )
+        parameter = f"{name}.{WEIGHT}.{joint}"
+        address = Address(name, "transmission", f"{WEIGHT}.{joint}")
+        sd = standard_deviation(tolerance, parameter)
+        entry = LinearMap(parameter, address)
+        errors.append(single_error(parameter, Dimension.RATIO, weights[joint], sd, entry))
+    return join_errors(errors)
