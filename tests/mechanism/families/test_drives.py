@@ -87,7 +87,8 @@ def test_a_screw_with_a_motor_angle_drives_the_leg_of_a_hexapod(tmp_path: Path) 
     assert_allclose(2e-3 + 5e-3 * turned / (2 * np.pi), length, atol=1e-14)  # [m] rounding
     assert robot.actuators[0].stroke is None
     lead = robot.parameters.entries[robot.parameters.index("q1.lead")]
-    assert lead.nominal == 5e-3 and lead.positive
+    assert lead.nominal == 5e-3
+    assert lead.positive
 
 
 def test_readings_that_count_down_count_down_with_a_stated_drive(tmp_path: Path) -> None:
