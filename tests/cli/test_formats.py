@@ -12,6 +12,7 @@ import loopcal as lc
 from loopcal.cli.entry_point import find_command
 from loopcal.io.formats import FORMATS
 from tests.cli.delta_printers import list_stored_geometry, read_records
+from tests.io.formats.linkages.test_urdf_closures import FIVE_BAR
 from tests.io.formats.printers import format_printer_cfg
 
 FIRMWARE_CALIBRATED = (
@@ -248,3 +249,9 @@ def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
         assert again.values[again.parameters.index(name)] / factor == pytest.approx(
             value, abs=1e-6
         )  # six decimals
+
+
+def test_output_beside_a_urdf_that_does_not_exist_is_no_input(loopcal, folder) -> None:
+    (folder / "r.urdf").write_text(FIVE_BAR)
+    loopcal("import r.urdf -o r.yaml", "5 rigid bodies")
+    loopcal("import r.urdf -o r.yaml --force", "5 rigid bodies")

@@ -9,8 +9,8 @@ import pytest
 import loopcal as lc
 from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
-from loopcal.io.formats.urdf.closures import read_mechanism
-from loopcal.io.formats.urdf.tree import read
+from loopcal.io.formats.linkages.closures import read_mechanism
+from loopcal.io.formats.linkages.urdf import read_tree
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.observations import Observations
@@ -165,4 +165,4 @@ def test_a_closure_that_is_no_name_is_refused(tmp_path) -> None:
     (tmp_path / "r.urdf").write_text(urdf)
     (tmp_path / "loops.yaml").write_text("closed_loop: [[[j], j]]\ntype: [6d]\nname_mot: [j]\n")
     with pytest.raises(FileError, match=r"loops\.yaml:1: .*names of two frames"):
-        read_mechanism(read(tmp_path / "r.urdf"), tmp_path / "loops.yaml")
+        read_mechanism(read_tree(tmp_path / "r.urdf"), tmp_path / "loops.yaml")

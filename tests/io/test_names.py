@@ -21,7 +21,7 @@ from loopcal.io.core.yaml_file import parse_yaml, read_yaml
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export
 from loopcal.io.exports.profile import read_profile
-from loopcal.io.formats.urdf import tree as urdf_tree
+from loopcal.io.formats.linkages import urdf
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
 
 CONTROLS = ["\x1b[31m", "\x07", "\x9b31m", "\x7f", "\u202e", "\u2066", "\u200b", "\ufeff", "\ud800"]
@@ -180,7 +180,7 @@ def test_names_of_an_export_that_no_file_may_contain_do_not_fit(tmp_path) -> Non
 def test_joint_of_a_urdf_with_such_a_name_is_refused() -> None:
     text = '<robot name="r">\n<link name="a"/>\n<link name="&#x202E;b"/>\n</robot>'
     with pytest.raises(FileError, match=r"a.urdf:3: the name '\\u202eb' contains U\+202E"):
-        urdf_tree.parse(text, Path("a.urdf"))
+        urdf.parse(text, Path("a.urdf"))
 
 
 def test_composed_names_may_be_longer() -> None:

@@ -129,6 +129,45 @@ CONSTRAINED = URDF.replace(
 
 CLOSURES = "closed_loop: [[closedloop1_A, closedloop1_B]]\ntype: ['6d']\nname_mot: [mot1, mot2]\n"
 
+SDF = (
+    '<sdf version="1.8"><model name="five-bar">\n<link name="base"/>\n'
+    + "".join(
+        f'<link name="{link}"><pose>{pose}</pose></link>\n'
+        for link, pose in (
+            ("arm1", "-0.075 0 0 0 0 2.3"),
+            ("rod1", "-0.208 0.149 0 0 0 0.3"),
+            ("arm2", "0.075 0 0 0 0 0.84"),
+            ("rod2", "0.208 0.149 0 0 0 2.8"),
+        )
+    )
+    + "".join(
+        f'<joint name="{name}" type="revolute"><parent>{a}</parent><child>{b}</child>\n'
+        f"<pose>{x} 0 0 0 0 0</pose><axis><xyz>0 0 1</xyz></axis></joint>\n"
+        for name, a, b, x in (
+            ("mot1", "base", "arm1", 0),
+            ("elbow1", "arm1", "rod1", 0),
+            ("mot2", "base", "arm2", 0),
+            ("elbow2", "arm2", "rod2", 0),
+            ("tip", "rod1", "rod2", 0.22),
+        )
+    )
+    + '<link name="tool"><pose relative_to="rod1">0.22 0 0 0 0 0</pose></link>\n'
+    '<joint name="flange" type="fixed"><parent>rod1</parent><child>tool</child></joint>\n'
+    '<plugin name="c"><joint_name>mot1</joint_name><joint_name>mot2</joint_name></plugin>\n'
+    "</model></sdf>\n"
+)
+
+MJCF = """<mujoco><worldbody>
+<body name="arm1" pos="-0.075 0 0" euler="0 0 131.8"><joint name="mot1"/>
+<body name="rod1" pos="0.2 0 0" euler="0 0 -114.6"><joint name="elbow1"/>
+<body name="tool" pos="0.22 0 0"/></body></body>
+<body name="arm2" pos="0.075 0 0" quat="0.913 0 0 0.408"><joint name="mot2"/>
+<body name="rod2" pos="0.2 0 0" axisangle="0 0 1 112.3"><joint name="elbow2"/></body></body>
+</worldbody>
+<equality><connect name="tip" body1="rod1" body2="rod2" anchor="0.22 0 0"/></equality>
+<actuator><motor joint="mot1"/><motor joint="mot2"/></actuator></mujoco>
+"""
+
 SOURCES = {
     "printer.cfg": DELTA_PROBES,
     "robot.g": REPRAP,
@@ -136,6 +175,8 @@ SOURCES = {
     "hexapod.hal": GENHEX,
     "robot.urdf": URDF,
     "constrained.urdf": CONSTRAINED,
+    "robot.sdf": SDF,
+    "robot.xml": MJCF,
     "loops.yaml": CLOSURES,
 }
 """Files by name."""

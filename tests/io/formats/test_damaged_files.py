@@ -25,7 +25,7 @@ from tools.fuzz.sources import SOURCES
 
 DIGITS = "0" * 5000
 """More digits than Python turns into a whole number."""
-MOST = {"urdf": 4, "hangprinter": 4}
+MOST = {"urdf": 4, "sdf": 1, "mjcf": 1, "hangprinter": 4}
 """Places of each sort of damage, for files that are slow to read; 6 for others, twice as many in
 the evidence.
 """
@@ -42,6 +42,8 @@ FILES = {
     "reprap": "robot.g",
     "linuxcnc": "hexapod.hal",
     "urdf": "robot.urdf",
+    "sdf": "robot.sdf",
+    "mjcf": "robot.xml",
     "hangprinter": "samples.json",
 }
 
@@ -96,7 +98,8 @@ def files(tmp_path, root, monkeypatch) -> Path:
 def import_file(name: str, path: Path) -> None:
     """Read a file, write its robot and measurements, and correct a copy of the file."""
     known = FORMATS[name]
-    options = ImportOptions("r", length_unit="mm", home_height=0.2, closures=Path("loops.yaml"))
+    closures = Path("loops.yaml") if name == "urdf" else None
+    options = ImportOptions("r", length_unit="mm", home_height=0.2, closures=closures)
     assert known.read is not None
     with np.errstate(all="raise", under="ignore"):
         imported = known.read(path, options)

@@ -17,6 +17,8 @@ OWN = {
     "linuxcnc": ("hexapod.hal",),
     "linuxcnc-ini": ("machine.ini",),
     "urdf": ("robot.urdf", "constrained.urdf"),
+    "sdf": ("robot.sdf",),
+    "mjcf": ("robot.xml",),
 }
 """Names in SOURCES of the files of each format that corrects a file."""
 
@@ -37,7 +39,7 @@ def robots() -> dict[str, Mechanism]:
     return {name: lc.load_robot("linear-delta") for name in ("klipper", "marlin", "reprap")} | {
         "linuxcnc": lc.load_robot("hexapod-42"),
         "linuxcnc-ini": lc.load_robot("hexapod-42"),
-        "urdf": lc.load_robot("five-bar"),
+        **{name: lc.load_robot("five-bar") for name in ("urdf", "sdf", "mjcf")},
     }
 
 

@@ -313,6 +313,7 @@ def import_(
         list_formats,
         save_imported,
     )
+    from loopcal.io.formats.linkages.closures import find_closures
     from loopcal.io.formats.program_format import ExportSource, ImportOptions
     from loopcal.io.runs.run_folder import list_reasons
 
@@ -330,7 +331,7 @@ def import_(
         )
     if corrected is not None and data is None:
         raise DataError(CORRECTED_ALONE)
-    beside = file.with_suffix(".yaml") if source.name == "urdf" else None
+    beside = find_closures(file) if "closures" in source.read_options else None
     inputs = (file, settings["closures"] or beside, *probes)
     refuse_outputs((output, data), inputs, force)
     refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected

@@ -57,6 +57,7 @@ def refuse_outputs(
         for path in inputs
         if path is not None
         for file in (path.iterdir() if path.is_dir() else (path,))
+        if file.exists()
     ]
     wanted = [path for path in outputs if path is not None]
     for i, path in enumerate(wanted):

@@ -78,13 +78,8 @@ class GraphJoint:
 
     def follow(self, drive: str, sign: float, offset: float) -> GraphJoint:
         """Return the joint as one of a drive, whose value is sign * value of the drive + offset."""
-        T_b = self.move(np.array(-offset))
-        return replace(
-            self,
-            drive=drive,
-            axis=sign * self.axis,
-            T_b=self.T_b @ geometry.invert_pose(self.T_a) @ T_b,
-        )
+        back = geometry.invert_pose(self.T_a) @ self.move(np.array(-offset))
+        return replace(self, drive=drive, axis=sign * self.axis, T_b=self.T_b @ back)
 
     def get_other_body(self, body: str) -> str:
         """Return the body at the other end."""
@@ -95,6 +90,16 @@ class GraphJoint:
         vectors = values[..., None] * self.axis
         turn, shift = (vectors, 0 * vectors) if self.kind == "R" else (0 * vectors, vectors)
         return self.T_a @ geometry.make_pose(geometry.exp_so3(turn), shift)
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """The value of a joint is factor * value of the leader + offset [rad or m]."""
+
+    joint: str
+    leader: str
+    factor: float
+    offset: float
 
 
 def list_axes_across(axis: FloatArray) -> str:

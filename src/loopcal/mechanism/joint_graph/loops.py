@@ -431,12 +431,17 @@ def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> t
 
 
 def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
-    """Return the finding of loops that do not close: the worst closure of the best pose."""
+    """Return the finding of loops that do not close: of the closures without which the others
+    close, or else of all, the one that is open the most in the best pose.
+    """
     q = approach_closure(graph, starts)
     best = q[[int(np.argmin((graph.linearize(q)[0] ** 2).sum(axis=1)))]]
     placement = graph.place(best)
-    gaps = [(measure_gap(graph, placement, joint), joint) for joint in graph.closing]
-    (gap, angle), joint = max(gaps, key=lambda entry: entry[0])
+    without = {joint: {*graph.closing} - {joint} for joint in graph.closing}
+    rest = {joint: replace(graph, closing=tuple(others)) for joint, others in without.items()}
+    alone = [joint for joint, other in rest.items() if np.isfinite(other.close(starts)).any()]
+    gaps = [(measure_gap(graph, placement, joint), joint) for joint in alone or graph.closing]
+    (gap, angle), joint = max(gaps, key=lambda entry: entry[0][0] / graph.size + entry[0][1])
     return report_finding(
         "files.loops-open",
         closure=joint.name,

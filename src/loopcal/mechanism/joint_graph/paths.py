@@ -18,7 +18,7 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
 from loopcal.mechanism.assembly import AXES
-from loopcal.mechanism.joint_graph.graph import GraphJoint, turn_between
+from loopcal.mechanism.joint_graph.graph import Coupling, GraphJoint, turn_between
 from loopcal.mechanism.joint_graph.loops import (
     Freedoms,
     JointGraph,
@@ -352,7 +352,8 @@ def find_stage_paths(
     `measure_rounding` the rounding errors [m, rad] of numbers that describe some bodies. Refusals
     name the joints.
     """
-    path = find_blocks(whole, platform)  # without joints that move nothing in between
+    path = _leave_floating(find_blocks(whole, platform))
+    whole = replace(whole, base=path[0].graph.base)
     kept = select_joints(whole, {joint for block in path for joint in block.graph.joints})
     repair = _repair_blocks(kept, find_blocks(kept, platform), measure_rounding)
     graph = repair.graph
@@ -370,8 +371,6 @@ def find_stage_paths(
     limit = share * max(freedoms.firmness for freedoms in moving)
     pairs = zip(homes, moving, strict=True)
     home, motions = next(pair for pair in pairs if pair[1].firmness >= limit)
-    if motions.mobility == 0:
-        raise MechanismError(report_finding("files.no-motion", platform=platform))
     stages: list[ClosedStage | SerialStage] = []
     for block, mount in map(_turn_base, blocks):
         frame = locate_frame(block.platform)
@@ -380,11 +379,23 @@ def find_stage_paths(
             stages.append(SerialStage(block.graph.tree[0], float(values[0]), frame))
         else:
             closed = place_limbs(block, values, frame)
+            if closed.motions.mobility == 0:
+                raise MechanismError(report_finding("files.no-motion", platform=block.platform))
             stages.append(ClosedStage(closed, mount, _align_frame(closed, frame)))
     names = {joint.name for joint in kept.joints}
     dangling = tuple(joint.name for joint in whole.joints if joint.name not in names)
     outside = tuple(name for name in whole.motors if name not in graph.motors)
     return StagePaths(graph, home, platform, tuple(stages), motions, dangling, outside, repair)
+
+
+FLOATING = 6
+"""Number of passive joints by which a file lets the base of a machine float."""
+
+
+def _leave_floating(path: tuple[Block, ...]) -> tuple[Block, ...]:
+    """Return the blocks behind the joints that only let the base float."""
+    count = next((i for i, block in enumerate(path) if block.graph.motors), 0)
+    return path[count:] if count >= FLOATING else path
 
 
 def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
@@ -557,6 +568,55 @@ def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, .
     if lost is not None:
         raise MechanismError(report_finding("files.motors-in-loop", motor=lost))
     return JointGraph(base, tree, closing, motors)
+
+
+MIMICS = 1e-9
+"""Largest difference between a joint and the one that it follows [rad, m], and of factors [1]."""
+
+
+def couple_joints(
+    graph: JointGraph, couplings: Sequence[Coupling]
+) -> tuple[JointGraph, tuple[Coupling, ...]]:
+    """Return the mechanism in which joints that follow a motor, or move against it, are joints of
+    its drive, and the couplings that remain. Those that the loops contain are left out.
+    """
+    joints = {joint.name: joint for joint in graph.joints}
+    known = [c for c in couplings if {c.joint, c.leader} <= joints.keys()]
+    if not known:
+        return graph, tuple(couplings)
+    left = [c for c in couplings if c not in known]
+    near = list_nearby(graph, find_homes(graph)[0]) if graph.closing else np.zeros((0, 0))
+    known = [c for c in known if not _is_contained(graph, near, c)]
+    drives = {joint.drive: (joint.drive, 1.0, 0.0) for joint in graph.tree if joint.drive}
+    for _ in known:
+        for c in known:
+            if c.leader in drives and c.joint not in drives:
+                drive, factor, offset = drives[c.leader]
+                drives[c.joint] = drive, c.factor * factor, c.factor * offset + c.offset
+            elif c.joint in drives and c.leader not in drives and c.factor:
+                drive, factor, offset = drives[c.joint]
+                drives[c.leader] = drive, factor / c.factor, (offset - c.offset) / c.factor
+    for name, (drive, factor, offset) in drives.items():
+        if name == drive:
+            continue
+        if abs(abs(factor) - 1) < MIMICS and joints[name].kind == joints[drive].kind:
+            joints[name] = joints[name].follow(drive, float(np.sign(factor)), offset)
+        else:
+            left.append(Coupling(name, drive, factor, offset))
+    left += [c for c in known if c.joint not in drives]
+    tree, closing = _span_tree(graph.base, tuple(joints.values()))
+    return JointGraph(graph.base, tree, closing, graph.motors), tuple(left)
+
+
+def _is_contained(graph: JointGraph, near: FloatArray, coupling: Coupling) -> bool:
+    """Return whether a coupling is true at poses (n, j) that the loops allow."""
+    names = graph.names
+    if len(near) < 2 or not {coupling.joint, coupling.leader} <= {*names}:
+        return False
+    i, j = names.index(coupling.joint), names.index(coupling.leader)
+    gap = near[:, i] - coupling.factor * near[:, j] - coupling.offset
+    turns = np.round(gap[0] / (2 * np.pi)) * 2 * np.pi if graph.tree[i].kind == "R" else 0.0
+    return bool(np.abs(gap - turns).max() < MIMICS)
 
 
 def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:

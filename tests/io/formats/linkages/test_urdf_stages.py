@@ -11,22 +11,22 @@ from scipy.stats import chi2
 from loopcal.errors import LoopcalError
 from loopcal.estimate.identification import identify
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.linkages import urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
-from loopcal.io.formats.urdf import urdf_format as urdf
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import simulate
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import forward, inverse
-from tests.io.formats.urdf.urdf_chains import (
+from tests.io.formats.linkages.urdf_chains import (
     make_digger,
     make_head_with_wrist,
     make_leg,
     make_lever_arm,
     make_tilted_table,
 )
-from tests.io.formats.urdf.urdf_machines import (
+from tests.io.formats.linkages.urdf_machines import (
     MachineJoint,
     UrdfSolver,
     write_element,

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mechanism of a URDF: its tree, the closures of a YAML file, and its own constraints.
+"""The mechanism of a file: its tree, its own constraints, and the closures of a YAML file.
 
 `closed_loop: [[A, B]]` names frames: links, or joints, which mean the links that they carry. With
 `type: ['6d']` the two frames coincide (a cut through a rigid link, or through a pin that two
-revolute joints describe), with `3d` their origins do (a ball joint). `name_mot` lists the motors.
+revolute joints describe), with `5d` their origins and z axes do (a pin), with `3d` their origins
+do (a ball joint). `name_mot` lists the motors.
 `joint_name` and `joint_type` replace joints of the tree: SPHERICAL by a ball joint, UJOINT_XY by a
 rotary joint about x, then one about y of the joint's frame, FIXED by none. This is the dialect of
 the example-parallel-robots collection.
+
+`closures: [{link_a, link_b, point, axis}]` are pins: point and axis are in the root link with all
+joints at zero; `independent` lists the motors. This is the dialect of scikit-robot.
 """
 
 from __future__ import annotations
@@ -23,25 +27,42 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError, MechanismError, suggest_names
 from loopcal.io.core.yaml_file import YamlFile, read_yaml, refuse_unknown_keys
-from loopcal.io.formats.urdf.tree import Urdf, UrdfConstraint, UrdfJoint
+from loopcal.io.formats.linkages.tree import (
+    Constraint,
+    LinkTree,
+    TreeJoint,
+    derive_end,
+    draw_links,
+    make_end,
+)
 from loopcal.mechanism.joint_graph.graph import (
+    Coupling,
     GraphJoint,
     find_perpendicular,
     list_axes_across,
     turn_between,
 )
 from loopcal.mechanism.joint_graph.loops import JointGraph
-from loopcal.mechanism.joint_graph.paths import Bodies, Weld, assemble_graph, weld_bodies
+from loopcal.mechanism.joint_graph.paths import (
+    Bodies,
+    Weld,
+    assemble_graph,
+    couple_joints,
+    weld_bodies,
+)
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
 
 WHAT = "file of loop closures"
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+PINS = ("closures", "independent", "dependent")
+"""Keys of a file, and those of a file of scikit-robot."""
 
-OVERRIDES = ("SPHERICAL", "FIXED", *(f"UJOINT_{a}{b}" for a, b in permutations("XYZ", 2)))
+SPHERICAL = "SPHERICAL"
+OVERRIDES = (SPHERICAL, "FIXED", *(f"UJOINT_{a}{b}" for a, b in permutations("XYZ", 2)))
 """Types by which a closure file replaces joints."""
 
-WELD, BALL = "6d", "3d"
+WELD, PIN, BALL = "6d", "5d", "3d"
 
 BALL_NAME = "_ball"
 """Ending of the name of a ball joint at the origin of a movable joint, which has its own name."""
@@ -49,8 +70,8 @@ BALL_NAME = "_ball"
 
 @dataclass(frozen=True)
 class Closures:
-    """The content of a closure file: pairs of frames with their kinds (WELD or BALL), driven
-    joints, and joint -> type of OVERRIDES.
+    """The content of a closure file: pairs of frames with their kinds (WELD, PIN or BALL), driven
+    joints, joint -> type of OVERRIDES, and pins.
     """
 
     file: YamlFile | None = None
@@ -58,32 +79,35 @@ class Closures:
     kinds: tuple[str, ...] = ()
     motors: tuple[str, ...] = ()
     overrides: Mapping[str, str] = field(default_factory=dict)
+    pins: tuple[Constraint, ...] = ()
 
 
 @dataclass(frozen=True)
-class UrdfMechanism:
-    """A URDF with its loops closed, as a graph of bodies and joints.
+class Linkage:
+    """A file with its loops closed, as a graph of bodies and joints.
 
     `bodies` are the rigid bodies that closures make of links, `frames` links that close loops
-    only, `rigid_closures` the frames of the closures of type 6d at whose ends no joint moves.
+    only, `couplings` those that neither the loops nor a drive express, `rigid_closures` the frames
+    of the closures of type 6d at whose ends no joint moves.
     """
 
-    urdf: Urdf
+    tree: LinkTree
     graph: JointGraph
     bodies: Bodies
     frames: frozenset[str]
+    couplings: tuple[Coupling, ...] = ()
     rigid_closures: tuple[str, ...] = ()
 
     def locate(self, link: str) -> tuple[str, FloatArray]:
         """Return the rigid body of a link, and T_body_link (4, 4)."""
-        body, T = self.bodies.locate(self.urdf.find_body(link))
-        return body, T @ self.urdf.place_in_body(link)
+        body, T = self.bodies.locate(self.tree.find_body(link))
+        return body, T @ self.tree.place_in_body(link)
 
     def measure_rounding(self, bodies: Collection[str]) -> tuple[float, float]:
         """Return the rounding error of all origins that join or are on bodies [m, rad]."""
-        ends = [end for constraint in self.urdf.constraints for end in constraint.ends]
+        ends = [end for constraint in self.tree.constraints for end in constraint.ends]
         chosen = [
-            *(j for j in self.urdf.joints.values() if self.locate(j.child)[0] in bodies),
+            *(j for j in self.tree.joints.values() if self.locate(j.child)[0] in bodies),
             *(end for end in ends if self.locate(end.parent)[0] in bodies),
         ]
         return math.hypot(*(j.rounding[0] for j in chosen)), math.hypot(
@@ -92,26 +116,27 @@ class UrdfMechanism:
 
     def list_links(self, body: str) -> tuple[str, ...]:
         """Return the links of a rigid body."""
-        links = (self.urdf.root, *self.urdf.carrier)
+        links = (self.tree.root, *self.tree.carrier)
         return tuple(link for link in links if self.locate(link)[0] == body)
 
 
-def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
+def read_mechanism(tree: LinkTree, path: Path | None) -> Linkage:
     """Return the mechanism of a URDF with its closures.
 
     FileError : an unknown frame or joint, a closure of a rigid body with itself, a motor that is
     not a movable joint.
     """
-    closures = Closures() if path is None else _read_closures(path, urdf)
+    closures = Closures() if path is None else _read_closures(path, tree)
     fixed = {name for name, kind in closures.overrides.items() if kind == "FIXED"}
-    urdf = urdf.with_fixed(fixed)
-    motors = closures.motors or tuple(urdf.motors)
+    tree = tree.with_joints(replace(tree.joints[name], kind="") for name in fixed)
+    tree = replace(tree, constraints=(*tree.constraints, *closures.pins))
+    motors = closures.motors or tuple(tree.motors)
     welds, balls = [], []
     for i, (pair, kind) in enumerate(zip(closures.pairs, closures.kinds, strict=True)):
-        closure = _build_closure(urdf, closures, i, pair, kind)
+        closure = _build_closure(tree, closures, i, pair, kind)
         (welds if isinstance(closure, Weld) else balls).append(closure)
-    _check_motors(urdf, closures, motors)
-    constraints = [_build_constraint(urdf, constraint) for constraint in urdf.constraints]
+    _check_motors(tree, closures, motors)
+    constraints = [_build_constraint(tree, constraint) for constraint in tree.constraints]
     welds += [closure for group in constraints for closure in group if isinstance(closure, Weld)]
     # a ball joint at the origin of a movable joint has no origin of its own to shift
     centers = {
@@ -122,37 +147,45 @@ def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
     joints = [
         *(
             replace(joint, shifts="xyz") if joint.body_b in centers else joint
-            for joint in _list_joints(urdf, closures.overrides)
+            for joint in _list_joints(tree, closures.overrides)
         ),
         *balls,
         *(closure for group in constraints for closure in group if isinstance(closure, GraphJoint)),
     ]
-    links = [_find_link(urdf, name) for pair in closures.pairs for name in pair]
+    links = [_find_link(tree, name) for pair in closures.pairs for name in pair]
     ends = frozenset(link for link in links if link is not None)
     try:
-        bodies = weld_bodies(urdf.root, welds)
-        graph = assemble_graph(urdf.root, [bodies.move(joint) for joint in joints], motors)
+        bodies = weld_bodies(tree.root, welds)
+        graph = assemble_graph(tree.root, [bodies.move(joint) for joint in joints], motors)
+        graph, left = couple_joints(graph, _list_couplings(tree))
     except MechanismError as error:
-        raise _locate_error(error, urdf, closures) from None
-    return UrdfMechanism(urdf, graph, bodies, ends, _list_rigid_closures(urdf, closures))
+        raise _locate_error(error, tree, closures) from None
+    rigid = _list_rigid_closures(tree, closures)
+    return Linkage(tree, graph, bodies, ends, left, rigid)
 
 
-def _read_closures(path: Path, urdf: Urdf) -> Closures:
+def _read_closures(path: Path, tree: LinkTree) -> Closures:
     """Return the content of a closure file."""
     file = read_yaml(path, WHAT)
+    if PINS[0] in file.content:
+        refuse_unknown_keys(file, tuple(file.content), PINS)
+        motors = file.content.get("independent", [])
+        _check_lists(file, [], [], motors)
+        return Closures(file, motors=tuple(map(str, motors)), pins=_read_pins(file, tree))
     refuse_unknown_keys(file, tuple(file.content), KEYS)
     pairs, kinds, motors, names, types = (file.content.get(key, []) for key in KEYS)
     _check_lists(file, pairs, kinds, motors)
     for i, kind in enumerate(kinds):
-        if str(kind).lower() not in (WELD, BALL):
+        if str(kind).lower() not in (WELD, PIN, BALL):
             sentence = f"closure {pairs[i][0]!r} is of type {quote(str(kind))}; allowed: 6d (the"
-            raise file.error(f"{sentence} frames coincide), 3d (their origins do)", ("type", i))
+            sentence += " frames coincide), 5d (their z axes do), 3d (their origins do)"
+            raise file.error(sentence, ("type", i))
     return Closures(
         file,
         tuple((a, b) for a, b in pairs),
         tuple(str(kind).lower() for kind in kinds),
         tuple(str(name) for name in motors),
-        _read_overrides(file, names, types, urdf),
+        _read_overrides(file, names, types, tree),
     )
 
 
@@ -170,16 +203,63 @@ def _check_lists(file: YamlFile, pairs: Any, kinds: Any, motors: Any) -> None:
         raise file.error(f"{sentence}; write 6d or 3d for each pair", ("type",))
 
 
-def _read_overrides(file: YamlFile, names: Any, types: Any, urdf: Urdf) -> dict[str, str]:
+def find_closures(path: Path) -> Path | None:
+    """Return the file of loop closures beside a file: of its name, or that of scikit-robot. It has
+    a key of a closure file, or one that is almost `closed_loop`.
+    """
+    for beside in (path.with_suffix(".yaml"), path.with_name("loop_closures.yaml")):
+        if beside != path and beside.is_file():
+            keys = [str(key) for key in read_yaml(beside, WHAT).content]
+            if any(key in (*KEYS, *PINS) or suggest_names(key, KEYS[:1]) for key in keys):
+                return beside
+    return None
+
+
+def _read_pins(file: YamlFile, tree: LinkTree) -> tuple[Constraint, ...]:
+    """Return the pins of a file of scikit-robot."""
+    entries, drawn, pins = file.content[PINS[0]], draw_links(tree), []
+    listed: list[Any] = entries if isinstance(entries, list) else [None]
+    for i, entry in enumerate(listed):
+        place = (PINS[0], i)
+        if not isinstance(entry, dict) or not {"link_a", "link_b", "point", "axis"} <= {*entry}:
+            sentence = f"closure {i + 1} needs link_a, link_b, point and axis; write all four"
+            raise file.error(sentence, place)
+        links, vectors = (str(entry["link_a"]), str(entry["link_b"])), []
+        for link in links:
+            if link not in drawn:
+                sentence = (
+                    f"closure {i + 1} names {link!r}, which is not a link of {tree.path.name}"
+                )
+                raise file.error(f"{sentence}{suggest_names(link, drawn)}; correct it", place)
+        for key in ("point", "axis"):
+            numbers = entry[key] if isinstance(entry[key], list) else []
+            if [type(v) in (int, float) for v in numbers] != [True] * 3:
+                sentence = f"{key} of closure {i + 1} must be three numbers; correct it"
+                raise file.error(sentence, place)
+            vectors.append(np.array(numbers, dtype=np.float64))
+        point, axis = vectors
+        if not np.linalg.norm(axis) > 0:
+            raise file.error(f"closure {i + 1} has the axis 0 0 0; write a direction", place)
+        name, frame = "_".join(links), geometry.make_pose(np.eye(3), point)
+        ends = [
+            make_end(name, end, link, derive_end(drawn, link, tree.root, frame), 0)
+            for end, link in zip(("parent", "child"), links, strict=True)
+        ]
+        axis = axis / np.linalg.norm(axis)
+        pins.append(Constraint(name, "R", (ends[0], ends[1]), (axis, axis), 0, derived=True))
+    return tuple(pins)
+
+
+def _read_overrides(file: YamlFile, names: Any, types: Any, tree: LinkTree) -> dict[str, str]:
     """Return joint -> type of the joints that a closure file replaces."""
     if not isinstance(names, list) or not isinstance(types, list) or len(names) != len(types):
         sentence = "'joint_name:' and 'joint_type:' must be lists of the same length; correct them"
         raise file.error(sentence, ("joint_name",))
     overrides: dict[str, str] = {}
     for i, (name, kind) in enumerate(zip(map(str, names), map(str, types), strict=True)):
-        if name not in urdf.joints or not urdf.joints[name].kind:
-            near = suggest_names(name, [n for n, joint in urdf.joints.items() if joint.kind])
-            sentence = f"{quote(name)} is not a movable joint of {urdf.path.name}{near}"
+        if name not in tree.joints or not tree.joints[name].kind:
+            near = suggest_names(name, [n for n, joint in tree.joints.items() if joint.kind])
+            sentence = f"{quote(name)} is not a movable joint of {tree.path.name}{near}"
             raise file.error(f"{sentence}; correct it", ("joint_name", i))
         if kind.upper() not in OVERRIDES:
             sentence = f"joint {name!r} is replaced by {quote(kind)}; allowed: "
@@ -190,42 +270,42 @@ def _read_overrides(file: YamlFile, names: Any, types: Any, urdf: Urdf) -> dict[
     return overrides
 
 
-def _check_motors(urdf: Urdf, closures: Closures, motors: Sequence[str]) -> None:
+def _check_motors(tree: LinkTree, closures: Closures, motors: Sequence[str]) -> None:
     """Refuse motors that are no movable joints of the tree."""
     ends = {name for pair in closures.pairs for name in pair}
     for i, name in enumerate(motors):
         if name in motors[:i] and closures.file is not None:
             raise closures.file.error(f"motor {name!r} is named twice; remove one", ("name_mot", i))
-        joint = urdf.joints.get(name)
+        joint = tree.joints.get(name)
         if joint is not None and joint.kind and name not in ends | {*closures.overrides}:
             continue
-        near = suggest_names(name, [n for n, joint in urdf.joints.items() if joint.kind])
-        reason = f"is not a movable joint of {urdf.path.name}{near}"
+        near = suggest_names(name, [n for n, joint in tree.joints.items() if joint.kind])
+        reason = f"is not a movable joint of {tree.path.name}{near}"
         if name in ends:
-            reason = f"is not a movable joint of {urdf.path.name} that a motor can drive: it closes"
+            reason = f"is not a movable joint of {tree.path.name} that a motor can drive: it closes"
             reason += " a loop"
         elif name in closures.overrides:
             reason = "is not a movable joint that a motor can drive: joint_type replaces it"
         sentence = f"the motor {quote(name)} {reason}; correct it"
         if closures.file is None or name not in closures.motors:
-            raise FileError(sentence, urdf.path, urdf.motors.get(name))
+            raise FileError(sentence, tree.path, tree.motors.get(name))
         raise closures.file.error(sentence, ("name_mot", i))
     if not motors:
         sentence = "no motor is named; list the driven joints in 'name_mot:'"
         if closures.file is not None:
             raise closures.file.error(sentence)
-        raise FileError(f"{sentence} of a YAML file beside the URDF", urdf.path)
+        raise FileError(f"{sentence} of a YAML file beside the URDF", tree.path)
 
 
-def _find_link(urdf: Urdf, name: str) -> str | None:
+def _find_link(tree: LinkTree, name: str) -> str | None:
     """Return the link of a frame: a link, or the one that a joint carries; None where unknown."""
-    if name in urdf.joints:
-        return urdf.joints[name].child
-    return name if name in urdf.carrier or name == urdf.root else None
+    if name in tree.joints:
+        return tree.joints[name].child
+    return name if name in tree.carrier or name == tree.root else None
 
 
 def _build_closure(
-    urdf: Urdf, closures: Closures, i: int, pair: tuple[str, str], kind: str
+    tree: LinkTree, closures: Closures, i: int, pair: tuple[str, str], kind: str
 ) -> Weld | GraphJoint:
     """Return one closure of the YAML file."""
     file = closures.file
@@ -235,39 +315,42 @@ def _build_closure(
         raise file.error(sentence, ("closed_loop", i))
     ends: list[tuple[str, FloatArray, str]] = []
     for name in pair:
-        link = _find_link(urdf, name)
+        link = _find_link(tree, name)
         if link is None:
-            near = suggest_names(name, [*urdf.joints, *urdf.carrier])
-            sentence = f"the closure {quote(name)} is not a joint or link of {urdf.path.name}"
+            near = suggest_names(name, [*tree.joints, *tree.carrier])
+            sentence = f"the closure {quote(name)} is not a joint or link of {tree.path.name}"
             raise file.error(f"{sentence}{near}; correct it", ("closed_loop", i))
-        carrier = urdf.carrier.get(link)
+        carrier = tree.carrier.get(link)
         origin = carrier.name if carrier is not None and not carrier.kind else ""
-        ends.append((urdf.find_body(link), urdf.place_in_body(link), origin))
+        ends.append((tree.find_body(link), tree.place_in_body(link), origin))
     (a, T_a, near), (b, T_b, far) = ends
     if kind == WELD:
         return Weld(pair[0], a, b, T_a, T_b)
-    name = pair[0] + BALL_NAME if pair[0] in urdf.joints else pair[0]
-    return GraphJoint(name, "S", a, b, T_a, T_b, np.array([0.0, 0.0, 1.0]), near, far)
+    name = pair[0] + BALL_NAME if pair[0] in tree.joints else pair[0]
+    z = np.eye(3)[2]
+    if kind == PIN:
+        return GraphJoint(name, "R", a, b, T_a, T_b, z, near, far, "xy")
+    return GraphJoint(name, "S", a, b, T_a, T_b, z, near, far)
 
 
-def _list_rigid_closures(urdf: Urdf, closures: Closures) -> tuple[str, ...]:
+def _list_rigid_closures(tree: LinkTree, closures: Closures) -> tuple[str, ...]:
     """Return the closures of type 6d both frames of which are fixed to their links.
 
     A pin is a closure of type 6d only where a revolute joint carries one of its frames.
     """
     rigid = []
     for pair, kind in zip(closures.pairs, closures.kinds, strict=True):
-        links = (_find_link(urdf, name) for name in pair)
-        carriers = [urdf.carrier.get(link) for link in links if link is not None]
+        links = (_find_link(tree, name) for name in pair)
+        carriers = [tree.carrier.get(link) for link in links if link is not None]
         if kind == WELD and not any(joint is not None and joint.kind for joint in carriers):
             rigid.append(f"{pair[0]}, {pair[1]}")
     return tuple(rigid)
 
 
-def _build_constraint(urdf: Urdf, constraint: UrdfConstraint) -> tuple[Weld | GraphJoint, ...]:
+def _build_constraint(tree: LinkTree, constraint: Constraint) -> tuple[Weld | GraphJoint, ...]:
     """Return a `<constraint>` of the URDF; a universal one has a body between its two joints."""
     (a, A), (b, B) = (
-        (urdf.find_body(end.parent), urdf.place_in_body(end.parent) @ end.origin)
+        (tree.find_body(end.parent), tree.place_in_body(end.parent) @ end.origin)
         for end in constraint.ends
     )
     near, far = (end.name for end in constraint.ends)
@@ -275,8 +358,8 @@ def _build_constraint(urdf: Urdf, constraint: UrdfConstraint) -> tuple[Weld | Gr
     if not constraint.kind:
         return (Weld(name, a, b, A, B),)
     if constraint.kind != "U":
-        kind: Literal["R", "S"] = "R" if constraint.kind == "R" else "S"
-        shifts = list_axes_across(first) if kind == "R" else "xyz"
+        kind: Literal["R", "P", "S"] = constraint.kind  # type: ignore[assignment]
+        shifts = "xyz" if kind == "S" else list_axes_across(first)
         return (GraphJoint(name, kind, a, b, A, B, first, near, far, shifts),)
     # the cross: at value zero the second axis is turned across the first
     cross = f"cross of {name}"
@@ -288,53 +371,69 @@ def _build_constraint(urdf: Urdf, constraint: UrdfConstraint) -> tuple[Weld | Gr
     )
 
 
-def _list_joints(urdf: Urdf, overrides: Mapping[str, str]) -> Iterator[GraphJoint]:
+def _list_couplings(tree: LinkTree) -> tuple[Coupling, ...]:
+    """Return which joints follow others."""
+    return tuple(
+        Coupling(joint.name, *joint.mimic)
+        for joint in tree.joints.values()
+        if joint.mimic is not None and joint.kind
+    )
+
+
+def _list_joints(tree: LinkTree, overrides: Mapping[str, str]) -> Iterator[GraphJoint]:
     """Yield the movable joints of the tree, with those that the closure file replaces."""
-    for joint in urdf.joints.values():
-        if joint.kind:
-            kind = overrides.get(joint.name, "")
-            yield from _replace_joint(urdf, joint, kind) if kind else [_make_joint(urdf, joint)]
+    for joint in tree.joints.values():
+        if not joint.kind:
+            continue
+        axes = {"S": np.eye(3)[::-1], "U": np.array([joint.axis, joint.axis_2])}.get(joint.kind)
+        if kind := overrides.get(joint.name, ""):
+            axes = np.eye(3)[["XYZ".index(a) for a in ("ZYX" if kind == SPHERICAL else kind[-2:])]]
+        yield from [_make_joint(tree, joint)] if axes is None else _split(tree, joint, axes)
 
 
-def _make_joint(urdf: Urdf, joint: UrdfJoint) -> GraphJoint:
+def _make_joint(tree: LinkTree, joint: TreeJoint) -> GraphJoint:
     """Return a joint of the tree."""
     kind: Literal["R", "P"] = "R" if joint.kind == "R" else "P"
     return GraphJoint(
         joint.name,
         kind,
-        urdf.find_body(joint.parent),
+        tree.find_body(joint.parent),
         joint.child,
-        urdf.place_in_body(joint.parent) @ joint.origin,
+        tree.place_in_body(joint.parent) @ joint.origin,
         np.eye(4),
         joint.axis,
-        joint.name,
+        joint.name if joint.shifts else "",
         shifts=list_axes_across(joint.axis),
         limits=joint.limits,
     )
 
 
-def _replace_joint(urdf: Urdf, joint: UrdfJoint, kind: str) -> Iterator[GraphJoint]:
-    """Yield the joints by which a closure file replaces one: of a ball joint z, y, x."""
-    first = _make_joint(urdf, joint)
-    letters = "ZYX" if kind == "SPHERICAL" else kind[-2:]
-    body, bodies = first.body_a, [f"cross {i + 1} of {joint.name}" for i in range(len(letters) - 1)]
-    for i, (letter, after) in enumerate(zip(letters, [*bodies, first.body_b], strict=True)):
+def _split(tree: LinkTree, joint: TreeJoint, axes: FloatArray) -> Iterator[GraphJoint]:
+    """Yield rotary joints about axes (a, 3) by which one joint is replaced: of a ball z, y, x."""
+    first = _make_joint(tree, joint)
+    body, bodies = first.body_a, [f"cross {i + 1} of {joint.name}" for i in range(len(axes) - 1)]
+    for i, (axis, after) in enumerate(zip(axes, [*bodies, first.body_b], strict=True)):
         yield replace(
             first,
-            name=f"{joint.name}_{letter}",
+            name=f"{joint.name}_{_name_axis(axis, i)}",
             kind="R",
             body_a=body,
             body_b=after,
             T_a=first.T_a if i == 0 else np.eye(4),
-            axis=np.eye(3)["XYZ".index(letter)],
-            origin_a=joint.name if i == 0 else "",
+            axis=axis,
+            origin_a=first.origin_a if i == 0 else "",
             shifts="xyz",
             limits=None,
         )
         body = after
 
 
-def _locate_error(error: MechanismError, urdf: Urdf, closures: Closures) -> FileError:
+def _name_axis(axis: FloatArray, i: int) -> str:
+    """Return the letter of an axis of the frame, or a number."""
+    return "XYZ"[int(axis.argmax())] if axis.max() == 1.0 else str(i + 1)
+
+
+def _locate_error(error: MechanismError, tree: LinkTree, closures: Closures) -> FileError:
     """Return an error of the mechanism at the line of the closure that it names."""
     finding = error.finding
     name = "" if finding is None else finding.data.get("closure", "")
@@ -343,6 +442,6 @@ def _locate_error(error: MechanismError, urdf: Urdf, closures: Closures) -> File
     places = places or [i for i, pair in enumerate(closures.pairs) if frame in pair]
     if places and closures.file is not None:
         return closures.file.error(finding, ("closed_loop", places[-1]))
-    lines = {constraint.name: constraint.line for constraint in urdf.constraints}
-    line = lines.get(name) or (urdf.joints[name].line if name in urdf.joints else None)
-    return FileError(error.args[0], urdf.path, line)
+    lines = {constraint.name: constraint.line for constraint in tree.constraints}
+    line = lines.get(name) or (tree.joints[name].line if name in tree.joints else None)
+    return FileError(error.args[0], tree.path, line)

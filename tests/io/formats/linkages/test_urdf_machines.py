@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.linkages import urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
-from loopcal.io.formats.urdf import urdf_format as urdf
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse, jacobian
-from tests.io.formats.urdf.urdf_machines import UrdfSolver, make_hexapod, write_machine
+from tests.io.formats.linkages.urdf_machines import UrdfSolver, make_hexapod, write_machine
 
 AGREES = 1e-9  # [m, 1]: of machines of about 1 m
 MACHINES = {

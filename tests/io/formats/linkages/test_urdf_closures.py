@@ -8,11 +8,11 @@ import pytest
 
 from loopcal.errors import FileError, LoopcalError
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.linkages import urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
-from loopcal.io.formats.urdf import urdf_format as urdf
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
-from tests.io.formats.urdf.urdf_machines import UrdfSolver, make_hexapod, write_machine
+from tests.io.formats.linkages.urdf_machines import UrdfSolver, make_hexapod, write_machine
 
 
 def make_joint(
@@ -165,7 +165,7 @@ def test_mimic_joint_that_a_loop_moves_is_accepted(tmp_path) -> None:
     elbow = text.index('<axis xyz="0 0 1"/>', text.index("elbow"))
     with_mimic = text[:elbow] + "MIMIC" + text[elbow + len('<axis xyz="0 0 1"/>') :]
     read(tmp_path, with_mimic.replace("MIMIC", mimic.format(-1)))  # as the loops make it
-    with pytest.raises(LoopcalError, match="'elbow' mimics 'motor', which the loops do not make"):
+    with pytest.raises(LoopcalError, match="'elbow' follows 'motor' with the factor 2"):
         read(tmp_path, with_mimic.replace("MIMIC", mimic.format(2)))
 
 

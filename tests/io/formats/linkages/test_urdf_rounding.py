@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from loopcal.errors import LoopcalError
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.linkages import urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
-from loopcal.io.formats.urdf import urdf_format as urdf
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
-from tests.io.formats.urdf.urdf_chains import make_leg, make_tilted_table
-from tests.io.formats.urdf.urdf_machines import MachineJoint, make_pose, write_machine
+from tests.io.formats.linkages.urdf_chains import make_leg, make_tilted_table
+from tests.io.formats.linkages.urdf_machines import MachineJoint, make_pose, write_machine
 
 MACHINES = {"leg": make_leg, "table": make_tilted_table}
 GAP = r"closure '.*', between '.*' and '.*', stays .* mm and .* rad apart"

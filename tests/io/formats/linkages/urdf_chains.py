@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from tests.io.formats.urdf.urdf_machines import BASE, PLATFORM, MachineJoint, make_pose
+from tests.io.formats.linkages.urdf_machines import BASE, PLATFORM, MachineJoint, make_pose
 
 ABOUT = {
     "x": Rotation.from_euler("y", np.pi / 2).as_matrix(),

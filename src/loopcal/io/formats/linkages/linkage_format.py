@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""URDF with loop closures: read as a robot of the family limbs; its joint origins are corrected.
+"""Files of links and joints: read as a robot of limbs or stages; their origins are corrected.
 
 The platform is the body that carries a frame (a link on a fixed joint), or the one that the options
 name; that frame becomes the platform frame. Parameters are the shifts of each joint across its
-axis, in its own frame, and the zeros of the motors. Written back, a shift d changes the origin's
-xyz by R d, and a motor's zero turns its rpy about the axis; a slide's zero shifts xyz. The rest of
-the text stays as it is.
+axis, in its own frame, and the zeros of the motors. Written back, a shift d changes the place of an
+origin by R d, and a motor's zero turns it about the axis; a slide's zero shifts it. The rest of the
+text stays as it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,11 @@ from loopcal import geometry
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.yaml_file import format_yaml
+from loopcal.io.formats.linkages.closures import Linkage, find_closures, read_mechanism
+from loopcal.io.formats.linkages.tree import Constraint, LinkTree, TreeJoint, derive_end
 from loopcal.io.formats.program_format import (
     Exported,
     ExportSource,
-    Format,
     Imported,
     ImportOptions,
     format_head,
@@ -32,9 +33,6 @@ from loopcal.io.formats.program_format import (
     get_record,
     report_changes,
 )
-from loopcal.io.formats.urdf import tree as urdf_tree
-from loopcal.io.formats.urdf.closures import UrdfMechanism, read_mechanism
-from loopcal.io.formats.urdf.tree import Urdf, UrdfJoint
 from loopcal.mechanism.assembly import BASE, PLATFORM
 from loopcal.mechanism.families.limb_records import Prismatic, Revolute, matrix_from_place
 from loopcal.mechanism.families.limbs import Limbs
@@ -44,7 +42,6 @@ from loopcal.mechanism.joint_graph.loops import (
     JointGraph,
     count_repeated_closures,
     get_value,
-    list_nearby,
     measure_rotation,
 )
 from loopcal.mechanism.joint_graph.paths import (
@@ -58,75 +55,131 @@ from loopcal.mechanism.joint_graph.paths import (
 )
 from loopcal.typing import FloatArray
 
-# Corrected origins of a URDF: from the parameters of the robot that was read from it.
+# Corrected origins of a file: from the parameters of the robot that was read from it.
 
 PLACED = 1e-9
-"""Accepted difference between the places of a joint in URDF and robot file [m, 1]."""
+"""Accepted difference between the places of a joint in the file and the robot file [m, 1]."""
 
 
-def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the URDF with corrected origins; DataError where none is given, FileError where its
+def write(
+    source: ExportSource,
+    into: Path | None,
+    read_tree: Callable[[Path], LinkTree],
+    name: str,
+    what: str,
+) -> Exported:
+    """Return the file with corrected origins; DataError where none is given, FileError where its
     joints have other places.
     """
     record = get_record(
-        source, (Limbs, PlacedStages), "urdf", "a robot of the family limbs or stages"
+        source, (Limbs, PlacedStages), name, "a robot of the family limbs or stages"
     )
     if into is None:
         raise DataError(report_finding("files.urdf-needed"))
-    urdf, changes, expressed = urdf_tree.read(into), [], set()
+    tree, changes, expressed = read_tree(into), [], set()
     nominal = source.robot.parameters.nominal.tolist()
     values = zip(source.values().items(), nominal, strict=True)
     deviations = {name: value - before for (name, value), before in values}
-    for name, shifts, offset in _list_origins(record, urdf):
+    origins: dict[str, FloatArray] = {}
+    for place, shifts, offset in _list_origins(record, tree):
         shift = np.array([deviations.get(parameter, 0.0) for parameter in shifts])
         zero = deviations.get(offset, 0.0)
         expressed |= {*shifts, offset}
         if not shift.any() and zero == 0.0:
             continue
-        joint = urdf.places[name]
+        joint = tree.places[place]
         turn = zero if joint.kind == "R" else 0.0
         R = geometry.exp_so3(turn * joint.axis)
         moved = joint.origin @ geometry.make_pose(R, shift + (zero - turn) * joint.axis)
-        urdf = urdf.with_origin(name, moved, turned=turn != 0.0)
+        origins[place] = moved
         distance = float(np.linalg.norm(moved[:3, 3] - joint.origin[:3, 3]))
         changes.append(
             report_finding(
                 "files.joint-moved",
                 line=joint.line,
-                joint=name,
+                joint=place,
                 distance=Quantity(distance * 1e3, "mm"),
                 turn=Quantity(turn, "rad"),
             )
         )
     others = tuple(name for name, d in deviations.items() if d and name not in expressed)
-    rest = (report_finding("files.not-expressed", format="the URDF", names=others),)
-    text = get_byte_order_mark(into) + urdf.text
+    rest = (report_finding("files.not-expressed", format=f"the {what}", names=others),)
+    moved = tree.with_origins(origins)
+    if origins and any(constraint.derived for constraint in tree.constraints):
+        moved = _draw_closed(moved, [actuator.name for actuator in source.robot.actuators])
+    text = tree.rewrite(tree, moved) if origins else tree.text
     findings = (*report_changes(changes), *(rest if others else ()))
-    return Exported(text, findings)
+    return Exported(get_byte_order_mark(into) + text, findings)
 
 
-def _list_origins(record: Limbs | PlacedStages, urdf: Urdf) -> Iterator[tuple[str, list[str], str]]:
+def _draw_closed(moved: LinkTree, motors: Sequence[str]) -> LinkTree:
+    """Return a tree that is drawn with its loops closed, and all motors at zero.
+
+    One end of a derived constraint is where the drawn pose puts it. So the pose in which these
+    constraints are closed becomes the drawn one: only the zeros of passive joints differ, and the
+    first axis of a universal joint, which is written in the frame of its child.
+    """
+    tree = replace(moved, motors=dict.fromkeys(motors, 0))
+    mechanism = read_mechanism(tree, find_closures(tree.path))
+    names = [constraint.name for constraint in moved.constraints if constraint.derived]
+    derived = {f"{name}{part}" for name in names for part in ("", "_1", "_2")}
+    closing = tuple(joint for joint in mechanism.graph.closing if joint.name in derived)
+    graph = replace(mechanism.graph, closing=closing)
+    q = graph.close(np.zeros((1, len(graph.tree))), graph.is_driven)
+    if not np.isfinite(q).all():
+        raise moved.error(report_finding("files.drawn-open"), "")
+    placement, links = graph.place(q), {}
+    for link in (moved.root, *moved.carrier):
+        body, T = mechanism.locate(link)
+        if body in graph.bodies:
+            links[link] = graph.get_place(placement, body)[0] @ T
+
+    def draw(joint: TreeJoint) -> TreeJoint:
+        T = geometry.invert_pose(links[joint.parent]) @ links[joint.child]
+        if np.abs(T - joint.origin).max() < ZERO:
+            return joint
+        axis = T[:3, :3].T @ joint.origin[:3, :3] @ joint.axis
+        return replace(joint, origin=T, axis=axis if joint.kind == "U" else joint.axis)
+
+    def derive(constraint: Constraint) -> Constraint:
+        near, far = constraint.ends
+        if not constraint.derived or not {near.parent, far.parent} <= links.keys():
+            return constraint
+        T = derive_end(links, near.parent, far.parent, far.origin)
+        axis = T[:3, :3].T @ near.origin[:3, :3] @ constraint.axes[0]
+        axes = (axis if constraint.kind == "U" else constraint.axes[0], constraint.axes[1])
+        return replace(constraint, ends=(replace(near, origin=T), far), axes=axes)
+
+    joints = moved.joints.values()
+    known = [j for j in joints if j.kind and {j.parent, j.child} <= links.keys()]
+    constraints = tuple(map(derive, moved.constraints))
+    return replace(moved.with_joints(map(draw, known)), constraints=constraints)
+
+
+def _list_origins(
+    record: Limbs | PlacedStages, tree: LinkTree
+) -> Iterator[tuple[str, list[str], str]]:
     """Yield URDF joint, names of the shifts along its axes, and of the offset of its motor;
     FileError where a limb begins at another place than in the robot file.
     """
     if isinstance(record, Limbs):
-        yield from _list_limb_origins(record, urdf, "", np.eye(4))
+        yield from _list_limb_origins(record, tree, "", np.eye(4))
         return
     for i, (stage, robot) in enumerate(zip(record.stages, record.robots, strict=True)):
         mount = stage.mount.matrix if i == 0 else None
         if isinstance(robot, Limbs):
-            yield from _list_limb_origins(robot, urdf, f"{stage.name}.", mount)
+            yield from _list_limb_origins(robot, tree, f"{stage.name}.", mount)
         elif stage.joint is not None:
             drive = stage.joint.drive or stage.name
-            if isinstance(drive, str) and drive in urdf.joints:
+            if isinstance(drive, str) and drive in tree.joints:
                 if mount is not None:
-                    _check_place(urdf, drive, mount @ matrix_from_place(stage.joint.at))
+                    _check_place(tree, drive, mount @ matrix_from_place(stage.joint.at))
                 shifts = [f"{stage.name}.{axis}" for axis in "xyz"]
                 yield drive, shifts, f"{stage.name}.offset"
 
 
 def _list_limb_origins(
-    record: Limbs, urdf: Urdf, prefix: str, mount: FloatArray | None
+    record: Limbs, tree: LinkTree, prefix: str, mount: FloatArray | None
 ) -> Iterator[tuple[str, list[str], str]]:
     """Yield the same of one robot of limbs; `prefix` begins the names of its parameters, mount (4,
     4) is its base in the root of the URDF, None where another stage carries it.
@@ -134,37 +187,34 @@ def _list_limb_origins(
     named = [parameter.name for parameter in record.parameters]
     for limb in record.limbs:
         first = limb.chain[0] if limb.chain else None
-        if first is not None and first.name in urdf.joints and mount is not None:
-            _check_place(urdf, first.name, mount @ matrix_from_place(first.at))
+        if first is not None and first.name in tree.joints and mount is not None:
+            _check_place(tree, first.name, mount @ matrix_from_place(first.at))
         driven = (j for j in limb.chain if isinstance(j, Revolute | Prismatic))
         motors = {joint.name: joint.actuated for joint in driven if joint.actuated}
         start = f"{limb.name}."
         names = [entry.name or entry.of for entry in limb.errors] + list(motors)
         names += [n.removeprefix(start)[:-2] for n in named if n.startswith(start)]
         for name in dict.fromkeys(names):
-            if name in urdf.places:
+            if name in tree.places:
                 shifts = [f"{prefix}{limb.name}.{name}.{axis}" for axis in "xyz"]
                 yield name, shifts, f"{prefix}{motors.get(name) or ''}.offset"
 
 
-def _check_place(urdf: Urdf, name: str, stated: FloatArray) -> None:
+def _check_place(tree: LinkTree, name: str, stated: FloatArray) -> None:
     """Refuse a URDF in which the first joint of a limb has another place; raises FileError."""
-    joint = urdf.joints[name]
-    if urdf.find_body(joint.parent) != urdf.root:
+    joint = tree.joints[name]
+    if tree.find_body(joint.parent) != tree.root:
         return  # a closure carries it
-    place = urdf.place_in_body(joint.parent) @ joint.origin
+    place = tree.place_in_body(joint.parent) @ joint.origin
     # a repaired loop has its axes elsewhere, by no more than the digits of the file explain
-    rounding = sum(sum(other.rounding) for other in urdf.places.values())
+    rounding = sum(sum(other.rounding) for other in tree.places.values())
     if np.abs(place - stated).max() > PLACED + rounding:
         sentence = f"joint {name!r} has another place in the robot file"
-        raise urdf.error(f"{sentence}; export into the URDF it was read from", name)
+        raise tree.error(f"{sentence}; export into the URDF it was read from", name)
 
 
 LARGE = 30.0
 """Largest distance of two joints of a link that is plausible [m]; URDF has no other unit."""
-
-MIMICS = 1e-9
-"""Largest difference between a joint and the one that it mimics [rad, m]."""
 
 REMARKS = {
     "limbs": "Limbs are named after their first joint, joints as in the URDF.",
@@ -174,16 +224,12 @@ REMARKS = {
 """What people should know about the names, by the family of the robot file."""
 
 
-def read(path: Path, options: ImportOptions) -> Imported:
-    """Read a URDF and its closures; FileError where it is not valid, or its loops do not close."""
-    urdf = urdf_tree.read(path)
-    closures: Path | None = options.closures or path.with_suffix(".yaml")
-    assert closures is not None
-    if options.closures is None and not closures.exists():
-        if not urdf.constraints:
-            raise FileError(report_finding("files.closures-missing"), path)
-        closures = None
-    mechanism = read_mechanism(urdf, closures)
+def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
+    """Return the robot of a file and its closures; FileError where its loops do not close."""
+    path, closures = tree.path, options.closures or find_closures(tree.path)
+    if closures is None and not tree.constraints and not tree.motors:
+        raise FileError(report_finding("files.closures-missing", what=what), path)
+    mechanism = read_mechanism(tree, closures)
     platform, frame = _find_platform(mechanism, options.platform)
 
     def locate_frame(body: str) -> FloatArray:
@@ -200,19 +246,19 @@ def read(path: Path, options: ImportOptions) -> Imported:
             raise MechanismError(finding)
     except MechanismError as error:
         finding = _name_links(mechanism, error.args[0])
-        raise urdf.error(finding, _find_origin(urdf, finding.data.get("joints", ()))) from None
-    _check_mimics(urdf, paths)
+        raise tree.error(finding, _find_origin(tree, finding.data.get("joints", ()))) from None
+    _check_couplings(mechanism, paths)
     closing = closures.name if closures is not None else "its constraints"
-    what = f"a URDF with loop closures in {closing}"
+    what = f"{what} with loop closures in {closing}"
     family = choose_family(paths)
     remark = REMARKS[family]
     head = format_head(path, what, family, options.name, ("m", "rad"), remark)
     text = head + format_yaml(describe_robot(mechanism, paths, frame))
-    findings = tuple(_report_structure(mechanism, paths, frame))
+    findings = (*tree.notes, *_report_structure(mechanism, paths, frame))
     return Imported(text, None, findings, _doubt_closures(mechanism, paths))
 
 
-def _doubt_closures(mechanism: UrdfMechanism, paths: StagePaths) -> Finding | None:
+def _doubt_closures(mechanism: Linkage, paths: StagePaths) -> Finding | None:
     """Return that rigid closures probably stand for pins, where motors exceed the mobility."""
     motors, mobility = len(paths.graph.motors), paths.motions.mobility
     if not mechanism.rigid_closures or motors <= mobility:
@@ -222,16 +268,20 @@ def _doubt_closures(mechanism: UrdfMechanism, paths: StagePaths) -> Finding | No
     )
 
 
-def _find_platform(mechanism: UrdfMechanism, name: str | None) -> tuple[str, str]:
+def _find_platform(mechanism: Linkage, name: str | None) -> tuple[str, str]:
     """Return the platform's body, and the link whose frame is the platform frame.
 
     It is the link that is named; else the only frame (a link on a fixed joint that closes no loop)
     on a moving body, of several the only one on a body at an end of the mechanism that limbs join
     to what carries it; else that body. Several ends, such as the feet of a humanoid, are listed.
     """
-    urdf, graph = mechanism.urdf, mechanism.graph
+    tree, graph = mechanism.tree, mechanism.graph
     moving = graph.bodies[1:]
-    fixed = (joint.child for joint in urdf.joints.values() if not joint.kind)
+    fixed = (
+        joint.child
+        for joint in tree.joints.values()
+        if not joint.kind and joint.parent not in tree.hidden
+    )
     frames = [link for link in fixed if link not in mechanism.frames]
     frames = [link for link in frames if mechanism.locate(link)[0] in moving]
     possible = list_possible_platforms(graph)
@@ -241,11 +291,11 @@ def _find_platform(mechanism: UrdfMechanism, name: str | None) -> tuple[str, str
     others = (choose_link(mechanism, body) for body in possible or moving if body not in named)
     links = (*suited, *others)
     if name is not None:
-        known = name in {*urdf.carrier, urdf.root}
+        known = name in {*tree.carrier, tree.root}
         body = mechanism.locate(name)[0] if known else None
         if body not in moving:
             finding = report_finding("files.platform-unknown", platform=name, links=links)
-            raise FileError(finding, urdf.path)
+            raise FileError(finding, tree.path)
         return str(body), name
     chosen = frames if len(frames) == 1 else suited
     if len(chosen) == 1:
@@ -253,23 +303,23 @@ def _find_platform(mechanism: UrdfMechanism, name: str | None) -> tuple[str, str
     if not chosen and len(possible) == 1:
         return possible[0], choose_link(mechanism, possible[0])
     finding = report_finding("files.platform-unclear", frames=tuple(frames), links=links)
-    raise FileError(finding, urdf.path)
+    raise FileError(finding, tree.path)
 
 
-def _find_origin(urdf: Urdf, names: Sequence[str]) -> str:
+def _find_origin(tree: LinkTree, names: Sequence[str]) -> str:
     """Return the last joint of the file among joints of a mechanism; empty where there is none.
 
     Parts of a replaced joint end in _X, _Y or _Z; a closure has the name of a link.
     """
     for name in reversed(names):
-        carrier = urdf.carrier.get(name)
+        carrier = tree.carrier.get(name)
         for joint in (name, name[:-2], carrier.name if carrier is not None else ""):
-            if joint in urdf.places:
+            if joint in tree.places:
                 return joint
     return ""
 
 
-def _name_links(mechanism: UrdfMechanism, finding: Finding) -> Finding:
+def _name_links(mechanism: Linkage, finding: Finding) -> Finding:
     """Return a refusal that names the links of the file instead of the bodies that they form."""
     bodies = {"body", "body_a", "body_b", "platform"}
     data = {
@@ -279,31 +329,29 @@ def _name_links(mechanism: UrdfMechanism, finding: Finding) -> Finding:
     return replace(finding, data=data)
 
 
-def _check_mimics(urdf: Urdf, paths: StagePaths) -> None:
-    """Refuse a joint that mimics another where the loops do not make it so; raises FileError."""
-    graph = paths.graph
-    near = list_nearby(graph, paths.home)
-    for joint in urdf.joints.values():
-        if joint.mimic is None or joint.name in paths.dangling or not joint.kind:
-            continue
-        followed, factor, offset = joint.mimic
-        if {joint.name, followed} <= {*graph.names}:
-            i, j = graph.names.index(joint.name), graph.names.index(followed)
-            gap = near[:, i] - factor * near[:, j] - offset
-            turns = np.round(gap[0] / (2 * np.pi)) * 2 * np.pi if joint.kind == "R" else 0.0
-            if len(near) > 1 and np.abs(gap - turns).max() < MIMICS:
-                continue
-        finding = report_finding("files.joint-mimics", joint=joint.name, followed=followed)
-        raise urdf.error(finding, joint.name)
+def _check_couplings(mechanism: Linkage, paths: StagePaths) -> None:
+    """Refuse a joint that follows another one in a way that no drive expresses; raises
+    FileError.
+    """
+    names = {joint.name for joint in paths.graph.joints}
+    for coupling in mechanism.couplings:
+        if coupling.joint in names:
+            finding = report_finding(
+                "files.joint-mimics",
+                joint=coupling.joint,
+                followed=coupling.leader,
+                factor=coupling.factor,
+            )
+            raise mechanism.tree.error(finding, coupling.joint)
 
 
-def _report_structure(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> Iterator[Finding]:
+def _report_structure(mechanism: Linkage, paths: StagePaths, frame: str) -> Iterator[Finding]:
     """Yield the size of the mechanism, its home, and what the robot file does not express."""
     graph, motions = paths.graph, paths.motions
     yield report_finding(
         "files.urdf-structure",
         bodies=len(graph.bodies),
-        links=len(mechanism.urdf.carrier) + 1,
+        links=len(mechanism.tree.carrier) + 1,
         joints=len(graph.joints),
         loops=len(graph.closing),
         motors=len(graph.motors),
@@ -413,6 +461,12 @@ def describe_pose(T: FloatArray) -> Content | list[float]:
     return shown or [0.0, 0.0, 0.0]
 
 
+def _describe_moved(key: str, T: FloatArray) -> Content:
+    """Return a pose (4, 4) by its key, nothing where it is the identity but for rounding."""
+    pose = describe_pose(T)
+    return {key: pose} if isinstance(pose, dict) else {}
+
+
 def _clear(numbers: Iterable[float]) -> list[float]:
     """Return numbers without rounding near 0."""
     return [float(v) if abs(v) > ZERO else 0.0 for v in numbers]
@@ -457,12 +511,11 @@ def choose_family(paths: StagePaths) -> str:
     return "limbs" if is_closed and not others else "stages"
 
 
-def describe_robot(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> Content:
+def describe_robot(mechanism: Linkage, paths: StagePaths, frame: str) -> Content:
     """Return a robot file without its head; `frame` is the link that is the platform frame."""
-    urdf, T_body_frame = mechanism.urdf, mechanism.locate(frame)[1]
+    tree, T_body_frame = mechanism.tree, mechanism.locate(frame)[1]
     tool = geometry.invert_pose(paths.stages[-1].frame) @ T_body_frame
-    is_turned = not np.array_equal(paths.stages[-1].frame, T_body_frame)
-    ending = {"tool": describe_pose(tool)} if is_turned else {}
+    ending = _describe_moved("tool", tool)
     if choose_family(paths) == "limbs":
         assert isinstance(paths.stages[0], ClosedStage)
         return _describe_limbs(mechanism, paths.stages[0]) | ending
@@ -472,7 +525,7 @@ def describe_robot(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> C
         {
             "name": name,
             **(
-                {"joint": _describe_joint(urdf, stage, before)}
+                {"joint": _describe_joint(tree, stage, before)}
                 if isinstance(stage, SerialStage)
                 else _describe_loop(mechanism, stage, before)
             ),
@@ -485,14 +538,17 @@ def describe_robot(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> C
     return {"controlled": controlled, "stages": stages, **ending}
 
 
-def choose_link(mechanism: UrdfMechanism, body: str) -> str:
-    """Return the link of a rigid body that has most movable joints: closures cut links in parts."""
-    movable = [joint for joint in mechanism.urdf.joints.values() if joint.kind]
+def choose_link(mechanism: Linkage, body: str) -> str:
+    """Return the link of a rigid body that has most movable joints, of those that the file names:
+    closures cut links in parts.
+    """
+    movable = [joint for joint in mechanism.tree.joints.values() if joint.kind]
     ends = [link for joint in movable for link in (joint.parent, joint.child)]
-    return max(mechanism.list_links(body), key=ends.count)
+    hidden = mechanism.tree.hidden
+    return max(mechanism.list_links(body), key=lambda link: (link not in hidden, ends.count(link)))
 
 
-def list_stage_names(mechanism: UrdfMechanism, paths: StagePaths) -> tuple[str, ...]:
+def list_stage_names(mechanism: Linkage, paths: StagePaths) -> tuple[str, ...]:
     """Return names of the stages: of a joint its own, of a loop that of the link it carries."""
     return _make_unique(
         stage.joint.name
@@ -521,10 +577,10 @@ def _choose_coordinates(
     return list(choose_coordinates(home, motions))
 
 
-def _describe_limbs(mechanism: UrdfMechanism, stage: ClosedStage) -> Content:
+def _describe_limbs(mechanism: Linkage, stage: ClosedStage) -> Content:
     """Return the keys of the family limbs."""
     paths, T_body_frame = stage.paths, stage.frame
-    graph, joints = paths.graph, mechanism.urdf.joints
+    graph, joints = paths.graph, mechanism.tree.joints
     links = (choose_link(mechanism, body) for body in paths.bodies)
     inner = _make_unique(links, (BASE, PLATFORM))
     bodies = dict(zip(paths.bodies, inner, strict=True))
@@ -545,49 +601,39 @@ def _describe_limbs(mechanism: UrdfMechanism, stage: ClosedStage) -> Content:
     }
 
 
-def _describe_loop(
-    mechanism: UrdfMechanism, stage: ClosedStage, T_frame_body: FloatArray
-) -> Content:
+def _describe_loop(mechanism: Linkage, stage: ClosedStage, T_frame_body: FloatArray) -> Content:
     """Return a stage with closed loops.
 
     T_frame_body (4, 4) is the body that carries it in the platform of the stage before.
     """
     mount = T_frame_body @ stage.mount
-    is_moved = not np.array_equal(mount, np.eye(4))
-    moved = {"mount": describe_pose(mount)} if is_moved else {}
-    return {**moved, "family": "limbs", **_describe_limbs(mechanism, stage)}
+    return {
+        **_describe_moved("mount", mount),
+        "family": "limbs",
+        **_describe_limbs(mechanism, stage),
+    }
 
 
-def _describe_joint(urdf: Urdf, stage: SerialStage, T_frame_body: FloatArray) -> Content:
+def _describe_joint(tree: LinkTree, stage: SerialStage, T_frame_body: FloatArray) -> Content:
     """Return a driven joint; arguments as those of `_describe_loop`."""
     joint, tip = stage.joint, geometry.invert_pose(stage.joint.T_b) @ stage.frame
     return {
         "kind": joint.kind,
         "at": describe_pose(T_frame_body @ joint.T_a),
         "axis": _clear(joint.axis),
-        **({} if np.array_equal(tip, np.eye(4)) else {"tip": describe_pose(tip)}),
+        **_describe_moved("tip", tip),
         "drive": joint.drive,
         "start": stage.start,
-        **_describe_stroke(urdf.joints[joint.drive]),
+        **_describe_stroke(tree.joints[joint.drive]),
         "errors": [*joint.shifts, "offset"],
     }
 
 
-def _describe_drive(joint: UrdfJoint) -> Content:
+def _describe_drive(joint: TreeJoint) -> Content:
     """Return one drive of the robot file."""
     reads = "angle" if joint.kind == "R" else "length"
     return {"reads": reads, "unknown": ["offset"], **_describe_stroke(joint)}
 
 
-def _describe_stroke(joint: UrdfJoint) -> Content:
+def _describe_stroke(joint: TreeJoint) -> Content:
     return {} if joint.limits is None else {"stroke": list(joint.limits)}
-
-
-FORMAT = Format(
-    "urdf",
-    "URDF with loop closures",
-    (".urdf",),
-    read,
-    write,
-    read_options={"closures": "", "platform": ""},
-)

@@ -9,14 +9,13 @@ import pytest
 
 from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.linkages import urdf
+from loopcal.io.formats.linkages.closures import read_mechanism
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
-from loopcal.io.formats.urdf import tree as urdf_tree
-from loopcal.io.formats.urdf import urdf_format as urdf
-from loopcal.io.formats.urdf.closures import read_mechanism
 from loopcal.mechanism.joint_graph.paths import find_stage_paths
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
-from tests.io.formats.urdf.urdf_machines import UrdfSolver
+from tests.io.formats.linkages.urdf_machines import UrdfSolver
 
 FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"
 FRAME = {FIVE_BAR: "effector", DELTA: "eff"}
@@ -61,7 +60,7 @@ def test_poses_agree_with_the_tree_after_closing_its_loops(files, read, name) ->
     """The reference closes all loops of the tree by Newton's method, branches included."""
     robot = read[name][1]
     solver = UrdfSolver(files[name], files[name].with_name("robot.yaml"))
-    mechanism = read_mechanism(urdf_tree.read(files[name]), files[name].with_name("robot.yaml"))
+    mechanism = read_mechanism(urdf.read_tree(files[name]), files[name].with_name("robot.yaml"))
     paths = find_stage_paths(mechanism.graph, mechanism.locate(FRAME[name])[0], lambda _: np.eye(4))
     start = np.zeros(len(solver.values))
     for joint, value in zip(paths.graph.names, paths.home, strict=True):
@@ -218,10 +217,10 @@ def test_circle_of_fixed_joints_is_refused(tmp_path) -> None:
     path = tmp_path / "robot.urdf"
     path.write_text(CIRCLE)
     with pytest.raises(FileError, match=r"urdf:4: joint 'k' closes a circle of links: 'a' is carr"):
-        urdf_tree.read(path)
+        urdf.read_tree(path)
     path.write_text(CIRCLE.replace('"fixed"', '"revolute"'))
     with pytest.raises(FileError, match="closes a circle of links"):
-        urdf_tree.read(path)
+        urdf.read_tree(path)
 
 
 def test_urdf_is_limited_in_joints_elements_and_nesting(tmp_path) -> None:
@@ -235,4 +234,4 @@ def test_urdf_is_limited_in_joints_elements_and_nesting(tmp_path) -> None:
     ):
         path.write_text(f'<robot name="r">{content}</robot>')
         with pytest.raises(FileError, match=reason):
-            urdf_tree.read(path)
+            urdf.read_tree(path)

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Links and joints of a file as a tree, with the constraints that close its loops.
+
+Formats differ in where they write a number; all of them give such a tree. A joint's frame is its
+parent link's frame moved by `origin`; the child link turns about, or slides along, `axis` in that
+frame. Lengths are meters, angles radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import FileError, suggest_names
+from loopcal.io.core.limits import XML_JOINTS, find_fault
+from loopcal.io.formats.linkages.xml_tree import Element
+from loopcal.typing import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class TreeJoint:
+    """A joint from link `parent` to `child`: R, P, S, U (about `axis`, then `axis_2`), or "" for a
+    fixed one.
+
+    `origin` : (4, 4) T_parent_joint [m]. `axis`, `axis_2` : (3,) unit vectors. `limits` : [rad or
+    m]. `line` : from 1. `element` : what states its origin, None without. `mimic` : the joint that
+    it follows, factor and offset [rad or m]; None without. `rounding` : error of origin and axis by
+    the rounding of their numbers [m, rad]. `shifts` : whether the file can state another origin.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: FloatArray
+    axis: FloatArray
+    limits: tuple[float, float] | None
+    line: int
+    element: Element | None = None
+    mimic: tuple[str, float, float] | None = None
+    rounding: tuple[float, float] = (0.0, 0.0)
+    axis_2: FloatArray = field(default_factory=lambda: np.eye(3)[1])
+    shifts: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """A constraint between two links: R, P, S, U, or "" for a rigid link that was cut.
+
+    `ends` are its frames on both links, as fixed joints without a child; `axes` (3,) unit vectors
+    in each of the frames. `derived` : whether only one end is written, and the other one is where
+    it is in the drawn pose.
+    """
+
+    name: str
+    kind: str
+    ends: tuple[TreeJoint, TreeJoint]
+    axes: tuple[FloatArray, FloatArray]
+    line: int
+    derived: bool = False
+
+
+@dataclass(frozen=True)
+class LinkTree:
+    """A file: joints by name, the link `root` that no joint carries, `carrier` link -> joint that
+    carries it, constraints that close loops, and `motors` joint -> line.
+
+    `rewrite` : returns the text with the origins and axes of another tree, from both trees.
+    `hidden` : links that the file does not name. `notes` : what was left out.
+    """
+
+    path: Path
+    text: str
+    joints: Mapping[str, TreeJoint]
+    root: str
+    carrier: Mapping[str, TreeJoint]
+    constraints: tuple[Constraint, ...]
+    motors: Mapping[str, int]
+    rewrite: Callable[[LinkTree, LinkTree], str]
+    hidden: frozenset[str] = frozenset()
+    notes: tuple[Any, ...] = ()
+
+    @cached_property
+    def places(self) -> Mapping[str, TreeJoint]:
+        """Joints and the ends of constraints, by name."""
+        ends = {end.name: end for constraint in self.constraints for end in constraint.ends}
+        return {**ends, **self.joints}
+
+    def error(self, sentence: Any, joint: str) -> FileError:
+        """Return an error at the line of a joint."""
+        line = self.places[joint].line if joint in self.places else None
+        return FileError(sentence, self.path, line)
+
+    def find_body(self, link: str) -> str:
+        """Return the rigid body of a link: of links on fixed joints the one nearest to the root."""
+        while link in self.carrier and not self.carrier[link].kind:
+            link = self.carrier[link].parent
+        return link
+
+    def place_in_body(self, link: str) -> FloatArray:
+        """Return T_body_link (4, 4) of a link in its rigid body."""
+        T = np.eye(4)
+        while link in self.carrier and not self.carrier[link].kind:
+            T, link = self.carrier[link].origin @ T, self.carrier[link].parent
+        return T
+
+    def with_joints(self, changed: Iterable[TreeJoint]) -> LinkTree:
+        """Return the tree with other joints in the place of those of their names."""
+        joints = {**self.joints, **{joint.name: joint for joint in changed}}
+        carrier = {link: joints[joint.name] for link, joint in self.carrier.items()}
+        return replace(self, joints=joints, carrier=carrier)
+
+    def with_origins(self, moved: Mapping[str, FloatArray]) -> LinkTree:
+        """Return the tree with other origins (4, 4) of joints and ends of constraints."""
+
+        def move(place: TreeJoint) -> TreeJoint:
+            return replace(place, origin=moved.get(place.name, place.origin))
+
+        constraints = tuple(
+            replace(constraint, ends=(move(constraint.ends[0]), move(constraint.ends[1])))
+            for constraint in self.constraints
+        )
+        tree = self.with_joints(map(move, self.joints.values()))
+        return replace(tree, constraints=constraints)
+
+
+def make_end(
+    constraint: str,
+    end: str,
+    link: str,
+    origin: FloatArray,
+    line: int,
+    element: Element | None = None,
+    rounding: tuple[float, float] = (0.0, 0.0),
+) -> TreeJoint:
+    """Return the end `parent` or `child` of a constraint, a frame (4, 4) of a link [m]."""
+    name, x = f"{constraint}_{end}", np.eye(3)[0]
+    return TreeJoint(name, "", link, "", origin, x, None, line, element, rounding=rounding)
+
+
+def build_tree(
+    path: Path,
+    text: str,
+    links: Sequence[str],
+    joints: Sequence[TreeJoint],
+    constraints: Sequence[Constraint],
+    motors: Mapping[str, int],
+    rewrite: Callable[[LinkTree, LinkTree], str],
+    what: str,
+) -> LinkTree:
+    """Return the tree of links and joints; FileError where names repeat, or they are not one
+    tree.
+    """
+    named: dict[str, dict[str, int]] = {"joint": {}, "constraint": {}}
+    for sort, entry in (*(("joint", j) for j in joints), *(("constraint", c) for c in constraints)):
+        if entry.name in named[sort]:
+            raise FileError(f"duplicate {sort} {entry.name!r}; rename one", path, entry.line)
+        if (fault := find_fault(entry.name)) is not None:
+            raise FileError(fault, path, entry.line)
+        named[sort][entry.name] = entry.line
+        XML_JOINTS.check(len(named[sort]), what, path, entry.line)
+    carrier: dict[str, TreeJoint] = {}
+    known = set(links)
+    for joint in joints:
+        for link in (joint.parent, joint.child):
+            if link not in known:
+                sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
+                raise FileError(f"{sentence}; correct it", path, joint.line)
+        if joint.child in carrier:
+            other = carrier[joint.child].name
+            sentence = f"link {joint.child!r} is the child of {other!r} and of {joint.name!r}"
+            raise FileError(f"{sentence}, but a URDF is a tree; correct it", path, joint.line)
+        carrier[joint.child] = joint
+    roots = [link for link in links if link not in carrier]
+    if len(roots) != 1:
+        listed = ", ".join(roots[:4])
+        sentence = f"this {what.removesuffix(' file')} has {len(roots)} root links ({listed})"
+        raise FileError(f"{sentence}, but one is needed; join them", path)
+    _refuse_cycles(path, links, roots[0], carrier)
+    for constraint in constraints:
+        for link in (end.parent for end in constraint.ends):
+            if link not in known:
+                sentence = f"constraint {constraint.name!r} names the link {link!r}"
+                sentence += f", which does not exist{suggest_names(link, links)}"
+                raise FileError(f"{sentence}; correct it", path, constraint.line)
+    tree = {joint.name: joint for joint in joints}
+    return LinkTree(path, text, tree, roots[0], carrier, tuple(constraints), motors, rewrite)
+
+
+def _refuse_cycles(
+    path: Path, links: Collection[str], root: str, carrier: Mapping[str, TreeJoint]
+) -> None:
+    """Raise FileError for a link that is not carried by the root, but by itself."""
+    carried = {root}
+    for start in links:
+        chain: dict[str, None] = {}
+        link = start
+        while link not in carried and link not in chain:
+            chain[link] = None
+            link = carrier[link].parent
+        if link in chain:
+            joint = carrier[link]
+            sentence = f"joint {joint.name!r} closes a circle of links: {joint.child!r} is carried"
+            raise FileError(f"{sentence} by itself; correct its parent", path, joint.line)
+        carried |= chain.keys()
+
+
+def draw_links(tree: LinkTree) -> dict[str, FloatArray]:
+    """Return link -> T_root_link (4, 4) with all joints at zero [m]."""
+    drawn = {tree.root: np.eye(4)}
+    for start in tree.carrier:
+        chain, link = [], start
+        while link not in drawn:
+            chain.append(tree.carrier[link])
+            link = chain[-1].parent
+        for joint in reversed(chain):
+            drawn[joint.child] = drawn[joint.parent] @ joint.origin
+    return drawn
+
+
+def derive_end(drawn: Mapping[str, FloatArray], link: str, other: str, T: FloatArray) -> FloatArray:
+    """Return the frame of a link that is, in the drawn pose, where the frame T (4, 4) of another
+    one is.
+    """
+    return geometry.invert_pose(drawn[link]) @ drawn[other] @ T

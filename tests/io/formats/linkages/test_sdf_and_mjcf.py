@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SDF and MJCF: read as the machine that an independent solver closes, and written back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal import forward, inverse
+from loopcal.io.formats import FORMATS
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import ExportSource, ImportOptions
+from loopcal.mechanism.model import Mechanism
+from tests.io.formats.linkages.linkage_texts import write_mjcf, write_sdf
+from tests.io.formats.linkages.urdf_chains import make_digger, make_leg
+from tests.io.formats.linkages.urdf_machines import MachineJoint, UrdfSolver, write_machine
+
+AGREES = 1e-9
+"""Largest difference of two solutions [m, 1]; both close loops to 1e-12."""
+MACHINES = {"leg": make_leg, "rocker": lambda: make_digger(has_rocker=True)}
+
+
+def write(folder: Path, joints: list[MachineJoint], name: str) -> Path:
+    path = folder / {"sdf": "robot.sdf", "mjcf": "robot.xml"}[name]
+    if name == "sdf":
+        text, motors = write_sdf(joints)
+        path.with_suffix(".yaml").write_text(motors)
+    else:
+        text = write_mjcf(joints)
+    path.write_text(text)
+    return path
+
+
+def read(path: Path, name: str, platform: str | None = None) -> Mechanism:
+    entry = FORMATS[name]
+    assert entry.read is not None
+    imported = entry.read(path, ImportOptions("machine", platform=platform))
+    return build_imported_robot(path, imported)
+
+
+def export(robot: Mechanism, path: Path, name: str) -> str:
+    entry = FORMATS[name]
+    assert entry.write is not None
+    exported = entry.write(ExportSource(robot), path)
+    assert "files.not-expressed" not in {finding.code for finding in exported.findings}
+    return exported.text
+
+
+def draw_readings(robot: Mechanism) -> np.ndarray:
+    home = inverse(robot, robot.home[None]).q
+    return home + np.random.default_rng(2).uniform(-0.05, 0.05, (3, home.shape[1]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sdf", "mjcf"])
+@pytest.mark.parametrize("machine", MACHINES)
+def test_machine_agrees_with_the_solver_and_is_written_back(tmp_path, machine, name) -> None:
+    joints = MACHINES[machine]()
+    path = write(tmp_path, joints, name)
+    robot = read(path, name, "tool")
+    q = draw_readings(robot)
+    urdf, closures = write_machine(joints)
+    (tmp_path / "m.urdf").write_text(urdf)
+    (tmp_path / "m.loops").write_text(closures)
+    solver = UrdfSolver(tmp_path / "m.urdf", tmp_path / "m.loops")
+    order = [[actuator.name for actuator in robot.actuators].index(m) for m in solver.motors]
+    found = forward(robot, q).T
+    expected = [solver.forward(one[order], "tool") for one in q]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=AGREES)
+    assert export(robot, path, name) == path.read_text()
+
+    changes = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
+    changed = robot.with_values(robot.values + changes)
+    text = export(changed, path, name)
+    assert text.count("<!--") == path.read_text().count("<!--")
+    path.write_text(text)
+    moved = forward(changed, q).T
+    np.testing.assert_allclose(forward(read(path, name, "tool"), q).T, moved, rtol=0, atol=AGREES)
+    assert np.abs(moved - found).max() > 1e-4  # [m, 1]: the changes matter
