@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
+from loopcal.apply.simulated_measurements import simulate_measurements
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError
 from loopcal.io.robot.robot_file import find_robot_file
@@ -273,3 +274,21 @@ def test_a_refused_pose_is_called_as_in_its_file(
     for command in commands:
         assert main(command.split()) == 1
         assert sentence in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("name", ["belt-4", "cable-4"])
+def test_skipping_leaves_out_only_poses_that_cannot_be_measured(name):
+    """Redundant drives of a true machine contradict each other; its poses are reached all the
+    same.
+    """
+    robot = zoo.load_cached_robot(name)
+    instrument = Instrument((Sensor(Position(), Gaussian(np.full(3, 1e-5))),))
+    for seed in (1, 2, 3):
+        made = [
+            simulate_measurements(
+                robot, instrument, 30, draw_errors=True, seed=seed, skip_unreachable=skip
+            )
+            for skip in (False, True)
+        ]
+        assert not made[1].skipped
+        assert_allclose(made[1].data.readings, made[0].data.readings, rtol=0.0, atol=0.0)

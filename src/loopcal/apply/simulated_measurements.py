@@ -20,13 +20,15 @@ from loopcal.measure.kinds.position import TargetKind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import StatedValue
 from loopcal.measure.simulation import (
+    reach_poses,
     replace_measured_values,
     sample_truth,
     simulate,
     simulate_contacts,
 )
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import resolve_poses
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
@@ -71,7 +73,8 @@ def simulate_measurements(
     skipped: tuple[str, ...] = ()
     if skip_unreachable:
         commanded = inverse(truth.nominal, targets)
-        reached = forward(truth, commanded.q, commanded).converged
+        _, state = reach_poses(truth, truth.values[None], commanded.q, commanded.state)
+        reached = state.status[0] == Status.CONVERGED
         inside = ~find_outside_strokes(commanded.q, truth).any(axis=1)
         is_kept = commanded.converged & reached & inside
         numbers = labels or tuple(str(i + 1) for i in range(len(targets)))

@@ -63,12 +63,12 @@ EXACT = 1e-6  # share of the noise to which a gap is reached
 OFFSETS = ("height", "a", "b")
 
 
-def _reach_poses(
+def reach_poses(
     robot: Mechanism,
     values: FloatArray,
     readings: FloatArray,
     start: State,
-    disturbance: Disturbance,
+    disturbance: Disturbance = NO_DISTURBANCE,
 ) -> tuple[FloatArray, State]:
     """Return the true readings (t | 1, n, a) and the states (t, n) of t machines of values (t, p)
     [SI], from the readings (n, a) of the controller and the state (1, n) of the commanded poses.
@@ -261,7 +261,7 @@ def simulate_trials(
     nuisance = nuisance.with_nominal(nuisance.values(nuisance_values))
     true_setup = _draw_setup(nuisance, nuisance_values or {}, len(values), seed)
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
-    true, state = _reach_poses(robot, values, readings, commanded.state, disturbance)
+    true, state = reach_poses(robot, values, readings, commanded.state, disturbance)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
     reached = np.array(np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2]))
     joints = select_joint_values(
