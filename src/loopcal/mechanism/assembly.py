@@ -204,6 +204,7 @@ class Assembly:
     closure : of over-constrained loops, `exact` or `least-squares`.
     bodies : name -> first guess (4, 4) of the home pose in the base, of each body beside base and
         platform that limbs join. They have the freedoms of the platform.
+    held : of a chain, the actuators that inverse kinematics leaves at their present readings.
     """
 
     name: str
@@ -223,6 +224,7 @@ class Assembly:
     stages: tuple[AttachedStage, ...] = ()
     closure: str = "exact"
     bodies: Mapping[str, FloatArray] = field(default_factory=dict)
+    held: tuple[str, ...] = ()
 
     @cached_property
     def numbers(self) -> Mapping[str, int]:

@@ -31,7 +31,9 @@ from loopcal.mechanism.transmission import (
     apply_weights,
     find_reversed,
     find_triangles,
+    joints_from_readings,
     select_weights,
+    transmit_readings,
 )
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -154,12 +156,14 @@ def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
 
 
 def find_carrying_actuators(robot: Mechanism) -> IntArray:
-    """Return the places of the actuators that move the end platform."""
+    """Return the places of the actuators that move the end platform and are not held."""
     places = np.arange(len(robot.actuators))
     if not robot.stages:
         return places
     stages = [robot.stages[i] for i in list_carrying_stages(robot)]
-    return np.concatenate([places[stage.actuators] for stage in stages])
+    names = [actuator.name for actuator in robot.actuators]
+    carrying = np.concatenate([places[stage.actuators] for stage in stages])
+    return np.array([i for i in carrying if names[i] not in robot.assembly.held], int)
 
 
 def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int, FloatArray]]:
@@ -531,6 +535,8 @@ class _Rows:
         weights of open sums, and transmissions of each stage, (1 | R, ..).
     sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
     units : (u,) lengths that a unit of each drive counts for: the robot's size for an angle.
+    spans : (u,) strokes of the drives, of which steps take equal shares with more drives than
+        coordinates; a full turn or the size without a stroke, and where the step is unique.
     """
 
     robot: Mechanism
@@ -543,6 +549,7 @@ class _Rows:
     sign: FloatArray
     serial: _SerialJoints
     units: FloatArray
+    spans: FloatArray
     moving: IntArray
     close: LoopSolver
     differentiate: LoopDerivative
@@ -591,7 +598,7 @@ class _Rows:
             residual, columns = compare_coordinates(
                 now.T, self.target, self.robot.controlled, self.robot.size
             )
-            slope = np.matmul(columns, now.D)[..., self.moving] / self.units[self.moving]
+            slope = np.matmul(columns, now.D)[..., self.moving] * self.spans[self.moving]
         ok = np.isfinite(slope).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
         if not ok.all():
             slope[~ok], residual[~ok] = np.eye(*slope.shape[1:]), 0.0
@@ -601,13 +608,14 @@ class _Rows:
         is_square = slope.shape[1] == slope.shape[2] and bool(sign.all())
         inverse = np.linalg.inv(slope) if is_square else np.linalg.pinv(slope)
         step[:, self.moving] = -np.matmul(inverse, residual[..., None])[..., 0]
+        step *= self.spans
         # no joint moves farther than the longest step: in radians, or sizes of the robot
-        size = self.robot.size
-        longest = np.maximum(np.abs(step).max(axis=1, initial=0.0) / size, LONGEST_STEP)
+        length = np.abs(step * self.units).max(axis=1, initial=0.0) / self.robot.size
+        longest = np.maximum(length, LONGEST_STEP)
         return replace(
             now,
             gap=np.where(ok, np.linalg.norm(residual, axis=1), np.inf),
-            step=step * (LONGEST_STEP / longest)[:, None] / self.units,
+            step=step * (LONGEST_STEP / longest)[:, None],
             sign=np.where(ok, sign, 0.0),
         )
 
@@ -799,10 +807,25 @@ def _make_rows(
         np.zeros(len(target)),
         _place_serial_joints(stages, e),
         np.where(turns, robot.size, 1.0),
+        _measure_spans(robot, np.array(turns)),
         find_carrying_actuators(robot),
         close,
         differentiate,
     )
+
+
+def _measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
+    """Return the `spans` of the drives (u,) of a robot."""
+    spans = np.where(turns, 2 * np.pi, robot.size)
+    if len(find_carrying_actuators(robot)) > len(robot.controlled):
+        _, tau = robot.slots(robot.values[None])
+        strokes = np.array([actuator.stroke or (np.nan, np.nan) for actuator in robot.actuators])
+        has_all = len(turns) == robot.program.n_joints  # else readings are open sums
+        convert = joints_from_readings if has_all else transmit_readings
+        ends = convert(strokes.T[None], tau, robot.slots.frequency)[0]
+        stated = np.abs(ends[1] - ends[0])
+        spans = np.where(stated > 0.0, stated, spans)
+    return spans
 
 
 def _begin(rows: _Rows, first: State) -> _Iterate:

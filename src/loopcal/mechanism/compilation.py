@@ -11,7 +11,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
-from loopcal.errors import MechanismError
+from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import name_count
 from loopcal.mechanism.assembly import (
@@ -568,16 +568,21 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
 
 def _check_chain(robot: Mechanism, home: ChainState) -> None:
     """Refuse a chain whose actuators do not set the controlled coordinates one by one."""
+    names = [actuator.name for actuator in robot.actuators]
+    for held in robot.assembly.held:
+        if held not in names:
+            hint = suggest_names(held, names)
+            raise MechanismError(f"`held:` names {held!r}, which is no actuator{hint}")
     moving = find_carrying_actuators(robot)
     values = robot.values[None]
     _, tau = robot.slots(values)
     q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.frequency)
-    D = differentiate_platform(robot, values, q, home, differentiate_pose).readings[0, 0]
-    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+    D = differentiate_platform(robot, values, q, home, differentiate_pose).readings[0, 0][:, moving]
+    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])[moving]
     scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)
     freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))
     c, a = len(robot.controlled), len(moving)
-    if c != a:
+    if not freedoms <= c <= a:
         raise MechanismError(
             report_finding(
                 "mechanism.chain-controlled",

@@ -294,4 +294,4 @@ def _compute_chain_margins(
     good = np.isfinite(slope).all(axis=(1, 2))
     _, r, W = np.linalg.svd(np.where(good[:, None, None], slope, 0.0))
     drive_margin = np.where(good, r[:, -1], np.nan)
-    return margin, direction, drive_margin, moving[np.abs(W[:, -1]).argmax(axis=1)]
+    return margin, direction, drive_margin, moving[np.abs(W[:, r.shape[1] - 1]).argmax(axis=1)]

@@ -89,7 +89,8 @@ def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide:
     gap = measure_gap(robot, forward(robot, result.q), result.T)
     assert gap[result.converged].max(initial=0.0) < ROUNDING
     other = result.status == Status.OTHER_MODE
-    if robot.stages:  # readings of a flipped arm lead to their pose
+    if robot.stages and len(robot.actuators) == len(robot.controlled):
+        # readings of a flipped arm lead to their pose
         home = measure_mobility_sign(robot, forward(robot, start_readings(robot)))
         other &= measure_mobility_sign(robot, result) == home
     # Close to a singularity the two solutions of a row lie close together.

@@ -14,15 +14,16 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from loopcal import geometry
-from loopcal.errors import FileError, MechanismError
+from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.estimate.identification import identify
-from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.modes import find_assembly_modes, find_working_modes
+from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
 from loopcal.mechanism.singularities import analyze_singularity
 from loopcal.mechanism.solutions import forward, inverse
@@ -35,7 +36,7 @@ from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
 
-CHAINS = ("arm-6r", "excavator", "solar-tracker", "tricept")
+CHAINS = ("arm-6r", "excavator", "hexapod-turntable", "solar-tracker", "tricept")
 
 HEAD = """format: 1
 family: stages
@@ -171,6 +172,96 @@ def test_tricept_agrees_with_a_constraint_solver() -> None:
     assert back.converged.all()
     known = np.array([solve_tricept(row) for row in q])
     assert_allclose(back.T, known, rtol=0, atol=1e-9 * machine.size)
+
+
+FEET, HEADS = np.radians([[0.0, 0, 120, 120, 240, 240], [-60.0, 60, 60, 180, 180, -60]])
+SIDE = np.array([-1.0, 1.0] * 3)  # two legs share a corner, 40 mm apart
+
+
+def measure_legs(q: Array, T: Array) -> Array:
+    """Return by how much (n, 6) the legs of `hexapod-turntable` miss their lengths [m]."""
+
+    def place(radius: float, angle: Array, side: Array) -> Array:
+        out = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1) * radius
+        across = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=-1)
+        return out + 0.02 * side[:, None] * across
+
+    feet = place(0.25, FEET + q[:, :1], SIDE) + np.array([0, 0, 0.12])
+    heads = place(0.15, HEADS, -SIDE) @ np.swapaxes(T[:, :3, :3], -1, -2) + T[:, None, :3, 3]
+    return np.linalg.norm(heads - feet, axis=-1) - 0.353332129 - q[:, 1:]
+
+
+def draw_coordinates(machine: Mechanism, n: int) -> Array:
+    """Draw controlled coordinates (n, c) evenly from the workspace."""
+    low, high = np.array([machine.assembly.workspace[name] for name in machine.controlled]).T
+    return np.random.default_rng(4).uniform(low, high, (n, len(low)))
+
+
+def test_hexapod_on_a_turntable_closes_its_legs_in_both_directions() -> None:
+    robot = load_cached_robot("hexapod-turntable")
+    target = draw_coordinates(robot, 100)
+    solution = inverse(robot, target)
+    assert solution.converged.all()
+    shown = read_coordinates(solution.T, robot.controlled)
+    assert np.abs(shown - target).max() < 1e-9  # [m, rad]
+    assert np.abs(measure_legs(solution.q, solution.T)).max() < 1e-9  # [m]
+    readings = draw_readings(robot, 100, 5) * ([1.0] + 6 * [0.3])
+    there = forward(robot, readings)
+    assert there.converged.all()
+    assert np.abs(measure_legs(readings, there.T)).max() < 1e-9  # [m]
+
+
+def test_more_drives_than_coordinates_take_shares_of_their_strokes() -> None:
+    robot = load_cached_robot("hexapod-turntable")
+    target = draw_coordinates(robot, 100)
+    solution = inverse(robot, target)
+    low, high = np.array([a.stroke for a in robot.actuators]).T
+    assert ((low <= solution.q) & (solution.q <= high)).all()
+    # of a small step, no change of the readings at constant pose makes the shares smaller
+    step = inverse(robot, target + 1e-7, start=solution).q - solution.q
+    kept = np.linalg.svd(
+        differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).readings[0]
+    )[2][:, -1]
+    shares = 1 / (high - low) ** 2
+    across = np.abs((step * shares * kept).sum(axis=1))
+    assert (across < 1e-4 * np.linalg.norm(step * shares, axis=1)).all()
+
+
+def test_a_held_drive_keeps_the_reading_of_the_start(tmp_path: Path) -> None:
+    text = (list_shipped_robots()["hexapod-turntable"]).read_text("utf-8") + "held: [turntable]\n"
+    path = tmp_path / "held.yaml"
+    path.write_text(text, "utf-8")
+    robot = load_robot(path)
+    at_home = draw_coordinates(robot, 20) * ([1.0] * 5 + [0.05])
+    solution = inverse(robot, at_home)
+    assert solution.converged.all()
+    assert_array_equal(solution.q[:, 0], 0.0)
+    turned = forward(robot, np.eye(7)[:1] * 0.5)
+    solution = inverse(robot, at_home + np.array([0, 0, 0, 0, 0, 0.5]), start=turned)
+    assert solution.converged.all()
+    assert_allclose(solution.q[:, 0], 0.5, rtol=0, atol=1e-15)
+    path.write_text(text.replace("[turntable]", "[turntabel]"), "utf-8")
+    with pytest.raises((FileError, MechanismError), match="turntable"):
+        load_robot(path)
+
+
+def test_modes_of_a_machine_with_a_drive_more_than_coordinates_are_refused() -> None:
+    with pytest.raises(DataError, match="held:"):
+        find_working_modes(load_cached_robot("hexapod-turntable"), [0, 0, 0.42, 0, 0, 0])
+
+
+def test_an_angle_beyond_the_dead_center_of_its_cylinder_is_another_mode() -> None:
+    robot = load_cached_robot("excavator")
+    there = forward(robot, [[0.0, 2.4, 2.7, 1.716]])  # 1.715 m is the shortest bucket cylinder
+    assert there.converged.all()
+    pin = compute_limb_frames(robot, robot.values[None], there.state)[3][0, 0, 0, :3, 3]
+    turned = np.array([rotate_about_y(angle) for angle in (0.3, -0.3)])
+    T = turned @ there.T
+    T[:, :3, 3] = (turned[:, :3, :3] @ (there.T[0, :3, 3] - pin)) + pin
+    solution = inverse(robot, read_coordinates(T, robot.controlled))
+    assert {Status(s) for s in solution.status} == {Status.CONVERGED, Status.OTHER_MODE}
+    back = forward(robot, solution.q)
+    assert_array_equal(np.abs(back.T - T).max(axis=(1, 2)) < 1e-9, solution.converged)
 
 
 # --- every chain, with errors of all parameters

@@ -153,6 +153,7 @@ def join_stages(
     tool: FloatArray,
     workspace: dict[str, tuple[float, float]],
     source: str,
+    held: tuple[str, ...] = (),
 ) -> Assembly:
     """Return the assembly of a chain; its home is found when it is compiled."""
     _refuse_wrong_drives(stages)
@@ -205,6 +206,7 @@ def join_stages(
             for error in part.common_errors
         ),
         tuple(stages),
+        held=held,
     )
 
 
@@ -321,7 +323,8 @@ class Stages(RobotRecord):
     Attributes
     ----------
     controlled : coordinates of the end platform in which the robot is commanded, one for each
-        actuator that moves it. stages : from the base on; the last one carries the end platform.
+        freedom that its actuators give it. held : actuators that inverse kinematics leaves at their
+        present readings. stages : from the base on; the last one carries the end platform.
     tolerances : of the unknowns of serial joints that state none.
     """
 
@@ -329,6 +332,7 @@ class Stages(RobotRecord):
 
     controlled: tuple[str, ...] = ()
     stages: tuple[StageRecord, ...] = ()
+    held: tuple[str, ...] = ()
     tolerances: LinkTolerances = field(default_factory=LinkTolerances)
 
     def expand(self) -> Assembly:
@@ -366,15 +370,15 @@ class PlacedStages(Stages):
         )
         actuators = [a.name for stage in attached for a in stage.assembly.actuators]
         refuse_idle_drives(self.drives, actuators, map(strip_number, actuators))
-        assembly = join_stages(
+        return join_stages(
             self.name,
             attached,
             controlled=self.controlled,
             tool=self.tool.matrix,
             workspace=dict(self.workspace.ranges),
             source=self.source,
+            held=self.held,
         )
-        return assembly
 
     def _expand_stage(self, i: int) -> Assembly:
         """Return the assembly of a stage alone."""
