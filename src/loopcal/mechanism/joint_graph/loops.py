@@ -261,6 +261,9 @@ class JointGraph:
 STARTS, SPREAD = 24, 0.6
 """Tries to close the loops, and range of their first joint values [rad, sizes]."""
 
+FEW = 12
+"""Largest number of closures that are left out one by one, to find the wrong one."""
+
 SAME = 1e-6
 """Difference of joint values of poses that count as one [rad, sizes]."""
 
@@ -430,6 +433,11 @@ def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> t
     return float(np.linalg.norm(gap)), angle
 
 
+def _can_close(graph: JointGraph, closing: tuple[GraphJoint, ...], starts: FloatArray) -> bool:
+    """Return whether some of the closures close from one of the first starts (n, j)."""
+    return bool(np.isfinite(replace(graph, closing=closing).close(starts[:NEAR])).any())
+
+
 def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
     """Return the finding of loops that do not close: of the closures without which the others
     close, or else of all, the one that is open the most in the best pose.
@@ -437,9 +445,9 @@ def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
     q = approach_closure(graph, starts)
     best = q[[int(np.argmin((graph.linearize(q)[0] ** 2).sum(axis=1)))]]
     placement = graph.place(best)
-    without = {joint: {*graph.closing} - {joint} for joint in graph.closing}
-    rest = {joint: replace(graph, closing=tuple(others)) for joint, others in without.items()}
-    alone = [joint for joint, other in rest.items() if np.isfinite(other.close(starts)).any()]
+    few = graph.closing if len(graph.closing) <= FEW else ()
+    rest = {joint: tuple(other for other in graph.closing if other is not joint) for joint in few}
+    alone = [joint for joint, others in rest.items() if _can_close(graph, others, starts)]
     gaps = [(measure_gap(graph, placement, joint), joint) for joint in alone or graph.closing]
     (gap, angle), joint = max(gaps, key=lambda entry: entry[0][0] / graph.size + entry[0][1])
     return report_finding(

@@ -39,11 +39,19 @@ def make_mimic(joint: str, followed: str, factor: float, offset: float = 0.0) ->
     return joint.replace("</joint>", mimic)
 
 
-@pytest.mark.parametrize("how", ["gazebo", "scikit-robot"])
+LOOP_JOINT = """\
+<loop_joint name="pin" type="revolute"><axis xyz="0 0 1"/>
+<link1 link="rod" xyz="0.3 0 0" rpy="0 0 0"/><link2 link="arm2" xyz="0.2 0 0" rpy="0 0 0"/>
+</loop_joint>
+"""
+
+
+@pytest.mark.parametrize("how", ["gazebo", "loop_joint", "scikit-robot"])
 def test_pins_of_other_programs_close_a_parallelogram(tmp_path, how) -> None:
     motor = TRANSMISSION.format("motor")
-    if how == "gazebo":
-        robot = read(tmp_path, f"{FOUR_BAR}{GAZEBO}{motor}</robot>")[1]
+    if how != "scikit-robot":
+        pin = {"gazebo": GAZEBO, "loop_joint": LOOP_JOINT}[how]
+        robot = read(tmp_path, f"{FOUR_BAR}{pin}{motor}</robot>")[1]
     else:
         (tmp_path / "loop_closures.yaml").write_text(SCIKIT)
         robot = read(tmp_path, f"{FOUR_BAR}</robot>")[1]

@@ -227,7 +227,7 @@ REFUSED = {
     ),
     "loop of another program": (
         FIVE_BAR.replace("</robot>", '<loop_joint name="x"/></robot>'),
-        ":19: <loop_joint> closes a loop in a way that loopcal does not read",
+        ":19: <loop_joint type=''> closes a loop in a way that loopcal does not read",
     ),
     "duplicate link": (
         FIVE_BAR.replace('<link name="tip"/>', '<link name="tip"/><link name="tip"/>'),

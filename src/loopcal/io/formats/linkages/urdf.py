@@ -6,8 +6,9 @@ Ry Rx). Source: the specification of URDF's joint element (ROS wiki).
 
 A `<constraint>` joins two links that the tree has placed already: `<parent link>` with
 `<parent_origin>` and `<parent_axis>`, `<child link>` with `<child_origin>` and `<child_axis>`.
-Source: pull request 264 of ros/urdfdom. Motors may be named by `<transmission>` or
-`<ros2_control>`.
+Source: pull request 264 of ros/urdfdom. A `<loop_joint>` has `<link1 link xyz rpy>`, `<link2>` of
+the same form and `<axis>` (Isaac Sim, RigidBodyDynamics.jl). Motors may be named by
+`<transmission>` or `<ros2_control>`.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ CONSTRAINTS = {
     "universal": "U",
 }
 """Types of a constraint -> the joint that it is; "" for none."""
-OTHER_LOOPS = ("loop_joint", "loop")
+LOOP = "loop_joint"
+OTHER_LOOPS = ("loop",)
 """Elements by which other programs close loops in a URDF."""
 
 
@@ -77,6 +79,7 @@ def parse(text: str, path: Path) -> LinkTree:
         links[name] = None
     joints = [_build_joint(part) for part in parts if part.name == "joint"]
     constraints = [_build_constraint(part) for part in parts if part.name == "constraint"]
+    constraints += [_build_loop(part) for part in parts if part.name == LOOP]
     motors = dict(motor for part in parts for motor in _list_motors(part))
     tree = build_tree(path, text, [*links], joints, constraints, motors, rewrite, WHAT)
     return list_embedded_constraints(tree, [part for part in parts if part.name == "gazebo"])
@@ -123,7 +126,7 @@ def _build_joint(element: Element) -> TreeJoint:
     parent, child = _get_links(element)
     kind, limit = KINDS[stated], _get_attributes(element, "limit")
     what = f"joint {name!r}"
-    T = _parse_origin(element, "origin", what)
+    T = _parse_origin(element, _get_attributes(element, "origin"), what)
     axis = _parse_axis(element, "axis", what) if kind else np.eye(3)[0]
     limits = None
     if kind and stated != "continuous" and {"lower", "upper"} <= limit.keys():
@@ -160,7 +163,7 @@ def _build_constraint(element: Element) -> Constraint:
             name,
             end,
             link,
-            _parse_origin(element, f"{end}_origin", what),
+            _parse_origin(element, _get_attributes(element, f"{end}_origin"), what),
             element.line,
             element.find(f"{end}_origin"),
             _measure_rounding(element, f"{end}_origin", f"{end}_axis"),
@@ -185,6 +188,29 @@ def _build_constraint(element: Element) -> Constraint:
     return Constraint(name, kind, (first, second), (axes["parent"], axes["child"]), element.line)
 
 
+def _build_loop(element: Element) -> Constraint:
+    """Return a loop joint as a constraint."""
+    name, kind = element.attributes.get("name", ""), element.attributes.get("type", "")
+    what, links = f"{LOOP} {name!r}", [*element.find_all("link1", "link2")]
+    if kind not in CONSTRAINTS or CONSTRAINTS[kind] == "U" or len(links) != 2:
+        finding = report_finding("files.urdf-other-loop", element=f"{LOOP} type={kind!r}")
+        raise element.error(finding)
+    first, second = (
+        make_end(
+            name,
+            end,
+            link.attributes.get("link", ""),
+            _parse_origin(link, link.attributes, what),
+            link.line,
+            link,
+            measure_rounding([link.attributes.get("xyz", "")], [link.attributes.get("rpy", "")]),
+        )
+        for end, link in zip(("parent", "child"), links, strict=True)
+    )
+    axis = _parse_axis(element, "axis", what)
+    return Constraint(name, CONSTRAINTS[kind], (first, second), (axis, axis), element.line)
+
+
 def _measure_rounding(element: Element, origin: str, axis: str) -> tuple[float, float]:
     """Return the rounding errors of an origin and an axis [m, rad]."""
     place, direction = _get_attributes(element, origin), _get_attributes(element, axis)
@@ -203,9 +229,8 @@ def _get_links(element: Element) -> tuple[str, str]:
     return parent, child
 
 
-def _parse_origin(element: Element, name: str, what: str) -> FloatArray:
+def _parse_origin(element: Element, origin: Mapping[str, str], what: str) -> FloatArray:
     """Return an origin as (4, 4)."""
-    origin = _get_attributes(element, name)
     xyz = element.parse_numbers(origin.get("xyz", "0 0 0"), 3, f"xyz of {what}")
     rpy = element.parse_numbers(origin.get("rpy", "0 0 0"), 3, f"rpy of {what}")
     return geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
