@@ -18,9 +18,9 @@ from loopcal.mechanism.sensitivity import differentiate_passive_joints, differen
 from loopcal.mechanism.solutions import forward, make_solution
 from loopcal.mechanism.transmission import (
     TERMS,
-    harmonic_frequencies,
     joint_slopes,
     joints_from_readings,
+    list_constants,
     nominal_terms,
     readings_from_joints,
     term_derivatives,
@@ -310,7 +310,7 @@ READINGS = np.random.default_rng(4).uniform(-0.1, 0.1, (1, 6, 3))
 
 
 def test_transmission_derivatives_agree_with_differences():
-    tau, w = nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
+    tau, w = nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS)
     check_jacobian(
         lambda x: joints_from_readings(READINGS + x[0], tau, w), joint_slopes(READINGS, tau, w)[..., None], np.zeros(1), scale=0.0005,  # noqa: E501
         automatic=lambda x: joints_from_readings(READINGS + x[0], tau, w),
@@ -330,7 +330,7 @@ def test_transmission_derivatives_agree_with_differences():
 
 
 def test_transmission_round_trips_to_rounding():
-    tau, w = nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
+    tau, w = nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS)
     assert_allclose(
         readings_from_joints(joints_from_readings(READINGS, tau, w), tau, w),
         READINGS,
@@ -340,9 +340,7 @@ def test_transmission_round_trips_to_rounding():
 
 
 def test_actuator_without_period_has_no_harmonics():
-    columns = term_derivatives(
-        READINGS, nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
-    )
+    columns = term_derivatives(READINGS, nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS))
     for term, column in zip(TERMS, columns, strict=True):
         if term.startswith(("sin", "cos")):
             assert_array_equal(column[..., 1], 0.0)

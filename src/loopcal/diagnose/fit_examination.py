@@ -275,7 +275,7 @@ def compute_reading_errors(
     _, tau = robot.slots(robot.values[None])
     # values (n, a) of the driven joints, or of their sums
     joint_values = [
-        transmit_readings(q[None], tau, robot.slots.frequency)[0] for q in (recorded, estimated)
+        transmit_readings(q[None], tau, robot.slots.constants)[0] for q in (recorded, estimated)
     ]
     joint = np.where(compared, joint_values[0] - joint_values[1], np.nan)
     limbs = robot.assembly.limbs

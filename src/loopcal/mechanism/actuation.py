@@ -54,7 +54,7 @@ def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJ
     e, tau = robot.slots(values)
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
-        return DrivenJoints(e, tau, joints_from_readings(q, tau, robot.slots.frequency))
+        return DrivenJoints(e, tau, joints_from_readings(q, tau, robot.slots.constants))
 
 
 class DrivenSums(NamedTuple):
@@ -70,10 +70,10 @@ class DrivenSums(NamedTuple):
 def drive_sums(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenSums:
     """Return displacements and sums for values (t | 1, p) and readings q (t | 1, n, a)."""
     e, tau = robot.slots(values)
-    weights = select_weights(tau)
+    weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
     with np.errstate(invalid="ignore"):  # as in `drive_joints`
-        return DrivenSums(e, evaluate_sums(q, tau, robot.slots.frequency), weights)
+        return DrivenSums(e, evaluate_sums(q, tau, robot.slots.constants), weights)
 
 
 # Redundant actuation with a prescribed pose: readings and passive joints follow limb by limb.
@@ -102,7 +102,7 @@ def solve_at_pose(
     guess, limbs = driven_values(robot.program, begin), robot.program.with_fixed_platform
     state = engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
     joints = driven_values(robot.program, state)
-    return state, readings_from_joints(joints, tau, robot.slots.frequency)
+    return state, readings_from_joints(joints, tau, robot.slots.constants)
 
 
 def differentiate_at_pose(
@@ -249,9 +249,9 @@ def differentiate_joints_by_readings(
 ) -> FloatArray:
     """Return d joint / d reading (t | 1, n | 1, J, a) of as many readings as joints."""
     _, tau = robot.slots(values)
-    weights = select_weights(tau)
+    weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
-    slopes = joint_slopes(q, tau, robot.slots.frequency)
+    slopes = joint_slopes(q, tau, robot.slots.constants)
     return invert_weights(weights)[:, None] * slopes[:, :, None]
 
 
@@ -261,13 +261,13 @@ def _differentiate_sums(
     """Return the weights (t | 1, 1, a, J), and the derivatives of s - W l at constant lengths l."""
     slots = robot.slots
     _, tau = slots(values)
-    weights = select_weights(tau)
+    weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
     lengths = driven_values(robot.program, state)
-    by_terms = differentiate_sums(q, tau, slots.frequency, lengths)
+    by_terms = differentiate_sums(q, tau, slots.constants, lengths)
     of_terms = slots.jacobian(values)[:, slots.n_displacements :]
     of_terms = of_terms.reshape(len(of_terms), *slots.terms.shape, -1)
     by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
-    slopes = joint_slopes(q, tau, slots.frequency)
+    slopes = joint_slopes(q, tau, slots.constants)
     by_readings = slopes[..., None] * np.eye(slopes.shape[-1])
     return weights[:, None], Derivatives(by_parameters, by_readings)

@@ -166,6 +166,8 @@ class Actuator:
     sigma : standard deviation of the reading, weighs redundant readings [m or rad].
     weights : of a summed drive, by the name of a driven joint: the transmission gives the sum of
         weight * joint value. Without them it gives the value of the joint of its own name.
+    points : readings of its table, whose values are the terms table1, table2, ..; between them it
+        is `linear` or `cubic`.
     """
 
     name: str
@@ -175,6 +177,8 @@ class Actuator:
     period: float = 0.0
     sigma: float | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
+    points: tuple[float, ...] = ()
+    interpolation: str = "linear"
 
     @property
     def driven_joints(self) -> tuple[str, ...]:

@@ -664,7 +664,8 @@ class _Rows:
         for stage, tau in zip(self.stages, self.terms, strict=True):
             triangles = find_triangles(tau)
             if len(triangles):
-                u, weights = now.u[:, None, stage.actuators], select_weights(tau)
+                u = now.u[:, None, stage.actuators]
+                weights = select_weights(tau, stage.robot.slots.constants)
                 if weights is not None and not stage.robot.has_open_sums:
                     u = apply_weights(weights, u)
                 beyond |= find_reversed(u, tau, triangles)[:, 0].any(axis=1)
@@ -784,7 +785,7 @@ def _make_rows(
     slots = [stage.robot.slots(values[:, stage.parameters]) for stage in stages]
     e = tuple(own for own, _ in slots)
     weights = tuple(
-        select_weights(tau) if stage.robot.has_open_sums else None
+        select_weights(tau, stage.robot.slots.constants) if stage.robot.has_open_sums else None
         for stage, (_, tau) in zip(stages, slots, strict=True)
     )
     turns: list[bool] = []

@@ -34,6 +34,7 @@ from loopcal.mechanism.chains import (
 )
 from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials, inverse_trials
 from loopcal.mechanism.mobility import (
+    STRETCHED,
     check_assembly,
     check_mobility,
     count_rank,
@@ -41,6 +42,7 @@ from loopcal.mechanism.mobility import (
     refuse_free_bodies,
     refuse_singular_home,
     refuse_uncontrolled,
+    shake_joints,
 )
 from loopcal.mechanism.model import Mechanism, SlotMap, Stage
 from loopcal.mechanism.over_constraint import report_over_constraint
@@ -49,7 +51,8 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import driven_values, is_closed, make_start
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
-    harmonic_frequencies,
+    count_points,
+    list_constants,
     name_terms,
     nominal_terms,
     readings_from_joints,
@@ -74,7 +77,7 @@ def find_impossible_values(
         state = inverse_trials(robot, values[None], target)
     else:  # at the readings of the nominal home, where nominal values displace nothing
         joints, slots = driven_values(robot.program, robot.home_state), robot.slots
-        q = readings_from_joints(joints, slots.terms[None], slots.frequency)
+        q = readings_from_joints(joints, slots.terms[None], slots.constants)
         state = forward_trials(robot, values[None], q)
     if is_closed(state.status).all():
         return ()
@@ -110,6 +113,8 @@ def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[
         yield p.name, report_finding(code, name=p.name, **shown)
 
 
+STARTS = 4
+"""Disturbed starts from which home is tried where it is not found."""
 DEFAULT_SIZE = 1.0
 """Characteristic length [m] of a mechanism whose lengths are all zero (a spherical one)."""
 POINT = 1e-9
@@ -396,7 +401,7 @@ def _map_slots(
             return places[address]
         return count + terms.shape[1] * actuators[address.owner] + names.index(address.axis)
 
-    terms, w = nominal_terms(assembly.actuators), harmonic_frequencies(assembly.actuators)
+    terms, constants = nominal_terms(assembly.actuators), list_constants(assembly.actuators)
     matrix = np.zeros((count + terms.size, len(table)))
     for entry in assembly.maps:
         matrix[place(entry.address), table.index(entry.parameter)] += entry.coefficient
@@ -404,7 +409,7 @@ def _map_slots(
         (s, tuple(table.index(name) for name in s.inputs), tuple(place(a) for a in s.outputs))
         for s in assembly.shared
     )
-    return SlotMap(matrix, shared, table.nominal, count, terms, w)
+    return SlotMap(matrix, shared, table.nominal, count, terms, constants)
 
 
 def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
@@ -432,6 +437,7 @@ def _find_home(robot: Mechanism) -> State:
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
         refuse_free_bodies(robot, robot.home_state)
+        _refuse_singular_start(robot, target)
         if not shared:
             refuse_uncontrolled(robot, robot.home_state)
         refuse_singular_home(robot, state)
@@ -443,6 +449,32 @@ def _find_home(robot: Mechanism) -> State:
     if shared:
         return replace(state, closure_sign=compute_closure_sign(robot, values, state))
     return state
+
+
+def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
+    """Refuse `start:` values from which home is not found, where it is from others beside them: at
+    the stated ones the limbs are in a singular position. The error proposes those of home.
+    """
+    guess, values = robot.home_state, robot.values[None]
+    for seed in range(STARTS):
+        state = inverse_trials(robot, values, target, shake_joints(guess, seed))
+        if state.status[0, 0] != engine.CONVERGED or abs(state.closure_sign[0, 0]) == 0.0:
+            continue
+        found = [
+            (f"{robot.assembly.limbs[i].name}.{joint.name}", joint.dimension, float(value))
+            for group, own in zip(robot.program.groups, state.joints, strict=True)
+            for i, limb in zip(group.limbs, own[0, 0], strict=True)
+            for joint, value in zip(robot.assembly.limbs[i].joints, limb, strict=False)
+            if abs(value - joint.start) > STRETCHED * (robot.size if joint.kind == "P" else 1.0)
+        ]
+        if found:
+            finding = report_finding(
+                "mechanism.singular-start",
+                name=robot.name,
+                joints=tuple(name for name, _, _ in found),
+                values=tuple(robot.to_quantity(value, d) for _, d, value in found),
+            )
+            raise MechanismError(finding)
 
 
 def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any) -> Mechanism:
@@ -539,21 +571,26 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
     maps = [stage.robot.slots for stage in stages]
     displacements = sum(own.n_displacements for own in maps)
     actuators = sum(len(own.terms) for own in maps)
-    k = max(own.terms.shape[1] for own in maps)
+    points = [count_points(own.constants) for own in maps]
+    first_weight = len(ALL_TERMS) + max(points)
+    k = max(own.terms.shape[1] for own in maps) if not any(points) else first_weight
     has_sums = any(stage.robot.has_sums for stage in stages)
     if has_sums:
-        k = len(ALL_TERMS) + sum(stage.robot.program.n_joints for stage in stages)
+        k = first_weight + sum(stage.robot.program.n_joints for stage in stages)
     matrix = np.zeros((displacements + actuators * k, len(nominal)))
     shared, first, term, joint = [], 0, displacements, 0
     terms = np.zeros((actuators, k))
+    constants = np.full((actuators, max(own.constants.shape[1] for own in maps)), np.nan)
     for stage, own in zip(stages, maps, strict=True):
         d = own.n_displacements
         a, width = own.terms.shape
+        own_first = len(ALL_TERMS) + count_points(own.constants)
         columns = np.arange(width)
-        columns[len(ALL_TERMS) :] += joint  # the weights of its own joints
+        columns[own_first:] += first_weight - own_first + joint  # the weights of its own joints
         terms[stage.actuators, columns] = own.terms
-        if has_sums and width <= len(ALL_TERMS):
-            terms[stage.actuators, len(ALL_TERMS) + joint + np.arange(a)] = np.eye(a)
+        constants[stage.actuators, : own.constants.shape[1]] = own.constants
+        if has_sums and width <= own_first:
+            terms[stage.actuators, first_weight + joint + np.arange(a)] = np.eye(a)
         joint += stage.robot.program.n_joints
         of_terms = (np.arange(a)[:, None] * k + columns).ravel()
         places = np.concatenate([np.arange(d) + first, of_terms + term])
@@ -562,8 +599,7 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
             values = tuple(i + stage.parameters.start for i in inputs)
             shared.append((function, values, tuple(int(places[o]) for o in outputs)))
         first, term = first + d, term + a * k
-    frequency = np.concatenate([own.frequency for own in maps])
-    return SlotMap(matrix, tuple(shared), nominal, displacements, terms, frequency)
+    return SlotMap(matrix, tuple(shared), nominal, displacements, terms, constants)
 
 
 def _check_chain(robot: Mechanism, home: ChainState) -> None:
@@ -576,7 +612,7 @@ def _check_chain(robot: Mechanism, home: ChainState) -> None:
     moving = find_carrying_actuators(robot)
     values = robot.values[None]
     _, tau = robot.slots(values)
-    q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.frequency)
+    q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.constants)
     D = differentiate_platform(robot, values, q, home, differentiate_pose).readings[0, 0][:, moving]
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])[moving]
     scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)

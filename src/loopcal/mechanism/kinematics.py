@@ -224,7 +224,7 @@ def forward_trials(
     if not len(find_triangles(tau)):
         return state
     # a length of a triangle that no angle reaches
-    excess = np.broadcast_to(measure_excess(q, tau, robot.slots.frequency), state.status.shape)
+    excess = np.broadcast_to(measure_excess(q, tau, robot.slots.constants), state.status.shape)
     is_beyond = (state.status == Status.NOT_FINITE.value) & (excess > 0.0) & np.isfinite(excess)
     return replace(
         state,
@@ -376,7 +376,7 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
     e, tau = robot.slots(values)
     joints = driven_values(robot.program, state)
     if robot.has_open_sums:
-        weights = select_weights(tau)
+        weights = select_weights(tau, robot.slots.constants)
         assert weights is not None
         sums = apply_weights(weights, joints)
         return solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
@@ -387,7 +387,7 @@ def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> Floa
     """Return the readings (t, n, a) of a state."""
     _, tau = robot.slots(values)
     joints = driven_values(robot.program, state)
-    return readings_from_joints(joints, tau, robot.slots.frequency)
+    return readings_from_joints(joints, tau, robot.slots.constants)
 
 
 def needs_readings(program: Program) -> bool:

@@ -91,11 +91,11 @@ def _linearize_block(
         )
     return LinearizedLimbs(
         robot,
-        engine.linearize(robot.program, e, joints_from_readings(q, tau, slots.frequency), state),
+        engine.linearize(robot.program, e, joints_from_readings(q, tau, slots.constants), state),
         J[:, :d],
         J[:, d:].reshape(len(J), *slots.terms.shape, -1),
-        term_derivatives(q, tau, slots.frequency),
-        joint_slopes(q, tau, slots.frequency),
+        term_derivatives(q, tau, slots.constants),
+        joint_slopes(q, tau, slots.constants),
     )
 
 

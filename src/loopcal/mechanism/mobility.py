@@ -140,7 +140,7 @@ def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
 def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
     """Refuse sums that leave the platform free at home; scale : (m,) of its freedoms."""
     e, tau = robot.slots(robot.values[None])
-    weights = select_weights(tau)
+    weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
     slope = differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
     if count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
@@ -202,6 +202,13 @@ def _word_dependent(robot: Mechanism, count: int) -> str:
     )
 
 
+def shake_joints(state: engine.State, seed: int) -> engine.State:
+    """Return a state with its joints away from any special position, by up to 0.3 rad or m."""
+    # the same disturbance in every limb: the result must not depend on the order of the limbs
+    shifts = [np.random.default_rng(seed).uniform(-0.3, 0.3, j.shape[-1]) for j in state.joints]
+    return replace(state, joints=tuple(j + s for j, s in zip(state.joints, shifts, strict=True)))
+
+
 def find_idle_joints(program: engine.Program, guess: engine.State) -> dict[int, tuple[int, ...]]:
     """Return the joints to lock of each limb that can move while tip and platform rest, one for
     each motion.
@@ -209,11 +216,7 @@ def find_idle_joints(program: engine.Program, guess: engine.State) -> dict[int, 
     Of the joints in a null combination the one with the largest component is chosen, at joint
     values away from any special position and independently of other limbs.
     """
-    # the same disturbance in every limb: the result must not depend on the order of the limbs
-    shifts = [np.random.default_rng(0).uniform(-0.3, 0.3, j.shape[-1]) for j in guess.joints]
-    shaken = replace(
-        guess, joints=tuple(j + shift for j, shift in zip(guess.joints, shifts, strict=True))
-    )
+    shaken = shake_joints(guess, 0)
     # driven joints are disturbed too: with a slide at zero the lower joint of a leg would seem to
     # spin it only
     e, q = np.zeros((1, program.n_displacements)), driven_values(program, shaken)

@@ -67,8 +67,8 @@ class ParameterUnits:
             slopes = slots.jacobian(values)[:, of_slots, of_columns] * units
         # with summed drives one for each joint, so that derivatives by readings are those by joints
         by_readings = (
-            joint_slopes(q, tau, slots.frequency)
-            if (weights := select_weights(tau)) is None
+            joint_slopes(q, tau, slots.constants)
+            if (weights := select_weights(tau, self.slots.constants)) is None
             else np.ones((1, 1, weights.shape[-1]))
         )
         return ParameterMap(
@@ -77,8 +77,8 @@ class ParameterUnits:
 
     def _evaluate_terms(self, q: FloatArray, tau: FloatArray) -> FloatArray:
         """Return what the moved transmission terms contribute, (t | 1, n | 1, a, terms)."""
-        w, terms = self.slots.frequency, self.slots.moved_by(self.places).terms
-        if (weights := select_weights(tau)) is not None:
+        w, terms = self.slots.constants, self.slots.moved_by(self.places).terms
+        if (weights := select_weights(tau, self.slots.constants)) is not None:
             actuators, numbers = np.divmod(np.array(terms, np.int64), tau.shape[-1])
             slopes = differentiate_sums(q, tau, w, joints_from_readings(q, tau, w))
             inverse = invert_weights(weights)[:, None][..., actuators]
@@ -114,12 +114,13 @@ class SlotMap:
 
     slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]. The first
     `n_displacements` slots are e, the others the terms of the actuators, (a, k) row by row, with
-    k = 18 where one is a triangle drive, 18 + J where one reads a sum of J joints, 8 elsewhere.
+    k = 18 where one is a triangle drive, 18 + K + J with tables of K points and sums of J joints, 8
+    elsewhere.
 
     matrix : (s, p) M. shared : the shared maps, each with the positions of its inputs and of its
         outputs, which differ.
     nominal : (p,). n_displacements : length of e.
-    terms : (a, k) nominal transmission terms. frequency : (a,) of their harmonics.
+    terms : (a, k) nominal transmission terms. constants : (a, 2 + K) of `list_constants`.
     """
 
     matrix: FloatArray
@@ -127,7 +128,7 @@ class SlotMap:
     nominal: FloatArray
     n_displacements: int
     terms: FloatArray
-    frequency: FloatArray
+    constants: FloatArray
 
     def __call__(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return e (t, n_displacements) and tau (t, a, k) of values (t, p)."""
@@ -181,7 +182,8 @@ class SlotMap:
         slot, column = np.nonzero(touches)
         cut = int(np.searchsorted(slot, self.n_displacements))
         joint, term = np.divmod(slot[cut:] - self.n_displacements, self.terms.shape[1])
-        if (weights := select_weights(self.terms)) is not None:  # once for each joint in sums
+        weights = select_weights(self.terms, self.constants)
+        if weights is not None:  # once for each joint in sums
             n = weights.shape[-1]
             term = np.tile(slot[cut:] - self.n_displacements, n)
             joint = np.repeat(np.arange(n), len(slot) - cut)
@@ -434,7 +436,7 @@ def _map_limb(program: Program, group: Group, k: int, slots: SlotMap) -> LimbMap
     for j, actuator in enumerate(group.actuator[:, k]):
         if actuator >= 0:
             a = int(actuator)
-            if select_weights(slots.terms) is not None:
+            if select_weights(slots.terms, slots.constants) is not None:
                 drives.append((j, a, ()))
                 continue
             count = slots.terms.shape[1]

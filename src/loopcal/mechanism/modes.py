@@ -193,9 +193,9 @@ def _close(robot: Mechanism, values: FloatArray, q: FloatArray, start: State | N
     if robot.stages:
         return solve_stages(robot, values, q, start, _close)
     e, tau = robot.slots(values)
-    begin, w = start or robot.home_state, robot.slots.frequency
+    begin, w = start or robot.home_state, robot.slots.constants
     if robot.has_open_sums:
-        weights = select_weights(tau)
+        weights = select_weights(tau, robot.slots.constants)
         assert weights is not None
         return solve_open_sums(robot.program, e, weights, evaluate_sums(q, tau, w), begin)
     joints = joints_from_readings(q, tau, w)
@@ -222,7 +222,7 @@ def _subtract_turns(robot: Mechanism, state: State) -> State:
         ]
     )
     _, tau = robot.slots(robot.values[None])
-    center = joints_from_readings(middle[None, None], tau, robot.slots.frequency)[0, 0]
+    center = joints_from_readings(middle[None, None], tau, robot.slots.constants)[0, 0]
     turns = np.round((driven_values(robot.program, state) - center) / (2 * np.pi))
     for group in robot.program.groups:
         for j, columns in enumerate(group.actuator):

@@ -69,7 +69,7 @@ def differentiate_pose(
         derivatives = differentiate_open_sums(robot, values, q, state, columns)
     else:
         e, tau = robot.slots(values)
-        joints = joints_from_readings(q, tau, robot.slots.frequency)
+        joints = joints_from_readings(q, tau, robot.slots.constants)
         chosen = robot.all_parameters if columns is None else columns
         inputs = chosen.linearize(values, tau, q)
         is_open = robot.program.may_stay_open
@@ -193,7 +193,7 @@ def _differentiate_open_joints(
     """
     program, limbs = robot.program, robot.assembly.limbs
     e, tau = robot.slots(values)
-    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    joints = joints_from_readings(q, tau, robot.slots.constants)
     inputs = robot.all_parameters.linearize(values, tau, q)
     exact = differentiate_unknowns(program, e, joints, state, inputs)
     places = [

@@ -254,7 +254,7 @@ def _sum_rows(
     A, Q : against freedoms and joints. The rows of open sums are W L_y dy - ds = 0.
     """
     e, tau = robot.slots(robot.values[None])
-    weights = select_weights(tau)
+    weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
     if robot.has_open_sums:
         rows = np.matmul(weights, differentiate_lengths(robot.program, e, state)[0])

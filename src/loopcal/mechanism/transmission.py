@@ -2,25 +2,32 @@
 """Transmissions: the value of a joint from the reading of its actuator, and back.
 
     joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r)
-            + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2
+            + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2 + table(r)
 
 with w = 2 pi / period and d = +1 or -1 the direction from which the reading was approached (0 if
 unknown). A gear ratio or a spool radius is a gain. A spool whose radius changes with the line on it
 is a curve: radius r0 - b phi / (2 pi) pays out r0 phi - b phi^2 / (4 pi). Derivation:
-docs/theory/parameters.md. Of a triangle drive this is the length of the actuator, from which the
-joint's angle follows.
+docs/theory/parameters.md. A table gives values at points, between which it is a broken line or a
+natural cubic spline, and straight beyond. Of a triangle drive this is the length of the actuator,
+from which the joint's angle follows.
 
 Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind them. Terms tau are
-(t, a, 8), or (t, a, 18) with those of triangles behind them, all zero for any other drive. Where a
-drive reads a sum of joint values, the weights W of the J driven joints follow, (t, a, 18 + J), and
-the formula gives the sums s = W joints.
+(t, a, 8), or (t, a, 18) with those of triangles behind them, all zero for any other drive. Values
+of tables with up to K points follow, (t, a, 18 + K). Where a drive reads a sum of joint values, the
+weights W of the J driven joints follow, (t, a, 18 + K + J), and the formula gives the sums s = W
+joints. What no parameter changes are the constants of `list_constants`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
@@ -162,39 +169,125 @@ def _apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     return np.matmul(matrix, vector[..., None])[..., 0]
 
 
-TERMS = ("offset", "gain", "curve", "sin1", "cos1", "sin2", "cos2", "backlash")
-"""Terms in the order of the last axis of tau (t, a, 8).
+class Shape(NamedTuple):
+    """What a term adds to the value of a joint: `value`(r, d, w) per unit of the term, and its
+    derivative `slope`(r, w) by the reading. r, d : readings and directions (t, n, a). w : (a,).
+    """
+
+    value: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+    slope: Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def _is_periodic(w: FloatArray) -> FloatArray:
+    """Return 1 where a drive has harmonics: with w = 0 the cosines would repeat the offset."""
+    return (w != 0).astype(float)
+
+
+SHAPES: Mapping[str, Shape] = {
+    "offset": Shape(lambda r, d, w: np.ones_like(r), lambda r, w: np.zeros_like(r)),
+    "gain": Shape(lambda r, d, w: r, lambda r, w: np.ones_like(r)),
+    "curve": Shape(lambda r, d, w: r * r, lambda r, w: 2 * r),
+    "sin1": Shape(lambda r, d, w: np.sin(w * r), lambda r, w: w * np.cos(w * r)),
+    "cos1": Shape(lambda r, d, w: _is_periodic(w) * np.cos(w * r), lambda r, w: -w * np.sin(w * r)),
+    "sin2": Shape(lambda r, d, w: np.sin(2 * w * r), lambda r, w: 2 * w * np.cos(2 * w * r)),
+    "cos2": Shape(
+        lambda r, d, w: _is_periodic(w) * np.cos(2 * w * r), lambda r, w: -2 * w * np.sin(2 * w * r)
+    ),
+    "backlash": Shape(lambda r, d, w: 0.5 * d, lambda r, w: np.zeros_like(r)),
+}
+"""The terms that a joint value is a sum of, in the order of the last axis of tau (t, a, 8). To add
+one, state its shape.
 
 Each has the joint's unit, per power of the reading's unit; of a triangle drive, that of its length.
 """
+TERMS = tuple(SHAPES)
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 ALL_TERMS = (*TERMS, *TRIANGLE_TERMS)
 """Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 18)."""
 SIDE = ALL_TERMS.index("side")
+TABLE = "table"
+"""What the name of the term of a table begins with; the number of its point follows."""
 WEIGHT = "weight."
 """What the name of the term of a weight begins with; the name of a driven joint follows."""
+FIXED = 2
+"""Constants of a drive before the points of its table: frequency, and whether it is cubic."""
+
+# Tables: a correction, or all of the motion of a cam, between points.
+
+
+def count_points(constants: FloatArray) -> int:
+    """Return the largest number K of points that a table of these drives has."""
+    return constants.shape[1] - FIXED
+
+
+def weigh_points(readings: FloatArray, constants: FloatArray, derivative: int = 0) -> FloatArray:
+    """Return the weights of a table's values at readings (..) of one drive, (.., K), or their
+    derivatives by the reading. constants : (2 + K,). Outside its points a table is straight.
+    """
+    points = constants[FIXED:][np.isfinite(constants[FIXED:])]
+    weights = np.zeros((*readings.shape, len(constants) - FIXED))
+    if len(points):
+        spline = _make_spline(points.tobytes(), bool(constants[1]))
+        inside = np.clip(readings, points[0], points[-1])
+        inside = np.where(np.isfinite(readings), inside, points[0])
+        slope = spline(inside, 1)
+        chosen = slope if derivative else spline(inside) + slope * (readings - inside)[..., None]
+        weights[..., : len(points)] = chosen
+    return weights
+
+
+@lru_cache
+def _make_spline(points: bytes, is_cubic: bool) -> PPoly:
+    """Return the weights of the values at points as functions of the reading: broken lines, or
+    natural cubic splines.
+    """
+    from scipy.interpolate import CubicSpline, PPoly
+
+    x = np.frombuffer(points)
+    values = np.eye(len(x))
+    if is_cubic:
+        return CubicSpline(x, values, bc_type="natural")
+    return PPoly(np.stack([np.diff(values, axis=0) / np.diff(x)[:, None], values[:-1]]), x)
+
+
+def _sum_tables(
+    q: FloatArray, tau: FloatArray, constants: FloatArray, derivative: int = 0
+) -> FloatArray:
+    """Return what tables add to joint values (t, n, a), or to their slopes."""
+    r, _ = split_readings(q, len(constants))
+    values = select_table(tau, constants)
+    parts = [
+        (weigh_points(r[..., a], constants[a], derivative) * values[:, None, a]).sum(axis=-1)
+        for a in range(len(constants))
+    ]
+    return np.stack(parts, axis=-1)
 
 
 def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
     """Return the names of the terms of actuators, in the order of the last axis of tau."""
+    points = max((len(a.points) for a in actuators), default=0)
+    terms = (*ALL_TERMS, *(f"{TABLE}{k + 1}" for k in range(points)))
     if any(a.weights for a in actuators):
         joints = dict.fromkeys(name for a in actuators for name in a.driven_joints)
-        return (*ALL_TERMS, *(f"{WEIGHT}{name}" for name in joints))
+        return (*terms, *(f"{WEIGHT}{name}" for name in joints))
+    if points:
+        return terms
     return ALL_TERMS if any("side" in a.terms for a in actuators) else TERMS
 
 
 def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
     """Return the nominal transmission terms (a, 8), (a, 18) if one is a triangle drive, or (a, 18 +
-    J) with summed drives.
+    K + J) with tables and summed drives.
     """
     for actuator in actuators:
-        wrong = sorted(set(actuator.terms) - set(ALL_TERMS))
+        table = (f"{TABLE}{k + 1}" for k in range(len(actuator.points)))
+        wrong = sorted(set(actuator.terms) - {*ALL_TERMS, *table})
         if wrong:
             raise MechanismError(
                 f"actuator {actuator.name!r} has an unknown term {wrong[0]!r}; allowed are "
                 f"{', '.join(TERMS)}"
             )
-        if actuator.terms.get("gain", 1.0) == 0.0:
+        if actuator.terms.get("gain", 1.0) == 0.0 and not actuator.points:
             raise MechanismError(
                 f"actuator {actuator.name!r} has a gain of 0, so its reading moves nothing; "
                 "state a gain other than 0"
@@ -207,61 +300,71 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
     return np.array(rows, dtype=float).reshape(-1, len(terms))
 
 
-def harmonic_frequencies(actuators: Sequence[Actuator]) -> FloatArray:
-    """Return the angular frequency of the harmonics (a,) [rad per unit of reading], 0 for none."""
-    return np.array([2 * np.pi / a.period if a.period else 0.0 for a in actuators])
+def list_constants(actuators: Sequence[Actuator]) -> FloatArray:
+    """Return what no parameter changes (a, 2 + K): the angular frequency of the harmonics [rad per
+    unit of reading], 0 for none, whether a table is cubic, and the readings at its points, NaN
+    behind the last one.
+    """
+    points = max((len(a.points) for a in actuators), default=0)
+    constants = np.full((len(actuators), FIXED + points), np.nan)
+    for row, a in zip(constants, actuators, strict=True):
+        row[:FIXED] = 2 * np.pi / a.period if a.period else 0.0, a.interpolation == "cubic"
+        row[FIXED : FIXED + len(a.points)] = a.points
+    return constants
 
 
 def term_derivatives(
-    q: FloatArray, tau: FloatArray, w: FloatArray, terms: Sequence[int] | None = None
+    q: FloatArray, tau: FloatArray, constants: FloatArray, terms: Sequence[int] | None = None
 ) -> list[FloatArray]:
     """Return the derivative of the joint values in each of the terms, or in some of them, arrays
     (t | 1, n, a).
     """
-    chosen = range(min(tau.shape[-1], len(TERMS) + MOVABLE)) if terms is None else terms
-    r, approach = split_readings(q, len(w))
-    # with w = 0 the cosines would repeat the offset
-    on = (w != 0).astype(float)
-    columns = {
-        "offset": lambda: np.ones_like(r),
-        "gain": lambda: r,
-        "curve": lambda: r * r,
-        "sin1": lambda: np.sin(w * r),
-        "cos1": lambda: on * np.cos(w * r),
-        "sin2": lambda: np.sin(2 * w * r),
-        "cos2": lambda: on * np.cos(2 * w * r),
-        "backlash": lambda: 0.5 * approach,
-    }
+    end = len(ALL_TERMS) + count_points(constants)
+    chosen = range(min(tau.shape[-1], end)) if terms is None else terms
     triangles = find_triangles(tau)
     if not len(triangles):
-        return [columns[TERMS[term]]() for term in chosen]
-    arm, by_term = _differentiate_triangles(joints_from_readings(q, tau, w), tau, triangles)
+        return [_evaluate_shape(q, constants, term) for term in chosen]
+    arm, by_term = _differentiate_triangles(joints_from_readings(q, tau, constants), tau, triangles)
     results = []
     for term in chosen:
-        column = columns[TERMS[term]]() if term < len(TERMS) else np.zeros_like(r)
-        column = np.array(np.broadcast_to(column, (*arm.shape[:2], len(w))))
+        column = _evaluate_shape(q, constants, term)
+        column = np.array(np.broadcast_to(column, (*arm.shape[:2], len(constants))))
         with np.errstate(divide="ignore", invalid="ignore"):
-            if term < len(TERMS):
-                column[..., triangles] /= arm
-            else:
+            if len(TERMS) <= term < len(TERMS) + MOVABLE:
                 column[..., triangles] = -by_term[..., term - len(TERMS)] / arm
+            else:
+                column[..., triangles] /= arm
         results.append(column)
     return results
 
 
-def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def _evaluate_shape(q: FloatArray, constants: FloatArray, term: int) -> FloatArray:
+    """Return what a term adds per unit to what the transmissions give (t | 1, n, a); a dimension of
+    a triangle adds nothing.
+    """
+    r, approach = split_readings(q, len(constants))
+    if term < len(TERMS):
+        return SHAPES[TERMS[term]].value(r, approach, constants[:, 0])
+    column, point = np.zeros_like(r), term - len(ALL_TERMS)
+    if point >= 0:
+        for a in range(len(constants)):
+            column[..., a] = weigh_points(r[..., a], constants[a])[..., point]
+    return column
+
+
+def joints_from_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return the joint values (t, n, a) of readings q under terms tau, NaN where no angle of a
     triangle drive reaches its length. Summed drives must have as many readings as joints.
     """
-    values = transmit_readings(q, tau, w)
-    if (weights := select_weights(tau)) is not None:
+    values = transmit_readings(q, tau, constants)
+    if (weights := select_weights(tau, constants)) is not None:
         return apply_weights(invert_weights(weights), values)
     return values
 
 
-def transmit_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def transmit_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return what the transmissions give (t, n, a): joint values, and of summed drives the sums."""
-    values = evaluate_sums(q, tau, w)
+    values = evaluate_sums(q, tau, constants)
     triangles = find_triangles(tau)
     if len(triangles):
         values = np.array(values)
@@ -271,25 +374,25 @@ def transmit_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArr
     return values
 
 
-def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def joint_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a); of summed drives d sum /
     d reading.
     """
-    slopes, triangles = _evaluate_slopes(q, tau, w), find_triangles(tau)
+    slopes, triangles = _evaluate_slopes(q, tau, constants), find_triangles(tau)
     if not len(triangles):
         return slopes
-    arm, _ = _differentiate_triangles(joints_from_readings(q, tau, w), tau, triangles)
-    slopes = np.array(np.broadcast_to(slopes, (*arm.shape[:2], len(w))))
+    arm, _ = _differentiate_triangles(joints_from_readings(q, tau, constants), tau, triangles)
+    slopes = np.array(np.broadcast_to(slopes, (*arm.shape[:2], len(constants))))
     with np.errstate(divide="ignore", invalid="ignore"):
         slopes[..., triangles] /= arm
     return slopes
 
 
-def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def readings_from_joints(joints: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return the readings (t, n, a) of joint values, without backlash; Newton's method adds what is
     not linear.
     """
-    if (weights := select_weights(tau)) is not None:
+    if (weights := select_weights(tau, constants)) is not None:
         joints = apply_weights(weights, joints)
     triangles = find_triangles(tau)
     if len(triangles):
@@ -301,32 +404,65 @@ def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> 
     if len(tau) == 1 and not tau[..., 0].any() and bool((tau[..., 1] == 1.0).all()):
         readings = joints
     else:
-        readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
-    if not tau[..., 2:7].any():
+        with np.errstate(divide="ignore", invalid="ignore"):  # a cam has no gain
+            readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
+    if not tau[..., 2:7].any() and not count_points(constants):
         return readings
+    if count_points(constants):
+        readings = _guess_readings(joints, readings, tau, constants)
     for _ in range(20):
-        step = (evaluate_sums(readings, tau, w) - joints) / _evaluate_slopes(readings, tau, w)
+        slopes = _evaluate_slopes(readings, tau, constants)
+        step = (evaluate_sums(readings, tau, constants) - joints) / slopes
         readings = readings - step
         if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
             break
     return readings
 
 
-def select_weights(tau: FloatArray) -> FloatArray | None:
+def _guess_readings(
+    joints: FloatArray, readings: FloatArray, tau: FloatArray, constants: FloatArray
+) -> FloatArray:
+    """Return readings (t, n, a) to begin with: of drives with tables by a line between points."""
+    shape = np.broadcast_shapes(readings.shape, joints.shape)
+    readings = np.array(np.broadcast_to(readings, shape))
+    for a in np.flatnonzero(np.isfinite(constants[:, FIXED])):
+        points = constants[a, FIXED:][np.isfinite(constants[a, FIXED:])]
+        own = np.repeat(points[None, :, None], len(constants), axis=2)
+        known = evaluate_sums(own, tau, constants)[..., a]
+        sign = np.where(known[:, -1] < known[:, 0], -1.0, 1.0)[:, None]
+        wanted, known = sign * joints[..., a], sign * known
+        low = (wanted[..., None] > known[:, None, 1:-1]).sum(axis=-1)
+        trials = np.broadcast_to(np.arange(len(known))[:, None], low.shape)
+        first, step = known[trials, low], np.diff(known)[trials, low]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (wanted - first) / step
+        readings[..., a] = points[low] + share * np.diff(points)[low]
+    return readings
+
+
+def select_table(tau: FloatArray, constants: FloatArray) -> FloatArray:
+    """Return the values (t | 1, a, K) of tables."""
+    first = len(ALL_TERMS)
+    return tau[..., first : first + count_points(constants)]
+
+
+def select_weights(tau: FloatArray, constants: FloatArray) -> FloatArray | None:
     """Return the weights (t | 1, a, J) of summed drives, None of a machine without them."""
-    return tau[..., len(ALL_TERMS) :] if tau.shape[-1] > len(ALL_TERMS) else None
+    first = len(ALL_TERMS) + count_points(constants)
+    return tau[..., first:] if tau.shape[-1] > first else None
 
 
 def differentiate_sums(
-    q: FloatArray, tau: FloatArray, w: FloatArray, joints: FloatArray
+    q: FloatArray, tau: FloatArray, constants: FloatArray, joints: FloatArray
 ) -> FloatArray:
     """Return d (s - W joints) / d tau at constant readings and joints (t, n, J), (t, n, a, k)."""
-    columns = term_derivatives(q, tau[..., : len(TERMS)], w)
-    shape = np.broadcast_shapes(columns[0].shape, (*joints.shape[:2], len(w)))
+    first = len(ALL_TERMS) + count_points(constants)
+    r, _ = split_readings(q, len(constants))
+    shape = np.broadcast_shapes(r.shape, (*joints.shape[:2], len(constants)))
     slopes = np.zeros((*shape, tau.shape[-1]))
-    for i, column in enumerate(columns):
-        slopes[..., i] = column
-    slopes[..., len(ALL_TERMS) :] = -joints[:, :, None]
+    for i in range(first):
+        slopes[..., i] = _evaluate_shape(q, constants, i)
+    slopes[..., first:] = -joints[:, :, None]
     return slopes
 
 
@@ -337,41 +473,46 @@ def find_triangles(tau: FloatArray) -> IntArray:
     return np.flatnonzero(tau[0, :, SIDE])
 
 
-def measure_excess(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def measure_excess(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return by how much the lengths of triangles are out of their reach (t, n) [m], the largest.
 
     It is NaN where a reading is not a number.
     """
     triangles = find_triangles(tau)
-    length = evaluate_sums(q, tau, w)[..., triangles]
+    length = evaluate_sums(q, tau, constants)[..., triangles]
     low, high = compute_range(_select_triangles(tau, triangles))
     return np.maximum(np.maximum(low - length, length - high), 0.0).max(axis=-1)
 
 
-def evaluate_sums(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def evaluate_sums(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
-    if not tau[..., 2 : len(TERMS)].any():
-        readings = q[..., : len(w)]
+    has_tables = count_points(constants) > 0
+    if not tau[..., 2 : len(TERMS)].any() and not has_tables:
+        readings = q[..., : len(constants)]
         if len(tau) in (1, len(q)) and (tau[..., :2] == (0.0, 1.0)).all():
             return readings + 0.0  # no offset and no gain: one pass, with the same bits
         return tau[:, None, :, 0] + readings * tau[:, None, :, 1]
-    columns = term_derivatives(q, tau[..., : len(TERMS)], w)
-    return sum(
-        (columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
-        start=columns[0] * tau[:, None, :, 0],
+    values = sum(
+        (_evaluate_shape(q, constants, i) * tau[:, None, :, i] for i in range(1, len(TERMS))),
+        start=_evaluate_shape(q, constants, 0) * tau[:, None, :, 0],
     )
+    return values + _sum_tables(q, tau, constants) if has_tables else values
 
 
-def _evaluate_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def _evaluate_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return d joint / d reading; of triangle drives d length / d reading."""
-    if not tau[..., 2:7].any():
+    has_tables = count_points(constants) > 0
+    if not tau[..., 2:7].any() and not has_tables:
         return tau[:, None, :, 1]
-    r, _ = split_readings(q, len(w))
-    turn = w * r
-    _, gain, curve, sin1, cos1, sin2, cos2, *_ = np.moveaxis(tau[:, None], -1, 0)
-    first = w * (sin1 * np.cos(turn) - cos1 * np.sin(turn))
-    second = 2 * w * (sin2 * np.cos(2 * turn) - cos2 * np.sin(2 * turn))
-    return gain + 2 * curve * r + first + second
+    r, _ = split_readings(q, len(constants))
+    slopes = sum(
+        (
+            shape.slope(r, constants[:, 0]) * tau[:, None, :, i]
+            for i, shape in enumerate(SHAPES.values())
+        ),
+        start=np.zeros(1),
+    )
+    return slopes + _sum_tables(q, tau, constants, 1) if has_tables else slopes
 
 
 def _select_triangles(tau: FloatArray, triangles: IntArray) -> FloatArray:

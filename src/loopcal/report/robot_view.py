@@ -11,7 +11,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.findings.wording import name_count
-from loopcal.mechanism.transmission import TRIANGLE_TERMS, WEIGHT, compute_range
+from loopcal.mechanism.transmission import TABLE, TRIANGLE_TERMS, WEIGHT, compute_range
 from loopcal.results.tables import (
     ABSENT,
     Block,
@@ -222,7 +222,11 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
                 power = POWERS.get(term, 0)
                 number = value * reading.factor_to_si**power / joint_unit.factor_to_si
                 unit = _unit_of_term(joint_unit, reading, power)
-                rows.append((*first, term, format_number(number, DIGITS), unit))
+                at = ""
+                if term.startswith(TABLE):
+                    point = actuator.points[int(term.removeprefix(TABLE)) - 1]
+                    at = f" at {_format(point, reading)} {reading}"
+                rows.append((*first, term + at, format_number(number, DIGITS), unit))
         for joint, weight in actuator.weights.items():
             rows.append((*first, f"{WEIGHT}{joint}", format_number(weight, DIGITS), "1"))
     drives = word_column("drives", wraps=True)

@@ -24,6 +24,7 @@ from loopcal.mechanism.solutions import forward, inverse
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
+from tests.robot_texts import load_text
 
 HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))
 
@@ -465,3 +466,36 @@ def test_serial_arm_is_a_valid_mechanism():
         zoo.assemble("arm", (limb,), ("x", "y"), ("x", "y"), zoo.place((0.35, 0.25, 0.0)))
     )
     assert robot.home_state.status[0, 0] == 0
+
+
+UPU = """
+format: 1
+family: limbs
+name: upu
+units: {length: mm, angle: deg}
+controlled: [x, y, z]
+limbs:
+  - name: leg
+    ending: rigid
+    chain:
+      - {joint: U, name: low, at: [300, 0, 0], axes: [y, x]}
+      - {joint: P, name: slide, axis: z, actuated: q, start: 500}
+      - {joint: U, name: up, axes: [x, y]}
+    attach: [150, 0, 0]
+    copies: {count: 3}
+home: {z: 500}
+"""
+
+
+def test_a_singular_start_is_refused_with_the_start_values_of_home(tmp_path: Path) -> None:
+    """Legs of a 3-UPU that begin upright lean by arctan(150 / 500) at home."""
+    with pytest.raises(MechanismError) as refusal:
+        load_text(tmp_path, UPU)
+    assert "State values near home: leg1.low.1 -16.7 deg, leg1.slide 522 mm" in str(refusal.value)
+    leaning = UPU.replace("axes: [y, x]", "axes: [y, x], start: [-16.7, 0]").replace(
+        "axes: [x, y]", "axes: [x, y], start: [0, 16.7]"
+    )
+    assert load_text(tmp_path, leaning).controlled == ("x", "y", "z")
+    parallel = UPU.replace("attach: [150", "attach: [300")  # singular at home itself
+    with pytest.raises(MechanismError, match="cannot be set independently"):
+        load_text(tmp_path, parallel)

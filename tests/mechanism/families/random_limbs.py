@@ -68,7 +68,7 @@ def sample_near_home(machine: Mechanism, n: int, seed: int) -> tuple[State, Arra
     state = engine.solve(
         machine.program,
         e,
-        joints_from_readings(q, tau, machine.slots.frequency),
+        joints_from_readings(q, tau, machine.slots.constants),
         machine.home_state,
     )
     # random machines have small workspaces: keep rows that closed in the mode of home

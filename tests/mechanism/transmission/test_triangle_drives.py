@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import FileError, MechanismError
+from loopcal.io.robot.robot_file import SHIPPED_ROBOTS
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.measurements import Measurements
@@ -349,3 +350,13 @@ SLIDE = PLANAR.replace("joint: R, name: motor", "joint: P, name: motor").replace
 def test_triangles_at_dead_points_and_of_slides_are_refused(tmp_path, text, sentence) -> None:
     with pytest.raises((FileError, MechanismError), match=sentence):
         load_text(tmp_path, text)
+
+
+def test_all_strokes_that_no_angle_reaches_are_reported_at_once(tmp_path: Path) -> None:
+    """Of three cylinders in stages two have strokes beyond their triangles."""
+    text = (SHIPPED_ROBOTS / "excavator.yaml").read_text()
+    text = text.replace("[2200, 3600]", "[22, 3600]").replace("[1800, 2750]", "[1800, 9999]")
+    with pytest.raises((FileError, MechanismError)) as refusal:
+        load_text(tmp_path, text)
+    assert "stick-cylinder' contains the length 22 mm" in str(refusal.value)
+    assert "bucket-cylinder' contains the length 9999 mm" in str(refusal.value)

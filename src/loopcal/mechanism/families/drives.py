@@ -32,10 +32,14 @@ from loopcal.mechanism.families.placement import (
 )
 from loopcal.mechanism.transmission import (
     HARMONICS,
+    TABLE,
     TRIANGLE_TERMS,
     compute_range,
     count_independent,
+    evaluate_sums,
     find_side,
+    list_constants,
+    nominal_terms,
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
@@ -48,6 +52,8 @@ ON_AXIS = 1e-9
 """Distance of an anchor from the axis, as a share of the larger one, that is no lever."""
 DEAD = 1e-6
 """Sine of the angle from a dead point, below which the actuator does not turn the joint."""
+MOST_POINTS = 200
+"""Rows of a table."""
 POINTS, SKEW = ("foot", "head"), "skew"
 
 
@@ -56,6 +62,18 @@ class DriveError(RecordError):
 
     def __init__(self, sentence: str, name: str) -> None:
         super().__init__(sentence, "drives", name)
+
+
+class StrokeError(DriveError):
+    """Strokes of triangle drives that contain lengths of no angle; `strokes` has a sentence for
+    each drive.
+    """
+
+    def __init__(self, strokes: Mapping[str, str]) -> None:
+        what = "strokes" if len(strokes) > 1 else "stroke"
+        sentence = "; ".join([*strokes.values(), f"correct the {what} or the anchors"])
+        super().__init__(sentence, next(iter(strokes)))
+        self.strokes = strokes
 
 
 @dataclass(frozen=True)
@@ -137,6 +155,15 @@ class GivesAngle:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Interpolation:
+    """How a `table`, rows of a reading and a value that is added to the joint value, goes from
+    point to point. Unknown values are table1, table2, .., or table for all.
+    """
+
+    interpolation: Literal["linear", "cubic"] = "linear"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Gain:
     """The scale of a drive whose reading has the unit of its joint, with its tolerance `ratio`."""
 
@@ -156,17 +183,21 @@ class Sum:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LengthDrive(Sum, Gain, GivesLength, ReadsLength):
+class LengthDrive(Interpolation, Sum, Gain, GivesLength, ReadsLength):
     """A drive of a slide or rod whose reading is a length."""
 
+    table: tuple[tuple[Length, Length], ...] = ()
+
 
 @dataclass(frozen=True, kw_only=True)
-class AngleDrive(Sum, Gain, GivesAngle, ReadsAngle):
+class AngleDrive(Interpolation, Sum, Gain, GivesAngle, ReadsAngle):
     """A drive of a rotary joint whose reading is an angle."""
 
+    table: tuple[tuple[Angle, Angle], ...] = ()
+
 
 @dataclass(frozen=True, kw_only=True)
-class SpoolDrive(Sum, GivesLength, ReadsAngle):
+class SpoolDrive(Interpolation, Sum, GivesLength, ReadsAngle):
     """A drive whose reading is an angle and moves a length.
 
     joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + .. `radius` is the
@@ -179,20 +210,22 @@ class SpoolDrive(Sum, GivesLength, ReadsAngle):
     buildup: Length = 0.0
     radii: LengthTolerance | None = None
     buildups: LengthTolerance | None = None
+    table: tuple[tuple[Angle, Length], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScrewDrive(Sum, GivesLength, ReadsAngle):
+class ScrewDrive(Interpolation, Sum, GivesLength, ReadsAngle):
     """A screw whose reading is its angle: it moves by `lead` in one turn, negative for a left-hand
     one, with the tolerance `leads`.
     """
 
     lead: Length
     leads: LengthTolerance | None = None
+    table: tuple[tuple[Angle, Length], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
-class TriangleDrive(Gain, GivesLength, ReadsLength):
+class TriangleDrive(Interpolation, Gain, GivesLength, ReadsLength):
     """A linear actuator that turns a revolute joint through two anchors.
 
     The distance of the anchors is what a length drive gives. `unknown` may also name dimensions of
@@ -203,6 +236,7 @@ class TriangleDrive(Gain, GivesLength, ReadsLength):
     reads: Literal["length"] = "length"
     triangle: Triangle
     angle: AngleTolerance | None = None
+    table: tuple[tuple[Length, Length], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,17 +320,34 @@ class PlacedDrive:
         return self.own.dimension is self.reading
 
     @property
-    def actuator(self) -> Actuator:
-        """The actuator; raises MechanismError for an impossible triangle."""
-        drive, name = self.drive, self.own.name
+    def law(self) -> dict[str, float]:
+        """Terms of the transmission but those of a triangle."""
         terms = {"offset": self.own.terms.get("offset", 0.0)}
         for _, value, _, term, coefficient in self.list_terms().values():
             if value or term == "gain":
                 terms[term] = terms.get(term, 0.0) + self.sense * coefficient * value
+        return terms
+
+    @property
+    def actuator(self) -> Actuator:
+        """The actuator; raises MechanismError for an impossible triangle."""
+        drive, name = self.drive, self.own.name
+        terms: Mapping[str, float] = self.law
         if isinstance(drive, TriangleDrive):
-            terms |= place_triangle(name, drive, self.rotation, self.start)
+            terms = {**terms, **place_triangle(name, drive, self.rotation, self.start)}
+        points = tuple(reading for reading, _ in drive.table)
         sigma = drive.sigma or (self.own.sigma if self._is_like_own else None)
-        return Actuator(name, self.reading, self.stroke, terms, drive.period, sigma, self.weights)
+        return Actuator(
+            name,
+            self.reading,
+            self.stroke,
+            terms,
+            drive.period,
+            sigma,
+            self.weights,
+            points,
+            drive.interpolation,
+        )
 
     def list_terms(self) -> Mapping[str, Term]:
         """Return the terms of the drive by the names that a file gives them."""
@@ -317,6 +368,8 @@ class PlacedDrive:
             if term == "curve":  # without a stroke it is refused where it is stated
                 coefficient = 1 / reach**2 if 0.0 < reach < np.inf else np.nan
             terms[term] = (own, getattr(drive, term), tolerance, term, coefficient)
+        for k, (_, value) in enumerate(drive.table, 1):
+            terms[f"{TABLE}{k}"] = (own, value, tolerance, f"{TABLE}{k}", 1.0)
         return terms
 
 
@@ -366,8 +419,27 @@ def place_drives(
     else:
         for name, joint in joints.items():
             drives[name] = place(name, stated.get(name) or stated.get(joint.stated), joint)
+    if strokes := {name: words for name in drives if (words := _word_stroke(drives[name]))}:
+        raise StrokeError(strokes)
     refuse_idle_drives(stated, drives, {joint.stated for joint in joints.values()})
     return drives
+
+
+def _word_stroke(placed: PlacedDrive) -> str:
+    """Return what of the stroke of a triangle drive no angle reaches, or nothing."""
+    if not isinstance(placed.drive, TriangleDrive):
+        return ""
+    terms = placed.actuator.terms
+    low, high = (float(end) for end in compute_range(np.array([terms[t] for t in TRIANGLE_TERMS])))
+    ends = [terms["offset"] + terms["gain"] * reading for reading in placed.stroke or ()]
+    outside = [f"{end * 1e3:.6g} mm" for end in ends if np.isfinite(end) and not low <= end <= high]
+    if not outside:
+        return ""
+    return (
+        f"the stroke of actuator {placed.own.name!r} contains the length {' and '.join(outside)}, "
+        f"which no angle of its joint reaches: the anchors are {low * 1e3:.6g} to "
+        f"{high * 1e3:.6g} mm apart"
+    )
 
 
 def refuse_idle_drives(
@@ -402,7 +474,31 @@ def _check_terms(placed: PlacedDrive) -> PlacedDrive:
             "stroke; state the stroke",
             name,
         )
+    if drive.table:
+        _check_table(placed)
     return placed
+
+
+def _check_table(placed: PlacedDrive) -> None:
+    """Refuse a table of one point, out of order, or with which a reading has two joint values."""
+    name, points = placed.own.name, np.array([reading for reading, _ in placed.drive.table])
+    if not 2 <= len(points) <= MOST_POINTS or not (np.diff(points) > 0.0).all():
+        raise DriveError(
+            f"the table of actuator {name!r} has {len(points)} points; state 2 to {MOST_POINTS} "
+            "rows [reading, value], the readings growing",
+            name,
+        )
+    share = np.linspace(0.0, 1.0, 9)[:-1]
+    own = [replace(placed.actuator, terms=placed.law)]
+    readings = np.append(points[:-1, None] + share * np.diff(points)[:, None], points[-1])
+    values = evaluate_sums(readings[None, :, None], nominal_terms(own)[None], list_constants(own))
+    steps = np.diff(values[0, :, 0])
+    if not ((steps > 0.0).all() or (steps < 0.0).all()):
+        raise DriveError(
+            f"the table of actuator {name!r} turns its joint back, so that two readings have one "
+            "joint value; correct a value, or state the gain",
+            name,
+        )
 
 
 def drive_errors(placed: PlacedDrive) -> ErrorModel:
@@ -413,7 +509,8 @@ def drive_errors(placed: PlacedDrive) -> ErrorModel:
     errors = [weight_errors(name, drive, placed.weights, tuple(known))]
     if isinstance(drive, TriangleDrive):
         errors.insert(0, triangle_errors(name, drive, placed.rotation, tuple(known)))
-    for term in drive.unknown:
+    whole = {TABLE: [f"{TABLE}{k + 1}" for k in range(len(drive.table))]} if drive.table else {}
+    for term in (part for stated in drive.unknown for part in whole.get(stated, [stated])):
         if is_of_triangle(drive, term) or is_weight(placed.weights, term):
             continue
         if term not in known:
@@ -499,15 +596,6 @@ def place_triangle(
             name,
         )
     terms[-2:] = np.sign(sine), middle
-    for reading in drive.stroke or ():
-        length = drive.offset + drive.gain * reading
-        if np.isfinite(length) and not low <= length <= high:
-            raise DriveError(
-                f"the stroke of actuator {name!r} contains the length {length * 1e3:.6g} mm, which "
-                f"no angle of its joint reaches: the anchors are {low * 1e3:.6g} to "
-                f"{high * 1e3:.6g} mm apart; correct the stroke or the anchors",
-                name,
-            )
     return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))
 
 

@@ -206,7 +206,7 @@ def _is_verified(robot: Mechanism, record: Limbs, chosen: list[AddedJoint]) -> b
     values = table.nominal + sd * rng.standard_normal((2, len(table)))
     joints = driven_values(robot.program, find_nearby_states(robot))
     slots = robot.slots
-    q = readings_from_joints(joints, slots.terms[None], slots.frequency)
+    q = readings_from_joints(joints, slots.terms[None], slots.constants)
     state = forward_trials(freer, values, q, follow=False)
     return bool((state.status == Status.CONVERGED.value).all())
 

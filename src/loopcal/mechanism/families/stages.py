@@ -29,6 +29,7 @@ from loopcal.mechanism.assembly import (
 from loopcal.mechanism.families.drives import (
     Drive,
     NamedTriangleDrive,
+    StrokeError,
     drive_errors,
     place_drives,
     refuse_idle_drives,
@@ -364,9 +365,17 @@ class PlacedStages(Stages):
             )
         names = [stage.name for stage in self.stages]
         parents = check_stage_names(names, [stage.on for stage in self.stages])
+        assemblies, strokes = list[Assembly](), dict[str, str]()
+        for i in range(len(names)):
+            try:
+                assemblies.append(self._expand_stage(i))
+            except StrokeError as error:  # those of all stages are reported at once
+                strokes |= error.strokes
+        if strokes:
+            raise StrokeError(strokes)
         attached = tuple(
-            AttachedStage(stage.name, on, stage.mount.matrix, self._expand_stage(i))
-            for i, (stage, on) in enumerate(zip(self.stages, parents, strict=True))
+            AttachedStage(stage.name, on, stage.mount.matrix, own)
+            for stage, on, own in zip(self.stages, parents, assemblies, strict=True)
         )
         actuators = [a.name for stage in attached for a in stage.assembly.actuators]
         refuse_idle_drives(self.drives, actuators, map(strip_number, actuators))
@@ -406,6 +415,8 @@ class PlacedStages(Stages):
             own = robot.assembly()
             drives = _select_drives(self.drives, [actuator.name for actuator in own.actuators])
             return replace(robot, drives={**drives, **robot.drives}).assembly() if drives else own
+        except StrokeError:
+            raise
         except MechanismError as error:
             raise StageError(f"stage {stage.name!r}: {error}", i) from None
 
