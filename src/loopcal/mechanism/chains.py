@@ -823,7 +823,7 @@ def _measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
         strokes = np.array([actuator.stroke or (np.nan, np.nan) for actuator in robot.actuators])
         has_all = len(turns) == robot.program.n_joints  # else readings are open sums
         convert = joints_from_readings if has_all else transmit_readings
-        ends = convert(strokes.T[None], tau, robot.slots.frequency)[0]
+        ends = convert(strokes.T[None], tau, robot.slots.constants)[0]
         stated = np.abs(ends[1] - ends[0])
         spans = np.where(stated > 0.0, stated, spans)
     return spans
