@@ -213,7 +213,7 @@ def test_identifiability_without_data_draws_poses_from_the_workspace(loopcal, ro
 def test_check_expand_shows_joints_and_parameters_in_file_units(loopcal) -> None:
     out = loopcal("check linear-delta --expand").out
     rows = [line.split() for line in out.splitlines()]
-    assert ["arm3", "tower", "0", "105", "0"] in [row[:5] for row in rows]
+    assert ["arm3", "carriage", "0", "105", "0"] in [row[:5] for row in rows]
     assert ["q1", "arm1/carriage", "offset", "493.326149", "mm"] in rows
     assert "radius tower1.angle" in out
     assert "q1/transmission/offset" in out
