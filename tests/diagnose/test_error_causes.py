@@ -10,7 +10,12 @@ import pytest
 
 import loopcal as lc
 from loopcal.diagnose.adjusted_uncertainty import SHARED, adjust_uncertainty
-from loopcal.diagnose.error_causes import NOISE, compare_causes, explain_residuals
+from loopcal.diagnose.error_causes import (
+    NOISE,
+    compare_causes,
+    explain_residuals,
+    measure_wrong_poses,
+)
 from loopcal.diagnose.residual_patterns import CAUSE, Effect
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
@@ -115,6 +120,14 @@ def test_a_component_is_taken_into_the_inverse_of_the_covariance():
     without = left @ np.linalg.svd(left.T @ Z)[0][:, 8:]  # nothing of Z
     assert gone.degrees == 22
     assert other.T @ gone.weigh(other) == pytest.approx(other.T @ without @ without.T @ other)
+
+
+@pytest.mark.parametrize(("rows", "estimated", "per_pose"), [(12, 6, 6), (12, 7, 6), (18, 12, 6)])
+def test_wrong_poses_need_degrees_of_freedom_beside_their_own(rows, estimated, per_pose):
+    """An estimated noise has none left where the rows of one pose are all that remain."""
+    remainder, _ = draw_remainder(np.random.default_rng(0), rows, estimated)
+    pose = np.arange(rows) // per_pose
+    assert measure_wrong_poses(remainder, pose, 0.0) == -np.inf
 
 
 def test_noise_alone_is_hardly_ever_excluded():

@@ -179,9 +179,14 @@ def measure_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> f
         distance = (np.where(is_open, y, 0.0) ** 2 / np.where(is_open, w, 1.0)).sum(axis=1)
         degrees = is_open.sum(axis=1)
         left = remainder.degrees + known - degrees
-        spread = np.ones(len(left)) if np.isinf(known) else (square + known - distance) / left
+        is_tested = (degrees > 0) & (left > 0.0)
+        if not is_tested.any():
+            break
+        spread = np.ones(len(left))
+        if not np.isinf(known):
+            np.divide(square + known - distance, left, out=spread, where=is_tested)
         p_value = compute_f_tail(degrees, left, distance / np.maximum(degrees, 1) / spread)
-        worst = int(np.nanargmin(np.where(degrees > 0, p_value, 2.0)))
+        worst = int(np.argmin(np.where(is_tested, p_value, 2.0)))
         columns = np.zeros((len(pose), int(count[worst])))
         columns[member[worst, : count[worst]], np.arange(count[worst])] = 1.0
         spectrum = remainder.find_spectrum(columns)
