@@ -241,7 +241,8 @@ SETTINGS: Any = opt.Group(
     ),
     home_height=_setting("Height of the home pose {home_height}.", "--home-z", type=opt.LENGTH),
     closures=_setting(
-        "Loops that a URDF closes {closures}; by default FILE with the ending .yaml.", type=opt.FILE
+        "Loops that FILE closes {closures}; by default those in FILE with the ending .yaml.",
+        type=opt.FILE,
     ),
     platform=_setting(
         "Link that is the platform {platform}; by default the one on a fixed joint.", metavar="LINK"

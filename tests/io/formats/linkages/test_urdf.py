@@ -119,7 +119,7 @@ def perturb(robot: Mechanism) -> Mechanism:
 
 
 def test_export_to_urdf_needs_a_file_to_correct(read) -> None:
-    with pytest.raises(DataError, match=r"name the URDF to correct"):
+    with pytest.raises(DataError, match=r"name the file to correct"):
         urdf.write(ExportSource(read[FIVE_BAR][1]), None)
 
 
@@ -127,7 +127,7 @@ def test_urdf_of_another_machine_is_refused(tmp_path, files, read) -> None:
     (tmp_path / "other.urdf").write_text(
         files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000')
     )
-    with pytest.raises(FileError, match="export into the URDF it was read from"):
+    with pytest.raises(FileError, match="export into the file it was read from"):
         urdf.write(ExportSource(read[FIVE_BAR][1]), tmp_path / "other.urdf")
 
 

@@ -294,7 +294,7 @@ def _check_motors(tree: LinkTree, closures: Closures, motors: Sequence[str]) -> 
         sentence = "no motor is named; list the driven joints in 'name_mot:'"
         if closures.file is not None:
             raise closures.file.error(sentence)
-        raise FileError(f"{sentence} of a YAML file beside the URDF", tree.path)
+        raise FileError(f"{sentence} of a YAML file beside it", tree.path)
 
 
 def _find_link(tree: LinkTree, name: str) -> str | None:

@@ -210,16 +210,16 @@ def _check_place(tree: LinkTree, name: str, stated: FloatArray) -> None:
     rounding = sum(sum(other.rounding) for other in tree.places.values())
     if np.abs(place - stated).max() > PLACED + rounding:
         sentence = f"joint {name!r} has another place in the robot file"
-        raise tree.error(f"{sentence}; export into the URDF it was read from", name)
+        raise tree.error(f"{sentence}; export into the file it was read from", name)
 
 
 LARGE = 30.0
 """Largest distance of two joints of a link that is plausible [m]; URDF has no other unit."""
 
 REMARKS = {
-    "limbs": "Limbs are named after their first joint, joints as in the URDF.",
+    "limbs": "Limbs are named after their first joint, joints as in the file.",
     "stages": "Stages are named after their joint, those with loops after the link that they "
-    "carry, limbs after their first joint, joints as in the URDF.",
+    "carry, limbs after their first joint, joints as in the file.",
 }
 """What people should know about the names, by the family of the robot file."""
 
