@@ -25,7 +25,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.families.joint_release import propose_added_joints
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import inverse
-from loopcal.mechanism.workspace import evaluate_limits
+from loopcal.mechanism.workspace import ReachableShare, evaluate_limits, measure_reachable_share
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.results.description import Field, fields, within
 from loopcal.typing import FloatArray
@@ -111,6 +111,8 @@ def analyze_identifiability(
     return IdentifiabilityReport(analysis, suggestions, subset, accuracy, is_readings_alone(data))
 
 
+POSITIONS, ENOUGH = 400, 0.95
+"""Random positions of the workspace, and share of them that a machine reaches without a warning."""
 ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
 
 
@@ -121,6 +123,7 @@ class RobotInspection:
     robot: Mechanism  # the robot
     home_readings: FloatArray  # (a,) readings of the actuators at home [SI]
     findings: tuple[Finding, ...]  # notes of the robot file, and limits that home exceeds
+    reachable: ReachableShare | None = None  # share of the stated workspace; None where none is
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(name="robot.name", path="robot.record.path", freedoms="robot.freedoms"),
@@ -134,8 +137,13 @@ class RobotInspection:
         ),
         *fields(parameters=lambda inspection: inspection.list_parameters()),
         *fields(common_errors="robot.parameters.common"),
+        *fields(reachable=lambda inspection: inspection.describe_reachable()),
         *fields(notes=lambda inspection: list(map(str, inspection.robot.findings)), findings=""),
     )
+
+    def describe_reachable(self) -> dict[str, Any] | None:
+        """Return the reachable share of the workspace by its fields."""
+        return None if self.reachable is None else self.reachable._asdict()
 
     def list_parameters(self) -> list[dict[str, Any]]:
         """Return what the robot states of each parameter [SI]."""
@@ -148,7 +156,7 @@ class RobotInspection:
 
 
 def inspect_robot(robot: Mechanism) -> RobotInspection:
-    """Return the readings at home, and findings."""
+    """Return the readings at home, the reachable share of the workspace, and findings."""
     solution = inverse(robot, robot.home[None])
     limits = evaluate_limits(robot, robot.values[None], solution.q[None], solution.state)
     exceeded = tuple(limit.name for limit in limits if limit.margin[0, 0] < -ROUNDING)
@@ -158,4 +166,19 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
         findings.append(report_finding("workflow.home-exceeds-limits", names=exceeded))
     if not len(robot.parameters):
         findings.append(report_finding("workflow.no-unknowns"))
-    return RobotInspection(robot, solution.q[0], tuple(findings))
+    reachable = measure_reachable_share(robot, POSITIONS)
+    if reachable is not None and reachable.high < ENOUGH:
+        reasons = reachable.reasons
+        findings.append(
+            report_finding(
+                "workflow.unreachable-workspace",
+                name=robot.name,
+                share=reachable.share,
+                low=reachable.low,
+                high=reachable.high,
+                count=reachable.positions,
+                reasons=tuple(reasons),
+                shares=tuple(number / reachable.positions for number in reasons.values()),
+            )
+        )
+    return RobotInspection(robot, solution.q[0], tuple(findings), reachable)

@@ -178,6 +178,39 @@ def sample_workspace(
     )
 
 
+class ReachableShare(NamedTuple):
+    """Which share of the stated workspace a machine reaches, of `positions` random ones.
+
+    low, high : 95 % interval of the share by Wilson's formula. reasons : those out of reach by
+    what prevents them, the most frequent first.
+    """
+
+    share: float
+    low: float
+    high: float
+    positions: int
+    reasons: Mapping[str, int]
+
+
+def measure_reachable_share(robot: Mechanism, n: int, seed: int = 0) -> ReachableShare | None:
+    """Return the reachable share of the stated workspace, of n random positions; None where no
+    workspace is stated.
+    """
+    try:
+        ranges = workspace_ranges(robot)
+    except MechanismError:
+        return None
+    if not ranges:
+        return None
+    rejected: Counter[str] = Counter()
+    drawn = draw_coordinates(np.random.default_rng(seed), robot.controlled, ranges, n)
+    k = int(find_reachable(robot, drawn, rejected).sum())
+    z = 1.96  # of the normal distribution at 95 %
+    middle, half = k + z * z / 2, z * np.sqrt(k * (n - k) / n + z * z / 4)
+    low, high = ((middle + sign * half) / (n + z * z) for sign in (-1.0, 1.0))
+    return ReachableShare(k / n, float(low), float(high), n, dict((+rejected).most_common()))
+
+
 RING_SHARES = (2 / 7, 4 / 7, 6 / 7)
 """Tilts of rings of poses, as shares of the largest one; the tilts between them stay for checks."""
 
