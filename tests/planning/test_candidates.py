@@ -246,6 +246,13 @@ def test_path_through_a_singularity_is_refused():
     assert verdict.violations[0] is not None
 
 
+def test_path_of_a_machine_with_a_spare_drive_ends_at_any_readings_of_its_pose():
+    robot = load_robot("hexapod-turntable")
+    home = locate_home(robot)
+    turned = home + np.array([0.02, 0.0, 0.0, 0.0, 0.1, 1.0])
+    assert check_paths(build_checker(robot, Constraints()), home[None], turned[None]).allowed[0]
+
+
 def test_tilt_path_takes_the_shorter_azimuth_or_passes_zero_tilt():
     robot = load_robot("3-prs")
     names = robot.controlled

@@ -166,6 +166,13 @@ def find_carrying_actuators(robot: Mechanism) -> IntArray:
     return np.array([i for i in carrying if names[i] not in robot.assembly.held], int)
 
 
+def has_spare_drives(robot: Mechanism) -> bool:
+    """Return whether a pose has infinitely many readings, because a chain has more drives than
+    coordinates.
+    """
+    return bool(robot.stages) and len(find_carrying_actuators(robot)) > len(robot.controlled)
+
+
 def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int, FloatArray]]:
     """Return the stages that carry a platform, and the maps (t, n, 6, 6) of their twists to it.
 
@@ -413,10 +420,11 @@ LONGEST_STEP = 0.5
 SHORTEST_SHARE = 1e-3
 """Share of a step that must bring a row closer to its target; below it the target is not
 reachable from here."""
-PROGRESS, PROGRESS_STEPS = 0.5, 10
-"""Share of its distance from the target that a row must lose in so many steps, else it has stalled.
+PROGRESS, PROGRESS_STEPS, PROGRESS_ON_PATH = 0.5, 10, 5
+"""Share of its distance from the target that a row must lose in so many steps, else it has stalled;
+fewer on a path, whose targets are near.
 
-In this time the longest steps turn a joint by 5 rad. Steps close to a stretched arm gain less.
+In ten steps the longest ones turn a joint by 5 rad. Steps close to a stretched arm gain less.
 """
 NEXT, LAST = (1, 2, 0), (2, 0, 1)
 """Components of a cross product: a x b = a[NEXT] b[LAST] - a[LAST] b[NEXT]."""
@@ -678,6 +686,7 @@ class _Rows:
         """
         size, R = self.robot.size, len(start.u)
         close = (CLOSE_ON_PATH if on_path else CLOSE) * size
+        period = PROGRESS_ON_PATH if on_path else PROGRESS_STEPS
         done = now = start
         rows, alive, share = self, np.arange(R), np.ones(R)
         before = now.gap
@@ -685,7 +694,7 @@ class _Rows:
             arrived = now.gap <= close
             broken = ~np.isfinite(now.gap)
             end = arrived | broken | (share < SHORTEST_SHARE)
-            if count % PROGRESS_STEPS == 0 and count:
+            if count % period == 0 and count:
                 end |= now.gap > PROGRESS * before
                 before = now.gap
             if end.any() or count == STEPS:
@@ -818,7 +827,7 @@ def _make_rows(
 def _measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
     """Return the `spans` of the drives (u,) of a robot."""
     spans = np.where(turns, 2 * np.pi, robot.size)
-    if len(find_carrying_actuators(robot)) > len(robot.controlled):
+    if has_spare_drives(robot):
         _, tau = robot.slots(robot.values[None])
         strokes = np.array([actuator.stroke or (np.nan, np.nan) for actuator in robot.actuators])
         has_all = len(turns) == robot.program.n_joints  # else readings are open sums

@@ -20,12 +20,7 @@ from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
 from loopcal.mechanism.actuation import solve_open_sums
 from loopcal.mechanism.assembly import BASE
-from loopcal.mechanism.chains import (
-    find_carrying_actuators,
-    join_stage_states,
-    solve_serial,
-    solve_stages,
-)
+from loopcal.mechanism.chains import has_spare_drives, join_stage_states, solve_serial, solve_stages
 from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings, inverse_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution
@@ -153,7 +148,7 @@ def find_working_modes(
         raise DataError(
             f"{len(wanted)} coordinates were given; {robot.name} has {', '.join(robot.controlled)}"
         )
-    if len(find_carrying_actuators(robot)) > len(wanted) and robot.stages:
+    if has_spare_drives(robot):
         raise DataError(
             f"{robot.name} has more drives than coordinates, so that the readings of a pose are "
             "not countable; name drives to keep at their readings under 'held:'"
