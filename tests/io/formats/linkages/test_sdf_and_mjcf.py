@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal import forward, inverse
+from loopcal.errors import LoopcalError
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
@@ -16,6 +17,7 @@ from loopcal.mechanism.model import Mechanism
 from tests.io.formats.linkages.linkage_texts import write_mjcf, write_sdf
 from tests.io.formats.linkages.urdf_chains import make_digger, make_leg
 from tests.io.formats.linkages.urdf_machines import MachineJoint, UrdfSolver, write_machine
+from tools.fuzz.sources import SOURCES
 
 AGREES = 1e-9
 """Largest difference of two solutions [m, 1]; both close loops to 1e-12."""
@@ -79,3 +81,34 @@ def test_machine_agrees_with_the_solver_and_is_written_back(tmp_path, machine, n
     moved = forward(changed, q).T
     np.testing.assert_allclose(forward(read(path, name, "tool"), q).T, moved, rtol=0, atol=AGREES)
     assert np.abs(moved - found).max() > 1e-4  # [m, 1]: the changes matter
+
+
+REFUSED = {
+    "another root": ("<robot/>", "the root is <robot>, but <mujoco> is needed"),
+    "include": (
+        '<mujoco><include file="../x.xml"/></mujoco>',
+        ":1: the included file 'x.xml' cannot be read; put it beside",
+    ),
+    "unknown body": (
+        SOURCES["robot.xml"].replace('body2="rod2"', 'body2="rod3"'),
+        ":8: <connect> names the body 'rod3', which does not exist",
+    ),
+    "not linear": (
+        SOURCES["robot.xml"].replace(
+            "</equality>", '<joint joint1="mot1" joint2="mot2" polycoef="0 1 2 0 0"/></equality>'
+        ),
+        "polycoef of 'mot1' is not linear",
+    ),
+    "generated bodies": (
+        SOURCES["robot.xml"].replace("<worldbody>", '<worldbody><replicate count="3"/>'),
+        "<replicate> makes bodies that the file does not write",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_mjcf_is_refused_in_one_sentence(tmp_path, case) -> None:
+    text, sentence = REFUSED[case]
+    (tmp_path / "robot.xml").write_text(text)
+    with pytest.raises(LoopcalError, match=sentence):
+        read(tmp_path / "robot.xml", "mjcf")

@@ -262,8 +262,10 @@ def _include(root: Element, path: Path) -> Element:
                 expand(child, count)
                 children.append(child)
                 continue
-            other = path.parent / child.attributes.get("file", "")
-            if count >= MOST_INCLUDES or not other.is_file():
+            name = Path(child.attributes.get("file", ""))
+            other = path.parent / name
+            is_beside = not name.is_absolute() and ".." not in name.parts
+            if count >= MOST_INCLUDES or not is_beside or not other.is_file():
                 raise child.error(f"the included file {other.name!r} cannot be read; put it beside")
             inner = parse_xml(read_text(other, WHAT), other, WHAT)
             expand(inner, count + 1)
