@@ -49,22 +49,25 @@ def measure_poses(robot: Mechanism, count: int, unknown: tuple[str, ...] = ()) -
 
 
 @pytest.mark.parametrize(
-    ("name", "rank", "unknown", "count"),
+    ("name", "ranks", "unknown", "count"),
     [
-        ("tsai-3upu", 60, (), 0),
-        ("3-prs", 60, ("frame",), 6),
-        ("ru-pus-prs", 57, (), 0),
-        pytest.param("arm-6r", 30, ("frame",), 6, marks=pytest.mark.slow),
+        ("tsai-3upu", {60}, (), 0),
+        ("3-prs", {60}, ("frame",), 6),
+        # two of 58 directions act by products of drawn errors only: 2e-12 to 7e-11 of the largest
+        # singular value in six drawn machines, about the tolerance of 1e-11; the next has 4e-16
+        ("ru-pus-prs", {56, 57, 58}, (), 0),
+        pytest.param("arm-6r", {30}, ("frame",), 6, marks=pytest.mark.slow),
     ],
 )
 def test_combinations_that_change_no_pose_do_not_lower_the_verdict(
-    name, rank, unknown, count, tmp_path
+    name, ranks, unknown, count, tmp_path
 ):
     robot = build_complete(name, tmp_path)
     data = measure_poses(robot, 60, unknown)
     report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
     free = len(report.identification.names)
-    assert report.identification.rank == rank - count
+    rank = report.identification.rank + count
+    assert rank in ranks
     (harmless,) = [f for f in report.findings if f.code == "workflow.frame-freedoms"]
     assert (harmless.data["still"], harmless.data["count"]) == (free - rank, count)
     assert "workflow.undetermined-combinations" not in {f.code for f in report.findings}

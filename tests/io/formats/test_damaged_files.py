@@ -25,7 +25,7 @@ from tools.fuzz.sources import SOURCES
 
 DIGITS = "0" * 5000
 """More digits than Python turns into a whole number."""
-MOST = {"urdf": 4, "sdf": 1, "mjcf": 1, "hangprinter": 4}
+MOST = {"urdf": 4, "sdf": 3, "mjcf": 3, "hangprinter": 4}
 """Places of each sort of damage, for files that are slow to read; 6 for others, twice as many in
 the evidence.
 """
