@@ -11,8 +11,9 @@ revolute joint on it. Derivation: docs/theory/tripods.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -178,7 +179,10 @@ LEFT_OUT = ("thOz", "thU1z")
 """Parameters of the twenty-seven that the twenty-five leave out."""
 
 
-SETS = {**RobotRecord.OLDER_KEYS, "parameters": (str, "parameter_set")}
+SETS: Mapping[str, tuple[type, str]] = {
+    **RobotRecord.OLDER_KEYS,
+    "parameters": (str, "parameter_set"),
+}
 """Older keys of both families: a set of parameters by its name."""
 
 
@@ -198,7 +202,7 @@ class RuPusPrs(RobotRecord):
     """
 
     family = "ru-pus-prs"
-    OLDER_KEYS = SETS
+    OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = SETS
 
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
@@ -278,7 +282,7 @@ class ThreePrs(RobotRecord):
     """
 
     family = "3-prs"
-    OLDER_KEYS = SETS
+    OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = SETS
 
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
