@@ -6,6 +6,7 @@ A sort of input is a function that draws arguments of `solve` for some rows. Wha
 through the C interface, and the results through `linearize` and `fold`.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -153,7 +154,7 @@ def _answer(native: Engine, call: Call, count: int) -> np.ndarray:
     except REFUSALS:
         return np.array([0, count, 0, 0])
     rows = blocks.closure[0].E
-    rows = rows.reshape(len(rows), -1, rows.shape[-1])
+    rows = rows.reshape(len(rows), math.prod(rows.shape[1:-1]), rows.shape[-1])  # there may be none
     native.fold(np.zeros((len(rows), rows.shape[2], rows.shape[2])), rows)
     closed = state.status == CONVERGED
     wrong = closed & ~np.isfinite(state.T).all(axis=(2, 3))
