@@ -27,5 +27,7 @@ def test_further_calls_cause_few_page_faults(monkeypatch):
     monkeypatch.setenv("LOOPCAL_ENGINE", "numpy")
     monkeypatch.delenv("LD_PRELOAD", raising=False)  # sanitizers replace the C library's memory
     words = [sys.executable, "-c", COUNT_FAULTS]
-    faults = subprocess.run(words, check=True, capture_output=True, text=True).stdout
-    assert int(faults) < 5000  # 20,000 where each call takes its memory from the system
+    runs = (subprocess.run(words, check=True, capture_output=True, text=True) for _ in range(3))
+    # 20,000 where each call takes its memory from the system; a process that the system is short
+    # of memory for has many once, but not three times
+    assert any(int(run.stdout) < 5000 for run in runs)
