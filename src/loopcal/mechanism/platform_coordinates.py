@@ -117,30 +117,13 @@ def compare_coordinates(
         columns[:, place, :3] = size * row
     if set(EULER) & set(names):
         angles = geometry.matrix_to_euler(rotation, "xyz")
-        rates = _differentiate_angles(rotation)
+        rates = geometry.euler_rates_inverse(angles, "xyz")
         for i, name in enumerate(EULER):
             if name in wanted:
                 place = names.index(name)
                 residual[:, place] = size * geometry.wrap_angle(angles[:, i] - wanted[name])
                 columns[:, place, :3] = size * rates[:, i]
     return residual, columns
-
-
-def _differentiate_angles(rotation: FloatArray) -> FloatArray:
-    """Return the slopes (N, 3, 3) of roll, pitch and yaw in angular velocity, huge at the poles.
-
-    omega = yaw' ez + pitch' (-s, c, 0) + roll' (c cos pitch, s cos pitch, -sin pitch) with the
-    cosine c and the sine s of the yaw.
-    """
-    x, y = rotation[:, 0, 0], rotation[:, 1, 0]
-    cosine = np.maximum(np.hypot(x, y), 1e-100)
-    x, y = x / cosine, y / cosine
-    rates = np.zeros((len(x), 3, 3))
-    rates[:, 0, 0], rates[:, 0, 1] = x / cosine, y / cosine
-    rates[:, 1, 0], rates[:, 1, 1] = -y, x
-    rates[:, 2, :2] = -rotation[:, 2, :1] * rates[:, 0, :2]
-    rates[:, 2, 2] = 1.0
-    return rates
 
 
 def _compare_normals(

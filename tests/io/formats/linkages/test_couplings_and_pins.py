@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
+from loopcal.io.formats.import_export import export_robot
 from loopcal.io.formats.linkages import urdf
 from loopcal.io.formats.program_format import ExportSource
 from loopcal.mechanism.solutions import forward, inverse
@@ -65,10 +66,10 @@ def test_pins_of_other_programs_close_a_parallelogram(tmp_path, how) -> None:
 def test_joint_inside_gazebo_is_written_back(tmp_path) -> None:
     text = f"{FOUR_BAR}{GAZEBO}{TRANSMISSION.format('motor')}</robot>"
     robot = read(tmp_path, text)[1]
-    assert urdf.write(ExportSource(robot), tmp_path / "r.urdf").text == text
+    assert export_robot(ExportSource(robot), urdf.FORMAT, tmp_path / "r.urdf").text == text
     changes = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
     changed = robot.with_values(robot.values + changes)
-    exported = urdf.write(ExportSource(changed), tmp_path / "r.urdf")
+    exported = export_robot(ExportSource(changed), urdf.FORMAT, tmp_path / "r.urdf")
     assert "<!-- cut -->" in exported.text
     q = np.linspace(-0.4, 0.4, 5)[:, None]
     expected = forward(changed, q).T

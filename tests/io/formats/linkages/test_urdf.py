@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, FileError, LoopcalError
-from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.linkages import urdf
+from loopcal.io.formats.import_export import build_imported_robot, export_robot
+from loopcal.io.formats.linkages import linkage_format, urdf
 from loopcal.io.formats.linkages.closures import read_mechanism
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.mechanism.joint_graph.paths import find_stage_paths
@@ -31,7 +31,10 @@ def files(data_folder) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def read(files) -> dict[str, tuple[Imported, Mechanism]]:
-    found = {name: urdf.read(path, ImportOptions(name)) for name, path in files.items()}
+    found = {
+        name: linkage_format.read(urdf.read_tree(path), ImportOptions(name), "a URDF")
+        for name, path in files.items()
+    }
     return {name: (one, build_imported_robot(files[name], one)) for name, one in found.items()}
 
 
@@ -79,7 +82,7 @@ def test_poses_agree_with_the_tree_after_closing_its_loops(files, read, name) ->
 @pytest.mark.parametrize("name", COUNTS)
 def test_unchanged_robot_keeps_the_file_byte_for_byte(files, read, name) -> None:
     assert (
-        urdf.write(ExportSource(read[name][1]), files[name]).text.encode()
+        export_robot(ExportSource(read[name][1]), urdf.FORMAT, files[name]).text.encode()
         == files[name].read_bytes()
     )
 
@@ -87,7 +90,10 @@ def test_unchanged_robot_keeps_the_file_byte_for_byte(files, read, name) -> None
 @pytest.mark.parametrize("name", COUNTS)
 def test_export_changes_only_attributes_of_origins(files, read, name) -> None:
     robot = perturb(read[name][1])
-    before, after = files[name].read_text(), urdf.write(ExportSource(robot), files[name]).text
+    before, after = (
+        files[name].read_text(),
+        export_robot(ExportSource(robot), urdf.FORMAT, files[name]).text,
+    )
     changed = [
         (a, b) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b
     ]
@@ -99,10 +105,15 @@ def test_export_changes_only_attributes_of_origins(files, read, name) -> None:
 
 def test_corrected_origins_are_read_as_the_same_machine(tmp_path, files, read) -> None:
     robot = perturb(read[FIVE_BAR][1])
-    (tmp_path / "robot.urdf").write_text(urdf.write(ExportSource(robot), files[FIVE_BAR]).text)
+    (tmp_path / "robot.urdf").write_text(
+        export_robot(ExportSource(robot), urdf.FORMAT, files[FIVE_BAR]).text
+    )
     (tmp_path / "robot.yaml").write_text(files[FIVE_BAR].with_name("robot.yaml").read_text())
     again = build_imported_robot(
-        tmp_path / "robot.urdf", urdf.read(tmp_path / "robot.urdf", ImportOptions("again"))
+        tmp_path / "robot.urdf",
+        linkage_format.read(
+            urdf.read_tree(tmp_path / "robot.urdf"), ImportOptions("again"), "a URDF"
+        ),
     )
     T = inverse(again, again.home[None]).T
     q = inverse(again, T).q + 0.05 * np.random.default_rng(2).uniform(-1, 1, (20, 2))
@@ -120,7 +131,7 @@ def perturb(robot: Mechanism) -> Mechanism:
 
 def test_export_to_urdf_needs_a_file_to_correct(read) -> None:
     with pytest.raises(DataError, match=r"name the file to correct"):
-        urdf.write(ExportSource(read[FIVE_BAR][1]), None)
+        export_robot(ExportSource(read[FIVE_BAR][1]), urdf.FORMAT, None)
 
 
 def test_urdf_of_another_machine_is_refused(tmp_path, files, read) -> None:
@@ -128,7 +139,7 @@ def test_urdf_of_another_machine_is_refused(tmp_path, files, read) -> None:
         files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000')
     )
     with pytest.raises(FileError, match="export into the file it was read from"):
-        urdf.write(ExportSource(read[FIVE_BAR][1]), tmp_path / "other.urdf")
+        export_robot(ExportSource(read[FIVE_BAR][1]), urdf.FORMAT, tmp_path / "other.urdf")
 
 
 JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>'  # noqa: E501
@@ -169,7 +180,7 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
 def test_invalid_urdf_is_refused_in_one_sentence(tmp_path, text, sentence) -> None:
     (tmp_path / "a.urdf").write_text(text)
     with pytest.raises(FileError, match=sentence):
-        urdf.read(tmp_path / "a.urdf", ImportOptions("a"))
+        linkage_format.read(urdf.read_tree(tmp_path / "a.urdf"), ImportOptions("a"), "a URDF")
 
 
 @pytest.mark.parametrize(
@@ -199,7 +210,7 @@ def test_invalid_closures_are_refused_in_one_sentence(tmp_path, closures, senten
     )
     (tmp_path / "a.yaml").write_text(closures)
     with pytest.raises(LoopcalError, match=sentence):
-        urdf.read(tmp_path / "a.urdf", ImportOptions("a"))
+        linkage_format.read(urdf.read_tree(tmp_path / "a.urdf"), ImportOptions("a"), "a URDF")
 
 
 CIRCLE = """<robot name="r">

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError, LoopcalError
-from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.linkages import urdf
+from loopcal.io.formats.import_export import build_imported_robot, export_robot
+from loopcal.io.formats.linkages import linkage_format, urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
@@ -54,7 +54,9 @@ def read(
     path.write_text(text)
     if closures is not None:
         path.with_suffix(".yaml").write_text(closures)
-    imported = urdf.read(path, ImportOptions("r", platform=platform))
+    imported = linkage_format.read(
+        urdf.read_tree(path), ImportOptions("r", platform=platform), "a URDF"
+    )
     return imported, build_imported_robot(path, imported)
 
 
@@ -97,7 +99,7 @@ def test_hexapods_with_constraints_agree_with_the_solver(tmp_path, seed) -> None
     np.testing.assert_allclose(inverse(robot, found.T).q, q, rtol=0, atol=1e-9)
     changes = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
     changed = robot.with_values(robot.values + changes)
-    exported = urdf.write(ExportSource(changed), tmp_path / "r.urdf")
+    exported = export_robot(ExportSource(changed), urdf.FORMAT, tmp_path / "r.urdf")
     assert "files.not-expressed" not in {finding.code for finding in exported.findings}
     (tmp_path / "corrected.urdf").write_text(exported.text)
     corrected = UrdfSolver(tmp_path / "corrected.urdf", tmp_path / "r.yaml")

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.linkages import urdf
+from loopcal.io.formats.import_export import build_imported_robot, export_robot
+from loopcal.io.formats.linkages import linkage_format, urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse, jacobian
@@ -38,7 +38,7 @@ def write(folder: Path, machine: str, seed: int | None) -> Path:
 
 
 def read(path: Path) -> tuple[Imported, Mechanism]:
-    imported = urdf.read(path, ImportOptions("machine"))
+    imported = linkage_format.read(urdf.read_tree(path), ImportOptions("machine"), "a URDF")
     return imported, build_imported_robot(path, imported)
 
 
@@ -75,7 +75,7 @@ def test_every_parameter_is_the_shift_of_an_origin_in_the_urdf(tmp_path, machine
     robot = read(path)[1]
     changes = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
     changed = robot.with_values(robot.values + changes)
-    exported = urdf.write(ExportSource(changed), path)
+    exported = export_robot(ExportSource(changed), urdf.FORMAT, path)
     assert "files.not-expressed" not in {finding.code for finding in exported.findings}
     (tmp_path / "corrected.urdf").write_text(exported.text)
     solver = UrdfSolver(tmp_path / "corrected.urdf", path.with_suffix(".yaml"))

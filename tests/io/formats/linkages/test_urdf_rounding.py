@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from loopcal.errors import LoopcalError
-from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.linkages import urdf
+from loopcal.io.formats.import_export import build_imported_robot, export_robot
+from loopcal.io.formats.linkages import linkage_format, urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
@@ -47,7 +47,7 @@ def write(folder: Path, machine: str, digits: int | None) -> Path:
 
 
 def read(path: Path) -> tuple[Imported, Mechanism]:
-    imported = urdf.read(path, ImportOptions("machine"))
+    imported = linkage_format.read(urdf.read_tree(path), ImportOptions("machine"), "a URDF")
     return imported, build_imported_robot(path, imported)
 
 
@@ -69,7 +69,7 @@ def test_rounded_loops_are_closed_and_the_gap_is_stated(tmp_path, machine, digit
     # [m, 1]: half a unit turns a lever of the ankle, 0.05 m, by ten units of angle
     np.testing.assert_allclose(found.T, forward(exact, q).T, rtol=0, atol=50 * unit)
     np.testing.assert_allclose(inverse(robot, found.T).q, q, rtol=0, atol=1e-9)
-    exported = urdf.write(ExportSource(robot), path)
+    exported = export_robot(ExportSource(robot), urdf.FORMAT, path)
     assert exported.text == path.read_text()
 
 

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from loopcal.errors import LoopcalError
 from loopcal.estimate.identification import identify
-from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.linkages import urdf
+from loopcal.io.formats.import_export import build_imported_robot, export_robot
+from loopcal.io.formats.linkages import linkage_format, urdf
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
@@ -59,7 +59,9 @@ def write(folder: Path, joints: list[MachineJoint], seed: int | None = None) -> 
 
 
 def read(path: Path, platform: str | None = None) -> tuple[Imported, Mechanism]:
-    imported = urdf.read(path, ImportOptions("machine", platform=platform))
+    imported = linkage_format.read(
+        urdf.read_tree(path), ImportOptions("machine", platform=platform), "a URDF"
+    )
     return imported, build_imported_robot(path, imported)
 
 
@@ -102,7 +104,7 @@ def test_chains_agree_with_the_solver(tmp_path, machine, seed) -> None:
     np.testing.assert_allclose(back.q, q, rtol=0, atol=AGREES)
     changes = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
     changed = robot.with_values(robot.values + changes)
-    exported = urdf.write(ExportSource(changed), path)
+    exported = export_robot(ExportSource(changed), urdf.FORMAT, path)
     assert "files.not-expressed" not in {finding.code for finding in exported.findings}
     corrected = tmp_path / "corrected.urdf"
     corrected.write_text(exported.text)
@@ -121,7 +123,7 @@ def test_shifts_at_constraints_in_a_limb_with_the_name_of_its_motor_agree(tmp_pa
     assert sum(values) == pytest.approx(3e-3)
     changed, q = robot.with_values(robot.values + values), draw_readings(robot, 1)
     corrected = tmp_path / "corrected.urdf"
-    corrected.write_text(urdf.write(ExportSource(changed), path).text)
+    corrected.write_text(export_robot(ExportSource(changed), urdf.FORMAT, path).text)
     moved = forward(changed, q).T
     np.testing.assert_allclose(moved, solve(corrected, robot, q), rtol=0, atol=AGREES)
 
@@ -145,7 +147,7 @@ def test_stages_have_names_of_their_own_without_points(tmp_path) -> None:
     assert tuple(stage.name for stage in robot.stages) == names
     assert robot.actuators[0].name == "arm.slew:1"
     changed = robot.with_values(robot.values + 1e-4)
-    exported = urdf.write(ExportSource(changed), path)
+    exported = export_robot(ExportSource(changed), urdf.FORMAT, path)
     assert "files.not-expressed" not in {finding.code for finding in exported.findings}
 
 
@@ -163,7 +165,7 @@ def test_urdf_of_another_chain_is_refused(tmp_path) -> None:
     robot = read(path)[1]
     path.write_text(path.read_text().replace('xyz="0.0 0.0 0.2"', 'xyz="0.0 0.0 0.3"', 1))
     with pytest.raises(LoopcalError, match="export into the file it was read from"):
-        urdf.write(ExportSource(robot), path)
+        export_robot(ExportSource(robot), urdf.FORMAT, path)
 
 
 def make_humanoid() -> list[MachineJoint]:

@@ -26,6 +26,7 @@ from loopcal.io.formats.linkages.tree import Constraint, LinkTree, TreeJoint, de
 from loopcal.io.formats.program_format import (
     Exported,
     ExportSource,
+    Format,
     Imported,
     ImportOptions,
     format_head,
@@ -61,19 +62,32 @@ PLACED = 1e-9
 """Accepted difference between the places of a joint in the file and the robot file [m, 1]."""
 
 
+def make_format(
+    what: str, about: str, endings: tuple[str, ...], read_tree: Callable[[Path], LinkTree]
+) -> Format:
+    """Return the format of files of links and joints that `read_tree` reads; `what` is one of them,
+    such as "an SDF".
+    """
+    name = what.rsplit(maxsplit=1)[-1]
+
+    def read_file(path: Path, options: ImportOptions) -> Imported:
+        return read(read_tree(path), options, what)
+
+    def write_file(source: ExportSource, into: Path | None) -> Exported:
+        return write(source, into, read_tree, name)
+
+    used = {"closures": "", "platform": ""}
+    return Format(name.lower(), about, endings, read_file, write_file, read_options=used)
+
+
 def write(
-    source: ExportSource,
-    into: Path | None,
-    read_tree: Callable[[Path], LinkTree],
-    name: str,
-    what: str,
+    source: ExportSource, into: Path | None, read_tree: Callable[[Path], LinkTree], what: str
 ) -> Exported:
     """Return the file with corrected origins; DataError where none is given, FileError where its
     joints have other places.
     """
-    record = get_record(
-        source, (Limbs, PlacedStages), name, "a robot of the family limbs or stages"
-    )
+    families = Limbs, PlacedStages
+    record = get_record(source, families, what.lower(), "a robot of the family limbs or stages")
     if into is None:
         raise DataError(report_finding("files.urdf-needed"))
     tree, changes, expressed = read_tree(into), [], set()

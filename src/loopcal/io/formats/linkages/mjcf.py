@@ -19,7 +19,7 @@ from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.linkages import linkage_format
+from loopcal.io.formats.linkages.linkage_format import make_format
 from loopcal.io.formats.linkages.tree import (
     Constraint,
     LinkTree,
@@ -35,13 +35,6 @@ from loopcal.io.formats.linkages.xml_tree import (
     format_numbers,
     measure_rounding,
     parse_xml,
-)
-from loopcal.io.formats.program_format import (
-    Exported,
-    ExportSource,
-    Format,
-    Imported,
-    ImportOptions,
 )
 from loopcal.mechanism.joint_graph.graph import turn_between
 from loopcal.typing import FloatArray
@@ -563,21 +556,6 @@ def _replace(
     return edit if edit is not None else (after_name, after_name, added)
 
 
-def read(path: Path, options: ImportOptions) -> Imported:
-    """Read an MJCF and its closures as a robot."""
-    return linkage_format.read(read_tree(path), options, "an MJCF")
-
-
-def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the MJCF with corrected places."""
-    return linkage_format.write(source, into, read_tree, "mjcf", "MJCF")
-
-
-FORMAT = Format(
-    "mjcf",
-    "MJCF with equalities that close loops",
-    (".xml", ".mjcf"),
-    read,
-    write,
-    read_options={"closures": "", "platform": ""},
+FORMAT = make_format(
+    "an MJCF", "MJCF with equalities that close loops", (".xml", ".mjcf"), read_tree
 )

@@ -19,7 +19,7 @@ from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.linkages import linkage_format
+from loopcal.io.formats.linkages.linkage_format import make_format
 from loopcal.io.formats.linkages.tree import (
     Constraint,
     LinkTree,
@@ -36,13 +36,6 @@ from loopcal.io.formats.linkages.xml_tree import (
     format_numbers,
     measure_rounding,
     parse_xml,
-)
-from loopcal.io.formats.program_format import (
-    Exported,
-    ExportSource,
-    Format,
-    Imported,
-    ImportOptions,
 )
 from loopcal.typing import FloatArray
 
@@ -377,21 +370,4 @@ def write_pose(tree: LinkTree, element: Element, T: FloatArray, stated: FloatArr
     return pose.end, pose.close, f"{format_numbers(T[:3, 3])} {angles}"
 
 
-def read(path: Path, options: ImportOptions) -> Imported:
-    """Read an SDF and its closures as a robot."""
-    return linkage_format.read(read_tree(path), options, "an SDF")
-
-
-def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the SDF with corrected poses."""
-    return linkage_format.write(source, into, read_tree, "sdf", "SDF")
-
-
-FORMAT = Format(
-    "sdf",
-    "SDF with joints that close loops",
-    (".sdf",),
-    read,
-    write,
-    read_options={"closures": "", "platform": ""},
-)
+FORMAT = make_format("an SDF", "SDF with joints that close loops", (".sdf",), read_tree)

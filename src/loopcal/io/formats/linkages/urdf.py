@@ -22,7 +22,7 @@ from loopcal import geometry
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import find_fault
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.linkages import linkage_format
+from loopcal.io.formats.linkages.linkage_format import make_format
 from loopcal.io.formats.linkages.sdf import list_embedded_constraints, write_pose
 from loopcal.io.formats.linkages.tree import Constraint, LinkTree, TreeJoint, build_tree, make_end
 from loopcal.io.formats.linkages.xml_tree import (
@@ -31,13 +31,6 @@ from loopcal.io.formats.linkages.xml_tree import (
     apply_edits,
     measure_rounding,
     parse_xml,
-)
-from loopcal.io.formats.program_format import (
-    Exported,
-    ExportSource,
-    Format,
-    Imported,
-    ImportOptions,
 )
 from loopcal.typing import FloatArray
 
@@ -274,21 +267,4 @@ def rewrite(before: LinkTree, after: LinkTree) -> str:
     return apply_edits(before.text, edits)
 
 
-def read(path: Path, options: ImportOptions) -> Imported:
-    """Read a URDF and its closures as a robot."""
-    return linkage_format.read(read_tree(path), options, "a URDF")
-
-
-def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the URDF with corrected origins."""
-    return linkage_format.write(source, into, read_tree, "urdf", "URDF")
-
-
-FORMAT = Format(
-    "urdf",
-    "URDF with loop closures",
-    (".urdf",),
-    read,
-    write,
-    read_options={"closures": "", "platform": ""},
-)
+FORMAT = make_format("a URDF", "URDF with loop closures", (".urdf",), read_tree)
