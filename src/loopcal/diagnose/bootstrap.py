@@ -252,14 +252,10 @@ def describe_scatter(linear: FitLinearization, blocks: Clusters) -> BlockScatter
         return BlockScatter(nan, few, few, nan, unit_sd, noise)
     spread = compute_robust_spread(linear, blocks)
     ratio, degrees, share, tail = nan.copy(), nan.copy(), nan.copy(), nan.copy()
-    tested_rows = spread.scaled_rows * spread.is_tested[:, None, :]
-    total = (spread.root**2).sum(axis=1)
     for j, effect in enumerate(np.eye(p)):
         compared = spread.compare(effect[None])
         ratio[j], degrees[j] = compared.ratio, compared.degrees
-        by_blocks = float((np.matmul(spread.root[j], tested_rows) ** 2).sum())
-        share[j] = by_blocks / total[j] if total[j] > 0.0 else np.nan
-        tail[j] = compared.p_value
+        share[j], tail[j] = compared.share, compared.p_value
     safe = np.where(np.isfinite(degrees) & (share > 0.0), share, 1.0)
     effective = np.where(np.isfinite(degrees), degrees / safe**2, np.inf)
     return BlockScatter(ratio, degrees, effective, tail, unit_sd, noise)

@@ -99,7 +99,7 @@ class Ratio(NamedTuple):
 
     ratio: float  # of the root mean square over the measured poses; NaN without uncertainty
     degrees: float  # degrees of freedom of its square for independent errors
-    share: float  # of the variance by noise that residuals can judge
+    share: float  # of the stated variance that comes from rows which residuals can judge
     p_value: float  # probability of a larger ratio for independent errors
 
 
@@ -141,8 +141,7 @@ class RobustSpread(NamedTuple):
         # Q = sum_g |E' h_g|^2 with E E' = root' root; for independent errors its mean is `mean`
         _, s, vt = np.linalg.svd(root, full_matrices=False)
         E = vt[s > COMMON * s[0]].T * s[s > COMMON * s[0]]
-        rows = np.matmul(E.T, self.scaled_rows)
-        tested_rows = rows * self.is_tested[:, None, :]
+        tested_rows = np.matmul(E.T, self.scaled_rows) * self.is_tested[:, None, :]
         mean, observed = float((tested_rows**2).sum()), float(((self.scores @ E) ** 2).sum())
         if not mean > 0.0:
             return NO_RATIO
@@ -160,7 +159,7 @@ class RobustSpread(NamedTuple):
         trace = float((joint * joint.T).sum() - single.sum() + (products**2).sum())
         degrees = mean**2 / trace if trace > 0.0 else np.inf
         p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
-        return Ratio(ratio, degrees, mean / float((rows**2).sum()), p_value)
+        return Ratio(ratio, degrees, mean / total, p_value)
 
 
 def compute_robust_spread(linear: FitLinearization, clusters: Clusters) -> RobustSpread:

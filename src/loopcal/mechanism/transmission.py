@@ -250,17 +250,22 @@ def _make_spline(points: bytes, is_cubic: bool) -> PPoly:
     return PPoly(np.stack([np.diff(values, axis=0) / np.diff(x)[:, None], values[:-1]]), x)
 
 
+def _weigh_tables(r: FloatArray, constants: FloatArray, derivative: int = 0) -> FloatArray:
+    """Return the weights of the values of all tables at readings (t, n, a), (t, n, a, K), or their
+    derivatives by the reading.
+    """
+    drives = range(len(constants))
+    weights = [weigh_points(r[..., a], constants[a], derivative) for a in drives]
+    return np.stack(weights, axis=-2)
+
+
 def _sum_tables(
     q: FloatArray, tau: FloatArray, constants: FloatArray, derivative: int = 0
 ) -> FloatArray:
     """Return what tables add to joint values (t, n, a), or to their slopes."""
     r, _ = split_readings(q, len(constants))
-    values = select_table(tau, constants)
-    parts = [
-        (weigh_points(r[..., a], constants[a], derivative) * values[:, None, a]).sum(axis=-1)
-        for a in range(len(constants))
-    ]
-    return np.stack(parts, axis=-1)
+    values = select_table(tau, constants)[:, None]
+    return (_weigh_tables(r, constants, derivative) * values).sum(axis=-1)
 
 
 def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
@@ -323,12 +328,11 @@ def term_derivatives(
     chosen = range(min(tau.shape[-1], end)) if terms is None else terms
     triangles = find_triangles(tau)
     if not len(triangles):
-        return [_evaluate_shape(q, constants, term) for term in chosen]
+        return _evaluate_shapes(q, constants, chosen)
     arm, by_term = _differentiate_triangles(joints_from_readings(q, tau, constants), tau, triangles)
     results = []
-    for term in chosen:
-        column = _evaluate_shape(q, constants, term)
-        column = np.array(np.broadcast_to(column, (*arm.shape[:2], len(constants))))
+    for term, shape in zip(chosen, _evaluate_shapes(q, constants, chosen), strict=True):
+        column = np.array(np.broadcast_to(shape, (*arm.shape[:2], len(constants))))
         with np.errstate(divide="ignore", invalid="ignore"):
             if len(TERMS) <= term < len(TERMS) + MOVABLE:
                 column[..., triangles] = -by_term[..., term - len(TERMS)] / arm
@@ -338,18 +342,26 @@ def term_derivatives(
     return results
 
 
-def _evaluate_shape(q: FloatArray, constants: FloatArray, term: int) -> FloatArray:
-    """Return what a term adds per unit to what the transmissions give (t | 1, n, a); a dimension of
-    a triangle adds nothing.
+def _evaluate_shapes(
+    q: FloatArray, constants: FloatArray, terms: Sequence[int]
+) -> list[FloatArray]:
+    """Return what each of the terms adds per unit to what the transmissions give, (t | 1, n, a); a
+    dimension of a triangle adds nothing.
     """
     r, approach = split_readings(q, len(constants))
-    if term < len(TERMS):
-        return SHAPES[TERMS[term]].value(r, approach, constants[:, 0])
-    column, point = np.zeros_like(r), term - len(ALL_TERMS)
-    if point >= 0:
-        for a in range(len(constants)):
-            column[..., a] = weigh_points(r[..., a], constants[a])[..., point]
-    return column
+    first, w = len(ALL_TERMS), constants[:, 0]
+    of_points: FloatArray | None = None
+    if any(term >= first for term in terms):
+        of_points = _weigh_tables(r, constants)
+
+    def evaluate(term: int) -> FloatArray:
+        if term < len(TERMS):
+            return SHAPES[TERMS[term]].value(r, approach, w)
+        if of_points is None or term < first:
+            return np.zeros_like(r)
+        return of_points[..., term - first]
+
+    return [evaluate(term) for term in terms]
 
 
 def joints_from_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
@@ -460,8 +472,8 @@ def differentiate_sums(
     r, _ = split_readings(q, len(constants))
     shape = np.broadcast_shapes(r.shape, (*joints.shape[:2], len(constants)))
     slopes = np.zeros((*shape, tau.shape[-1]))
-    for i in range(first):
-        slopes[..., i] = _evaluate_shape(q, constants, i)
+    for i, column in enumerate(_evaluate_shapes(q, constants, range(first))):
+        slopes[..., i] = column
     slopes[..., first:] = -joints[:, :, None]
     return slopes
 
@@ -492,9 +504,10 @@ def evaluate_sums(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Floa
         if len(tau) in (1, len(q)) and (tau[..., :2] == (0.0, 1.0)).all():
             return readings + 0.0  # no offset and no gain: one pass, with the same bits
         return tau[:, None, :, 0] + readings * tau[:, None, :, 1]
+    shapes = _evaluate_shapes(q, constants, range(len(TERMS)))
     values = sum(
-        (_evaluate_shape(q, constants, i) * tau[:, None, :, i] for i in range(1, len(TERMS))),
-        start=_evaluate_shape(q, constants, 0) * tau[:, None, :, 0],
+        (shapes[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
+        start=shapes[0] * tau[:, None, :, 0],
     )
     return values + _sum_tables(q, tau, constants) if has_tables else values
 

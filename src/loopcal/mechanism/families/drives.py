@@ -514,13 +514,15 @@ def drive_errors(placed: PlacedDrive) -> ErrorModel:
         if is_of_triangle(drive, term) or is_weight(placed.weights, term):
             continue
         if term not in known:
-            raise DriveError(
-                f"actuator {name!r} has no term {term!r}{suggest_names(term, list(known))}; "
-                f"allowed are {', '.join(known)}",
-                name,
-            )
+            raise _refuse_term(name, term, tuple(known))
         errors.append(_term_error(placed, term))
     return join_errors(errors)
+
+
+def _refuse_term(name: str, term: str, allowed: tuple[str, ...]) -> DriveError:
+    """Return the error of a drive that has no such term."""
+    hint = f"{suggest_names(term, allowed)}; allowed are {', '.join(allowed)}"
+    return DriveError(f"actuator {name!r} has no term {term!r}{hint}", name)
 
 
 def _term_error(placed: PlacedDrive, term: str) -> ErrorModel:
@@ -613,12 +615,7 @@ def triangle_errors(
     errors = []
     for term in _expand_unknowns(drive, rotation):
         if term not in known:
-            allowed = (*other, *POINTS, SKEW, *known)
-            raise DriveError(
-                f"actuator {name!r} has no term {term!r}{suggest_names(term, allowed)}; allowed "
-                f"are {', '.join(allowed)}",
-                name,
-            )
+            raise _refuse_term(name, term, (*other, *POINTS, SKEW, *known))
         part, _, axis = term.partition(".")
         direction = np.eye(3)[AXES.index(axis) % 3]
         components = rotation.T @ direction
