@@ -137,13 +137,9 @@ class RobotInspection:
         ),
         *fields(parameters=lambda inspection: inspection.list_parameters()),
         *fields(common_errors="robot.parameters.common"),
-        *fields(reachable=lambda inspection: inspection.describe_reachable()),
+        *fields(reachable=lambda found: found.reachable and found.reachable._asdict()),
         *fields(notes=lambda inspection: list(map(str, inspection.robot.findings)), findings=""),
     )
-
-    def describe_reachable(self) -> dict[str, Any] | None:
-        """Return the reachable share of the workspace by its fields."""
-        return None if self.reachable is None else self.reachable._asdict()
 
     def list_parameters(self) -> list[dict[str, Any]]:
         """Return what the robot states of each parameter [SI]."""

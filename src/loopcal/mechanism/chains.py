@@ -610,11 +610,10 @@ class _Rows:
         ok = np.isfinite(slope).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
         if not ok.all():
             slope[~ok], residual[~ok] = np.eye(*slope.shape[1:]), 0.0
-        step, sign = np.zeros_like(now.u), np.ones(len(ok))
-        if slope.shape[1] == slope.shape[2]:
-            sign = np.sign(np.linalg.det(slope))
-        is_square = slope.shape[1] == slope.shape[2] and bool(sign.all())
-        inverse = np.linalg.inv(slope) if is_square else np.linalg.pinv(slope)
+        is_square = slope.shape[1] == slope.shape[2]
+        sign = np.sign(np.linalg.det(slope)) if is_square else np.ones(len(ok))
+        inverse = np.linalg.inv(slope) if is_square and sign.all() else np.linalg.pinv(slope)
+        step = np.zeros_like(now.u)
         step[:, self.moving] = -np.matmul(inverse, residual[..., None])[..., 0]
         step *= self.spans
         # no joint moves farther than the longest step: in radians, or sizes of the robot

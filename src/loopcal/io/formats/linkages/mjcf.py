@@ -29,6 +29,7 @@ from loopcal.io.formats.linkages.tree import (
     make_end,
 )
 from loopcal.io.formats.linkages.xml_tree import (
+    SAME,
     Edit,
     Element,
     apply_edits,
@@ -44,8 +45,6 @@ WORLD = "world"
 KINDS = {"hinge": "R", "slide": "P", "ball": "S"}
 TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 """Attributes that state an orientation; one of them at most."""
-SAME = 1e-13
-"""Difference of places that count as the same [m, 1]."""
 MOST_INCLUDES = 50
 """Largest number of files that one file includes."""
 

@@ -30,6 +30,7 @@ from loopcal.io.formats.linkages.tree import (
     make_end,
 )
 from loopcal.io.formats.linkages.xml_tree import (
+    SAME,
     Edit,
     Element,
     apply_edits,
@@ -53,8 +54,6 @@ KINDS = {
 GEARBOX = "gearbox"
 UNLIMITED = 1e15
 """Limit from which a joint counts as unlimited; SDF writes 1e16 [rad, m]."""
-SAME = 1e-13
-"""Difference of places that count as the same [m, 1]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,6 +85,10 @@ class Element:
         return first, first + len(match[2].encode()), format_numbers(values)
 
 
+SAME = 1e-13
+"""Difference of places that count as the same, so that their text stays [m, 1]."""
+
+
 def format_numbers(values: Iterable[float]) -> str:
     """Return numbers that read back as the same doubles."""
     return " ".join(repr(float(v)) for v in values)
