@@ -26,8 +26,8 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 def test_further_calls_cause_few_page_faults(monkeypatch):
     monkeypatch.setenv("LOOPCAL_ENGINE", "numpy")
     monkeypatch.delenv("LD_PRELOAD", raising=False)  # sanitizers replace the C library's memory
+    # Dask states it for its workers, in the environment of the process that begins a cluster
+    monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
     words = [sys.executable, "-c", COUNT_FAULTS]
-    runs = (subprocess.run(words, check=True, capture_output=True, text=True) for _ in range(3))
-    # 20,000 where each call takes its memory from the system; a process that the system is short
-    # of memory for has many once, but not three times
-    assert any(int(run.stdout) < 5000 for run in runs)
+    faults = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    assert int(faults) < 5000  # 20,000 where each call takes its memory from the system
