@@ -23,8 +23,9 @@ WRITTEN = "loopcal: written completely before the following: data.csv\n"
     [(">/dev/full", 1, WRITTEN + FULL), (">&-", 0, ""), (">/dev/full 2>/dev/full <&-", 1, "")],
 )
 def test_results_are_written_whatever_becomes_of_standard_output(
-    tmp_path, streams, code, said
+    tmp_path, monkeypatch, streams, code, said
 ) -> None:
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)  # nothing is left to write with it
     words = ["bash", "-c", f"{COMMAND} {streams}"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (code, "", said)

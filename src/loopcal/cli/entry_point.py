@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             terminal.flush_output()
             return code if isinstance(code, int) else 0
         except BrokenPipeError:  # the reader of our output stopped (`loopcal ... | head`)
-            terminal.silence_output()
+            terminal.silence(sys.stdout)
             return 1
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 the one place for all of them
             return _report(error, command, words, list_outputs())

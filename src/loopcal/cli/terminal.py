@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import click
 
@@ -105,17 +105,17 @@ def _report_output_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        silence_output()
+        silence(sys.stdout)
         if isinstance(error, BrokenPipeError):
             raise
         reason = (error.strerror or str(error)).lower()
         raise FileError(f"cannot be written ({reason})", "standard output") from error
 
 
-def silence_output() -> None:
-    """Discard what is left of standard output."""
+def silence(stream: TextIO) -> None:
+    """Discard what is left of a standard stream, which Python would try to write when it exits."""
     with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def prepare_streams() -> None:
@@ -140,8 +140,10 @@ def print_message(text: str) -> None:
     text = escape(text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]} …")
     if sys.stderr.isatty():
         text = textwrap.fill(text, width(), break_long_words=False, break_on_hyphens=False)
-    with suppress(OSError):  # a message that cannot be shown must not end the work
+    try:
         click.echo(text, err=True)
+    except OSError:  # a message that cannot be shown must not end the work
+        silence(sys.stderr)
 
 
 def print_note(text: object) -> None:
