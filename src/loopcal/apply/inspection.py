@@ -24,11 +24,13 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.families.joint_release import propose_added_joints
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.singularities import NEAR_SHARE, analyze_singularity
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.workspace import ReachableShare, evaluate_limits, measure_reachable_share
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.results.description import Field, fields, within
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
 
 FEW = 3  # combinations that change poses and that a summary lists one by one
 
@@ -113,6 +115,8 @@ def analyze_identifiability(
 
 POSITIONS, ENOUGH = 400, 0.95
 """Random positions of the workspace, and share of them that a machine reaches without a warning."""
+SMALL, LARGE = 0.005, 100.0  # characteristic lengths of machines [m]; others are doubted
+FLAT = 0.02  # margin [m/m] below which home is close to a singularity
 ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
 
 
@@ -152,7 +156,11 @@ class RobotInspection:
 
 
 def inspect_robot(robot: Mechanism) -> RobotInspection:
-    """Return the readings at home, the reachable share of the workspace, and findings."""
+    """Return the readings at home, the reachable share of the workspace, and findings.
+
+    Home is near a singularity if it is so in units of the workspace's median, or if a motion of
+    the platform and one of an actuator differ by a factor of 1 / FLAT.
+    """
     solution = inverse(robot, robot.home[None])
     limits = evaluate_limits(robot, robot.values[None], solution.q[None], solution.state)
     exceeded = tuple(limit.name for limit in limits if limit.margin[0, 0] < -ROUNDING)
@@ -162,6 +170,22 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
         findings.append(report_finding("workflow.home-exceeds-limits", names=exceeded))
     if not len(robot.parameters):
         findings.append(report_finding("workflow.no-unknowns"))
+    if not SMALL <= robot.size <= LARGE:
+        size = robot.to_quantity(robot.size, Dimension.LENGTH)
+        findings.append(report_finding("workflow.unusual-size", size=size))
+    home = analyze_singularity(robot, solution)
+    clearance = min(home.ratio[0] / NEAR_SHARE, home.margin[0] / FLAT)
+    of_drives = min(home.drive_ratio[0] / NEAR_SHARE, home.drive_margin[0] / FLAT)
+    if min(clearance, of_drives) < 1.0:
+        is_weak = of_drives < clearance
+        findings.append(
+            report_finding(
+                "workflow.home-near-singularity",
+                actuator=home.actuators[home.drive[0]] if is_weak else None,
+                motion=home.motion(0),
+                margin=float((home.drive_margin if is_weak else home.margin)[0]),
+            )
+        )
     reachable = measure_reachable_share(robot, POSITIONS)
     if reachable is not None and reachable.high < ENOUGH:
         reasons = reachable.reasons
