@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bad input gives exit code 1 and one sentence on standard error; nothing is written."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -381,3 +382,33 @@ def test_a_pose_out_of_reach_is_named_as_in_its_file(run_refused, words) -> None
     poses = "pose,z [mm],phi [deg],theta [deg]\nlow,700,0,10\nsteep,700,90,80\n"
     said = run_refused(f"{words} --poses p.csv", p_csv=poses)
     assert "does not reach commanded pose 'steep' at p.csv:3 (1 of 2 fail)" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "sentence"),
+    [
+        ("check --json", None, "Missing argument 'ROBOT'."),
+        ("check no-such.yaml --json", None, "no-such.yaml: this robot file does not exist"),
+        ("check hexapod-42 --json --colour", None, "--colour"),
+        ("calibrate hexapod-42 still.csv --json", "workflow.too-few-equations", "equations"),
+    ],
+)
+def test_a_refusal_under_json_is_a_document_that_says_what_standard_error_says(
+    tmp_path, capsys, monkeypatch, words, code, sentence
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "still.csv").write_text(DATA)
+    assert main(words.split()) == 1
+    printed = capsys.readouterr()
+    stated = json.loads(printed.out)["error"]
+    assert sentence in stated["text"]
+    assert stated["code"] == code
+    assert f"loopcal: {stated['text']}\n" in printed.err
+    assert (stated["hint"] is None) == ("Hint: " not in printed.err)
+
+
+def test_a_defect_under_json_is_a_document_too(capsys, monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("loopcal.apply.inspection.inspect_robot", lambda _: 1 / 0)
+    assert main(["check", "hexapod-42", "--json"]) == 3
+    assert "this is a defect of loopcal" in json.loads(capsys.readouterr().out)["error"]["text"]

@@ -44,6 +44,20 @@ def test_simulate_reproduces_the_shipped_measurements(loopcal, tmp_path) -> None
     )  # [mm, deg]: rounding of another linear algebra library
 
 
+def test_calibrate_without_a_folder_shows_the_same_result_and_writes_nothing(
+    loopcal, tmp_path
+) -> None:
+    before = sorted(tmp_path.iterdir())
+    shown = loopcal("calibrate hexapod-42 measurements.csv").out
+    assert sorted(tmp_path.iterdir()) == before
+    page, _, last = shown.strip().rpartition("\n\n")
+    assert (
+        last.split()
+        == "Nothing was written; -o RUN keeps the result and the corrected robot file.".split()
+    )  # noqa: E501
+    assert loopcal(CALIBRATE).out.strip().rpartition("\n\n")[0] == page
+
+
 def test_calibrate_estimates_the_truth_and_writes_a_complete_run_folder(loopcal, tmp_path) -> None:
     loopcal(
         "calibrate hexapod-42 measurements.csv -o out/run --hold-out 0.25",

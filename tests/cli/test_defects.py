@@ -28,7 +28,7 @@ from loopcal.cli.commands import robot_commands
 np.seterr(divide="raise")
 f = lambda: f()
 robot_commands.check.callback = lambda **_: {}
-sys.exit(main(["check", "hexapod-42", "--json"]))
+sys.exit(main(["check", "hexapod-42"]))
 """
 
 
@@ -50,7 +50,7 @@ def test_defect_gives_one_sentence_a_report_and_exit_code_3(tmp_path) -> None:
     (report,) = tmp_path.iterdir()
     assert str(report) in done.stderr
     text = report.read_text()
-    assert "command: loopcal check hexapod-42 --json\n" in text
+    assert "command: loopcal check hexapod-42\n" in text
     assert f"loopcal {version('loopcal')}, numpy {np.__version__}" in text
     assert text.rstrip().endswith("ZeroDivisionError: division by zero")
     assert report.stat().st_mode & 0o077 == 0, "others may read the report"

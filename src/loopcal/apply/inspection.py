@@ -115,6 +115,7 @@ def analyze_identifiability(
 
 POSITIONS, ENOUGH = 400, 0.95
 """Random positions of the workspace, and share of them that a machine reaches without a warning."""
+FEW_REACHED = 0.05  # share of the workspace up to which nothing is compared with its median
 SMALL, LARGE = 0.005, 100.0  # characteristic lengths of machines [m]; others are doubted
 FLAT = 0.02  # margin [m/m] below which home is close to a singularity
 ROUNDING = 1e-9  # how far home may exceed a limit by rounding [m or rad]
@@ -173,7 +174,9 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
     if not SMALL <= robot.size <= LARGE:
         size = robot.to_quantity(robot.size, Dimension.LENGTH)
         findings.append(report_finding("workflow.unusual-size", size=size))
-    home = analyze_singularity(robot, solution)
+    reachable = measure_reachable_share(robot, POSITIONS)
+    has_medians = reachable is None or reachable.share > FEW_REACHED
+    home = analyze_singularity(robot, solution, None if has_medians else (FLAT, FLAT))
     clearance = min(home.ratio[0] / NEAR_SHARE, home.margin[0] / FLAT)
     of_drives = min(home.drive_ratio[0] / NEAR_SHARE, home.drive_margin[0] / FLAT)
     if min(clearance, of_drives) < 1.0:
@@ -186,7 +189,6 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
                 margin=float((home.drive_margin if is_weak else home.margin)[0]),
             )
         )
-    reachable = measure_reachable_share(robot, POSITIONS)
     if reachable is not None and reachable.high < ENOUGH:
         reasons = reachable.reasons
         findings.append(

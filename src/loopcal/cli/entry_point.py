@@ -189,7 +189,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(command, click.Group) and len(words) > 1:
                 command = command.commands.get(words[1], command)
             if command is not None and not _has_working_folder():
-                return _refuse("the working folder was removed; change to a folder that exists.")
+                sentence = "the working folder was removed; change to a folder that exists."
+                return _refuse(sentence, words)
             code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
             terminal.flush_output()
             return code if isinstance(code, int) else 0
@@ -220,42 +221,53 @@ def _report(
         names = " and ".join(str(path) for path in outputs)
         terminal.print_message(f"loopcal: written completely before the following: {names}")
     unwritten = "" if outputs else "; no result was written"
+    hint = None
     match error:
         case click.exceptions.NoArgsIsHelpError():
             terminal.print_message(error.format_message())
             return 1
         case click.BadParameter() | click.NoSuchOption():
             path = "loopcal" if error.ctx is None else error.ctx.command_path
-            return _refuse(error.format_message(), f"see {path} --help")
+            sentence, hint = error.format_message(), f"see {path} --help"
         case click.ClickException():
-            return _refuse(error.format_message())
+            sentence = error.format_message()
         case LoopcalError():
             finding = error.args[0] if error.args else None
-            hint = find_hint(error.code, command)
-            return _refuse(
-                str(error), word_hint(finding, hint) if isinstance(finding, Finding) else hint
-            )
+            sentence, hint = str(error), find_hint(error.code, command)
+            hint = word_hint(finding, hint) if isinstance(finding, Finding) else hint
         case KeyboardInterrupt() | click.exceptions.Abort():
-            return _refuse(f"stopped before the end{unwritten}.")
+            sentence = f"stopped before the end{unwritten}."
         case OSError():
             place = f"{error.filename}: " if error.filename else ""
             reason = (error.strerror or str(error)).lower()
-            return _refuse(
+            sentence = (
                 f"{place}the operating system refused ({reason}); check the path and its "
                 "permissions."
             )
         case MemoryError():
-            return _refuse("there is not enough memory for this; use fewer poses at a time.")
+            sentence = "there is not enough memory for this; use fewer poses at a time."
         case _:
-            _refuse(describe_defect(error, words))
+            _refuse(describe_defect(error, words), words)
             return 3
+    return _refuse(sentence, words, hint, getattr(error, "code", None))
 
 
-def _refuse(sentence: str, hint: str | None = None) -> int:
-    """Print a sentence, and a hint where there is one, on standard error; return exit code 1."""
-    terminal.print_message(f"loopcal: {' '.join(sentence.split())}")
+def _refuse(
+    sentence: str, words: Sequence[str], hint: str | None = None, code: str | None = None
+) -> int:
+    """Print a sentence, and a hint where there is one, on standard error; return exit code 1.
+
+    With --json among the words of the command, a document on standard output says the same.
+    """
+    sentence = " ".join(sentence.split())
+    terminal.print_message(f"loopcal: {sentence}")
     if hint:
         terminal.print_message(f"Hint: {hint}")
+    if "--json" in words:
+        from loopcal.io.core.text_file import to_json
+
+        with suppress(LoopcalError, BrokenPipeError):  # the sentence above is said all the same
+            terminal.print_text(to_json({"error": {"code": code, "text": sentence, "hint": hint}}))
     return 1
 
 

@@ -25,7 +25,9 @@ REGULARIZATION = "loopcal.diagnose.cross_validation:compute_regularization_curve
 def calibrate(
     robot: str = opt.ROBOT,
     data: tuple[Path, ...] = opt.data(),
-    output: Path = opt.path("Run folder to make.", "-o", required=True),
+    output: Path | None = opt.path(
+        "Run folder to make; without it the result is only shown.", "-o"
+    ),
     hold_out: float = opt.option(
         "Share of the poses, from 0 to below 1, to keep out of the fit for validation, such as "
         "0.25. The poses are those of data.split(hold_out=SHARE, seed=SEED) in Python.",
@@ -61,8 +63,8 @@ def calibrate(
     ),
     verbose: bool = opt.VERBOSE,
 ) -> Output:
-    """Identify the free parameters of ROBOT from DATA, validate them on held-out poses, and write a
-    run folder with the corrected robot file.
+    """Identify the free parameters of ROBOT from DATA, validate them on held-out poses, and with -o
+    write a run folder with the corrected robot file.
 
     DATA may be several files, which are joined by the names of poses.
 
@@ -77,6 +79,7 @@ def calibrate(
     errors on held-out poses grew, or a limit is exceeded.
 
     Examples:
+      loopcal calibrate hexapod-42 measurements.csv --hold-out 0.25
       loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
       loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm
       loopcal calibrate robot.yaml data.csv -o run --volume radius=80mm --volume z=0mm..60mm
@@ -114,14 +117,17 @@ def calibrate(
         allow_still=allowed.pop("allow_still"),
         allow_duplicates=allowed["allow_duplicates"],
     )
-    refuse_run_folder(output, force, list(inputs.values()))
+    if output is not None:
+        refuse_run_folder(output, force, list(inputs.values()))
     measurements = opt.read_measurements(data, machine, **allowed)
     with terminal.TerminalProgress() as progress:
         report = lc.calibrate(machine, measurements, settings, progress)
     opt.print_convention_note(report.conventions, data)
-    with terminal.TerminalProgress("writing the run folder"):
-        lc.save_run(output, report, inputs, opt.list_words(), force)
-    written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
+    written = "Nothing was written; -o RUN keeps the result and the corrected robot file."
+    if output is not None:
+        with terminal.TerminalProgress("writing the run folder"):
+            lc.save_run(output, report, inputs, opt.list_words(), force)
+        written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
     return Output(
         build_document(report, inputs, opt.list_words()),
         lambda: [*view_calibration(report, verbose, hint_for), "", written],
