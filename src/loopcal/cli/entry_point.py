@@ -37,6 +37,7 @@ SECTIONS = {
         "new": ("robot", "Write a robot file, and a measurement file, to fill in."),
         "check": ("robot", "Read a robot file and show what it contains."),
         "view": ("robot", "Show a robot, or a calibration, as a 3-D view in the browser."),
+        "schema": ("robot", "Print the JSON Schema of a kind of file, for editors."),
         "import": ("exchange", "Read the file of a controller as a robot file."),
         "export": ("exchange", "Write identified numbers into the file of a controller."),
     },

@@ -17,6 +17,15 @@ if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
 
+SCHEMAS = {
+    "robot": "loopcal.io.file_schemas:build_robot_schema",
+    "settings": "loopcal.io.file_schemas:build_settings_schema",
+    "profile": "loopcal.io.file_schemas:build_profile_schema",
+    "study": "loopcal.studies.files.study_file:build_study_schema",
+}
+"""Kind of file -> what makes its JSON Schema."""
+
+
 @opt.command()
 def new(
     family: str = opt.argument("FAMILY"),
@@ -42,10 +51,10 @@ def new(
     from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.core.text_file import write_text
+    from loopcal.io.core.text_file import to_json, write_text
     from loopcal.io.core.yaml_file import parse_yaml
     from loopcal.io.data.measurement_writer import format_template
-    from loopcal.io.robot.robot_file import build_robot, format_new_robot
+    from loopcal.io.robot.robot_file import EDITOR_SCHEMA, build_robot, format_new_robot
 
     stated = unknown | instrument
     opt.make_instrument(stated)  # refuses wrong options before anything is written
@@ -55,12 +64,16 @@ def new(
     template = format_template(robot, opt.make_instrument(stated, robot))
     if measurements is not None:
         refuse_settings_beside(measurements)
+    schema_file = output.with_name(EDITOR_SCHEMA)
     with restore_on_failure((output, measurements)):
         write_text(output, robot_text)
+        if not schema_file.exists():
+            write_text(schema_file, to_json(opt.look_up(SCHEMAS["robot"])()))
         if measurements is not None:
             write_text(measurements, template)
     page = [
         f"{output}: a complete robot. Replace its numbers with yours.",
+        f"{schema_file}: the keys of robot files, which editors complete and check.",
         suggest_command("check", output),
     ]
     if measurements is not None:
@@ -69,6 +82,33 @@ def new(
             suggest_command("calibrate", output, measurements, "-o", "run"),
         ]
     return Output({"robot": output, "measurements": measurements}, lambda: page)
+
+
+@opt.command()
+def schema(
+    file: str = opt.argument("KIND", type=click.Choice(list(SCHEMAS))),
+    output: Path | None = opt.path("File to write; by default the schema is printed.", "-o"),
+    force: bool = opt.force("the file"),
+) -> Output:
+    """Print the JSON Schema of a kind of file: robot, settings (of a measurement file), profile or
+    study.
+
+    An editor that knows it completes keys, shows their meaning and marks mistakes. It is found by
+    the first line of a file that `loopcal new` writes.
+
+    Examples:
+      loopcal schema robot -o robot.schema.json
+      loopcal schema study > study.schema.json
+    """
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import to_json, write_text
+
+    content = opt.look_up(SCHEMAS[file])()
+    if output is None:
+        return Output(content, lambda: to_json(content))
+    refuse_outputs((output,), (), force)
+    write_text(output, to_json(content))
+    return Output({"schema": output}, lambda: [f"Written to {output}"])
 
 
 @opt.command()

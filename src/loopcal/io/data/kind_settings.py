@@ -122,8 +122,8 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
         raise file.error(f"{sentence}; allowed: {', '.join(KINDS)}", (*location, "kind"))
     kind = KINDS[name]
     settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
-    hints = get_field_types(_make_record(kind))
-    record = read_record(file, settings, _make_record(kind), None, location)
+    hints = get_field_types(make_settings_record(kind))
+    record = read_record(file, settings, make_settings_record(kind), None, location)
     given = {key: getattr(record, key) for key in settings}
     for key, value in given.items():
         if hints[key] in (LENGTHS, NUMBERS):
@@ -199,7 +199,7 @@ def describe_kind(
 
     Keyword-only settings are left out where they are the default, or the robot's `tool`.
     """
-    hints = get_field_types(_make_record(type(kind)))
+    hints = get_field_types(make_settings_record(type(kind)))
     settings: dict[str, Any] = {"kind": kind.name}
     for setting in dataclasses.fields(cast(Any, kind)):
         if not setting.init or (value := getattr(kind, setting.name)) is None:
@@ -236,7 +236,7 @@ def describe_quantity(value: float, dimension: Dimension, unit: Unit | None = No
 
 
 @cache
-def _make_record(kind: type[Kind]) -> type:
+def make_settings_record(kind: type[Kind]) -> type:
     """Return a record of the settings of a kind (cached); all may be left out."""
     fields = [(n, _annotate(n, hint), None) for n, hint in list_kind_settings(kind).items()]
     return make_dataclass(f"{kind.__name__}Settings", fields, frozen=True)

@@ -523,6 +523,8 @@ EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar", "stages": "arm-6r"}
 """The shipped robot of a family that does not have the name of the family."""
 
 WIDTH = 120
+EDITOR_SCHEMA = "robot.schema.json"
+"""The file beside a new robot file from which editors know its keys."""
 
 
 def format_new_robot(family: str, name: str) -> str:
@@ -545,6 +547,7 @@ def format_new_robot(family: str, name: str) -> str:
         line = f"{key}: {value}"
         text = re.sub(rf"^{key}: .*$", lambda _, line=line: line, text, count=1, flags=re.MULTILINE)
     lines = [
+        f"# yaml-language-server: $schema={EDITOR_SCHEMA}",
         f"# A new robot of the family {record}, with the numbers of the shipped robot {example}.",
         "# Replace them by your own.",
         "#",

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.penalties import Ridge
-from loopcal.io.core.records import read_record
+from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import (
     Location,
@@ -23,6 +23,7 @@ from loopcal.io.core.yaml_file import (
     refuse_unknown_keys,
 )
 from loopcal.io.data.measurement_file import load_poses
+from loopcal.io.file_schemas import SchemaMaker
 from loopcal.io.robot.robot_file import (
     check_format,
     find_robot_file,
@@ -66,6 +67,24 @@ LEVELS: Mapping[str, type] = {
 
 SETTINGS = tuple(item.name for item in fields(StudySettings))
 QUICK = "quick"
+
+
+def build_study_schema() -> dict[str, Any]:
+    """Return the JSON Schema of study files."""
+    make = SchemaMaker(units=False)
+    whole = make.list_keys(StudySettings)
+    levels: dict[str, Any] = {}
+    for key, record in LEVELS.items():
+        stated = [make.refer(record)]
+        if plain := getattr(record, "PLAIN", ""):
+            stated.append(make.describe(get_field_types(record)[plain]))
+        one = {"anyOf": stated}
+        named = {"type": "object", "additionalProperties": one}
+        levels[key] = {"anyOf": [named, {"type": ["array", "string", "number", "boolean"]}]}
+    levels |= {key: {} for key in FACTORS if key not in levels}
+    replaced = {"type": "object", "additionalProperties": {}}
+    whole["properties"] |= {"format": {"const": 1}, **levels, QUICK: replaced}
+    return make.finish("loopcal study file", whole)
 
 
 class StudyContent(NamedTuple):
