@@ -11,9 +11,14 @@ import numpy as np
 from loopcal import engine
 from loopcal.engine import Program, State
 from loopcal.mechanism.limb_rows import (
+    differentiate_displacements,
+    divide_limbs,
+    expand_map,
+    join_columns,
     linearize_limbs,
+    move_passive_joints,
     name_passive_joints,
-    solve_passive_motion,
+    select_block,
     stack_closure_rows,
     stack_driven_columns,
 )
@@ -55,6 +60,19 @@ def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJ
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
         return DrivenJoints(e, tau, joints_from_readings(q, tau, robot.slots.constants))
+
+
+def differentiate_transmissions(robot: Mechanism, values: FloatArray, q: FloatArray) -> FloatArray:
+    """Return the derivatives (t | 1, n | 1, J, p + a) of driven joints, as many as readings q (t |
+    1, n, a), by parameters in SI and by readings.
+    """
+    _, tau = robot.slots(values)
+    inputs = robot.all_parameters.linearize(values, tau, q)
+    joints = expand_map(robot.program, inputs)[1]
+    if robot.has_sums:  # of which the map knows no reading
+        turns = differentiate_joints_by_readings(robot, values, q)
+        return join_columns(joints[..., : len(robot.parameters)], turns)
+    return joints
 
 
 class DrivenSums(NamedTuple):
@@ -108,34 +126,37 @@ def solve_at_pose(
 def differentiate_at_pose(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PoseDrivenSensitivity:
-    """Differentiate readings and passive joints of redundant actuators at states (t, n).
-
-    With summed drives the derivatives are those of the driven joints in place of readings, and q is
-    not used.
-    """
-    t, n = state.T.shape[:2]
-    names = name_passive_joints(robot)
-    a, p, m = robot.program.n_joints, len(robot.parameters), len(robot.freedoms)
-    readings, passive = np.zeros((t, n, a, p + m)), np.zeros((t, n, len(names), p + m))
-    for rows, limbs in linearize_limbs(robot, values, q, state):
-        for limb in limbs.rows(limbs.blocks.closure):
-            both = np.concatenate([np.zeros((*limb.A.shape[:2], p)), limb.A[:, :, 0]], axis=-1)
-            both[..., :p][..., limb.parameters] += limb.by_parameter[:, :, 0]
-            with np.errstate(all="ignore"):
-                by_pose = -(both / limb.by_reading[:, :, 0])
-            readings[rows][:, :, limb.readings] = by_pose[:, :, None]
-        for places, U, limb in limbs.passive_joints(names):
-            moved = np.matmul(limb.by_reading, readings[rows][:, :, limb.readings])
-            moved[..., p:] += limb.A
-            moved[..., :p][..., limb.parameters] += limb.by_parameter
-            passive[rows][:, :, places] = solve_passive_motion(U, moved)
-        for place, column, by_values in limbs.turned_joints(names):
-            slope = limbs.joints_by_reading[:, :, column, None]
-            passive[rows][:, :, place] = slope * readings[rows][:, :, column]
-            passive[rows][:, :, place, :p] += by_values
+    """Differentiate readings and passive joints of redundant actuators at states (t, n)."""
+    p, m = len(robot.parameters), len(robot.freedoms)
+    joints = _differentiate_joints_at_pose(robot, values, state)
+    twists = np.broadcast_to(np.eye(m, p + m, p), (*joints.shape[:2], m, p + m))
+    passive = move_passive_joints(robot, values, state, twists, joints)
+    by_inputs = differentiate_transmissions(robot, values, q)
+    joints[..., :p] -= by_inputs[..., :p]
+    with np.errstate(all="ignore"):
+        readings = joints / np.einsum("...jj->...j", by_inputs[..., p:])[..., None]
     return PoseDrivenSensitivity(
-        names, (readings[..., :p], readings[..., p:]), (passive[..., :p], passive[..., p:])
+        name_passive_joints(robot),
+        (readings[..., :p], readings[..., p:]),
+        (passive[..., :p], passive[..., p:]),
     )
+
+
+def _differentiate_joints_at_pose(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
+    """Return the derivatives (t, n, J, p + m) of driven joints by parameters at constant pose, and
+    by the m freedoms: -(E de + A dy) / Q, of limbs with one drive and one closure row each.
+    """
+    p, m = len(robot.parameters), len(robot.freedoms)
+    displacements = differentiate_displacements(robot, values)
+    out = np.zeros((*state.T.shape[:2], robot.program.n_joints, p + m))
+    for rows, blocks in linearize_limbs(robot, values, state):
+        own = select_block(displacements, rows[:1])
+        for limb in divide_limbs(robot.program, blocks):
+            by_parameters = np.matmul(limb.E, own[:, None, limb.slots])
+            both = np.concatenate([by_parameters, limb.A], axis=3)
+            with np.errstate(all="ignore"):
+                out[rows][:, :, limb.drives] = -(both / limb.Q)
+    return out
 
 
 # Summed drives: s(q) = W l, with l the values of the driven joints.
@@ -213,7 +234,9 @@ def differentiate_open_sums(
     `columns`, all parameters in SI without it.
     """
     chosen = robot.all_parameters if columns is None else columns
-    at_pose = differentiate_at_pose(robot, values, q, state).readings
+    at_pose = np.split(
+        _differentiate_joints_at_pose(robot, values, state), [len(robot.parameters)], axis=3
+    )
     by_parameters = at_pose[0][..., chosen.places] * chosen.units
     weights, moved = _differentiate_sums(robot, values, q, state)
     moved = Derivatives(moved.parameters[..., chosen.places] * chosen.units, moved.readings)
@@ -230,18 +253,17 @@ def differentiate_open_sums(
 
 def differentiate_driven_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State, platform: Derivatives
-) -> Derivatives:
-    """Return the derivatives of the driven joints, (t, n, J, p) and (t, n, J, a), of those of the
-    platform's twist by all parameters in SI and by readings.
+) -> FloatArray:
+    """Return the derivatives (t | 1, n | 1, J, p + a) of the driven joints by all parameters in SI
+    and readings, of those of the platform's twist.
     """
     if robot.has_open_sums:
-        by_parameters, by_pose = differentiate_at_pose(robot, values, q, state).readings
-        freedoms = list(robot.program.freedoms)
-        moved, driven = (np.matmul(by_pose, part[:, :, freedoms]) for part in platform)
-        return Derivatives(moved + by_parameters, driven)
-    weights, moved = _differentiate_sums(robot, values, q, state)
-    inverse = invert_weights(weights)
-    return Derivatives(*(np.matmul(inverse, part) for part in moved))
+        p, freedoms = len(robot.parameters), list(robot.program.freedoms)
+        at_pose = _differentiate_joints_at_pose(robot, values, state)
+        joints = np.matmul(at_pose[..., p:], np.concatenate(platform, axis=3)[:, :, freedoms])
+        joints[..., :p] += at_pose[..., :p]
+        return joints
+    return differentiate_transmissions(robot, values, q)
 
 
 def differentiate_joints_by_readings(

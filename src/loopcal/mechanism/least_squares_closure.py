@@ -25,9 +25,9 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.engine import ParameterMap, Program, State, TwistRows
-from loopcal.mechanism.limb_rows import follow_limb, measure_rod
+from loopcal.mechanism.limb_rows import expand_map, follow_limb, measure_rod
 from loopcal.mechanism.states import make_start
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray
 
 CHUNK = 512
 """Rows differentiated together."""
@@ -139,6 +139,10 @@ def differentiate_unknowns(
     ]
     count = len(program.unknown_twists) + len(list_unknown_joints(program))
     out = np.zeros((t * n, count, inputs.pattern.parameters + program.n_joints))
+    displacements, driven = expand_map(program, inputs)
+    displacements = np.pad(displacements, [(0, 0), (0, 0), (0, program.n_joints)])
+    displacements = np.broadcast_to(displacements, (t, *displacements.shape[1:]))
+    driven = np.broadcast_to(driven, (t, n, *driven.shape[2:]))
     for first in range(0, t * n, CHUNK):
         trial, pose = np.divmod(np.arange(first, min(first + CHUNK, t * n)), n)
         rows = _Rows(
@@ -148,7 +152,8 @@ def differentiate_unknowns(
             tuple(own[trial, pose][:, None] for own in joints),
         )
         with np.errstate(all="ignore"):
-            moved = _differentiate_rows(program, rows, _map_inputs(program, inputs, trial, pose))
+            own = _InputMap(displacements[trial], driven[trial, pose])
+            moved = _differentiate_rows(program, rows, own)
         out[first : first + len(trial)] = moved
     return out.reshape(t, n, *out.shape[1:])
 
@@ -202,28 +207,6 @@ class _InputMap:
         columns = group.actuator[:, k]
         joints = np.where((columns >= 0)[:, None], self.joints[:, columns], 0.0)
         return np.concatenate([self.displacements[:, first : first + width], joints], axis=1)
-
-
-def _map_inputs(
-    program: Program, inputs: ParameterMap, trial: IntArray, pose: IntArray
-) -> _InputMap:
-    """Return the derivatives of displacements and driven joints at rows."""
-
-    def pick(array: FloatArray, *rows: IntArray) -> FloatArray:
-        sizes = zip(rows, array.shape, strict=False)
-        return array[tuple(i if length > 1 else 0 * i for i, length in sizes)]
-
-    p, a, N = inputs.pattern.parameters, program.n_joints, len(trial)
-    displacements = np.zeros((N, program.n_displacements, p + a))
-    coefficients = pick(inputs.displacements, trial)
-    for i, (place, parameter) in enumerate(inputs.pattern.displacements):
-        displacements[:, place, parameter] += coefficients[:, i]
-    joints = np.zeros((N, a, p + a))
-    basis, coefficients = pick(inputs.basis, trial, pose), pick(inputs.joints, trial)
-    for i, (column, function, parameter) in enumerate(inputs.pattern.joints):
-        joints[:, column, parameter] += basis[:, column, function] * coefficients[:, i]
-    joints[:, np.arange(a), p + np.arange(a)] = pick(inputs.readings, trial, pose)
-    return _InputMap(displacements, joints)
 
 
 def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> FloatArray:

@@ -1,25 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linearized closure of limbs by parameters and readings, in blocks that fit the cache.
+"""Linearized closure limb by limb, in blocks that fit the cache, and frames along limbs.
 
 A limb's rows are A y + E de + Q dq = 0 and, for its eliminated joints, U dtheta + A y + E de + Q dq
-= 0; they contain its own displacements and actuators only. With summed drives, dq are changes of
-joint values in place of readings. Derivation: docs/theory/engine.md.
+= 0; they contain its own displacements and driven joints only. Derivation: docs/theory/engine.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.engine import LENGTH, PITCH, Block, Group, State
-from loopcal.mechanism.model import Columns, LimbMap, Mechanism
+from loopcal.engine import LENGTH, PITCH, Group, ParameterMap, Program, State
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
-from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.numerics.trial_batch import map_arrays
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 BLOCK_ROWS = 1024
 """Rows linearized together."""
@@ -43,146 +41,120 @@ def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
 
 
 class LimbRows(NamedTuple):
-    """Linearized closure rows of one limb.
+    """Rows U dtheta + A y + E de + Q dq = 0 of one limb, with its own columns only.
 
-    A : (t, n, r, M) against the freedoms of all nodes. by_parameter : (t, n, r, ..) against the
-    parameters in `parameters`. by_reading : (t, n, r, ..) against the actuators in `readings`, of
-    summed drives against driven joints.
+    limb : its number. joints : its eliminated joints. slots, drives : the places of its
+    displacements in e, and of its driven joints in q.
+    U : (t, n, r, u) against the eliminated joints. A : (t, n, r, M) against the freedoms of all
+    nodes. E : (t, n, r, ..) against the displacements. Q : (t, n, r, ..) against driven joints.
     """
 
+    limb: int
+    joints: tuple[int, ...]
+    slots: slice
+    drives: IntArray
+    U: FloatArray
     A: FloatArray
-    parameters: Columns
-    by_parameter: FloatArray
-    readings: Columns
-    by_reading: FloatArray
+    E: FloatArray
+    Q: FloatArray
+
+
+def divide_limbs(
+    program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
+) -> Iterator[LimbRows]:
+    """Yield the closure rows of each limb, group by group, or those of its `passive` joints."""
+    chosen = blocks.passive if passive else blocks.closure
+    for group, block, joints in zip(program.groups, chosen, blocks.joints, strict=True):
+        width = len(group.slots)
+        for k, limb in enumerate(group.limbs):
+            first = group.columns.start + k * width
+            driven = np.flatnonzero(group.actuator[:, k] >= 0)
+            U, A, E, Q = (a[:, :, k] for a in (block.U, block.A, block.E, block.Q))
+            drives, slots = group.actuator[driven, k], slice(first, first + width)
+            yield LimbRows(limb, joints, slots, drives, U, A, E, Q[..., driven])
 
 
 def linearize_limbs(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
-) -> Iterator[tuple[tuple[slice, slice], LinearizedLimbs]]:
-    """Linearize all limbs, block by block; yields the trials and poses of each block with it."""
+    robot: Mechanism, values: FloatArray, state: State
+) -> Iterator[tuple[tuple[slice, slice], engine.ClosureBlocks]]:
+    """Linearize all limbs at a state (t, n), block by block; yields the trials and poses of each
+    block with it.
+    """
     t, n = state.T.shape[:2]
+    e, _ = robot.slots(values)
     poses = max(min(n, BLOCK_ROWS), 1)
     trials = max(1, BLOCK_ROWS // poses)
     for i in range(0, t, trials):
         for j in range(0, n, poses):
             rows = slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
-            chosen_values, chosen_q = _select(values, rows[:1]), _select(q, rows)
-            block = map_arrays(lambda a, rows=rows: a[rows], state)
-            yield rows, _linearize_block(robot, chosen_values, chosen_q, block)
+            part = map_arrays(lambda a, rows=rows: a[rows], state)
+            joints = driven_values(robot.program, part)
+            yield rows, engine.linearize(robot.program, select_block(e, rows[:1]), joints, part)
 
 
-def _linearize_block(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
-) -> LinearizedLimbs:
-    """Linearize all limbs at the states of one block."""
-    slots, d = robot.slots, robot.program.n_displacements
-    e, tau = slots(values)
-    J = slots.jacobian(values)
-    if robot.has_sums:
-        joints = driven_values(robot.program, state)
-        return LinearizedLimbs(
-            robot,
-            engine.linearize(robot.program, e, joints, state),
-            J[:, :d],
-            np.zeros((len(J), 0, 0, J.shape[-1])),
-            (),
-            np.ones((1, 1, robot.program.n_joints)),
-        )
-    return LinearizedLimbs(
-        robot,
-        engine.linearize(robot.program, e, joints_from_readings(q, tau, slots.constants), state),
-        J[:, :d],
-        J[:, d:].reshape(len(J), *slots.terms.shape, -1),
-        term_derivatives(q, tau, slots.constants),
-        joint_slopes(q, tau, slots.constants),
-    )
-
-
-def _select(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
+def select_block(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
     """Return a block of an array whose leading axes may be 1 and then broadcast."""
     pairs = zip(rows, array.shape, strict=False)
     return array[tuple(s if length > 1 else slice(None) for s, length in pairs)]
 
 
-class LinearizedLimbs(NamedTuple):
-    """Linearized closure of a block of t trials and n poses, limb by limb.
+def differentiate_displacements(robot: Mechanism, values: FloatArray) -> FloatArray:
+    """Return the derivatives (t | 1, d, p) of displacements by parameters in SI."""
+    return robot.slots.jacobian(values)[:, : robot.program.n_displacements]
 
-    blocks : of the engine.
-    displacements_by_parameter : (t, d, p). terms_by_parameter : (t, a, k, p).
-    joints_by_term : k arrays (t, n, a). joints_by_reading : (t, n, a). With summed drives there
-        are no terms, and readings are joint values.
+
+def expand_map(program: Program, inputs: ParameterMap) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of displacements (t | 1, d, p) by parameters, and of driven joints (t
+    | 1, n | 1, J, p + J) by parameters and readings.
     """
+    pattern, p = inputs.pattern, inputs.pattern.parameters
+    place, parameter = pattern.displacements.T
+    displacements = np.zeros((len(inputs.displacements), program.n_displacements, p))
+    displacements[:, place, parameter] = inputs.displacements
+    shape = max(len(inputs.basis), len(inputs.joints)), inputs.basis.shape[1]
+    joints = np.zeros((*shape, program.n_joints, p))
+    for i in range(inputs.basis.shape[3]):
+        own = pattern.joints[:, 1] == i
+        column, _, parameter = pattern.joints[own].T
+        slopes = inputs.basis[:, :, column, i] * inputs.joints[:, None, own]
+        joints[:, :, column, parameter] += slopes
+    by_readings = inputs.readings[..., None] * np.eye(program.n_joints)
+    return displacements, join_columns(joints, by_readings)
 
-    robot: Mechanism
-    blocks: engine.ClosureBlocks
-    displacements_by_parameter: FloatArray
-    terms_by_parameter: FloatArray
-    joints_by_term: Sequence[FloatArray]
-    joints_by_reading: FloatArray
 
-    def rows(self, blocks: tuple[Block, ...]) -> Iterator[LimbRows]:
-        """Yield the rows of each limb in `blocks.closure` or `blocks.passive`."""
-        for maps, block in zip(self.robot.limb_maps, blocks, strict=True):
-            for k, limb in enumerate(maps):
-                yield LimbRows(
-                    block.A[:, :, k],
-                    limb.parameters,
-                    self._differentiate_by_parameters(limb, block, k),
-                    limb.readings,
-                    self._differentiate_by_readings(limb, block, k),
-                )
+def join_columns(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return columns (.., r, c) and (.., r, d) side by side; leading axes of 1 broadcast."""
+    lead = np.broadcast_shapes(first.shape[:-1], second.shape[:-1])
+    both = (np.broadcast_to(a, (*lead, a.shape[-1])) for a in (first, second))
+    return np.concatenate(list(both), axis=-1)
 
-    def passive_joints(
-        self, names: tuple[str, ...]
-    ) -> Iterator[tuple[list[int], FloatArray, LimbRows]]:
-        """Yield, for each limb, the places of its joints in `names`, their U and their rows."""
-        limbs, blocks = self.robot.assembly.limbs, self.blocks
-        limb_rows = self.rows(blocks.passive)
-        for group, block, joints in zip(
-            self.robot.program.groups, blocks.passive, blocks.joints, strict=True
-        ):
-            for k, i in enumerate(group.limbs):
-                rows = next(limb_rows)
-                if joints:
-                    chosen = [f"{limbs[i].name}.{limbs[i].joints[j].name}" for j in joints]
-                    yield [names.index(name) for name in chosen], block.U[:, :, k], rows
 
-    def turned_joints(self, names: tuple[str, ...]) -> Iterator[tuple[int, int, FloatArray]]:
-        """Yield, for each joint that a triangle drive turns, its place in `names`, its actuator and
-        its derivatives (t, n, p) by the parameters, of which its angle alone depends on those of
-        its drive.
-        """
-        column = {a.name: i for i, a in enumerate(self.robot.actuators) if a.is_triangle}
-        for limb, joint in self.robot.assembly.passive_joints:
-            if joint.actuator is not None:
-                a = column[joint.actuator]
-                slopes = self.terms_by_parameter[:, None, a]
-                moved = (
-                    self.joints_by_term[i][:, :, a, None] * slopes[:, :, i]
-                    for i in range(len(self.joints_by_term))
-                )
-                yield names.index(f"{limb.name}.{joint.name}"), a, sum(moved, start=np.zeros(1))
+def move_passive_joints(
+    robot: Mechanism, values: FloatArray, state: State, twists: FloatArray, driven: FloatArray
+) -> FloatArray:
+    """Return the derivatives (t, n, j, w) of the passive joints of `name_passive_joints` by w
+    inputs, of which the first p are the parameters; those of a locked joint are zero.
 
-    def _differentiate_by_parameters(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
-        """Return d rows / d parameters of limb k (t, n, r, ..)."""
-        right = block.E[:, :, k]
-        if not limb.is_plain:
-            t, n, r, width = right.shape
-            of_slots = self.displacements_by_parameter[:, limb.displacements, limb.parameters]
-            product = np.matmul(right.reshape(t, n * r, width), of_slots)
-            right = product.reshape(t, n, r, of_slots.shape[-1])
-        for j, a, terms in limb.drives:
-            for i in terms:
-                slopes = self.terms_by_parameter[:, None, None, a, i, limb.parameters]
-                driven = block.Q[:, :, k, :, j] * self.joints_by_term[i][:, :, a, None]
-                right = right + driven[..., None] * slopes
-        return right
-
-    def _differentiate_by_readings(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
-        """Return d rows / d readings of limb k (t, n, r, ..)."""
-        driven = block.Q[:, :, k][..., [j for j, *_ in limb.drives]]
-        return driven * self.joints_by_reading[:, :, None, limb.readings]
+    twists : (t, n, M, w) the freedoms of all nodes by the inputs. driven : (t | 1, n | 1, J, w)
+    the driven joints by them.
+    """
+    names, limbs = name_passive_joints(robot), robot.assembly.limbs
+    out = np.zeros((*state.T.shape[:2], len(names), twists.shape[-1]))
+    displacements = differentiate_displacements(robot, values)
+    for rows, blocks in linearize_limbs(robot, values, state):
+        slopes, turned = select_block(displacements, rows[:1]), select_block(driven, rows)
+        for own in divide_limbs(robot.program, blocks, passive=True):
+            if own.joints:
+                moved = np.matmul(own.A, twists[rows])
+                moved += np.matmul(own.Q, turned[:, :, own.drives])
+                moved[..., : slopes.shape[2]] += np.matmul(own.E, slopes[:, None, own.slots])
+                limb = limbs[own.limb]
+                places = [names.index(f"{limb.name}.{limb.joints[j].name}") for j in own.joints]
+                out[rows][:, :, places] = solve_passive_motion(own.U, moved)
+    for i, (_, joint) in enumerate(robot.assembly.passive_joints):
+        if joint.actuator is not None:  # the pin of a triangle, which its drive turns
+            out[:, :, i] = driven[:, :, robot.assembly.driven_joints.index(joint.actuator)]
+    return out
 
 
 def stack_closure_rows(blocks: engine.ClosureBlocks) -> FloatArray:
@@ -193,7 +165,7 @@ def stack_closure_rows(blocks: engine.ClosureBlocks) -> FloatArray:
 
 
 def reduce_to_platform(
-    program: engine.Program, blocks: engine.ClosureBlocks
+    program: Program, blocks: engine.ClosureBlocks
 ) -> tuple[FloatArray, FloatArray]:
     """Return the closure rows that contain no twist of other nodes than the platform, against its
     freedoms (t, n, c, m) and the actuated joints (t, n, c, a), by an orthogonal reduction.
@@ -207,17 +179,28 @@ def reduce_to_platform(
     return np.matmul(free, A[..., :m]), np.matmul(free, Q)
 
 
-def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray:
+def stack_driven_columns(program: Program, blocks: engine.ClosureBlocks) -> FloatArray:
     """Return all closure rows against the actuated joints, (t, n, c, a)."""
-    columns_of_limbs = []
-    for group, block in zip(program.groups, blocks.closure, strict=True):
-        for k in range(len(group.limbs)):
-            Q = np.zeros((*block.Q.shape[:2], block.Q.shape[3], program.n_joints))
-            for j, columns in enumerate(group.actuator):
-                if columns[k] >= 0:
-                    Q[..., columns[k]] = block.Q[:, :, k, :, j]
-            columns_of_limbs.append(Q)
-    return np.concatenate(columns_of_limbs, axis=2)
+    parts = ((limb.Q, limb.drives) for limb in divide_limbs(program, blocks))
+    return _stack_columns(parts, program.n_joints)
+
+
+def stack_displacement_columns(
+    program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
+) -> FloatArray:
+    """Return all closure rows, or those of passive joints, against displacements (t, n, c, d)."""
+    parts = ((limb.E, limb.slots) for limb in divide_limbs(program, blocks, passive=passive))
+    return _stack_columns(parts, program.n_displacements)
+
+
+def _stack_columns(parts: Iterable[tuple[FloatArray, IntArray | slice]], width: int) -> FloatArray:
+    """Return the rows of limbs (t, n, r, ..) at their columns in a matrix (t, n, c, width)."""
+    rows = []
+    for part, columns in parts:
+        whole = np.zeros((*part.shape[:3], width))
+        whole[..., columns] = part
+        rows.append(whole)
+    return np.concatenate(rows, axis=2)
 
 
 # Frames along a limb for displacements and joint values, and the length of its rod.

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.engine import Group, MapPattern, ParameterMap, Program, State
+from loopcal.engine import MapPattern, ParameterMap, Program, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
@@ -104,8 +104,6 @@ class ParameterUnits:
 
 SHOWN_ACTUATORS = 8
 """Actuators that `repr` names before it counts the others."""
-
-Columns = slice | IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,24 +209,6 @@ class SlotMap:
             for i, column in enumerate(inputs):
                 J[:, outputs, column] += slopes[:, :, i]
         return J
-
-
-class LimbMap(NamedTuple):
-    """The parameters and readings in the equations of one limb.
-
-    displacements : those of the limb in e. parameters : those in its equations, as columns.
-    is_plain : whether each of these parameters is exactly one displacement of the limb, in the same
-        order and with coefficient 1.
-    drives : for each driven joint: the joint, its actuator, and the transmission terms that
-        parameters move. Of summed drives it is the number of the driven joint, without terms.
-    readings : the actuators, as columns; of summed drives the driven joints.
-    """
-
-    displacements: slice
-    parameters: Columns
-    is_plain: bool
-    drives: tuple[tuple[int, int, tuple[int, ...]], ...]
-    readings: Columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,14 +371,6 @@ class Mechanism(DrawnResult):
         return not self.stages and self.program.n_joints > len(self.actuators)
 
     @cached_property
-    def limb_maps(self) -> tuple[tuple[LimbMap, ...], ...]:
-        """Maps of each limb, group by group."""
-        return tuple(
-            tuple(_map_limb(self.program, g, k, self.slots) for k in range(len(g.limbs)))
-            for g in self.program.groups
-        )
-
-    @cached_property
     def all_parameters(self) -> ParameterUnits:
         """All parameters in SI, as columns of derivatives."""
         count = len(self.parameters)
@@ -425,38 +397,3 @@ class Mechanism(DrawnResult):
             raise MechanismError(f"the value of {bad} is not finite; give a number")
         new.setflags(write=False)
         return replace(self, values=new)
-
-
-def _map_limb(program: Program, group: Group, k: int, slots: SlotMap) -> LimbMap:
-    """Return the map of limb k of a group."""
-    width = len(group.slots)
-    first = group.columns.start + k * width
-    place = slice(first, first + width)
-    touched, drives = slots.touches[place].any(axis=0), []
-    for j, actuator in enumerate(group.actuator[:, k]):
-        if actuator >= 0:
-            a = int(actuator)
-            if select_weights(slots.terms, slots.constants) is not None:
-                drives.append((j, a, ()))
-                continue
-            count = slots.terms.shape[1]
-            begin = program.n_displacements + count * a
-            terms = slots.touches[begin : begin + count]
-            touched = touched | terms.any(axis=0)
-            drives.append((j, a, tuple(int(i) for i in np.flatnonzero(terms.any(axis=1)))))
-    columns = np.flatnonzero(touched)
-    one_each = np.array_equal(
-        slots.touches[place][:, columns], np.eye(width, len(columns), dtype=bool)
-    )
-    unit = width == len(columns) and np.array_equal(slots.matrix[place][:, columns], np.eye(width))
-    actuators = np.array([a for _, a, _ in drives], dtype=np.int64)
-    return LimbMap(
-        place, as_columns(columns), one_each and unit, tuple(drives), as_columns(actuators)
-    )
-
-
-def as_columns(places: IntArray) -> Columns:
-    """Return consecutive places as a slice, which selects a view in place of a copy."""
-    if len(places) and (np.diff(places) == 1).all():
-        return slice(int(places[0]), int(places[-1]) + 1)
-    return places

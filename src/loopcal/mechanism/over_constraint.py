@@ -24,7 +24,12 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
-from loopcal.mechanism.limb_rows import stack_closure_rows, stack_driven_columns
+from loopcal.mechanism.limb_rows import (
+    divide_limbs,
+    stack_closure_rows,
+    stack_displacement_columns,
+    stack_driven_columns,
+)
 from loopcal.mechanism.mobility import RANK, check_assembly, count_rank
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
@@ -88,26 +93,12 @@ def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     blocks = engine.linearize(program, e, driven_values(program, state), state)
     scale = 1 / robot.twist_scale[[f for _, f in program.unknown_twists]]
     A, Q = stack_closure_rows(blocks)[0] * scale, stack_driven_columns(program, blocks)[0]
-    E, limb = _stack_displacements(program, blocks.closure)
-    absorbed, _ = _stack_displacements(program, blocks.passive)
-    n = state.T.shape[1]
-    return [_Rows(A[i], Q[i], E[i], limb, absorbed[i]) for i in range(n)]
-
-
-def _stack_displacements(
-    program: engine.Program, blocks: tuple[engine.Block, ...]
-) -> tuple[FloatArray, IntArray]:
-    """Return rows of all limbs by all displacements (n, c, d), and the limb of each row (c,)."""
-    rows, limb = [], []
-    for group, block in zip(program.groups, blocks, strict=True):
-        width = len(group.slots)
-        for k, number in enumerate(group.limbs):
-            E = np.zeros((*block.E.shape[1:2], block.E.shape[3], program.n_displacements))
-            first = group.columns.start + k * width
-            E[..., first : first + width] = block.E[0, :, k]
-            rows.append(E)
-            limb += [number] * E.shape[1]
-    return np.concatenate(rows, axis=1), np.array(limb)
+    E, absorbed = (
+        stack_displacement_columns(program, blocks, passive=passive)[0] for passive in (False, True)
+    )
+    counts = [(own.limb, own.A.shape[2]) for own in divide_limbs(program, blocks)]
+    limb = np.repeat(*np.transpose(counts))
+    return [_Rows(A[i], Q[i], E[i], limb, absorbed[i]) for i in range(state.T.shape[1])]
 
 
 def report_over_constraint(

@@ -41,7 +41,7 @@ from loopcal.mechanism.least_squares_closure import (
     fold_unclosed_poses,
     list_unknown_joints,
 )
-from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
+from loopcal.mechanism.limb_rows import move_passive_joints, name_passive_joints
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
 from loopcal.mechanism.transmission import joints_from_readings
@@ -146,43 +146,21 @@ def differentiate_passive_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PassiveSensitivity:
     """Differentiate passive joints in every parameter and reading; a locked joint has zeros."""
-    names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
+    names = name_passive_joints(robot)
     if robot.stages:
         whole = differentiate_joints(robot, values, q, state, differentiate_passive_joints)
         return PassiveSensitivity(names, *whole)
-    parameters = np.zeros((t, n, len(names), len(robot.parameters)))
-    readings = np.zeros((t, n, len(names), len(robot.actuators)))
-    nodes = len(robot.program.nodes)
+    nodes, p = len(robot.program.nodes), len(robot.parameters)
     platform = differentiate_pose(robot, values, q, state, nodes=nodes)
     freedoms = [6 * node + f for node, f in robot.program.unknown_twists]
-    summed = None
-    if robot.has_sums:
-        summed = differentiate_driven_joints(robot, values, q, state, platform)
-    for rows, limbs in linearize_limbs(robot, values, q, state):
-        by_parameter = platform.parameters[rows][:, :, freedoms]
-        by_reading = platform.readings[rows][:, :, freedoms]
-        for places, U, limb in limbs.passive_joints(names):
-            moved, driven = np.matmul(limb.A, by_parameter), np.matmul(limb.A, by_reading)
-            moved[..., limb.parameters] += limb.by_parameter
-            if summed is None:
-                driven[..., limb.readings] += limb.by_reading
-            else:
-                moved += np.matmul(limb.by_reading, summed.parameters[rows][:, :, limb.readings])
-                driven += np.matmul(limb.by_reading, summed.readings[rows][:, :, limb.readings])
-            both = solve_passive_motion(U, np.concatenate([moved, driven], axis=-1))
-            cut = moved.shape[-1]
-            parameters[rows][:, :, places] = both[..., :cut]
-            readings[rows][:, :, places] = both[..., cut:]
-        for place, column, by_values in limbs.turned_joints(names):
-            parameters[rows][:, :, place] = by_values
-            readings[rows][:, :, place, column] = limbs.joints_by_reading[:, :, column]
-    if robot.program.may_stay_open and summed is None:
+    twists = np.concatenate(platform, axis=3)[:, :, freedoms]
+    driven = differentiate_driven_joints(robot, values, q, state, platform)
+    by_inputs = move_passive_joints(robot, values, state, twists, driven)
+    if robot.program.may_stay_open and not robot.has_sums:
         places, exact = _differentiate_open_joints(robot, values, q, state, names)
-        parameters[:, :, places], readings[:, :, places] = np.split(
-            exact, [len(robot.parameters)], axis=-1
-        )
-    parameters[~is_closed(state.status)] = readings[~is_closed(state.status)] = np.nan
-    return PassiveSensitivity(names, parameters, readings)
+        by_inputs[:, :, places] = exact
+    by_inputs[~is_closed(state.status)] = np.nan
+    return PassiveSensitivity(names, by_inputs[..., :p], by_inputs[..., p:])
 
 
 def _differentiate_open_joints(
