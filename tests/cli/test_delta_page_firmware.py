@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.io.formats.delta_gcode import read_reports
+from loopcal.io.formats.probe_reports import read_reports
 from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_points
 
 NOISE = 0.02
@@ -83,7 +83,7 @@ def test_lines_of_the_page_probe_its_thirteen_points(root, tmp_path) -> None:
     heights = " ".join(["0.010", *["0.020"] * 12])
     (tmp_path / "bed.g").write_text(reprap)
     (tmp_path / "g32.txt").write_text(f"G32 bed probe heights: {heights}, mean 0.019")
-    read = read_reports([tmp_path / "g32.txt", tmp_path / "bed.g"], "reprap")
+    read, _ = read_reports([tmp_path / "g32.txt", tmp_path / "bed.g"], "reprap", {})
     np.testing.assert_allclose([(p.x, p.y) for p in read], POINTS, atol=0.006)
     assert reprap.strip().endswith(" S-1")
     typed = page.split("## What to type")[1].split("\n## ")[0]

@@ -66,13 +66,20 @@ G32, BED = (
     ("G32 bed probe heights:{}, mean 0, deviation 0", " {h:.3f}"),
     "G30 P{i} X{x:.3f} Y{y:.3f} Z-99999 ; point\n",
 )
+OLD = (
+    "M561\nBed probe heights: 0.000 0.000\nBed probe heights:{}, mean 0, deviation 0",
+    " {h:.3f}",
+)
+"""Before RepRapFirmware 2.0, below the five heights of M122."""
+STOPPED = "Stopped at height {s:.3f} mm\nok\n"
+MACRO = "G1 X{x:.3f} F6000\nG1 Y{y:.3f}\nG30 S-1\n"
 G31, M851 = "G31 P500 X15 Y5 Z2.5 ; inductive probe\n", "M851 X20.00 Y-10.00 Z-1.50\n"
 
 
 def write_points(points, heights, file="report.txt", text=G30[0], line=G30[1]) -> None:
     """Write a text with a line for each point."""
     rows = enumerate(zip(points, heights, strict=True))
-    lines = "".join(line.format(i=i, x=x, y=y, h=h) for i, ((x, y), h) in rows)
+    lines = "".join(line.format(i=i, x=x, y=y, h=h, s=h + 2.5) for i, ((x, y), h) in rows)
     Path(file).write_text(text.format(lines))
 
 
@@ -94,6 +101,13 @@ REPORTS = {
     "probe beside the nozzle": (MARLIN + M851, (20.0, -10.0), {"report.txt": G30}),
     "touches by hand": (MARLIN, (0.0, 0.0), {"m114.txt": M114}),
     "G32": (REPRAP, (0.0, 0.0), {"report.txt": G32, "bed.g": ("M561\n{} S6\n", BED)}),
+    "before 2.0": (REPRAP, (0.0, 0.0), {"report.txt": OLD, "bed.g": ("M561\n{} S-1\n", BED)}),
+    "G30 S-1": (REPRAP + G31, (0.0, 0.0), {"report.txt": ("{}", MACRO + STOPPED)}),
+    "G30 S-1 of a macro": (
+        REPRAP + G31,
+        (0.0, 0.0),
+        {"report.txt": ("{}", STOPPED), "probe.g": ("G28\n{}M84\n", MACRO)},
+    ),
     "probe in another file": (
         REPRAP,
         (15.0, 5.0),
@@ -198,10 +212,24 @@ def test_a_height_map_of_reprapfirmware() -> None:
         ("m503.gcode", "ok\nBed X: 1.00 Y: 2.\n", "cannot be read: 'Bed X: 1.00 Y: 2.'. Marlin"),
         ("m503.gcode", "X:1,0 Y:2,0 Z:0,1 E:0,0 Count X:1\n", "with decimal points"),
         ("config.g", "G32 bed probe heights: 0,1 0,2, mean 1\n", "cannot be read: '0,1 0,2'"),
+        ("config.g", "G1 X0 Y0\nG30 S-1\nStopped at height 2.1 mm\n", "state none (G31 Z..)"),
+        (
+            "config.g",
+            "G31 Z2\nG30 S-1\nStopped at height 2 mm\nG1 X0 Y0\n",
+            "its point is not known",
+        ),
+        (
+            "config.g",
+            "G31 Z2\n" + 2 * "G1 X0 Y0\nG30 S-1\n" + "Stopped at height 2 mm\n",
+            "has 1 height, but the files state 2 points",
+        ),
+        ("config.g", "Calibrated 6 factors using 13 points, deviation\n", "End bed.g with S-1"),
+        ("config.g", "Bed probe heights: 0.000 0.000 0.000 0.000 0.000\n", "no probe report"),
+        ("m503.gcode", 9 * "Bed X:1 Y:2 Z:0\nBed X:1 Y:2 Z:319\n", "are they in micrometers?"),
         (
             "config.g",
             "G30 P0 X0 Y0\nG30 P1 X9 Y0\nG30 P2 X0 Y9\nG32 bed probe heights: 0.1 0.2, mean 1\n",
-            "report.txt:4: G32 reports 2 heights, but the files state 3 points",
+            "report.txt:4: The answer has 2 heights, but the files state 3 points",
         ),
         ("config.g", "RepRapFirmware height map file v2\nx\n", "rows and columns that it states"),
     ],
@@ -250,3 +278,34 @@ def test_one_wrong_height_is_an_outlier_and_no_target_that_stands_still(capsys) 
     captured = capsys.readouterr()
     assert "never moves" not in captured.err
     assert "Pose 14" in captured.out
+
+
+@pytest.mark.parametrize(
+    ("config", "shift", "words"),
+    [
+        (REPRAP + "G31 P500 X0 Y0 Z-2.1\n", 4.2, "twice the stated Z-2.1: its sign"),
+        (REPRAP + "G31 P500 X0 Y0 Z2.1\n", 3.0, "shifted by 3 mm, and differ by 0"),
+        (REPRAP + "G31 P500 Z2.1\n", 0.5, "No file states X and Y of G31"),
+        (MARLIN + "M851 X0 Y0 Z1.4\n", 2.8, "twice the stated Z1.4: its sign"),
+    ],
+)
+def test_what_heights_cannot_show_of_the_probe_is_said(config, shift, words, capsys) -> None:
+    file = "config.g" if config.startswith(REPRAP) else "m503.gcode"
+    Path(file).write_text(config)
+    heights = [shift + 0.1 * np.sin(k) for k in range(len(POINTS))]
+    write_points(POINTS, heights, "report.txt", *(G32 if file == "config.g" else G30))
+    write_points(POINTS, heights, "bed.g", "{}", BED)
+    more = "--probes bed.g" if file == "config.g" else ""
+    assert run(f"import {file} --probes report.txt {more} -o p.yaml --data h.csv") == 0
+    assert words in " ".join(capsys.readouterr().out.split())
+
+
+def test_height_maps_of_two_days_are_named(capsys) -> None:
+    Path("config.g").write_text(REPRAP + "G31 X0 Y0 Z1\n")
+    titles = "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n-30,30,-30,30,45,30,30,3,3\n"
+    for name, day, h in (("a", "2026-05-04", 0.1), ("b", "2026-05-31", 0.2)):
+        rows = "".join(f"{h},{h + 0.01 * j},{h + 0.02 * j}\n" for j in range(3))
+        head = f"RepRapFirmware height map file v2 generated at {day} 10:00, min error 0\n"
+        Path(f"{name}.csv").write_text(head + titles + rows)
+    assert run("import config.g --probes a.csv --probes b.csv -o p.yaml --data h.csv") == 0
+    assert "are of 2026-05-04 and 2026-05-31" in " ".join(capsys.readouterr().out.split())

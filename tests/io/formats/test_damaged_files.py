@@ -17,8 +17,8 @@ from loopcal.errors import LoopcalError
 from loopcal.io.exports.conversion import convert_export, save_converted
 from loopcal.io.exports.profile import read_profile
 from loopcal.io.formats import FORMATS
-from loopcal.io.formats.delta_gcode import read_reports
 from loopcal.io.formats.import_export import export_robot, save_imported
+from loopcal.io.formats.probe_reports import read_reports
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from tests.io.changed_documents import change_value, list_places
 from tools.fuzz.sources import SOURCES
@@ -174,7 +174,11 @@ REPORTS = {
         f"{PROBED}Checking... AC at radius:50 (DRY-RUN)\n.c:+0.10 x:-0.20 y:0.30\n.Height:250\n",
         "X:1.00 Y:2.00 Z:3.00 E:0 Count X:1\n",
     ),
-    "reprap": (HEIGHT_MAP, f"{POINTS}G32 bed probe heights: 0.1 -0.2, mean 0, deviation 0\n"),
+    "reprap": (
+        HEIGHT_MAP,
+        f"{POINTS}G32 bed probe heights: 0.1 -0.2, mean 0, deviation 0\n",
+        "G1 X1.0 Y-2 F600\nG30 S-1\nStopped at height 2.4 mm\n",
+    ),
 }
 
 
@@ -184,7 +188,7 @@ def test_a_damaged_report_of_probed_points_is_refused_or_read(files, firmware, t
     path = Path("report.txt")
 
     def read(path: Path) -> None:
-        points = read_reports([path], firmware)
+        points, _ = read_reports([path], firmware, {"X": 0.0, "Y": 0.0, "Z": 2.1})
         assert np.isfinite([point[:3] for point in points]).all()
         assert len(points) <= 10
 

@@ -26,14 +26,13 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
-
-import numpy as np
+from typing import Any, ClassVar
 
 from loopcal.errors import FileError
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.io.core.text_file import read_text
-from loopcal.io.core.yaml_file import format_yaml, parse_yaml
+from loopcal.io.core.yaml_file import format_yaml
+from loopcal.io.formats.probe_reports import import_probes
 from loopcal.io.formats.program_format import (
     MM,
     Exported,
@@ -48,17 +47,12 @@ from loopcal.io.formats.program_format import (
     format_number,
     get_record,
     is_same,
-    parse_number,
     round_digits,
     round_length,
     shorten_numbers,
 )
-from loopcal.io.robot.robot_file import build_robot
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from loopcal.plain_text import quote
-
-if TYPE_CHECKING:
-    from loopcal.measure.measurements import Measurements
 
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
 """Angles of the towers in firmware, before any correction [deg]."""
@@ -314,8 +308,8 @@ class DeltaFirmware(ABC):
         text = format_robot(geometry, options, path, program, has_distances=False)
         if not options.probes:
             return Imported(text, None, findings)
-        measurements, finding = import_probes(text, path, options, self.name)
-        return Imported(text, measurements, (*findings, finding))
+        measurements, noted = import_probes(text, path, options, self.name)
+        return Imported(text, measurements, (*findings, *noted))
 
     def write(self, source: ExportSource, into: Path | None) -> Exported:
         """Return the corrected words in an existing file, or two lines of their own."""
@@ -465,202 +459,7 @@ MARLIN, REPRAP = (
             "RepRapFirmware",
             "config.g, config-override.g",
             ".g",
-            "G32 with bed.g, heightmap.csv",
+            "G32 or G30 S-1 with their points, heightmap.csv",
         ),
     )
 )
-
-# Heights that the firmware of a delta printer reports, as measurements.
-
-FEWEST = 7
-"""Points below which six numbers of a firmware cannot be determined and tested."""
-
-NUMBER = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
-SINGLE = re.compile(rf"Bed X:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}(?![\d.,])", re.IGNORECASE)
-TOUCH = re.compile(r"\bBed X:|^.*?\bX:\s*[-+]?\d*,\d+.*\bCount\b", re.IGNORECASE)
-"""A line that reports a point, whether or not its numbers can be read."""
-POSITION = re.compile(rf"^.*?\bX:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}\s.*\bCount\b")
-DRY_RUN = re.compile(r"Checking\.\.\. AC(?: at radius:\s*" + NUMBER + r")?.*\(DRY-RUN\)")
-CHECKING = re.compile(r"Checking\.\.\. AC")
-SETTING = re.compile(r"Height|Radius|\b[ET][xyz]:")
-PART = re.compile(rf"(?<![A-Za-z])(yz|zx|xy|c|x|y|z):\s*{NUMBER}")
-AROUND = {"x": 210.0, "y": 330.0, "z": 90.0, "yz": 30.0, "zx": 150.0, "xy": 270.0}
-"""Angles of the points of G33 around the center [deg]."""
-
-HEIGHTS = re.compile(r"G32 bed probe heights:(.*?)(?:,\s*mean|$)", re.IGNORECASE)
-POINT = re.compile(rf"^\s*(?:N\d+\s*)?G30(?!\d)(?=.*P(\d+))(?=.*X\s*{NUMBER})(?=.*Y\s*{NUMBER})")
-HEIGHT_MAP = "RepRapFirmware height map file"
-UNPROBED = "0"
-"""Cell of a height map that was not probed."""
-
-OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b(.*)")}
-"""Command that states where the probe is beside the nozzle."""
-
-
-class ProbedPoint(NamedTuple):
-    """A probed point: coordinates of the touched point and reported height [mm], and the name that
-    G33 gives it.
-    """
-
-    x: float
-    y: float
-    height: float
-    name: str = ""
-
-
-def import_probes(
-    robot_text: str, path: Path, options: ImportOptions, firmware: str
-) -> tuple[Measurements, Finding]:
-    """Return the probed heights of the reports as measurements, and a finding about them.
-
-    `robot_text` states the geometry with which the firmware probed, as `path` does.
-
-    FileError : no heights, a report that cannot be used, or a point out of reach.
-    """
-    from loopcal.measure.kinds.poses import Component
-    from loopcal.measure.measurements import Measurements
-    from loopcal.mechanism.solutions import inverse
-
-    points, first = read_reports(options.probes, firmware), options.probes[0]
-    if len(points) < FEWEST:
-        finding = report_finding("files.probes-too-few", count=len(points), least=FEWEST)
-        raise FileError(finding, first)
-    labels = tuple(f"{i}-{p.name}" if p.name else str(i) for i, p in enumerate(points, 1))
-    offset = {"X": 0.0, "Y": 0.0}  # of the probe beside the nozzle [mm]
-    for file in (path, *options.probes):
-        for i, line in enumerate(read_text(file, GcodeFile.what).splitlines(), 1):
-            if match := OFFSETS[firmware].search(line.partition(";")[0].upper()):
-                for letter in offset:
-                    if word := re.search(rf"{letter}\s*{NUMBER}", match[1]):
-                        offset[letter] = parse_number(word[1], f"{letter} of the probe", file, i)
-    robot = build_robot(parse_yaml(robot_text, path, "robot file"))
-    target = [(p.x - offset["X"], p.y - offset["Y"], p.height) for p in points]
-    solution = inverse(robot, MM * np.array(target))
-    if not solution.converged.all():
-        label = labels[int(np.argmin(solution.converged))]
-        raise FileError(report_finding("files.probe-out-of-reach", point=label), first)
-    kind, zeros = Component(components=("z",)), np.zeros((len(points), 1))
-    rows = options.observe(kind, range(len(points)), zeros, "height")
-    heights = np.array([p.height for p in points])
-    finding = report_finding(
-        "files.probes-imported",
-        count=len(points),
-        rms=Quantity(float(np.sqrt((heights**2).mean())), "mm"),
-        largest=Quantity(float(np.abs(heights).max()), "mm"),
-        sigma=Quantity(options.choose_noise("height") / MM, "mm"),
-        assumed=rows.is_noise_assumed,
-    )
-    return Measurements(options.name, solution.q, (rows,), labels=labels), finding
-
-
-def read_reports(paths: Sequence[Path], firmware: str) -> list[ProbedPoint]:
-    """Return the probed points of the reports of a firmware; FileError where there are none."""
-    texts = {path: read_text(path, "probe report") for path in paths}
-    points = _read_marlin(texts) if firmware == "marlin" else _read_reprap(texts)
-    if not points:
-        raise FileError(report_finding("files.no-probe-report", firmware=firmware), paths[0])
-    return points
-
-
-def _parse_point(match: re.Match[str], path: Path, line: int) -> ProbedPoint:
-    """Return the point of a line."""
-    numbers = zip(("X", "Y", "Z"), match.groups(), strict=True)
-    x, y, height = (parse_number(text, name, path, line) for name, text in numbers)
-    return ProbedPoint(x, y, height)
-
-
-def _read_marlin(texts: Mapping[Path, str]) -> list[ProbedPoint]:
-    """Return the points of G30 and of dry runs of G33; those of M114 where there are no others."""
-    probed: list[ProbedPoint] = []
-    touched: list[ProbedPoint] = []
-    for path, text in texts.items():
-        radius: float | None = None
-        for i, line in enumerate(text.splitlines(), 1):
-            if match := SINGLE.search(line):
-                probed.append(_parse_point(match, path, i))
-            elif CHECKING.search(line):
-                dry = DRY_RUN.search(line)
-                if dry is None or dry[1] is None:
-                    reason = "calibrates" if dry is None else "radius"
-                    raise FileError(report_finding("files.g33-unusable", reason=reason), path, i)
-                radius = parse_number(dry[1], "the radius", path, i)
-            elif TOUCH.search(line):
-                finding = report_finding("files.probe-line-unreadable", line=line.strip())
-                raise FileError(finding, path, i)
-            elif radius is not None and line.startswith("."):
-                for name, height in () if SETTING.search(line) else PART.findall(line):
-                    angle = math.radians(AROUND.get(name, 0.0))
-                    r = 0.0 if name == "c" else radius
-                    place = (r * math.cos(angle), r * math.sin(angle))
-                    probed.append(ProbedPoint(*place, parse_number(height, name, path, i), name))
-            elif match := POSITION.match(line):
-                touched.append(_parse_point(match, path, i))
-    return probed or touched
-
-
-def _read_reprap(texts: Mapping[Path, str]) -> list[ProbedPoint]:
-    """Return the points of height maps, and of G32 with the points of bed.g."""
-    places: dict[float, tuple[float, float]] = {}
-    reports: list[tuple[Path, int, str]] = []
-    points: list[ProbedPoint] = []
-    for path, text in texts.items():
-        if text.lstrip().startswith(HEIGHT_MAP):
-            points += _read_height_map(path, text)
-            continue
-        for i, line in enumerate(text.splitlines(), 1):
-            if match := HEIGHTS.search(line):
-                reports.append((path, i, match[1]))
-            elif match := POINT.match(line.partition(";")[0].upper()):
-                names = zip(("P", "X", "Y"), match.groups(), strict=True)
-                key, x, y = (parse_number(text, name, path, i) for name, text in names)
-                places[key] = (x, y)
-    for path, number, cells in reports:
-        heights = cells.split()
-        wanted, finding = set(range(len(heights))), None
-        if not re.fullmatch(rf"(?:\s+{NUMBER})+\s*", cells):
-            has_failed = re.search(r"not set|failed", cells, re.IGNORECASE)
-            finding = (
-                report_finding("files.g32-failed")
-                if has_failed
-                else report_finding("files.g32-unreadable", cells=cells.strip())
-            )
-        elif missing := wanted - set(places):
-            finding = report_finding(
-                "files.g32-no-points", count=len(heights), missing=min(missing)
-            )
-        elif set(places) - wanted:
-            finding = report_finding("files.g32-too-few", count=len(heights), points=len(places))
-        if finding is not None:
-            raise FileError(finding, path, number)
-        points += [
-            ProbedPoint(*places[k], parse_number(height, f"height {k}", path, number))
-            for k, height in enumerate(heights)
-        ]
-    return points
-
-
-def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:
-    """Return the probed cells of a height map."""
-    lines = [
-        (i, [cell.strip() for cell in line.split(",")])
-        for i, line in enumerate(text.splitlines(), 1)
-        if line.strip()
-    ]
-    try:
-        (_, header), (line, cells), *rows = lines[1:]
-        stated = dict(zip(header, cells, strict=True))
-        names = ("min0", "min1", "spacing0", "spacing1", "num0", "num1")
-        if "xmin" in stated:
-            names = ("xmin", "ymin", "xspacing", "yspacing", "xnum", "ynum")
-        numbers = [parse_number(stated[name], name, path, line) for name in names]
-    except (KeyError, ValueError):
-        raise FileError(report_finding("files.height-map-damaged"), path) from None
-    x0, y0, dx, dy, width, count = numbers
-    if len(rows) != count or any(len(row) != width for _, row in rows):
-        raise FileError(report_finding("files.height-map-damaged"), path)
-    return [
-        ProbedPoint(x0 + k * dx, y0 + j * dy, parse_number(cell, "a height", path, line))
-        for j, (line, row) in enumerate(rows)
-        for k, cell in enumerate(row)
-        if cell != UNPROBED
-    ]

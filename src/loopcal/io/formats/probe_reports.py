@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heights that the firmware of a delta printer reports, as measurements.
+
+A report is text that a firmware printed: each line with a height matches one of the patterns below.
+The firmware believes the nozzle at the reported height when the probe triggers, and the nozzle is
+then at z = 0 in truth, so that the readings are those of this height and the measured z is 0. The
+stopped height of `G30 S-1` contains the trigger height of the probe (G31 Z), all others do not.
+Source: the functions that print these lines in Marlin 2.1 (G30, G33) and RepRapFirmware 1.18 to 3.5
+(RandomProbePointSet, Move, GCodes).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from loopcal.errors import FileError
+from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.io.core.text_file import read_text
+from loopcal.io.core.yaml_file import parse_yaml
+from loopcal.io.formats.program_format import MM, ImportOptions, parse_number
+from loopcal.io.robot.robot_file import build_robot
+from loopcal.typing import FloatArray
+
+if TYPE_CHECKING:
+    from loopcal.measure.measurements import Measurements
+
+FEWEST = 7
+"""Points below which six numbers of a firmware cannot be determined and tested."""
+
+NUMBER = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
+SINGLE = re.compile(rf"Bed X:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}(?![\d.,])", re.IGNORECASE)
+TOUCH = re.compile(r"\bBed X:|^.*?\bX:\s*[-+]?\d*,\d+.*\bCount\b", re.IGNORECASE)
+"""A line that reports a point, whether or not its numbers can be read."""
+POSITION = re.compile(rf"^.*?\bX:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}\s.*\bCount\b")
+DRY_RUN = re.compile(r"Checking\.\.\. AC(?: at radius:\s*" + NUMBER + r")?.*\(DRY-RUN\)")
+CHECKING = re.compile(r"Checking\.\.\. AC")
+SETTING = re.compile(r"Height|Radius|\b[ET][xyz]:")
+PART = re.compile(rf"(?<![A-Za-z])(yz|zx|xy|c|x|y|z):\s*{NUMBER}")
+AROUND = {"x": 210.0, "y": 330.0, "z": 90.0, "yz": 30.0, "zx": 150.0, "xy": 270.0}
+"""Angles of the points of G33 around the center [deg]."""
+
+# Before 2.0, RepRapFirmware wrote no G32; its M122 prints five heights without their mean.
+HEIGHTS = re.compile(
+    r"\bG32 bed probe heights:(.*?)(?:,\s*mean|$)|\bBed probe heights:(.*?),\s*mean", re.IGNORECASE
+)
+POINT = re.compile(rf"^\s*(?:N\d+\s*)?G30(?!\d)(?=.*P(\d+))(?=.*X\s*{NUMBER})(?=.*Y\s*{NUMBER})")
+STOPPED = re.compile(rf"Stopped at height\s*{NUMBER}\s*mm")
+MOVE = re.compile(r"(?<![A-Z\d])G0*[01](?!\d)(.*)")
+TOUCHING = re.compile(r"(?<![A-Z\d])G30(?!\d)(?!.*P\s*\d).*S\s*-1(?!\d)")
+"""A G30 that reports the height at which it stops, at the place of the last move."""
+CALIBRATED = re.compile(r"Calibrated (\d+) factors using")
+HEIGHT_MAP = "RepRapFirmware height map file"
+GENERATED = re.compile(r"generated at (\d{4}-\d\d-\d\d)")
+FAILED = re.compile(r"not set|failed|Probe (?:was not|already) triggered", re.IGNORECASE)
+UNPROBED = "0"
+"""Cell of a height map that was not probed."""
+
+OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b(.*)")}
+"""Command that states where the probe is beside the nozzle, and the height at which it triggers."""
+ROUGH = 5.0
+"""Median deviation of heights from their median [mm] beyond which their unit is another one."""
+SHIFTED = 1.0
+"""Median height [mm] from which a wrong trigger height is as probable as wrong end stops."""
+
+
+class ProbedPoint(NamedTuple):
+    """A probed point: where the nozzle was commanded, and the height at which it touched [mm]; the
+    name of the point in the report.
+    """
+
+    x: float
+    y: float
+    height: float
+    name: str = ""
+
+
+def import_probes(
+    robot_text: str, path: Path, options: ImportOptions, firmware: str
+) -> tuple[Measurements, list[Finding]]:
+    """Return the probed heights of the reports as measurements, and findings about them.
+
+    `robot_text` states the geometry with which the firmware probed, as `path` does.
+
+    FileError : no heights, a report that cannot be used, or a point out of reach.
+    """
+    from loopcal.measure.kinds.poses import Component
+    from loopcal.measure.measurements import Measurements
+    from loopcal.mechanism.solutions import inverse
+
+    first = options.probes[0]
+    probe = _read_probe((path, *options.probes), firmware)
+    points, noted = read_reports(options.probes, firmware, probe)
+    if len(points) < FEWEST:
+        finding = report_finding("files.probes-too-few", count=len(points), least=FEWEST)
+        raise FileError(finding, first)
+    heights = np.array([p.height for p in points])
+    noted += _check_heights(heights, probe, firmware, first)
+    names = [p.name for p in points]
+    are_names = len(set(names) - {""}) == len(names)
+    labels = tuple(n if are_names else f"{i}-{n}" if n else str(i) for i, n in enumerate(names, 1))
+    robot = build_robot(parse_yaml(robot_text, path, "robot file"))
+    solution = inverse(robot, MM * np.array([(p.x, p.y, p.height) for p in points]))
+    if not solution.converged.all():
+        label = labels[int(np.argmin(solution.converged))]
+        raise FileError(report_finding("files.probe-out-of-reach", point=label), first)
+    kind, zeros = Component(components=("z",)), np.zeros((len(points), 1))
+    rows = options.observe(kind, range(len(points)), zeros, "height")
+    finding = report_finding(
+        "files.probes-imported",
+        count=len(points),
+        rms=Quantity(float(np.sqrt((heights**2).mean())), "mm"),
+        largest=Quantity(float(np.abs(heights).max()), "mm"),
+        sigma=Quantity(options.choose_noise("height") / MM, "mm"),
+        assumed=rows.is_noise_assumed,
+    )
+    return Measurements(options.name, solution.q, (rows,), labels=labels), [finding, *noted]
+
+
+def read_reports(
+    paths: Sequence[Path], firmware: str, probe: Mapping[str, float]
+) -> tuple[list[ProbedPoint], list[Finding]]:
+    """Return the probed points of the reports of a firmware, and findings about them; FileError
+    where there are none. `probe` : X, Y and Z that files state of it [mm].
+    """
+    texts = {path: read_text(path, "probe report") for path in paths}
+    read = _read_marlin if firmware == "marlin" else _read_reprap
+    points, noted = read(texts, probe)
+    if not points:
+        raise FileError(report_finding("files.no-probe-report", firmware=firmware), paths[0])
+    return points, noted
+
+
+def _read_probe(paths: Sequence[Path], firmware: str) -> dict[str, float]:
+    """Return what the files state of the probe: X, Y beside the nozzle, and Z [mm]."""
+    stated: dict[str, float] = {}
+    for file in paths:
+        for i, line in enumerate(read_text(file, "G-code file").splitlines(), 1):
+            if match := OFFSETS[firmware].search(line.partition(";")[0].upper()):
+                for letter in "XYZ":
+                    if word := re.search(rf"{letter}\s*{NUMBER}", match[1]):
+                        stated[letter] = parse_number(word[1], f"{letter} of the probe", file, i)
+    return stated
+
+
+def _check_heights(
+    heights: FloatArray, probe: Mapping[str, float], firmware: str, path: Path
+) -> list[Finding]:
+    """Return whether all heights (n,) [mm] are shifted; FileError where they are no millimeters."""
+    shift = float(np.median(heights))
+    if float(np.median(np.abs(heights - shift))) > ROUGH:
+        least, largest = (Quantity(float(h), "mm") for h in (heights.min(), heights.max()))
+        raise FileError(report_finding("files.heights-unit", least=least, largest=largest), path)
+    rest = float(np.sqrt(((heights - heights.mean()) ** 2).mean()))
+    if abs(shift) < max(SHIFTED, 3.0 * rest):
+        return []
+    trigger = probe.get("Z", 0.0) if firmware == "reprap" else -probe.get("Z", 0.0)
+    finding = report_finding(
+        "files.heights-shifted",
+        shift=Quantity(shift, "mm"),
+        rest=Quantity(rest, "mm"),
+        firmware=firmware,
+        stated=probe.get("Z"),
+        is_twice=abs(shift + 2.0 * trigger) < max(0.1 * abs(shift), rest),
+    )
+    return [finding]
+
+
+def _shift_points(
+    points: Sequence[ProbedPoint], probe: Mapping[str, float], firmware: str
+) -> tuple[list[ProbedPoint], list[Finding]]:
+    """Return points with the place of the nozzle in place of that of the probe beside it."""
+    x, y = probe.get("X", 0.0), probe.get("Y", 0.0)
+    missing = tuple(letter for letter in "XY" if letter not in probe)
+    code, facts = "files.probe-place-assumed", {"letters": missing, "firmware": firmware}
+    noted = [report_finding(code, **facts)] if points and missing else []
+    return [p._replace(x=p.x - x, y=p.y - y) for p in points], noted
+
+
+def _parse_point(match: re.Match[str], path: Path, line: int) -> ProbedPoint:
+    """Return the point of a line."""
+    numbers = zip(("X", "Y", "Z"), match.groups(), strict=True)
+    x, y, height = (parse_number(text, name, path, line) for name, text in numbers)
+    return ProbedPoint(x, y, height)
+
+
+def _read_marlin(
+    texts: Mapping[Path, str], probe: Mapping[str, float]
+) -> tuple[list[ProbedPoint], list[Finding]]:
+    """Return the points of G30 and of dry runs of G33; those of M114, which are touched by the
+    nozzle, where there are no others.
+    """
+    probed: list[ProbedPoint] = []
+    touched: list[ProbedPoint] = []
+    for path, text in texts.items():
+        radius: float | None = None
+        for i, line in enumerate(text.splitlines(), 1):
+            if match := SINGLE.search(line):
+                probed.append(_parse_point(match, path, i))
+            elif CHECKING.search(line):
+                dry = DRY_RUN.search(line)
+                if dry is None or dry[1] is None:
+                    reason = "calibrates" if dry is None else "radius"
+                    raise FileError(report_finding("files.g33-unusable", reason=reason), path, i)
+                radius = parse_number(dry[1], "the radius", path, i)
+            elif TOUCH.search(line):
+                finding = report_finding("files.probe-line-unreadable", line=line.strip())
+                raise FileError(finding, path, i)
+            elif radius is not None and line.startswith("."):
+                for name, height in () if SETTING.search(line) else PART.findall(line):
+                    angle = math.radians(AROUND.get(name, 0.0))
+                    r = 0.0 if name == "c" else radius
+                    place = (r * math.cos(angle), r * math.sin(angle))
+                    probed.append(ProbedPoint(*place, parse_number(height, name, path, i), name))
+            elif match := POSITION.match(line):
+                touched.append(_parse_point(match, path, i))
+    points, noted = _shift_points(probed, probe, "marlin")
+    return points or touched, noted
+
+
+def _read_reprap(
+    texts: Mapping[Path, str], probe: Mapping[str, float]
+) -> tuple[list[ProbedPoint], list[Finding]]:
+    """Return the points of height maps, of G32 with the points of bed.g, and of `G30 S-1`."""
+    places: dict[float, tuple[float, float]] = {}
+    reports: list[tuple[Path, int, str]] = []
+    probed: list[ProbedPoint] = []
+    factors: tuple[Path, int, str] | None = None
+    for path, text in texts.items():
+        if text.lstrip().startswith(HEIGHT_MAP):
+            probed += _read_height_map(path, text)
+            continue
+        for i, line in enumerate(text.splitlines(), 1):
+            if match := HEIGHTS.search(line):
+                reports.append((path, i, match[1] or match[2] or ""))
+            elif match := POINT.match(line.partition(";")[0].upper()):
+                names = zip(("P", "X", "Y"), match.groups(), strict=True)
+                key, x, y = (parse_number(text, name, path, i) for name, text in names)
+                places[key] = (x, y)
+            elif match := CALIBRATED.search(line):
+                factors = path, i, match[1]
+    for path, number, cells in reports:
+        probed += _read_heights(cells, places, path, number)
+    points, noted = _shift_points(probed, probe, "reprap")
+    points += _read_stops(texts, probe)
+    if factors is not None:
+        path, number, count = factors
+        level = Severity.WARNING if points else Severity.REFUSAL
+        facts = {"factors": int(count), "alone": not points}
+        finding = report_finding("files.log-calibrates", level, **facts)
+        if not points:
+            raise FileError(finding, path, number)
+        noted.append(finding)
+    dates = {match[1] for text in texts.values() if (match := GENERATED.search(text))}
+    if len(dates) > 1:
+        noted.append(report_finding("files.reports-of-dates", dates=sorted(dates)))
+    return points, noted
+
+
+def _read_heights(
+    cells: str, places: Mapping[float, tuple[float, float]], path: Path, line: int
+) -> list[ProbedPoint]:
+    """Return the points P0, P1, ... of a list of heights."""
+    heights = cells.split()
+    wanted, finding = set(range(len(heights))), None
+    if not re.fullmatch(rf"(?:\s+{NUMBER})+\s*", cells):
+        finding = (
+            report_finding("files.g32-failed")
+            if FAILED.search(cells)
+            else report_finding("files.g32-unreadable", cells=cells.strip())
+        )
+    elif missing := wanted - set(places):
+        finding = report_finding("files.g32-no-points", count=len(heights), missing=min(missing))
+    elif set(places) - wanted:
+        finding = report_finding("files.g32-too-few", count=len(heights), points=len(places))
+    if finding is not None:
+        raise FileError(finding, path, line)
+    return [
+        ProbedPoint(*places[k], parse_number(height, f"height {k}", path, line), f"P{k}")
+        for k, height in enumerate(heights)
+    ]
+
+
+def _read_stops(texts: Mapping[Path, str], probe: Mapping[str, float]) -> list[ProbedPoint]:
+    """Return the points of `G30 S-1`, at the places of the moves before it, in the same text or
+    in a macro.
+    """
+    places: list[dict[str, float]] = []
+    stops: list[tuple[Path, int, float, dict[str, float]]] = []
+    for path, text in texts.items():
+        place: dict[str, float] = {}
+        for i, line in enumerate(text.splitlines(), 1):
+            code = line.partition(";")[0].upper()
+            if match := MOVE.search(code):
+                words = ((n, re.search(rf"{n}\s*{NUMBER}", match[1])) for n in "XY")
+                place |= {n: parse_number(w[1], n, path, i) for n, w in words if w}
+            if TOUCHING.search(code):
+                places.append(dict(place))
+            if match := STOPPED.search(line):
+                stops.append((path, i, parse_number(match[1], "the height", path, i), dict(place)))
+            elif stops and "triggered" in line and FAILED.search(line):
+                raise FileError(report_finding("files.g32-failed"), path, i)
+    if not stops:
+        return []
+    path, line, *_ = stops[0]
+    if places and len(places) != len(stops):
+        finding = report_finding("files.g32-too-few", count=len(stops), points=len(places))
+        raise FileError(finding, path, line)
+    if "Z" not in probe:
+        raise FileError(report_finding("files.trigger-height-missing"), path, line)
+    points = []
+    for (file, i, height, own), of_command in zip(
+        stops, places or [s[3] for s in stops], strict=True
+    ):
+        place = of_command or own
+        if len(place) < 2:
+            raise FileError(report_finding("files.probe-place-missing"), file, i)
+        points.append(ProbedPoint(place["X"], place["Y"], height - probe["Z"]))
+    return points
+
+
+def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:
+    """Return the probed cells of a height map."""
+    lines = [
+        (i, [cell.strip() for cell in line.split(",")])
+        for i, line in enumerate(text.splitlines(), 1)
+        if line.strip()
+    ]
+    try:
+        (_, header), (line, cells), *rows = lines[1:]
+        stated = dict(zip(header, cells, strict=True))
+        names = ("min0", "min1", "spacing0", "spacing1", "num0", "num1")
+        if "xmin" in stated:
+            names = ("xmin", "ymin", "xspacing", "yspacing", "xnum", "ynum")
+        numbers = [parse_number(stated[name], name, path, line) for name in names]
+    except (KeyError, ValueError):
+        raise FileError(report_finding("files.height-map-damaged"), path) from None
+    x0, y0, dx, dy, width, count = numbers
+    if len(rows) != count or any(len(row) != width for _, row in rows):
+        raise FileError(report_finding("files.height-map-damaged"), path)
+    return [
+        ProbedPoint(x0 + k * dx, y0 + j * dy, parse_number(cell, "a height", path, line))
+        for j, (line, row) in enumerate(rows)
+        for k, cell in enumerate(row)
+        if cell != UNPROBED
+    ]
