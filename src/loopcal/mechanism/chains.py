@@ -10,16 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
-from loopcal.mechanism.actuation import Derivatives
 from loopcal.mechanism.limb_rows import follow_limb, measure_rod, place_links, sum_displacements
-from loopcal.mechanism.model import Mechanism, ParameterUnits, Stage
+from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
     compare_coordinates,
@@ -128,22 +127,31 @@ def get_platforms(robot: Mechanism, state: State) -> list[FloatArray]:
     return locate_stage_bases(robot.stages, state.poses)[1]
 
 
-def select_readings(q: FloatArray, stage: Stage, count: int) -> FloatArray:
-    """Return the readings of a stage among those (.., a) of a chain with `count` actuators, or
-    those (.., 2 a) with the directions of approach.
+class StagePart(NamedTuple):
+    """A stage of a chain with its values (t | 1, p), its state (t, n), and its readings (t | 1, n,
+    a), or these with their directions of approach.
     """
-    own = q[..., :count][..., stage.actuators]
-    if q.shape[-1] == count:
-        return own
-    return np.concatenate([own, q[..., count:][..., stage.actuators]], axis=-1)
+
+    stage: Stage
+    values: FloatArray
+    state: State
+    readings: FloatArray
+
+
+NO_READINGS = np.zeros((1, 1, 0))
 
 
 def each_stage(
-    robot: Mechanism, values: FloatArray, state: State
-) -> Iterator[tuple[Stage, FloatArray, State]]:
-    """Yield the stages of a chain with their own values and states."""
+    robot: Mechanism, values: FloatArray, state: State, q: FloatArray = NO_READINGS
+) -> Iterator[StagePart]:
+    """Yield the stages of a chain with their own values, states and readings."""
+    count = len(robot.actuators)
     for stage, own in zip(robot.stages, split_stage_states(robot, state), strict=True):
-        yield stage, values[:, stage.parameters], own
+        readings = q[..., :count][..., stage.actuators]
+        if q.shape[-1] > count:
+            directions = q[..., count:][..., stage.actuators]
+            readings = np.concatenate([readings, directions], axis=-1)
+        yield StagePart(stage, values[:, stage.parameters], own, readings)
 
 
 def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
@@ -190,115 +198,6 @@ def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int
     return transports
 
 
-StageSolver = Callable[[Mechanism, FloatArray, FloatArray, State | None], State]
-"""Solves forward kinematics of one stage at values (t | 1, p) and readings (t | 1, n, a), as
-`forward_trials` does.
-"""
-PoseDerivative = Callable[..., Derivatives]
-"""Differentiates the pose of one stage, as `differentiate_pose` does."""
-JointDerivative = Callable[[Mechanism, FloatArray, FloatArray, State], Any]
-"""Differentiates the passive joints of one stage, as `differentiate_passive_joints` does."""
-
-
-def solve_stages(
-    robot: Mechanism, values: FloatArray, q: FloatArray, start: State | None, solve: StageSolver
-) -> ChainState:
-    """Solve forward kinematics of a chain for readings q (t | 1, n, a) and values (t | 1, p) from
-    `start` (default: home).
-    """
-    begins = [None] * len(robot.stages) if start is None else split_stage_states(robot, start)
-    count = len(robot.actuators)
-    states = [
-        solve(stage.robot, values[:, stage.parameters], select_readings(q, stage, count), begin)
-        for stage, begin in zip(robot.stages, begins, strict=True)
-    ]
-    return join_stage_states(robot, states)
-
-
-def judge_stage_modes(
-    robot: Mechanism,
-    state: State,
-    begin: State,
-    judge: Callable[[Mechanism, State, State], tuple[State, BoolArray]],
-) -> tuple[State, BoolArray]:
-    """Return a state (1, n) with closure signs, and its rows in which a stage is in another mode.
-
-    `judge` is the same function of a stage at its present values.
-    """
-    is_other, judged = np.zeros(state.T.shape[1], bool), []
-    states, begins = split_stage_states(robot, state), split_stage_states(robot, begin)
-    for stage, own, first in zip(robot.stages, states, begins, strict=True):
-        if stage.robot.is_serial:
-            judged.append(own)
-            continue
-        machine = stage.robot.with_values(robot.values[stage.parameters])
-        part, is_part_other = judge(machine, own, first)
-        judged.append(part)
-        is_other |= is_part_other
-    whole = join_stage_states(robot, judged)
-    return replace(state, closure_sign=whole.closure_sign, signs=whole.signs), is_other
-
-
-def differentiate_platform(
-    robot: Mechanism,
-    values: FloatArray,
-    q: FloatArray,
-    state: State,
-    differentiate: PoseDerivative,
-    columns: ParameterUnits | None = None,
-    end: int = -1,
-) -> Derivatives:
-    """Return the derivatives of the twist of the platform of a stage (default: the end), by the
-    parameters, all in SI or those of `columns`, and the readings: (t, n, 6, p) and (t, n, 6, a).
-
-    Only the stages that carry the platform are differentiated.
-    """
-    columns = columns or robot.all_parameters
-    count, states = len(robot.actuators), split_stage_states(robot, state)
-    whole = _make_zeros(robot, state, 6, len(columns.places))
-    for i, transport in transport_to_end(robot, state, end):
-        stage = robot.stages[i]
-        first, last = stage.parameters.start, stage.parameters.stop
-        place = np.flatnonzero((columns.places >= first) & (columns.places < last))
-        own_columns = ParameterUnits(
-            stage.robot.slots, columns.places[place] - first, columns.units[place]
-        )
-        own = differentiate(
-            stage.robot,
-            values[:, stage.parameters],
-            select_readings(q, stage, count),
-            states[i],
-            own_columns,
-        )
-        whole.parameters[..., place] = np.matmul(transport, own.parameters)
-        whole.readings[..., stage.actuators] = np.matmul(transport, own.readings)
-    return whole
-
-
-def differentiate_joints(
-    robot: Mechanism,
-    values: FloatArray,
-    q: FloatArray,
-    state: State,
-    differentiate: JointDerivative,
-) -> Derivatives:
-    """Return the derivatives of the passive joints of all stages, (t, n, j, p) and (t, n, j, a)."""
-    count = len(robot.actuators)
-    own = [
-        differentiate(stage.robot, of_stage, select_readings(q, stage, count), part)
-        for stage, of_stage, part in each_stage(robot, values, state)
-    ]
-    rows = sum(part.parameters.shape[2] for part in own)
-    whole = _make_zeros(robot, state, rows, len(robot.parameters))
-    first = 0
-    for stage, part in zip(robot.stages, own, strict=True):
-        last = first + part.parameters.shape[2]
-        whole.parameters[:, :, first:last, stage.parameters] = part.parameters
-        whole.readings[:, :, first:last, stage.actuators] = part.readings
-        first = last
-    return whole
-
-
 def name_platform_entries(stage: str) -> tuple[str, ...]:
     """Return the names of the twelve numbers of the platform of a stage, [R t] row by row."""
     return tuple(f"{stage}:T{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
@@ -311,32 +210,6 @@ def select_platform_entries(robot: Mechanism, state: State) -> dict[str, FloatAr
         numbers = np.moveaxis(T[..., :3, :].reshape(*T.shape[:-2], 12), -1, 0)
         entries |= dict(zip(name_platform_entries(stage.name), numbers, strict=True))
     return entries
-
-
-def differentiate_platform_entries(
-    robot: Mechanism,
-    values: FloatArray,
-    q: FloatArray,
-    state: State,
-    differentiate: PoseDerivative,
-    name: str,
-) -> Derivatives:
-    """Return the derivatives of the numbers of a platform, (t, n, 12, p) and (t, n, 12, a).
-
-    A column r of the rotation moves by omega x r, the origin by v.
-    """
-    i = [stage.name for stage in robot.stages].index(name)
-    twist = differentiate_platform(robot, values, q, state, differentiate, end=i)
-    slope = geometry.differentiate_entries(get_platforms(robot, state)[i])
-    return Derivatives(*(slope @ part for part in twist))
-
-
-def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> Derivatives:
-    """Return derivatives (t, n, rows, ..) of zero by `columns` parameters and all readings."""
-    t, n = state.T.shape[:2]
-    return Derivatives(
-        np.zeros((t, n, rows, columns)), np.zeros((t, n, rows, len(robot.actuators)))
-    )
 
 
 # A sphere that the platform cannot leave, from the lengths of the links.

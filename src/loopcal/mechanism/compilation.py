@@ -26,7 +26,6 @@ from loopcal.mechanism.assembly import (
 )
 from loopcal.mechanism.chains import (
     ChainState,
-    differentiate_platform,
     find_carrying_actuators,
     join_stage_states,
     locate_stage_bases,
@@ -613,7 +612,7 @@ def _check_chain(robot: Mechanism, home: ChainState) -> None:
     values = robot.values[None]
     _, tau = robot.slots(values)
     q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.constants)
-    D = differentiate_platform(robot, values, q, home, differentiate_pose).readings[0, 0][:, moving]
+    D = differentiate_pose(robot, values, q, home).readings[0, 0][:, moving]
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])[moving]
     scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)
     freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))

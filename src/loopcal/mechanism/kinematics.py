@@ -24,10 +24,10 @@ from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums, 
 from loopcal.mechanism.chains import (
     ChainState,
     each_stage,
+    join_stage_states,
     locate_stage_bases,
     solve_by_drives,
     solve_serial,
-    solve_stages,
 )
 from loopcal.mechanism.limb_rows import follow_limb
 from loopcal.mechanism.model import Mechanism
@@ -215,7 +215,11 @@ def forward_trials(
     if not q.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(q)))
     if robot.stages:
-        return solve_stages(robot, values, q, start, partial(forward_trials, follow=follow))
+        states = [
+            forward_trials(own.stage.robot, own.values, own.readings, own.state, follow)
+            for own in each_stage(robot, values, start or robot.home_state, q)
+        ]
+        return join_stage_states(robot, states)
     if robot.has_open_sums:
         e, sums, weights = drive_sums(robot, values, q)
         return close_at_joints(robot, e, sums, start, follow, weights=weights)
@@ -365,10 +369,9 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
     equations than freedoms. It changes only at a singularity.
     """
     if robot.stages:
-        whole = np.ones(state.status.shape, np.int8)
-        for stage, own, part in each_stage(robot, values, state):
-            whole = whole * compute_closure_sign(stage.robot, own, part)
-        return whole
+        parts = each_stage(robot, values, state)
+        signs = [compute_closure_sign(own.stage.robot, own.values, own.state) for own in parts]
+        return np.multiply.reduce(signs, dtype=np.int8)
     if robot.is_serial:
         return np.ones(state.status.shape, np.int8)
     if not is_square(robot):
@@ -457,10 +460,8 @@ def compute_limb_frames(
         bases, _ = locate_stage_bases(robot.stages, state.poses)
         return tuple(
             (base if base.ndim == 2 else base[:, :, None]) @ frames
-            for base, (stage, own, part) in zip(
-                bases, each_stage(robot, values, state), strict=True
-            )
-            for frames in compute_limb_frames(stage.robot, own, part)
+            for base, own in zip(bases, each_stage(robot, values, state), strict=True)
+            for frames in compute_limb_frames(own.stage.robot, own.values, own.state)
         )
     e, _ = robot.slots(values)
     frames: dict[int, FloatArray] = {}

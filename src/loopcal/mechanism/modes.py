@@ -20,7 +20,7 @@ from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
 from loopcal.mechanism.actuation import solve_open_sums
 from loopcal.mechanism.assembly import BASE
-from loopcal.mechanism.chains import has_spare_drives, join_stage_states, solve_serial, solve_stages
+from loopcal.mechanism.chains import each_stage, has_spare_drives, join_stage_states, solve_serial
 from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings, inverse_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution
@@ -186,7 +186,9 @@ def find_working_modes(
 def _close(robot: Mechanism, values: FloatArray, q: FloatArray, start: State | None) -> State:
     """Return the states (1, n) at readings (1, n | 1, a), in whatever mode the start leads to."""
     if robot.stages:
-        return solve_stages(robot, values, q, start, _close)
+        parts = each_stage(robot, values, start or robot.home_state, q)
+        states = [_close(own.stage.robot, own.values, own.readings, own.state) for own in parts]
+        return join_stage_states(robot, states)
     e, tau = robot.slots(values)
     begin, w = start or robot.home_state, robot.slots.constants
     if robot.has_open_sums:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine
+from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.mechanism.actuation import (
     Derivatives,
@@ -30,10 +30,10 @@ from loopcal.mechanism.actuation import (
     drive_joints,
 )
 from loopcal.mechanism.chains import (
-    differentiate_joints,
-    differentiate_platform,
-    differentiate_platform_entries,
+    each_stage,
+    get_platforms,
     name_platform_entries,
+    transport_to_end,
 )
 from loopcal.mechanism.least_squares_closure import (
     differentiate_open,
@@ -64,7 +64,7 @@ def differentiate_pose(
     or NaN.
     """
     if robot.stages:
-        return differentiate_platform(robot, values, q, state, differentiate_pose, columns)
+        return differentiate_platform(robot, values, q, state, columns)
     if robot.has_open_sums:
         derivatives = differentiate_open_sums(robot, values, q, state, columns)
     else:
@@ -84,6 +84,41 @@ def differentiate_pose(
         for derivative in derivatives:
             derivative[lost] = np.nan
     return Derivatives(*derivatives)
+
+
+def differentiate_platform(
+    robot: Mechanism,
+    values: FloatArray,
+    q: FloatArray,
+    state: State,
+    columns: ParameterUnits | None = None,
+    end: int = -1,
+) -> Derivatives:
+    """Differentiate the platform of a stage of a chain (default: the end) as `differentiate_pose`
+    does that of a robot, by the twists of the stages that carry it.
+    """
+    columns = columns or robot.all_parameters
+    whole = _make_zeros(robot, state, 6, len(columns.places))
+    parts = list(each_stage(robot, values, state, q))
+    for i, transport in transport_to_end(robot, state, end):
+        stage, own, part, readings = parts[i]
+        first, last = stage.parameters.start, stage.parameters.stop
+        place = np.flatnonzero((columns.places >= first) & (columns.places < last))
+        own_columns = ParameterUnits(
+            stage.robot.slots, columns.places[place] - first, columns.units[place]
+        )
+        by_own = differentiate_pose(stage.robot, own, readings, part, own_columns)
+        whole.parameters[..., place] = np.matmul(transport, by_own.parameters)
+        whole.readings[..., stage.actuators] = np.matmul(transport, by_own.readings)
+    return whole
+
+
+def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> Derivatives:
+    """Return derivatives (t, n, rows, ..) of zero by `columns` parameters and all readings."""
+    t, n = state.T.shape[:2]
+    return Derivatives(
+        np.zeros((t, n, rows, columns)), np.zeros((t, n, rows, len(robot.actuators)))
+    )
 
 
 def differentiate_by_drives(
@@ -148,7 +183,14 @@ def differentiate_passive_joints(
     """Differentiate passive joints in every parameter and reading; a locked joint has zeros."""
     names = name_passive_joints(robot)
     if robot.stages:
-        whole = differentiate_joints(robot, values, q, state, differentiate_passive_joints)
+        whole = _make_zeros(robot, state, len(names), len(robot.parameters))
+        first = 0
+        for stage, own, part, readings in each_stage(robot, values, state, q):
+            moved = differentiate_passive_joints(stage.robot, own, readings, part)
+            rows = slice(first, first + len(moved.names))
+            whole.parameters[:, :, rows, stage.parameters] = moved.parameters
+            whole.readings[:, :, rows, stage.actuators] = moved.readings
+            first = rows.stop
         return PassiveSensitivity(names, *whole)
     nodes, p = len(robot.program.nodes), len(robot.parameters)
     platform = differentiate_pose(robot, values, q, state, nodes=nodes)
@@ -187,15 +229,14 @@ def differentiate_sensed_values(
     """Differentiate passive joints and the numbers of platforms of stages, by name."""
     known: list[str] = []
     derivatives: list[tuple[FloatArray, FloatArray]] = []
-    for stage in robot.stages:
+    for i, stage in enumerate(robot.stages):
         entries = name_platform_entries(stage.name)
         if not set(entries).isdisjoint(names):
             known += entries
-            derivatives.append(
-                differentiate_platform_entries(
-                    robot, values, q, state, differentiate_pose, stage.name
-                )
-            )
+            # a column r of the rotation moves by omega x r, the origin by v
+            slope = geometry.differentiate_entries(get_platforms(robot, state)[i])
+            twist = differentiate_platform(robot, values, q, state, end=i)
+            derivatives.append((slope @ twist.parameters, slope @ twist.readings))
     if not set(names) <= set(known):
         joints = differentiate_passive_joints(robot, values, q, state)
         known += joints.names

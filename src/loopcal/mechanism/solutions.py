@@ -20,7 +20,7 @@ from loopcal.engine import NEAR_GOAL, State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
-from loopcal.mechanism.chains import judge_stage_modes
+from loopcal.mechanism.chains import join_stage_states, split_stage_states
 from loopcal.mechanism.kinematics import (
     clear_sign,
     close_at_coordinates,
@@ -310,7 +310,7 @@ def judge_modes(
     computed, and those of the right sign are solved by forward kinematics up to their pose.
     """
     if robot.stages:
-        return judge_stage_modes(robot, state, begin, judge_modes)
+        return _judge_stages(robot, state, begin)
     if robot.is_serial:
         return state, np.zeros(state.T.shape[1], bool)
     if robot.has_open_sums:
@@ -337,6 +337,19 @@ def judge_modes(
     judged, is_other[rows] = _judge_paths(robot, first, select_poses(state, rows))
     new = reshape_rows(judged, len(rows), 1)
     return replace_rows(state, np.zeros_like(rows), rows, new), is_other
+
+
+def _judge_stages(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
+    """Return what `judge_modes` returns, of a chain: another mode is one of any of its stages."""
+    is_other, judged = np.zeros(state.T.shape[1], bool), []
+    parts = robot.stages, split_stage_states(robot, state), split_stage_states(robot, begin)
+    for stage, own, first in zip(*parts, strict=True):
+        machine = stage.robot.with_values(robot.values[stage.parameters])
+        part, is_part_other = judge_modes(machine, own, first)
+        judged.append(part)
+        is_other |= is_part_other
+    whole = join_stage_states(robot, judged)
+    return replace(state, closure_sign=whole.closure_sign, signs=whole.signs), is_other
 
 
 def _judge_by_readings(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
