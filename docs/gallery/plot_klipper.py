@@ -105,5 +105,5 @@ print(table[columns].round(3).to_string())
 # %%
 # Write them into a copy of printer.cfg: everything else in it stays as it is.
 
-lc.save_run(folder / "run", report)
+lc.save_run(report, folder / "run")
 run("export run --format klipper --into printer.cfg -o corrected.cfg")

@@ -35,7 +35,7 @@ for seed, (name, machine) in enumerate({"may": may, "june": june}.items()):
     poses = lc.sample_workspace(robot, 40, seed=seed).coordinates
     data = lc.simulate(machine, poses, tracker, seed=seed)
     report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.2))
-    lc.save_run(folder / name, report)
+    lc.save_run(report, folder / name)
 
 comparison = lc.compare_runs([lc.load_run(folder / "may"), lc.load_run(folder / "june")])
 print(comparison)

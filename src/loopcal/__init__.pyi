@@ -59,9 +59,9 @@ from .diagnose.posterior_sample import sample_posterior as sample_posterior
 from .diagnose.value_comparison import ValueComparison as ValueComparison
 from .diagnose.value_comparison import compare_with_truth as compare_with_truth
 from .diagnose.value_comparison import compare_with_values as compare_with_values
-from .documents import write_comparison as write_comparison
-from .documents import write_report as write_report
-from .documents import write_view as write_view
+from .documents import save_comparison as save_comparison
+from .documents import save_report as save_report
+from .documents import save_view as save_view
 from .errors import DataError as DataError
 from .errors import EstimationError as EstimationError
 from .errors import FileError as FileError

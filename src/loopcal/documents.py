@@ -27,7 +27,7 @@ from loopcal.io.core.text_file import as_path, to_json, write_bytes, write_text
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_source, export_robot
 from loopcal.io.formats.program_format import ExportSource
-from loopcal.io.runs.result_files import save_comparison
+from loopcal.io.runs.result_files import format_comparison
 from loopcal.io.runs.run_folder import Run, build_document, refuse_changed_run
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
@@ -97,7 +97,7 @@ HTML = (".html", SHORT_HTML)
 """Endings of a page's name."""
 
 
-def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
+def save_report(report: CalibrationReport | Run, path: str | Path) -> Path:
     """Write the report of a calibration as one HTML file for people, and as JSON beside it.
 
     The HTML file loads nothing and can be printed, sent and archived. It contains one script, the
@@ -106,8 +106,8 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
 
     Parameters
     ----------
-    path : of the HTML file, whose name ends in .html; the JSON file has the same name otherwise.
     report : of `loopcal.calibrate`, or a run from `loopcal.load_run`.
+    path : of the HTML file, whose name ends in .html; the JSON file has the same name otherwise.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     >>> robot = lc.load_robot("hexapod-42")
     >>> data = lc.load_measurements("examples/hexapod-42/measurements.csv", robot)
     >>> report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
-    >>> lc.write_report("report.html", report)  # doctest: +SKIP
+    >>> lc.save_report(report, "report.html")  # doctest: +SKIP
     """
     path = as_path(path, "report")
     data = name_data(path)
@@ -167,7 +167,7 @@ ENDINGS = (*HTML, ".json", ".csv")
 """Endings of the files of a comparison."""
 
 
-def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
+def save_comparison(comparison: RunComparison, path: str | Path) -> Path:
     """Write a comparison of calibrations to a file; the ending of its name is the format.
 
     `.html` is a page for people, which loads nothing and runs no program. `.json` has all numbers
@@ -175,7 +175,7 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
 
     Parameters
     ----------
-    path : of the file; an older one is replaced. comparison : of `loopcal.compare_runs`.
+    comparison : of `loopcal.compare_runs`. path : of the file; an older one is replaced.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
     --------
     >>> import loopcal as lc
     >>> runs = [lc.load_run("may"), lc.load_run("june")]  # doctest: +SKIP
-    >>> lc.write_comparison("sessions.html", lc.compare_runs(runs))  # doctest: +SKIP
+    >>> lc.save_comparison(lc.compare_runs(runs), "sessions.html")  # doctest: +SKIP
     """
     path = as_path(path, "comparison")
     ending = check_ending(path, "comparison", ENDINGS)
@@ -200,7 +200,8 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
         write_text(path, to_json(comparison.to_dict()))
     else:
         table = tabulate_comparison(comparison)
-        save_comparison(path, [column.title for column in table.columns], table.rows)
+        titles = [column.title for column in table.columns]
+        write_text(path, format_comparison(titles, table.rows))
     return path
 
 
@@ -287,7 +288,7 @@ def _check_pdf(file: Path) -> None:
 # Write the 3-D view of a robot or of a calibration as one HTML file, and open it.
 
 
-def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) -> Path:
+def save_view(source: Mechanism | CalibrationReport | Run, path: str | Path) -> Path:
     """Write the interactive 3-D view of a robot or of a calibration as one HTML file.
 
     The page shows the robot at home. Of a calibration it also shows the robot at the measured
@@ -297,8 +298,8 @@ def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) ->
 
     Parameters
     ----------
-    path : of the HTML file, whose name ends in .html.
     source : a robot, the result of `loopcal.calibrate`, or a run from `loopcal.load_run`.
+    path : of the HTML file, whose name ends in .html.
 
     Returns
     -------
@@ -312,7 +313,7 @@ def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) ->
     Examples
     --------
     >>> import loopcal as lc
-    >>> lc.write_view("view.html", lc.load_robot("hexapod-42"))  # doctest: +SKIP
+    >>> lc.save_view(lc.load_robot("hexapod-42"), "view.html")  # doctest: +SKIP
     """
     path = as_path(path, "page")
     check_ending(path, "view")

@@ -90,7 +90,7 @@ def test_json_document_contains_the_verdict_and_every_finding(report):
 
 
 def test_parts_of_a_report_and_its_run_folder_print_on_a_screen(report, tmp_path):
-    run = load_run(save_run(tmp_path / "run", report))
+    run = load_run(save_run(report, tmp_path / "run"))
     assert repr(run).endswith("run': hexapod-42, calibrated>")
     assert repr(report.validation) == str(report.validation)
     for value in (run, report.validation, report.examination, report.robot.parameters):

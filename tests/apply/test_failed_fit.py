@@ -84,7 +84,7 @@ def test_run_of_a_failed_fit_with_an_unknown_frame_is_read_back(tmp_path):
     tracker = Instrument((Sensor(Position(unknown=("frame",)), Gaussian(np.full(3, 5e-6))),))
     report = calibrate(lc.load_robot("hexapod-42"), wrong_data(tracker), options)
     assert not report.identification.converged
-    lc.save_run(tmp_path / "run", report)
+    lc.save_run(report, tmp_path / "run")
     arrays = lc.load_run(tmp_path / "run").arrays
     assert arrays["frames_T"].shape == (0, 4, 4)
 

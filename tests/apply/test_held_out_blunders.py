@@ -138,7 +138,7 @@ def test_error_of_a_millimeter_is_found_by_the_calibrated_robot_in_a_run_folder(
 ):
     options = CalibrationOptions(held_out=split[1].labels)
     report = calibrate(robot, data, options)
-    run = load_run(save_run(tmp_path / "run", report))
+    run = load_run(save_run(report, tmp_path / "run"))
     wrong = change(split[1], WRONG_VALUES["target moved"], WRONG)
     result = validate(
         run.robot,

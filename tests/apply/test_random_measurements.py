@@ -48,5 +48,5 @@ def test_random_positions_are_never_a_calibration(tmp_path, method, noise):
     report = calibrate(robot, data, options)
     assert report.verdict is Verdict.NOT_CALIBRATED
     assert report.next_step.code == "workflow.next-check-data"
-    lc.save_run(tmp_path / "run", report)
+    lc.save_run(report, tmp_path / "run")
     assert lc.load_run(tmp_path / "run").failure is not None

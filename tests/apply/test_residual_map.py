@@ -156,7 +156,7 @@ def test_the_map_of_an_uneven_bed_removes_its_bumps_in_held_out_regions():
 def test_a_run_keeps_its_map_and_the_command_line_uses_it(tmp_path, capsys):
     robot, data = delta(), bent("linear-delta", 0)[1]
     report = lc.calibrate(robot, data)
-    save_run(tmp_path / "run", report)
+    save_run(report, tmp_path / "run")
     targets = sample_workspace(robot, 4, 8).coordinates
     stored = load_run(tmp_path / "run").load_posterior()
     first, second = (

@@ -36,7 +36,7 @@ def test_errors_of_all_quantities_are_those_of_the_validation(quantities, tmp_pa
     after = report.validation.after.quantities
     assert {"position", "orientation", *quantities} == set(after)
     for name in ("first", "second"):
-        lc.save_run(tmp_path / name, report, {"data": file})
+        lc.save_run(report, tmp_path / name, {"data": file})
     runs = [lc.load_run(tmp_path / name) for name in ("first", "second")]
     others = lc.compare_runs(runs, simulate(robot, quantities, 2))
     comparison = lc.compare_runs(runs)

@@ -72,7 +72,7 @@ def test_run_folder_knows_which_frames_are_open(robot, tmp_path) -> None:
     data = measure(robot, ["monday"] * 40 + ["tuesday"] * 4, 5)
     fitted, other = data.take(np.arange(42)), data.take([42, 43])
     report = lc.calibrate(robot, fitted)
-    save_run(tmp_path / "run", report)
+    save_run(report, tmp_path / "run")
     run = load_run(tmp_path / "run")
     with pytest.raises(lc.DataError, match=r"43 and 44\. The fitted poses do not determine"):
         validate(

@@ -245,7 +245,7 @@ def test_hostile_names_are_text_in_all_formats(runs, monkeypatch, tmp_path) -> N
         errors=(replace(comparison.errors[0], run=HOSTILE), comparison.errors[1]),
     )
     for name in ("page.html", "rows.csv", "all.json"):
-        lc.write_comparison(name, changed)
+        lc.save_comparison(changed, name)
         text = Path(name).read_text("utf-8")
         assert "\x1b" not in text
     page = Path("page.html").read_text("utf-8")

@@ -64,7 +64,7 @@ def test_a_run_of_python_is_repeated_with_the_constant_of_its_loss(loopcal, fold
     for name, loss in (("narrow", lc.Huber(0.5)), ("wide", lc.Huber(2.0))):
         options = lc.CalibrationOptions(fit=lc.FitOptions(lc.LeastSquares(), loss))
         report = lc.calibrate(robot, lc.load_measurements(data, robot), options)
-        run = lc.save_run(folder / name, report, {"data": data})
+        run = lc.save_run(report, folder / name, {"data": data})
         document = loopcal(f"bootstrap {run} --count 10 --json").json
         assert document["resamples"] == 10
     # with the loss of the other run, the estimate is another one

@@ -139,7 +139,7 @@ def test_calibration_and_its_run_folder_state_the_errors_of_the_drives(tmp_path)
     report = lc.calibrate(ROBOT, measure_hexapod(2, SIGMA, error=REPEATABILITY).data)
     assert "residuals.drive-errors" in {finding.code for finding in report.findings}
     assert report.identification.residual_test.p_value > 1e-3
-    lc.save_run(tmp_path / "run", report)
+    lc.save_run(report, tmp_path / "run")
     kept = lc.load_run(tmp_path / "run").load_posterior().repeatability
     assert kept.tolist() == report.identification.posterior.repeatability.tolist()
     assert kept.min() > 3e-6

@@ -24,11 +24,11 @@ def calibration() -> lc.CalibrationReport:
 @pytest.fixture(scope="session")
 def run(calibration, tmp_path_factory) -> lc.Run:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    lc.save_run(folder, calibration, {"data": EXAMPLE}, ["loopcal", "calibrate", "hexapod-42"])
+    lc.save_run(calibration, folder, {"data": EXAMPLE}, ["loopcal", "calibrate", "hexapod-42"])
     return lc.load_run(folder)
 
 
 @pytest.fixture(scope="session")
 def page(run, tmp_path_factory) -> Path:
     """Return the report of the run folder."""
-    return lc.write_report(tmp_path_factory.mktemp("reports") / "report.html", run)
+    return lc.save_report(run, tmp_path_factory.mktemp("reports") / "report.html")

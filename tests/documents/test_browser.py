@@ -85,7 +85,7 @@ def test_page_of_a_comparison_opens_without_requests_and_passes_axe(browser, run
     second = tmp_path / "second"
     shutil.copytree(run.path, second)
     comparison = lc.compare_runs([run, lc.load_run(second)])
-    written = lc.write_comparison(tmp_path / "comparison.html", comparison)
+    written = lc.save_comparison(comparison, tmp_path / "comparison.html")
     context = browser.new_context(
         offline=True, bypass_csp=True, viewport={"width": 420, "height": 800}
     )
@@ -131,7 +131,7 @@ def written_page(request, tmp_path, monkeypatch) -> Path:
     assert main(words.split()) == 0
     words = f"calibrate {request.param} data.csv -o run --hold-out 0.25"
     assert main(words.split()) in (0, 2)
-    return lc.write_report(tmp_path / "report.html", lc.load_run("run"))
+    return lc.save_report(lc.load_run("run"), tmp_path / "report.html")
 
 
 @pytest.mark.parametrize(

@@ -222,9 +222,9 @@ def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
 
 def test_limits_of_calls_are_sentences(calibration, tmp_path) -> None:
     with pytest.raises(FileError, match=r"the name of a report ends in \.html, but this one has"):
-        lc.write_report(tmp_path / "report.pdf", calibration)
+        lc.save_report(calibration, tmp_path / "report.pdf")
     with pytest.raises(FileError, match="does not exist"):
-        lc.write_report(tmp_path / "nowhere" / "report.html", calibration)
+        lc.save_report(calibration, tmp_path / "nowhere" / "report.html")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -264,7 +264,7 @@ def test_report_of_a_printer_shows_the_heights_over_the_bed(root, tmp_path) -> N
     robot = lc.load_robot(root / "examples" / "delta-printer" / "printer.yaml")
     data = lc.load_measurements(root / "examples" / "delta-printer" / "heights.csv", robot)
     report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.4))
-    lc.save_run(tmp_path / "run", report)
+    lc.save_run(report, tmp_path / "run")
     for source in (report, lc.load_run(tmp_path / "run")):
         section = build(load_record(source), "heights").sections[0]
         assert section.title == "Height errors"

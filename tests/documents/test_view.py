@@ -28,7 +28,7 @@ def read_scene(page: Path) -> dict:
 
 
 def test_view_of_a_robot_shows_its_home_and_its_picture(tmp_path) -> None:
-    page = lc.write_view(tmp_path / "view.html", lc.load_robot("five-bar"))
+    page = lc.save_view(lc.load_robot("five-bar"), tmp_path / "view.html")
     scene = read_scene(page)
     assert scene["planar"]
     assert scene["unit"] == "mm"
@@ -52,7 +52,7 @@ def test_view_of_a_run_has_its_poses_errors_and_map(
     meanings = " ".join(row["text"] for row in scene["legend"])
     assert re.search(r"before calibration, [0-9]+ times magnified", meanings)
     assert re.search(r"over the workspace, [0-9.]+ to [0-9.]+ mm", meanings)
-    again = lc.write_view("again.html", calibration)
+    again = lc.save_view(calibration, "again.html")
     assert read_scene(again) == scene
 
 
@@ -75,7 +75,7 @@ def test_wrong_use_is_refused_and_writes_nothing(tmp_path, monkeypatch, capsys) 
         assert main(["view", *words.split()]) == 1
         assert sentence in " ".join(capsys.readouterr().err.split())
     with pytest.raises(FileError, match="ends in"):
-        lc.write_view("view", lc.load_robot("five-bar"))
+        lc.save_view(lc.load_robot("five-bar"), "view")
     assert list(tmp_path.iterdir()) == []
     Path("view.html").write_text("mine")
     assert main(["view", "five-bar", "--no-browser"]) == 1

@@ -177,7 +177,7 @@ def stored(tmp_path_factory) -> tuple[lc.CalibrationReport, lc.Run]:
     data = lc.load_measurements(EXAMPLE, robot)
     report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
     folder = tmp_path_factory.mktemp("runs") / "run"
-    lc.save_run(folder, report)
+    lc.save_run(report, folder)
     return report, lc.load_run(folder)
 
 
@@ -199,7 +199,7 @@ def test_a_stored_run_with_too_large_residuals_knows_its_noise_as_stated(tmp_pat
         replace(data, observations=tuple(rows)),
         lc.CalibrationOptions(fit=lc.FitOptions(sigma_uncertainty=0.0)),
     )
-    lc.save_run(tmp_path / "run", report)
+    lc.save_run(report, tmp_path / "run")
     uncertainty = lc.load_run(tmp_path / "run").load_uncertainty()
     assert uncertainty is not None
     assert uncertainty.noise.scale == 1.0

@@ -135,7 +135,7 @@ def run(tmp_path_factory, robot, data):  # noqa: F811
     volume = {"x": (-0.01, 0.01)}
     options = lc.CalibrationOptions(hold_out=0.25, limit_position=1e-3, volume=volume)
     path = tmp_path_factory.mktemp("certificate") / "run"
-    return lc.save_run(path, lc.calibrate(robot, measured, options))
+    return lc.save_run(lc.calibrate(robot, measured, options), path)
 
 
 def write_facts(folder, name="A", **changed):

@@ -64,7 +64,7 @@ def folder(tmp_path_factory) -> Path:
         lc.load_measurements(folder / "old.csv", robot),
         lc.CalibrationOptions(hold_out=0.25),
     )
-    lc.save_run(folder / "RUN", report, {"data": folder / "old.csv"}, ["loopcal", "calibrate"])
+    lc.save_run(report, folder / "RUN", {"data": folder / "old.csv"}, ["loopcal", "calibrate"])
     return folder
 
 

@@ -22,7 +22,7 @@ def calibrated():
 
 def test_saved_report_is_loaded_as_a_run(tmp_path, calibrated) -> None:
     robot, report = calibrated
-    lc.save_run(tmp_path / "run", report, {"data": DATA}, ["a test"])
+    lc.save_run(report, tmp_path / "run", {"data": DATA}, ["a test"])
     run = lc.load_run(tmp_path / "run")
     np.testing.assert_allclose(run.robot.values, report.robot.values, rtol=0, atol=1e-15)
     np.testing.assert_allclose(run.initial_robot.values, robot.values, rtol=0, atol=1e-15)
@@ -35,17 +35,17 @@ def test_saved_report_is_loaded_as_a_run(tmp_path, calibrated) -> None:
     assert held_out is not None
     assert held_out.labels == report.split.held_out.labels == run.held_out
     with expect_refusal("files.folder-in-use", FileError):
-        lc.save_run(tmp_path / "run", report)
+        lc.save_run(report, tmp_path / "run")
 
 
 def test_changed_or_missing_measurements_of_a_run_are_refused(tmp_path, calibrated) -> None:
     _, report = calibrated
     copy = tmp_path / "data.csv"
     copy.write_bytes(DATA.read_bytes())
-    lc.save_run(tmp_path / "run", report, {"data": copy})
+    lc.save_run(report, tmp_path / "run", {"data": copy})
     copy.write_bytes(DATA.read_bytes() + b"\n")
     with pytest.raises(FileError, match="was changed since the run"):
         lc.load_run(tmp_path / "run").load_measurements()
-    lc.save_run(tmp_path / "bare", report)
+    lc.save_run(report, tmp_path / "bare")
     with pytest.raises(FileError, match="names no measurement files"):
         lc.load_run(tmp_path / "bare").load_measurements()

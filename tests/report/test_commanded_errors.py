@@ -40,7 +40,7 @@ def test_report_of_a_tripod_says_that_commanded_poses_are_still_missed(tmp_path)
     assert rms > 10.0 * 0.02  # [mm] far above the limit that the predicted poses keep
     text = " ".join(render_text(view_calibration(report), 100).split())
     assert sentence in text
-    lc.write_report(tmp_path / "report.html", report)
+    lc.save_report(report, tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text("utf-8").count(sentence) == 2  # verdict, errors
 
 

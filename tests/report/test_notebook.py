@@ -110,7 +110,7 @@ def results(five_bar, plan, root, tmp_path_factory) -> dict[str, Any]:
     boot = lc.bootstrap(fit, data, 20, seed=1)
     sample = lc.sample_posterior(fit, data, 200, seed=1)
     folder = tmp_path_factory.mktemp("runs") / "run"
-    lc.save_run(folder, report)
+    lc.save_run(report, folder)
     made: list[Any] = [
         fit,
         report,

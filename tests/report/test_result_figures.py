@@ -98,7 +98,7 @@ def runs(five_bar, tmp_path_factory) -> lc.RunComparison:
     instrument = lc.Instrument((lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 2e-5))),))
     moved = lc.simulate(robot.with_values(truth), poses, instrument, 2)
     for name, data in {"may": five_bar.fitted, "june": moved}.items():
-        lc.save_run(folder / name, lc.calibrate(robot, data))
+        lc.save_run(lc.calibrate(robot, data), folder / name)
     return lc.compare_runs([lc.load_run(folder / name) for name in ("may", "june")])
 
 

@@ -457,7 +457,7 @@ def calibrate_trial(
     write_result_folder(place, INPUTS, document, files, force=force)
     paths = {"robot": place / ROBOT, "data": place / DATA}
     report = calibrate(robot, data, options, progress)
-    save_run(output, report, paths, command, force)
+    save_run(report, output, paths, command, force)
     errors = study.errors[levels[FACTORS["errors"]]]
     is_changed = errors.tolerance_factor != 1.0 or bool(errors.tolerances)
     findings = [report_finding("store.replay-tolerances", file=ROBOT)] if is_changed else []

@@ -126,7 +126,7 @@ def calibrate(
     written = "Nothing was written; -o RUN keeps the result and the corrected robot file."
     if output is not None:
         with terminal.TerminalProgress("writing the run folder"):
-            lc.save_run(output, report, inputs, opt.list_words(), force)
+            lc.save_run(report, output, inputs, opt.list_words(), force)
         written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
     return Output(
         build_document(report, inputs, opt.list_words()),
@@ -392,7 +392,7 @@ def compare(
     measurements = opt.read_checked_measurements(data, loaded[0].robot, **allowed) if data else None
     comparison = lc.compare_runs(loaded, measurements)
     if output is not None:
-        lc.write_comparison(output, comparison)
+        lc.save_comparison(comparison, output)
     written = [] if output is None else ["", f"Written to {output}"]
     return Output(comparison.to_dict(), lambda: [*view_comparison(comparison), *written])
 
@@ -458,7 +458,7 @@ def report(
     if pdf:
         check_browser(files[-1])
     with terminal.TerminalProgress("writing the report") as progress:
-        lc.write_report(output, calibrated)
+        lc.save_report(calibrated, output)
         if pdf:
             progress(0, 1, "printing the report")
             print_pdf(output, files[-1])

@@ -174,7 +174,7 @@ def view(
       loopcal view hexapod-42
       loopcal view run -o hexapod.html --no-browser
     """
-    from loopcal.documents import check_ending, open_page, write_view
+    from loopcal.documents import check_ending, open_page, save_view
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.runs.run_folder import load_run_or_robot
 
@@ -183,7 +183,7 @@ def view(
     files = [Path(source) / name for name in run.result.get("files", {})]
     refuse_outputs((output,), files or (Path(source),), force)
     with terminal.TerminalProgress("writing the view"):
-        write_view(output, run if run.result else run.robot)
+        save_view(run if run.result else run.robot, output)
     is_open = not no_browser and open_page(output.resolve().as_uri())
     failures = [] if run.failure is None else [run.failure]
     unopened = "" if is_open or no_browser else "; no browser could be started here"

@@ -38,9 +38,15 @@ ACTIONS = {
 
 
 def as_path(path: Any, what: str) -> Path:
-    """Return a path given as text or Path; DataError where no file can have this name."""
+    """Return a path given as text or Path; DataError where no file can have this name, or where
+    another object stands in its place.
+    """
     try:
         name = os.fsencode(path)
+    except TypeError:
+        given = type(path).__name__
+        sentence = f"the path of a {what} is of type {given}; give a text or a pathlib.Path"
+        raise DataError(f"{sentence}, after the object to save: save_..(object, path)") from None
     except UnicodeEncodeError:
         name = b"\0"
     if b"\0" in name:

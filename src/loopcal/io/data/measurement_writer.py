@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError
 from loopcal.io.core.csv_table import format_row, refuse_settings_beside
 from loopcal.io.core.limits import find_fault, format_comment
-from loopcal.io.core.text_file import write_text
+from loopcal.io.core.text_file import as_path, write_text
 from loopcal.io.core.yaml_file import format_flow, quote_scalar
 from loopcal.io.data.columns import (
     COVARIANCE,
@@ -93,8 +93,9 @@ def save_measurements(
     FileError : the file cannot be written, or a file of settings has its name.
     DataError : a name that a file cannot hold.
     """
+    path = as_path(path, "measurement file")
     text = format_measurements(data, robot, remark)
-    refuse_settings_beside(Path(path))
+    refuse_settings_beside(path)
     write_text(path, text)
 
 

@@ -239,7 +239,7 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
     FileError : the file cannot be written. MechanismError : the robot was not loaded from a file.
     DataError : there is not one uncertainty for each parameter.
     """
-    count = len(robot.parameters.names)
+    path, count = as_path(path, WHAT), len(robot.parameters.names)
     if plus_minus is not None and np.shape(plus_minus) != (count,):
         raise DataError(
             f"plus_minus has shape {np.shape(plus_minus)}; give one uncertainty for each of the "

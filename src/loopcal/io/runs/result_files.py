@@ -26,7 +26,6 @@ from loopcal.io.core.csv_table import (
     require_columns,
 )
 from loopcal.io.core.outputs import FolderKind
-from loopcal.io.core.text_file import write_text
 from loopcal.io.data.columns import COMMANDED, NOTE
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
@@ -104,10 +103,10 @@ def _format_error(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.{DIGITS}g}"
 
 
-def save_comparison(path: Path, titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Write the table of a comparison: titles of columns, and their cells as text."""
+def format_comparison(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return the table of a comparison as CSV: titles of columns, and their cells as text."""
     lines = [titles, *rows]
-    write_text(path, "".join(format_row(map(escape_formula, line)) + "\n" for line in lines))
+    return "".join(format_row(map(escape_formula, line)) + "\n" for line in lines)
 
 
 CURVES_FORMAT, POINTS, PICTURE = 1, "curves.csv", "curves.png"

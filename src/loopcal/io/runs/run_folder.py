@@ -377,8 +377,8 @@ def _find_robot_file(path: Path) -> Path:
 
 
 def save_run(
-    path: str | Path,
     report: CalibrationReport,
+    path: str | Path,
     inputs: Mapping[str, Path] | None = None,
     command: Sequence[str] = (),
     force: bool = False,
@@ -387,7 +387,7 @@ def save_run(
 
     Parameters
     ----------
-    path : the folder to make. report : of `loopcal.calibrate`, with a robot from `load_robot`.
+    report : of `loopcal.calibrate`, with a robot from `load_robot`. path : the folder to make.
     inputs : role -> file, such as `{"robot": .., "data": ..}`; their names and digests are kept.
     command : the command line that made the report.
     force : replace an older run, and call the robot file of a calibration that failed robot.yaml.
@@ -397,6 +397,7 @@ def save_run(
     FileError : the folder is in use, or cannot be written; an input cannot be read.
     MechanismError : the robot was not loaded from a file.
     """
+    path = as_path(path, "run folder")
     document = build_document(report, inputs, command)
     text = remove_mark(format_robot(report.robot, report.identification.plus_minus))
     name = name_robot_file(report, force)
