@@ -35,7 +35,15 @@ def draw_commands(robot: Mechanism, count: int, seed: int) -> np.ndarray:
     return read_coordinates(poses, robot.controlled)
 
 
-@pytest.mark.parametrize("name", ["six-bar", "jansen-leg", "parallelogram-delta", "h4"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "six-bar",
+        "h4",
+        pytest.param("jansen-leg", marks=pytest.mark.evidence),
+        pytest.param("parallelogram-delta", marks=pytest.mark.evidence),
+    ],
+)
 def test_estimates_of_20_machines_scatter_as_stated(name):
     robot = load_robot(name)
     scores, p_values = [], []

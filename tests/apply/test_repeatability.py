@@ -67,14 +67,20 @@ def test_numbers_equal_those_of_the_formulas() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sd", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2)])
 @pytest.mark.parametrize(
-    ("visits", "bias"),
+    ("visits", "bias", "sd"),
     [
-        (5, 0.0),
-        (30, 2.0),
-        pytest.param(5, 5.0, marks=pytest.mark.evidence),
-        pytest.param(30, 0.3, marks=pytest.mark.evidence),
+        (5, 0.0, (1.0, 1.0, 1.0)),
+        (30, 2.0, (1.0, 0.5, 0.2)),
+        *(
+            pytest.param(*case, marks=pytest.mark.evidence)
+            for case in (
+                (5, 0.0, (1.0, 0.5, 0.2)),
+                (30, 2.0, (1.0, 1.0, 1.0)),
+                *((5, 5.0, sd) for sd in ((1.0, 1.0, 1.0), (1.0, 0.5, 0.2))),
+                *((30, 0.3, sd) for sd in ((1.0, 1.0, 1.0), (1.0, 0.5, 0.2))),
+            )
+        ),
     ],
 )
 def test_intervals_contain_the_truth(visits, bias, sd) -> None:

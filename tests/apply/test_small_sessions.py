@@ -118,7 +118,7 @@ def test_split_keeps_three_points_of_each_session(robot, name: str) -> None:
 
 
 def test_split_of_faultless_small_sessions_blames_no_pose(robot) -> None:
-    data = measure(robot, [f"s{i}" for i in range(20) for _ in range(4)], 4)
+    data = measure(robot, [f"s{i}" for i in range(12) for _ in range(4)], 4)
     report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
     assert report.validation is not None
     assert report.validation.blunders == ()

@@ -70,13 +70,14 @@ def test_the_errors_of_drives_are_recovered_in_every_family(
     values = robot.values.copy()
     for _ in range(6):
         current = robot.with_values(values)
-        change = np.linalg.inv(lc.forward(current, q).T) @ T
-        own = lc.forward(current, q).T[:, :3, :3]
+        reached = lc.forward(current, q).T
+        change, own = np.linalg.inv(reached) @ T, reached[:, :3, :3]
         turn = np.einsum("nij,njk->nik", own, change[:, :3, :3] - np.eye(3))
         skew = np.einsum("nij,nkj->nik", turn, own)
         residual = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-        residual = np.concatenate([residual, T[:, :3, 3] - lc.forward(current, q).T[:, :3, 3]], 1)
-        columns = [lc.jacobian(current, q).of(name).ravel() for name in names]
+        residual = np.concatenate([residual, T[:, :3, 3] - reached[:, :3, 3]], 1)
+        jacobian = lc.jacobian(current, q)
+        columns = [jacobian.of(name).ravel() for name in names]
         step = np.linalg.lstsq(np.stack(columns, axis=1), residual.ravel(), rcond=1e-12)[0]
         values[places] += step
     # Newton's method squares what is left of the errors in each step
