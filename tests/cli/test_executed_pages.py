@@ -23,6 +23,7 @@ PAGES = [
     for path in [
         *(p for folder in FOLDERS for p in sorted((DOCS / folder).glob("*.md"))),
         DOCS / "controllers.md",
+        DOCS / "production.md",
     ]
     if (name := path.relative_to(DOCS).with_suffix("").as_posix()) not in STUDIES
     and "```sh" in path.read_text("utf-8")
