@@ -32,7 +32,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in every run; no deadline, because machines differ.
 settings.register_profile(
-    "loopcal", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    "loopcal",
+    max_examples=40,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("loopcal")
 

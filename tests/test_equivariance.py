@@ -29,7 +29,7 @@ from loopcal.mechanism.families import FAMILIES
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
-from tests.zoo import ROBOTS, load_cached_robot, move_base
+from tests.zoo import FEW_ROBOTS, ROBOTS, load_cached_robot, move_base
 
 Array = NDArray[np.float64]
 SINGLE = [robot for robot in ROBOTS if not load_cached_robot(str(robot.values[0])).stages]
@@ -153,7 +153,7 @@ def check_estimate(name: str, data: Measurements, order: Array | None = None) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", FEW_ROBOTS)
 def test_fit_does_not_depend_on_the_frame_of_the_instrument(name: str) -> None:
     data = measure_robot(name)
     (rows,) = data.observations
@@ -163,7 +163,7 @@ def test_fit_does_not_depend_on_the_frame_of_the_instrument(name: str) -> None:
     check_estimate(name, replace(data, observations=(moved,)))
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", FEW_ROBOTS)
 def test_fit_does_not_depend_on_the_order_of_poses(name: str) -> None:
     data = measure_robot(name)
     check_estimate(name, data.take(np.random.default_rng(8).permutation(POSES)))

@@ -49,6 +49,16 @@ ROBOTS = [
 ]
 """The names of all shipped robots, as parameters of a test."""
 
+FEW = {"3-prs", "arm-6r", "core-xy", "five-bar", "h4", "hexapod-42", "linear-delta", "ru-pus-prs"}
+"""One robot of each family and way to solve a closure: limbs in a plane and in space, shared
+drives, bodies in loops, stages."""
+
+FEW_ROBOTS = [
+    pytest.param(name, marks=() if name in FEW else pytest.mark.evidence)
+    for name in list_shipped_robots()
+]
+"""All shipped robots for statements that other tests prove of their parts; most run as evidence."""
+
 # --- hexapods with 42 parameters
 # ------------------------------------------------------------------------------------- "Numerical
 # simulation of the calibration algorithm for a 6-DOF parallel mechanism": Table 2 (nominal: base,

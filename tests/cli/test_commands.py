@@ -11,7 +11,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots
-from tests.zoo import ROBOTS
+from tests.zoo import FEW_ROBOTS
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 CALIBRATE = "calibrate hexapod-42 measurements.csv -o run"
@@ -254,7 +254,7 @@ def test_check_expand_shows_joint_angles_at_the_home_pose(loopcal, name) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", FEW_ROBOTS)
 def test_check_expand_of_every_shipped_robot_truncates_no_number(loopcal, robot) -> None:
     _, out, err = loopcal(f"check {robot} --expand")
     assert err == ""

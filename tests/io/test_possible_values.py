@@ -15,7 +15,7 @@ from loopcal.measure.instrument import Gaussian
 from loopcal.mechanism.compilation import find_impossible_values
 from loopcal.mechanism.solutions import forward
 from loopcal.units import SI_SYMBOLS
-from tests.zoo import ROBOTS
+from tests.zoo import FEW_ROBOTS
 
 WITHOUT_RODS = ("3-rps", "agile-eye", "belt-4", "pentapod", "pulley-3")
 
@@ -28,7 +28,7 @@ def write_table(tmp_path: Path, robot: str, rows: str) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", FEW_ROBOTS)
 def test_impossible_identified_values_are_refused_at_their_line(name: str, tmp_path: Path) -> None:
     robot = load_robot(name)
     positive = [p for p in robot.parameters.entries if p.positive]
@@ -83,7 +83,7 @@ def test_a_length_that_is_declared_positive_needs_such_a_value(tmp_path: Path, n
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", FEW_ROBOTS)
 def test_values_of_tolerated_machines_are_accepted(name: str, tmp_path: Path) -> None:
     robot = load_robot(name)
     sd = np.nan_to_num(robot.parameters.tolerance, nan=1e-4)

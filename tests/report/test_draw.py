@@ -14,7 +14,7 @@ from tests import zoo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", zoo.ROBOTS)
+@pytest.mark.parametrize("name", zoo.FEW_ROBOTS)
 def test_picture_of_every_shipped_robot_has_units_on_its_axes(name):
     robot = load_robot(name)
     figure = draw_robot(robot)

@@ -16,7 +16,7 @@ from tests.engine.cases import displacement_units, draw_map, make_pose_rows, pos
 from tests.engine.native.instruction_sets import list_arrays, make_engines, make_robot_case
 from tests.engine.test_compare_poses import draw_poses
 from tests.engine.test_triangles import make_systems
-from tests.zoo import ROBOTS
+from tests.zoo import FEW_ROBOTS, ROBOTS
 
 ENGINES = make_engines()
 NATIVE, NUMPY = next(iter(ENGINES.values())), select_engine("numpy")
@@ -65,7 +65,7 @@ def test_blocks_agree_with_numpy_and_between_instruction_sets(name, free):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", FEW_ROBOTS)
 @pytest.mark.parametrize(("t", "n"), [(1, 21), (5, 17), (9, 3)])
 @pytest.mark.parametrize("per_trial", [False, True])
 def test_derivatives_agree_with_numpy_and_between_instruction_sets(name, t, n, per_trial):
@@ -79,7 +79,7 @@ def test_derivatives_agree_with_numpy_and_between_instruction_sets(name, t, n, p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", FEW_ROBOTS)
 @pytest.mark.parametrize(("t", "n"), [(1, 21), (13, 5)])
 def test_folded_poses_agree_with_numpy_and_between_instruction_sets(name, t, n):
     arguments = make_pose_rows(NUMPY, name, t, n)
@@ -117,7 +117,7 @@ def test_inverse_solutions_agree_with_numpy_and_between_instruction_sets(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", FEW_ROBOTS)
 @pytest.mark.parametrize(("t", "n"), [(1, 21), (9, 3)])
 def test_limbs_of_a_given_platform_agree_with_numpy_and_between_instruction_sets(name, t, n):
     case = make_robot_case(name, t, n)
