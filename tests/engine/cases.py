@@ -352,5 +352,6 @@ def take_pose_rows(arguments: PoseRows, trials: NDArray[np.int64]) -> PoseRows:
     names = ("displacements", "joints", "basis", "readings")
     own = replace(inputs, **{name: take(getattr(inputs, name)) for name in names})
     rows = [replace(o, by_twist=take(o.by_twist), residual=o.residual[trials]) for o in observed]
-    moved = replace(state, T=state.T[trials], joints=tuple(a[trials] for a in state.joints))
+    joints, others = (tuple(a[trials] for a in arrays) for arrays in (state.joints, state.others))
+    moved = replace(state, T=state.T[trials], joints=joints, others=others)
     return program, e[trials], q[trials], moved, own, rows

@@ -56,7 +56,7 @@ def test_the_factor_is_that_of_written_rows(engine, name, t, n, per_trial):
     assert_same_gram(again, np.concatenate([rows, rows], axis=1))
 
 
-@pytest.mark.parametrize(("name", "n"), [("hexapod-42", 3), ("five-bar", 200)])
+@pytest.mark.parametrize(("name", "n"), [("hexapod-42", 3), ("five-bar", 200), ("six-bar", 200)])
 def test_trials_equal_single_trials_bit_for_bit(engine, name, n):
     arguments = make_pose_rows(engine, name, 13, n)
     together, _ = engine.fold_poses(make_zeros(arguments, 13), *arguments)

@@ -301,7 +301,8 @@ def fold_poses(
     for first in range(0, t, step):
         part = slice(first, min(first + step, t))
         if shared is None:
-            own = replace(state, T=state.T[part], joints=tuple(a[part] for a in state.joints))
+            joints, others = (tuple(a[part] for a in of) for of in (state.joints, state.others))
+            own = replace(state, T=state.T[part], joints=joints, others=others)
             arrays = _take(e, part), _take(q, part), own, _take_inputs(inputs, part)
             D, ok = _differentiate(program, *arrays)
         else:
