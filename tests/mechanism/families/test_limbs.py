@@ -315,6 +315,10 @@ INVALID_RECORDS = {
         "state a direction",
     ),
     "no copies": (change_limb(copies=Copies(0)), "has 0 copies"),
+    "copies about no axis": (
+        change_limb(copies=Copies(3, (0.0, 0.0, 0.0))),
+        "a copy has the axis [0, 0, 0]; state a direction",
+    ),
     "unknown owner": (
         replace(SLIDER, parameters=(NamedLength("r", 0.1, (MapEntry("arm", "P1", "x"),)),)),
         "'r' is mapped onto 'arm', which is not there; known are rod, q1, q2",

@@ -123,7 +123,7 @@ def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
                 for i in members:
                     T = frames[i][0, 0, element]
                     turn, point = _follow_joint(robot, i, element, T, values[i][element])
-                    u = turn @ frame_from_axis(_last_axis(joint), name).T @ axis
+                    u = turn @ frame_from_axis(_last_axis(joint), f"joint {name!r}").T @ axis
                     twist = np.concatenate([np.zeros(3), u])
                     if added.joint == "R":
                         twist = np.concatenate([u, np.cross(u, centers[i] - point)])

@@ -126,7 +126,7 @@ class Copies:
     """
 
     count: int
-    about: Literal["x", "y", "z"] = "z"
+    about: Axis = "z"
     step: Angle | None = None
     start: Angle = 0.0
 

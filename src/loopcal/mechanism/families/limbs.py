@@ -133,7 +133,8 @@ def _list_turns(copies: Copies | None) -> list[FloatArray]:
     if copies is None:
         return [np.eye(4)]
     step = copies.step if copies.step is not None else 2 * np.pi / copies.count
-    return [rotate_about(copies.about, copies.start + i * step) for i in range(copies.count)]
+    axis = axis_vector(copies.about)
+    return [rotate_about(axis, copies.start + i * step) for i in range(copies.count)]
 
 
 def _place_bodies(record: Limbs, limbs: Sequence[Limb]) -> dict[str, FloatArray]:

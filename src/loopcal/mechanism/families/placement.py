@@ -112,7 +112,7 @@ def place_limb(
     """
     back, links, rotations, placements = np.eye(4), [], {}, {}
     for step in steps:
-        link, turn = step.joint.name, frame_from_axis(step.axis, step.joint.name)
+        link, turn = step.joint.name, frame_from_axis(step.axis, f"joint {step.joint.name!r}")
         links.append(Link(link, back @ step.place @ rotation_matrix(turn)))
         rotations[link], placements[link] = turn, step.place
         back = rotation_matrix(turn.T)
@@ -153,13 +153,13 @@ def place_limb_with_ball(
     return place_limb(name, (*steps, *ball), np.eye(4), "rigid", attachment)
 
 
-def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
+def frame_from_axis(axis: FloatArray, owner: str) -> FloatArray:
     """Return a rotation (3, 3) whose third column is along `axis`; x, y and z give a cyclic
     permutation.
     """
     length = float(np.linalg.norm(axis))
     if not length > 0:
-        raise MechanismError(f"joint {name!r} has the axis [0, 0, 0]; state a direction")
+        raise MechanismError(f"{owner} has the axis [0, 0, 0]; state a direction")
     z = np.asarray(axis, dtype=float) / length
     # the cyclic successor of the largest component is never parallel to the axis
     across = np.eye(3)[(int(np.argmax(np.abs(z))) + 1) % 3]
@@ -227,9 +227,9 @@ def rotation_matrix(rotation: FloatArray) -> FloatArray:
     return geometry.make_pose(rotation, np.zeros(3))
 
 
-def rotate_about(axis: str, angle: float) -> FloatArray:
-    """Return a rotation (4, 4) about x, y or z [rad]."""
-    return rotation_matrix(geometry.exp_so3(angle * np.eye(3)["xyz".index(axis)]))
+def rotate_about(axis: FloatArray, angle: float) -> FloatArray:
+    """Return a rotation (4, 4) by an angle [rad] about an axis (3,) of any length but zero."""
+    return rotation_matrix(geometry.exp_so3(angle * frame_from_axis(axis, "a copy")[:, 2]))
 
 
 # Error models: named parameters with their maps, by hand for `ideal`, by rule for `complete`.

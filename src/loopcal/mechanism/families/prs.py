@@ -298,7 +298,7 @@ class ThreePrs(RobotRecord):
         check_spherical(self.name, self.spherical, self.error_model)
         limbs, errors = [], ErrorModel()
         for number in (1, 2, 3):
-            turn = rotate_about("z", 2 * np.pi / 3 * (number - 1))
+            turn = rotate_about(EZ, 2 * np.pi / 3 * (number - 1))
             base, platform = translate(self.base_radius), translate(self.platform_radius)
             frames = ChainFrames(turn @ base, turn @ platform, self.rod, self.home.matrix)
             axes = self.spherical == "axes"
