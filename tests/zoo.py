@@ -38,8 +38,9 @@ Array = NDArray[np.float64]
 MM = 1e-3
 
 RELATIVES = {
-    "3-rps", "6-pus", "cable-4", "hexapod-nategh-agheli", "hexapod-octahedral", "linear-delta-6",
-    "palletizer", "pulley-3", "rotary-delta", "solar-tracker", "tricept",
+    "3-rps", "6-pus", "cable-4", "cable-camera", "hexapod-nategh-agheli", "hexapod-octahedral",
+    "klann-leg", "linear-delta-6", "orthoglide", "palletizer", "pulley-3", "rotary-delta",
+    "solar-tracker", "telescopic-delta", "tricept",
 }  # fmt: skip
 """Shipped robots whose closure another shipped robot has, too; here the evidence tests them."""
 

@@ -17,7 +17,7 @@ from loopcal.mechanism.solutions import forward
 from loopcal.units import SI_SYMBOLS
 from tests.zoo import FEW_ROBOTS
 
-WITHOUT_RODS = ("3-rps", "agile-eye", "belt-4", "pentapod", "pulley-3")
+WITHOUT_RODS = ("3-rps", "agile-eye", "belt-4", "cable-camera", "pentapod", "pulley-3")
 
 
 def write_table(tmp_path: Path, robot: str, rows: str) -> Path:

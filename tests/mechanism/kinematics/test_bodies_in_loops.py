@@ -19,7 +19,7 @@ from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.modes import find_assembly_modes
 from loopcal.mechanism.sensitivity import differentiate_passive_joints
-from loopcal.mechanism.solutions import forward, inverse, jacobian
+from loopcal.mechanism.solutions import Solution, forward, inverse, jacobian
 from tests.mechanism.families.ranks import random_coordinates
 from tests.zoo import load_cached_robot
 
@@ -69,9 +69,27 @@ def place_jansen_leg(q: Array) -> tuple[Array, Array]:
     return foot, angle(U - foot)
 
 
+def place_klann_leg(q: Array) -> tuple[Array, Array]:
+    """Return feet (n, 2) in (x, z) and the directions (n,) from the feet to the knees."""
+    AC, BH, CF, CH, DE, EF, EG, FG, FH = 1e-3 * np.array(
+        [17.5, 23.7, 73.4, 38.8, 34.1, 57.7, 111.7, 59, 35.2]
+    )
+    B, D = 1e-3 * np.array([[-38.8, -12.5]]), 1e-3 * np.array([[-14.6, 41.9]])
+    C = AC * np.stack([np.cos(q), np.sin(q)], axis=1)
+    H = meet(C, CH, B, BH, -1)
+    F = meet(C, CF, H, FH, -1)
+    E = meet(F, EF, D, DE, 1)
+    foot = meet(E, EG, F, FG, 1)
+    return foot, angle(F - foot)
+
+
 @pytest.mark.parametrize(
     ("name", "place", "axes", "first"),
-    [("six-bar", place_six_bar, [0, 1], 0.0), ("jansen-leg", place_jansen_leg, [0, 2], np.pi / 2)],
+    [
+        ("six-bar", place_six_bar, [0, 1], 0.0),
+        ("jansen-leg", place_jansen_leg, [0, 2], np.pi / 2),
+        ("klann-leg", place_klann_leg, [0, 2], np.pi / 2),
+    ],
 )
 def test_planar_linkage_agrees_with_constructed_circles(
     name: str, place: Callable[[Array], tuple[Array, Array]], axes: list[int], first: float
@@ -85,6 +103,96 @@ def test_planar_linkage_agrees_with_constructed_circles(
         # the x axis of the lever in the plane (x, y), the z axis of the foot in (x, z)
         column = 0 if not first else 2
         assert_allclose(angle(solution.T[:, axes, column]), direction, rtol=0, atol=ATOL)
+
+
+def draw_machine(name: str, seed: int) -> tuple[Mechanism, dict[str, float]]:
+    """Return a shipped robot with errors as large as its tolerances, and its values by name."""
+    nominal = load_cached_robot(name)
+    draws = np.random.default_rng(seed).standard_normal(len(nominal.parameters))
+    machine = nominal.with_values(nominal.values + draws * nominal.parameters.tolerance)
+    return machine, dict(zip(machine.parameters.names, machine.values.tolist(), strict=True))
+
+
+def reach_poses(machine: Mechanism, seed: int) -> Solution:
+    """Return forward solutions of poses that inverse kinematics reaches, which must be the same."""
+    wanted = inverse(machine, random_coordinates(machine, POSES, seed))
+    assert wanted.converged.all()
+    back = forward(machine, wanted.q)
+    assert_allclose(back.T, wanted.T, rtol=0, atol=ATOL)
+    return back
+
+
+def test_both_fingers_of_a_gripper_are_where_the_rods_of_its_disc_put_them() -> None:
+    machine, value = draw_machine("gripper", 6)
+    solution = reach_poses(machine, 6)
+    q = solution.q[:, 0] + value["motor.offset"]
+    for side, way in (("right", 1.0), ("left", -1.0)):
+        pin = value[f"{side}-rod.pin.x"] * np.stack([np.cos(q), np.sin(q)], axis=1)
+        across = value[f"{side}.rail.y"] - pin[:, 1]
+        x = pin[:, 0] + way * np.sqrt(value[f"{side}-rod.length"] ** 2 - across**2)
+        if side == "right":
+            assert_allclose(solution.T[:, 0, 3], x, rtol=0, atol=ATOL)
+            assert_allclose(solution.T[:, 1, 3], value["right.rail.y"], rtol=0, atol=ATOL)
+        else:
+            rail = solution.passive_names.index("left.rail")
+            assert_allclose(solution.passive[:, rail], -x, rtol=0, atol=ATOL)
+
+
+def test_foot_of_a_biped_is_where_knee_and_push_rods_put_it() -> None:
+    machine, value = draw_machine("biped-leg", 7)
+    solution = reach_poses(machine, 7)
+    q = solution.q + [value[f"{name}.offset"] for name in ("knee", "left", "right")]
+    # the knee in the plane (z, x), in which a rotation about y is counterclockwise
+    arm = np.array([0.0, value["bend.crank.x"]])
+    crank = turn(q[:, 0], arm) + np.array([0.28, 0.0])
+    lever = np.array([-0.045962667, -0.038567257])
+    radius = float(np.linalg.norm(lever))
+    tip = meet(crank, value["bend.length"], np.zeros((1, 2)), radius, 1)
+    knee = angle(tip) - np.arctan2(*lever[::-1])
+    shank = geometry.exp_so3(knee[:, None] * [0.0, 1.0, 0.0])
+    cross = np.array([value["ankle.cross.x"], 0.0, value["ankle.cross.z"]])
+    assert_allclose(solution.T[:, :3, 3], shank @ cross, rtol=0, atol=ATOL)
+    foot = shank.swapaxes(1, 2) @ solution.T[:, :3, :3]
+    assert_allclose(foot[:, 1, 0], 0.0, atol=ATOL)  # its x axis is across the axis of the pitch
+    for k, (side, y, z) in enumerate((("left", 0.04, -0.08), ("right", -0.04, -0.18)), 1):
+        radius = value[f"{side}.crank.x"]
+        top = radius * np.stack([np.cos(q[:, k]), 0.0 * q[:, k], -np.sin(q[:, k])], axis=1)
+        ball = [value[f"{side}.platform.x"], value[f"{side}.platform.y"], -0.01]
+        rod = cross + foot @ ball - (top + np.array([0.0, y, z]))
+        length = np.linalg.norm(rod, axis=1)
+        assert_allclose(length, value[f"{side}.length"], rtol=0, atol=ATOL)
+
+
+def rotate(axis: Array | list[float], a: Array | float = 1.0) -> Array:
+    """Return rotations (n, 3, 3) by angles (n,) about an axis (3,) or axes (n, 3)."""
+    return geometry.exp_so3(np.atleast_1d(a)[:, None] * np.asarray(axis))
+
+
+def test_tool_of_a_delta_turns_with_its_telescopic_shaft() -> None:
+    machine, value = draw_machine("telescopic-delta", 8)
+    solution = reach_poses(machine, 8)
+    q, tool, origin = solution.q, solution.T[:, :3, :3], solution.T[:, :3, 3]
+    spindle = solution.passive[:, solution.passive_names.index("bearing.spindle")]
+    plate = tool @ rotate([0.0, 0.0, -1.0], spindle)
+    off = np.array([value["bearing.platform.x"], value["bearing.platform.y"], 0.0])
+    axis = np.array([value["bearing.spindle.x"], value["bearing.spindle.y"], 0.0])
+    center = origin + tool @ off - plate @ axis
+    for k in range(3):
+        arm, base = k + 1, rotate([0.0, 0.0, 2 * np.pi * k / 3])
+        tilt = [value[f"shoulder{arm}.motor.rx"], 0.0, value[f"shoulder{arm}.motor.rz"]]
+        swing = rotate(tilt) @ rotate([0.0, 1.0, 0.0], q[:, k] + value[f"q{arm}.offset"])
+        for side, y in (("left", 0.04), ("right", -0.04)):
+            elbow = swing @ [value[f"{side}{arm}.arm.x"], y, 0.0] + [0.2, 0.0, 0.0]
+            end = center + plate @ (base[0] @ [0.05, y, 0.0])
+            length = np.linalg.norm(end - elbow @ base[0].T, axis=1)
+            assert_allclose(length, value[f"{side}{arm}.length"], rtol=0, atol=ATOL)
+    tilt = rotate([value["shaft.motor.rx"], value["shaft.motor.ry"], 0.0])
+    yoke = (tilt @ rotate([0.0, 0.0, 1.0], q[:, 3] + value["tool.offset"]))[..., 0]
+    up = -origin / np.linalg.norm(origin, axis=1, keepdims=True)
+    upper = np.cross(up, yoke)  # the cross of a joint is square to its yoke and to the shaft
+    upper /= np.linalg.norm(upper, axis=1, keepdims=True)
+    lower = rotate(value["shaft.yoke.rz"] * up) @ upper[..., None]
+    assert_allclose(np.einsum("ni,ni->n", lower[..., 0], tool[..., 0]), 0.0, atol=ATOL)
 
 
 ARMS_OF_H4 = (
@@ -206,7 +314,7 @@ def test_machine_has_the_same_poses_derivatives_and_modes_in_every_form(
     assert modes[0] == modes[1] > 1
 
 
-@pytest.mark.parametrize("name", ["six-bar", "jansen-leg", "h4"])
+@pytest.mark.parametrize("name", ["six-bar", "h4", "klann-leg", "telescopic-delta"])
 def test_passive_joints_beside_bodies_have_the_derivatives_of_forward_kinematics(name: str) -> None:
     machine = load_cached_robot(name)
     q = inverse(machine, random_coordinates(machine, 2, seed=6)).q

@@ -152,13 +152,27 @@ def readings_of_agile_eye(T):
     )
 
 
+def readings_of_orthoglide(T):
+    """A carriage is behind the tool by the part of the rod along its slide."""
+    p, length = T[:, :3, 3], 0.31058
+    across = (p**2).sum(axis=1, keepdims=True) - p**2
+    return p + length - np.sqrt(length**2 - across)
+
+
+def readings_of_cable_camera(T):
+    """Lengths from four masts, the first two in one reading."""
+    masts = np.array([[-7, 5, 8], [7, 5, 8], [7, -5, 8], [-7, -5, 8]])
+    m, n, k, h = np.linalg.norm(T[:, :3, 3] - masts[:, None], axis=2)
+    return np.stack([m + n, k, h], axis=1)
+
+
 def draw(low, high, n, seed):
     """Draw coordinates (n, c) evenly."""
     return np.random.default_rng(seed).uniform(low, high, (n, len(low)))
 
 
 def sample(name, seed):
-    return sample_workspace(zoo.load_cached_robot(name), 60, seed=seed).coordinates
+    return sample_workspace(zoo.load_cached_robot(name), 100, seed=seed).coordinates
 
 
 PRS_RANGE = [0.65, -np.pi, 0.0], [0.75, np.pi, np.deg2rad(35)]
@@ -197,6 +211,18 @@ CLOSED_FORMS = {
         lambda: sample("agile-eye", 7),
         readings_of_agile_eye,
         1e-13,
+    ),
+    "orthoglide": (
+        lambda: zoo.load_cached_robot("orthoglide"),
+        lambda: sample("orthoglide", 8),
+        readings_of_orthoglide,
+        1e-13,
+    ),
+    "cable-camera": (
+        lambda: zoo.load_cached_robot("cable-camera"),
+        lambda: sample("cable-camera", 9),
+        readings_of_cable_camera,
+        1e-12,
     ),
 }
 
