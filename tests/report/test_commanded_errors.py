@@ -44,6 +44,13 @@ def test_report_of_a_tripod_says_that_commanded_poses_are_still_missed(tmp_path)
     assert (tmp_path / "report.html").read_text("utf-8").count(sentence) == 2  # verdict, errors
 
 
+def test_errors_that_the_actuators_correct_are_not_called_missed() -> None:
+    errors = calibrate_drawn("biped-leg").validation  # roll and pitch are commanded, x alone
+    assert errors is not None
+    (missed,) = re.findall(r"misses commanded poses by (.+) \(rms\)", describe_commanded(errors))
+    assert missed.split()[1:] == ["mm", "in", "position"]
+
+
 def test_a_machine_that_can_correct_everything_has_no_such_sentence() -> None:
     errors = calibrate_drawn("hexapod-42").validation
     assert errors is not None

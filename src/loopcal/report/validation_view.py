@@ -159,7 +159,7 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
     Errors after commanding are left out where they equal the prediction errors, because the
     actuators can correct everything.
     """
-    is_correctable = is_fully_compensable(validation)
+    is_correctable = bool(validation.quantities) and not list_missed_quantities(validation)
     errors = validation.errors() if with_before else {"predicted": validation.after}
     if is_correctable:
         errors = {name: e for name, e in errors.items() if name.startswith("predicted")}
@@ -177,27 +177,26 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
     return [table]
 
 
-def is_fully_compensable(validation: Validation) -> bool:
-    """Return whether the actuators can correct all of the measured error."""
-    errors = validation.not_compensable
-    return bool(validation.quantities) and all(
-        errors.statistics(quantity).max / validation.units[quantity].factor_to_si < ROUNDING
+def list_missed_quantities(validation: Validation) -> list[str]:
+    """Return the quantities whose measured errors the actuators cannot correct in full."""
+    errors, units = validation.not_compensable, validation.units
+    return [
+        quantity
         for quantity in validation.quantities
-    )
+        if not errors.statistics(quantity).max / units[quantity].factor_to_si < ROUNDING
+    ]
 
 
 def describe_commanded(validation: Validation) -> str:
     """Return by how much commanded poses are missed after calibration, as a sentence; empty where
     the actuators can correct all of the measured error.
     """
-    if not validation.quantities or is_fully_compensable(validation):
-        return ""
     shown = []
-    for quantity in validation.quantities:
+    for quantity in list_missed_quantities(validation):
         statistics = validation.commanded_after.statistics(quantity)
         unit = validation.units[quantity]
         if statistics.count and math.isfinite(statistics.rms):
-            shown.append(f"{format_in(unit, statistics.rms, 3)} {unit.symbol}")
+            shown.append(f"{format_in(unit, statistics.rms, 3)} {unit.symbol} in {quantity}")
     return COMMANDED.format(errors=" and ".join(shown)) if shown else ""
 
 
