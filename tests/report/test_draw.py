@@ -10,6 +10,7 @@ from loopcal.io.core.text_file import write_bytes
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.pictures import save_figure
+from loopcal.report.scene.scene import list_parts
 from tests import zoo
 
 
@@ -57,6 +58,13 @@ def test_a_machine_in_an_upright_plane_is_shown_from_the_side():
     assert axes.get_title() == "from the side"
     assert axes.get_ylabel() == "z [mm]"
     assert draw_robot(zoo.hexapod()).axes[1].get_title() == "from above"
+
+
+def test_universal_joint_between_two_bodies_is_drawn_as_one_point():
+    robot = load_robot("biped-leg")
+    (line,) = (p for p in list_parts(robot, robot.home_state) if p.role == "limb" and p.index == 2)
+    assert robot.assembly.limbs[2].name == "ankle"
+    assert np.ptp(line.points, axis=1).max() < 1e-12  # [m] was an arc of 84 mm about the joint
 
 
 def test_links_of_a_spherical_machine_are_arcs_about_its_center():

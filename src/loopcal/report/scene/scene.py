@@ -171,12 +171,12 @@ def _arrange_limb(frames: FloatArray, size: float) -> tuple[FloatArray, FloatArr
     """Return the frames (n, J + 2, 4, 4) of a limb as they are drawn, and the line (n, m, 3) along
     it.
 
-    Where all axes of a limb meet in one point, its links have no lengths. They are drawn as arcs
-    about this point, each joint on its axis, from the motor inwards.
+    Where three or more axes of a limb meet in one point, its links have no lengths. They are drawn
+    as arcs about this point, each joint on its axis, from the motor inwards.
     """
     points, n_joints = frames[:, :, :3, 3], frames.shape[1] - 2
     center = points[:, :1]
-    if n_joints < 2 or np.abs(points - center).max() > COINCIDENT * size:
+    if n_joints < 3 or np.abs(points - center).max() > COINCIDENT * size:
         return frames, points[:, :-1]
     arms = frames[:, :n_joints, :3, 2] * (size * np.linspace(*SPHERE, n_joints))[:, None]
     arranged = frames.copy()
