@@ -14,9 +14,9 @@ length.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -260,21 +260,15 @@ class State:
     closure_sign: NDArray[np.int8]
     others: tuple[FloatArray, ...] = ()
 
-    def select(self, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
+    def select(self, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> Self:
         """Return rows (trial, pose) of a state that broadcasts to a shape (t, n), as (rows, 1)."""
 
-        def chosen(a: np.ndarray) -> np.ndarray:
+        def chosen(a: Any) -> Any:
+            if isinstance(a, tuple):
+                return tuple(map(chosen, a))
             return np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None]
 
-        return State(
-            chosen(self.T),
-            tuple(map(chosen, self.joints)),
-            chosen(self.status),
-            chosen(self.residual),
-            chosen(self.iterations),
-            chosen(self.closure_sign),
-            tuple(map(chosen, self.others)),
-        )
+        return replace(self, **{f.name: chosen(getattr(self, f.name)) for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)

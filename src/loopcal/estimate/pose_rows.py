@@ -154,7 +154,7 @@ class PoseRows:
         is_simple = all(r.kind.poses_per_row == 1 and not r.kind.sensed_joints for r in self.rows)
         robot = self.free.robot
         has_more = self.free.errors is not None or robot.stages or robot.has_open_sums
-        return is_simple and not has_more
+        return is_simple and not (has_more or robot.program.may_stay_open)
 
     @property
     def is_kept(self) -> bool:

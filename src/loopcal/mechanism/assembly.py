@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -132,26 +132,23 @@ class LinearMap:
     coefficient: float = 1.0
 
 
-class SharedMap(Protocol):
-    """Smooth map of several parameters onto several addresses, such as delta radius and angle."""
+@dataclass(frozen=True)
+class SharedMap:
+    """Smooth map of several parameters onto several addresses, such as delta radius and angle.
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the i parameters."""
-        ...
+    inputs : names of the i parameters. outputs : the o addresses.
+    """
 
-    @property
-    def outputs(self) -> tuple[Address, ...]:
-        """The o addresses."""
-        ...
+    inputs: tuple[str, ...]
+    outputs: tuple[Address, ...]
 
     def value(self, inputs: FloatArray) -> FloatArray:
         """Map (t, i) to (t, o); its change from the nominal value is the displacement."""
-        ...
+        raise NotImplementedError
 
     def jacobian(self, inputs: FloatArray) -> FloatArray:
         """Return the derivative (t, o, i) at inputs (t, i)."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from loopcal.mechanism.platform_coordinates import (
     pose_from_coordinates,
     read_coordinates,
 )
-from loopcal.mechanism.states import Status, driven_values, make_start, without_poses
+from loopcal.mechanism.states import Status, driven_values, without_poses
 from loopcal.mechanism.transmission import (
     apply_weights,
     find_reversed,
@@ -592,21 +592,13 @@ class _Rows:
 
     def list_states(self, now: _Iterate) -> list[State]:
         """Return the states (R, 1) of all stages at an iterate."""
-        X, parts, states = self.serial.move(now.u), iter(now.loops), []
-        for i, stage in enumerate(self.stages):
-            if stage.robot.is_serial:
-                T = np.broadcast_to(np.eye(4), (len(now.u), 4, 4))
-                for k in self.serial.places[i]:
-                    T = T @ X[:, k]
-                (group,) = stage.robot.program.groups
-                joints = np.zeros((len(T), 1, 1, len(group.actuator)))
-                drives = group.actuator[: len(group.joints), 0]
-                joints[:, 0, 0, : len(drives)] = now.u[:, stage.actuators][:, drives]
-                start = make_start(T[:, None], (joints,))
-                states.append(replace(start, closure_sign=np.ones_like(start.status)))
-            else:
-                states.append(next(parts))
-        return states
+        parts = iter(now.loops)
+        return [
+            solve_serial(stage.robot, e, now.u[:, None, stage.actuators])
+            if stage.robot.is_serial
+            else next(parts)
+            for stage, e in zip(self.stages, self.e, strict=True)
+        ]
 
 
 def solve_by_drives(

@@ -37,14 +37,7 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_by_drives
-from loopcal.mechanism.states import (
-    Status,
-    driven_values,
-    list_bodies,
-    replace_rows,
-    select_rows,
-    without_poses,
-)
+from loopcal.mechanism.states import Status, driven_values, list_bodies, replace_rows, without_poses
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
     TERMS,
@@ -136,12 +129,12 @@ def follow_path(
     trial, pose = np.nonzero(wrong)
     loops = loops.select(trial, shape[0])
     target = np.broadcast_to(joints, (*shape, joints.shape[2]))[trial, pose][:, None]
-    first, result = select_rows(begin, shape, trial, pose), select_rows(state, shape, trial, pose)
+    first, result = begin.select(shape, trial, pose), state.select(shape, trial, pose)
     origin = loops.read(first)
     alive = np.arange(len(trial))
     for count in PATH_STEPS:
         zero = np.zeros(len(alive), int)
-        begun = select_rows(first, (len(trial), 1), alive, zero)
+        begun = first.select((len(trial), 1), alive, zero)
         path = origin[alive], target[alive]
         leave = count == PATH_STEPS[-1]
         current = _take_steps(loops.select(alive), path, begun, count, leave)
@@ -171,7 +164,7 @@ def _take_steps(
     for step in range(1, count + 1):
         zero = np.zeros(len(moving), int)
         q = origin[moving] + (target[moving] - origin[moving]) * (step / count)
-        begun = select_rows(current, (len(target), 1), moving, zero)
+        begun = current.select((len(target), 1), moving, zero)
         solved = loops.select(moving).solve(q, begun)
         current = replace_rows(current, moving, zero, solved)
         if leave and step < count:
@@ -179,7 +172,7 @@ def _take_steps(
             failed = moving[(status != Status.CONVERGED.value) | (gap > WIDE * robot.size)]
             if len(failed):
                 zero = np.zeros(len(failed), int)
-                state = select_rows(current, (len(target), 1), failed, zero)
+                state = current.select((len(target), 1), failed, zero)
                 solved = loops.select(failed).solve(target[failed], state)
                 current = replace_rows(current, failed, zero, solved)
                 moving = np.setdiff1d(moving, failed)

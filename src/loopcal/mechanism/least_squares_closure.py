@@ -18,16 +18,16 @@ docs/theory/over-constraint.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.engine import ParameterMap, Program, State, TwistRows
+from loopcal.engine import ParameterMap, Program, State
 from loopcal.mechanism.limb_rows import expand_map, follow_limb, measure_rod
 from loopcal.mechanism.states import make_start
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import FloatArray
 
 CHUNK = 512
 """Rows differentiated together."""
@@ -166,29 +166,6 @@ def list_unknown_joints(program: Program) -> list[tuple[int, int]]:
         for limb in group.limbs
         for joint in group.unknown_joints(False)
     ]
-
-
-def fold_unclosed_poses(
-    factor: FloatArray,
-    program: Program,
-    e: FloatArray,
-    q: FloatArray,
-    state: State,
-    inputs: ParameterMap,
-    observed: Sequence[TwistRows],
-) -> tuple[FloatArray, BoolArray]:
-    """Fold rows of observed poses with the derivatives above; see `loopcal.engine.fold_poses`."""
-    D, _ = differentiate_open(program, e, q, state, inputs)
-    is_finite = np.asarray(np.isfinite(D).all(axis=(2, 3)))
-    D = np.where(is_finite[..., None, None], D, 0.0)
-    shape = len(factor), state.T.shape[1]
-    for twists in observed:
-        poses = twists.poses
-        residual = np.where(is_finite[:, poses, None], twists.residual, 0.0)
-        slopes = np.broadcast_to(twists.by_twist @ D[:, poses], (*residual.shape, D.shape[3]))
-        rows = np.concatenate([slopes, residual[..., None]], axis=-1)
-        factor = engine.fold(factor, rows.reshape(len(rows), -1, rows.shape[-1]))
-    return factor, np.broadcast_to(is_finite, shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,6 @@ from loopcal.mechanism.chains import (
 from loopcal.mechanism.least_squares_closure import (
     differentiate_open,
     differentiate_unknowns,
-    fold_unclosed_poses,
     list_unknown_joints,
 )
 from loopcal.mechanism.limb_rows import move_passive_joints, name_passive_joints
@@ -159,12 +158,11 @@ def fold_pose_rows(
 ) -> tuple[FloatArray, BoolArray]:
     """Fold rows [G D | r] of observed poses into factors (t, p + 1, p + 1), with D of
     `differentiate_pose`; see `engine.fold_poses`. For robots without stages whose readings
-    determine the joints.
+    determine the joints, and whose loops close.
     """
     e, tau, joints = driven or drive_joints(robot, values, q)
     inputs = columns.linearize(values, tau, q)
-    fold_poses = fold_unclosed_poses if robot.program.may_stay_open else engine.fold_poses
-    return fold_poses(factor, robot.program, e, joints, state, inputs, observed)
+    return engine.fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 
 class PassiveSensitivity(NamedTuple):

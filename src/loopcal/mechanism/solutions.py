@@ -84,7 +84,11 @@ def connect_by_readings(robot: Mechanism, first: State, last: State) -> tuple[St
 
 def connect_by_poses(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
     """Follow the straight paths of poses, and return what `connect_by_readings` returns."""
-    return _connect(robot, first, last, np.zeros(last.T.shape[1], bool), _move_poses)
+
+    def path(robot: Mechanism, first: State, last: State) -> Step:
+        return _move_poses(robot, first, last.T[0])
+
+    return _connect(robot, first, last, np.zeros(last.T.shape[1], bool), path)
 
 
 def _connect(
@@ -162,10 +166,10 @@ def _move_readings(robot: Mechanism, first: State, last: State) -> Step:
     return step
 
 
-def _move_poses(robot: Mechanism, first: State, last: State) -> Step:
-    """Return the steps along straight paths of poses between states (1, k)."""
+def _move_poses(robot: Mechanism, first: State, last: FloatArray) -> Step:
+    """Return the steps along straight paths from states (1, k) to poses (k, 4, 4)."""
     values = robot.values[None]
-    twist = geometry.pose_difference(last.T[0], first.T[0])
+    twist = geometry.pose_difference(last, first.T[0])
 
     def step(rows: IntArray, share: FloatArray, current: State) -> State:
         via = geometry.apply_twist(first.T[0, rows], share[:, None] * twist[rows])
@@ -411,13 +415,9 @@ def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State,
     """Return solutions (1, k) close to poses T (n, 4, 4), reached from the start (1, n) in equal
     steps, and which of these rows arrived (k,).
     """
-    values, alive, current = robot.values[None], np.arange(len(T)), first
-    twist = geometry.pose_difference(T, first.T[0])
+    alive, current, step = np.arange(len(T)), first, _move_poses(robot, first, T)
     for i in range(1, STEPS + 1):
-        via = geometry.apply_twist(first.T[0, alive], (i / STEPS) * twist[alive])
-        target = read_coordinates(via, robot.controlled)
-        cheap = {"follow": False, "max_iterations": ITERATIONS}
-        current = close_at_coordinates(robot, values, target[None], current, **cheap)
+        current = step(alive, np.full(len(alive), i / STEPS), current)
         closed = current.status[0] == Status.CONVERGED
         current, alive = select_poses(current, closed), alive[closed]
         if not len(alive):

@@ -61,13 +61,6 @@ def list_bodies(state: State) -> list[FloatArray]:
     return [state.T, *state.others, np.eye(4)]
 
 
-def select_rows(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
-    """Return rows (trial, pose) of a state that broadcasts to `shape` = (t, n), as (rows, 1)."""
-    return map_arrays(
-        lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None], state
-    )
-
-
 def select_poses(state: State, rows: np.ndarray) -> State:
     """Return poses `rows` (positions or a mask) of a state (t, n), all trials."""
     return map_arrays(lambda a: a[:, rows], state)

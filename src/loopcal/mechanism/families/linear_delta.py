@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.geometry import stack_matrix
-from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, LinearMap
+from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, LinearMap, SharedMap
 from loopcal.mechanism.families.placement import (
     EZ,
     AngleTolerance,
@@ -47,14 +47,11 @@ class DeltaTolerances:
 
 
 @dataclass(frozen=True)
-class TowerMap:
+class TowerMap(SharedMap):
     """Map (radius, angle, arm, stop) to the tower's displacement and the carriage's offset.
 
     x = radius cos angle, y = radius sin angle, offset = stop + sqrt(arm^2 - radius^2).
     """
-
-    inputs: tuple[str, ...]
-    outputs: tuple[Address, ...]
 
     def value(self, inputs: FloatArray) -> FloatArray:
         """Map (t, 4) [m, rad, m, m] to (t, 3) [m]."""

@@ -24,7 +24,6 @@ from loopcal.mechanism.assembly import (
     AttachedStage,
     Joint,
     LinearMap,
-    SharedMap,
 )
 from loopcal.mechanism.families.drives import (
     Drive,
@@ -62,8 +61,6 @@ from loopcal.mechanism.families.placement import (
     strip_number,
 )
 from loopcal.mechanism.families.records import RobotRecord
-from loopcal.parameters import CommonError
-from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
 # The assembly of a chain: those of its stages, with the stage before each name.
@@ -74,26 +71,6 @@ class StageError(RecordError):
 
     def __init__(self, sentence: str, index: int) -> None:
         super().__init__(sentence, "stages", index)
-
-
-@dataclass(frozen=True)
-class StageMap:
-    """A shared map of a stage, with the names of the chain.
-
-    inputs, outputs : as in `SharedMap`. own : the map of the stage.
-    """
-
-    inputs: tuple[str, ...]
-    outputs: tuple[Address, ...]
-    own: SharedMap
-
-    def value(self, inputs: FloatArray) -> FloatArray:
-        """Return the value of the stage's own map."""
-        return self.own.value(inputs)
-
-    def jacobian(self, inputs: FloatArray) -> FloatArray:
-        """Return the derivative of the stage's own map."""
-        return self.own.jacobian(inputs)
 
 
 def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> list[str]:
@@ -146,21 +123,12 @@ def _refuse_later(names: Sequence[str], parents: Sequence[str], i: int) -> None:
     )
 
 
-def join_stages(
-    name: str,
-    stages: Sequence[AttachedStage],
-    *,
-    controlled: tuple[str, ...],
-    tool: FloatArray,
-    workspace: dict[str, tuple[float, float]],
-    source: str,
-    held: tuple[str, ...] = (),
-) -> Assembly:
+def join_stages(record: Stages, stages: Sequence[AttachedStage]) -> Assembly:
     """Return the assembly of a chain; its home is found when it is compiled."""
     _refuse_wrong_drives(stages)
     assemblies = [(stage.name, stage.assembly) for stage in stages]
     return Assembly(
-        name,
+        record.name,
         tuple(
             replace(limb, name=f"{prefix}.{limb.name}")
             for prefix, part in assemblies
@@ -168,7 +136,7 @@ def join_stages(
         ),
         tuple(actuator for _, part in assemblies for actuator in part.actuators),
         AXES,
-        controlled,
+        record.controlled,
         stages[-1].mount,
         tuple(
             replace(parameter, name=f"{prefix}.{parameter.name}")
@@ -185,29 +153,29 @@ def join_stages(
             for entry in part.maps
         ),
         tuple(
-            StageMap(
-                tuple(f"{prefix}.{name}" for name in shared.inputs),
-                tuple(_rename_address(prefix, part, address) for address in shared.outputs),
+            replace(
                 shared,
+                inputs=tuple(f"{prefix}.{name}" for name in shared.inputs),
+                outputs=tuple(_rename_address(prefix, part, address) for address in shared.outputs),
             )
             for prefix, part in assemblies
             for shared in part.shared
         ),
-        tool,
-        workspace,
-        source,
+        record.tool.matrix,
+        record.workspace.ranges,
+        record.source,
         tuple(f"{prefix}.{name}" for prefix, part in assemblies for name in part.stored_parameters),
         tuple(
-            CommonError(
-                f"{prefix}.{error.name}",
-                tuple(f"{prefix}.{name}" for name in error.parameters),
-                error.tolerance,
+            replace(
+                error,
+                name=f"{prefix}.{error.name}",
+                parameters=tuple(f"{prefix}.{name}" for name in error.parameters),
             )
             for prefix, part in assemblies
             for error in part.common_errors
         ),
         tuple(stages),
-        held=held,
+        held=record.held,
     )
 
 
@@ -379,15 +347,7 @@ class PlacedStages(Stages):
         )
         actuators = [a.name for stage in attached for a in stage.assembly.actuators]
         refuse_idle_drives(self.drives, actuators, map(strip_number, actuators))
-        return join_stages(
-            self.name,
-            attached,
-            controlled=self.controlled,
-            tool=self.tool.matrix,
-            workspace=dict(self.workspace.ranges),
-            source=self.source,
-            held=self.held,
-        )
+        return join_stages(self, attached)
 
     def _expand_stage(self, i: int) -> Assembly:
         """Return the assembly of a stage alone."""

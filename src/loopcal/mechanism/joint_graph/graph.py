@@ -81,10 +81,6 @@ class GraphJoint:
         back = geometry.invert_pose(self.T_a) @ self.move(np.array(-offset))
         return replace(self, drive=drive, axis=sign * self.axis, T_b=self.T_b @ back)
 
-    def get_other_body(self, body: str) -> str:
-        """Return the body at the other end."""
-        return self.body_b if body == self.body_a else self.body_a
-
     def move(self, values: FloatArray) -> FloatArray:
         """Return the frames (.., 4, 4) of the second body in the first one, at values (..)."""
         vectors = values[..., None] * self.axis

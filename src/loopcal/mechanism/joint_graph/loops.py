@@ -99,7 +99,7 @@ class JointGraph:
         return float(np.linalg.norm(places, axis=-1).max(initial=0.0)) or 1.0
 
     @cached_property
-    def _columns(self) -> FloatArray:
+    def units(self) -> FloatArray:
         """Unit of each joint value in the scaled closures (j,) [rad, m]."""
         return np.where(self.turns, 1.0, self.size)
 
@@ -159,6 +159,13 @@ class JointGraph:
         """Return the places (n, 4, 4) of a body."""
         return placement.T[:, self._index[body]]
 
+    def locate_ends(self, placement: Placement, joint: GraphJoint) -> tuple[FloatArray, FloatArray]:
+        """Return the frames (n, 4, 4) of a joint on both of its bodies, in the base."""
+        return (
+            self.get_place(placement, joint.body_a) @ joint.T_a,
+            self.get_place(placement, joint.body_b) @ joint.T_b,
+        )
+
     def differentiate(
         self, placement: Placement, body: str, point: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -178,20 +185,19 @@ class JointGraph:
         Lengths are divided by `size`, and a slide's value is counted in it.
         """
         placement = self.place(q)
-        residual = [q / self._columns @ self.shared.T]
+        residual = [q / self.units @ self.shared.T]
         rows = [np.tile(self.shared, (len(q), 1, 1))]
         for joint in self.closing:
             r, J = self._linearize_joint(placement, joint)
             residual.append(r)
-            rows.append(J * self._columns)
+            rows.append(J * self.units)
         return np.concatenate(residual, axis=1), np.concatenate(rows, axis=1)
 
     def _linearize_joint(
         self, placement: Placement, joint: GraphJoint
     ) -> tuple[FloatArray, FloatArray]:
         """Return residuals and derivatives of one closure."""
-        P = self.get_place(placement, joint.body_a) @ joint.T_a
-        Q = self.get_place(placement, joint.body_b) @ joint.T_b
+        P, Q = self.locate_ends(placement, joint)
         p, q = P[:, :3, 3], Q[:, :3, 3]
         turn_p, speed_p = self.differentiate(placement, joint.body_a, p)
         turn_q, speed_q = self.differentiate(placement, joint.body_b, q)
@@ -231,7 +237,7 @@ class JointGraph:
             inverse = np.linalg.pinv(rows[active][:, :, free], rcond=CLOSURE_RANK_TOLERANCE)
             step[:, free] = -(inverse @ residual[active][:, :, None])[:, :, 0]
             largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
-            q[left[active]] += step * np.minimum(1.0, LARGEST_STEP / largest) * self._columns
+            q[left[active]] += step * np.minimum(1.0, LARGEST_STEP / largest) * self.units
         q[~is_closed] = np.nan
         return q
 
@@ -242,10 +248,10 @@ class JointGraph:
         """
         rows = self.linearize(q[None])[1][0]
         if not len(rows):
-            return np.diag(self._columns)
+            return np.diag(self.units)
         _, s, V = np.linalg.svd(rows)
         null = V[int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum()) :]
-        return self._columns[:, None] * null.T
+        return self.units[:, None] * null.T
 
     def find_twists(self, q: FloatArray, body: str, frame: FloatArray) -> FloatArray:
         """Return the twist (6, j) of a frame (4, 4) of a body by joint values (j,), about its
@@ -299,23 +305,22 @@ def find_homes(graph: JointGraph) -> tuple[FloatArray, ...]:
     """Return joint values (j,) that close the loops, those within their limits and nearest to zero
     first, without poses of larger mobility; raises MechanismError where the loops do not close.
     """
-    sizes = np.where(graph.turns, 1.0, graph.size)
     low, high = _list_limits(graph)
     rest = np.clip(np.zeros(len(low)), low, high)
     spreads = [0.0, *[SPREAD] * (STARTS - 1)]  # of the starts from zero: the first is there
     drawn = [np.random.default_rng(i).uniform(-s, s, len(rest)) for i, s in enumerate(spreads)]
-    starts = np.stack([rest + shift * sizes for shift in drawn])
+    starts = np.stack([rest + shift * graph.units for shift in drawn])
     closed = [q for q in graph.close(starts) if np.isfinite(q).all()]
     if not closed:
         raise MechanismError(_describe_gap(graph, starts))
     mobilities = [graph.find_motions(q).shape[1] for q in closed]
     regular = [q for q, m in zip(closed, mobilities, strict=True) if m == min(mobilities)]
     inside = [bool(((low - SAME <= q) & (q <= high + SAME)).all()) for q in regular]
-    distances = [float((((q - rest) / sizes) ** 2).sum()) for q in regular]
+    distances = [float((((q - rest) / graph.units) ** 2).sum()) for q in regular]
     order = sorted(range(len(regular)), key=lambda i: (not inside[i], distances[i]))
     homes: list[FloatArray] = []
     for q in (regular[i] for i in order):
-        if all(np.abs((q - other) / sizes).max(initial=0.0) > SAME for other in homes):
+        if all(np.abs((q - other) / graph.units).max(initial=0.0) > SAME for other in homes):
             homes.append(q)
     return tuple(homes)
 
@@ -323,8 +328,7 @@ def find_homes(graph: JointGraph) -> tuple[FloatArray, ...]:
 def is_drawn_pose(graph: JointGraph, q: FloatArray) -> bool:
     """Return whether a pose (j,) is the one that all joints have at zero, or at a limit near it."""
     rest = np.clip(np.zeros(len(q)), *_list_limits(graph))
-    sizes = np.where(graph.turns, 1.0, graph.size)
-    return bool(np.abs((q - rest) / sizes).max(initial=0.0) < DRAWN)
+    return bool(np.abs((q - rest) / graph.units).max(initial=0.0) < DRAWN)
 
 
 def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
@@ -332,10 +336,9 @@ def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
     smallest singular values of the closures by the passive joints, and of the platform's twist by
     the rates.
     """
-    sizes, passive = np.where(graph.turns, 1.0, graph.size), ~graph.is_driven
-    rates = graph.find_motions(q) / sizes[:, None]
+    passive, rates = ~graph.is_driven, graph.find_motions(q) / graph.units[:, None]
     place = graph.get_place(graph.place(q[None]), platform)[0]
-    twists = graph.find_twists(q, platform, np.eye(4)) * sizes
+    twists = graph.find_twists(q, platform, np.eye(4)) * graph.units
     twists[3:] /= max(graph.size, float(np.linalg.norm(place[:3, 3])))
     outputs = np.concatenate([rates[graph.is_driven], twists @ rates])
     _, s, V = np.linalg.svd(outputs)
@@ -354,13 +357,12 @@ def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
 
 def list_nearby(graph: JointGraph, home: FloatArray) -> FloatArray:
     """Return a pose (j,), and others (n, j) with the motors moved a little."""
-    sizes = np.where(graph.turns, 1.0, graph.size) * graph.is_driven
     shifts = [np.zeros(len(home))]
     for seed in range(NEAR):
         rng = np.random.default_rng(seed)
         values = dict(zip(graph.motors, rng.uniform(-1, 1, len(graph.motors)), strict=True))
         moved = np.array([values.get(joint.drive, 0.0) for joint in graph.tree])
-        shifts.append(NEAR_RANGE * moved * sizes)
+        shifts.append(NEAR_RANGE * moved * graph.units * graph.is_driven)
     near = graph.close(home + np.stack(shifts), graph.is_driven)
     near[0] = home
     return near[np.isfinite(near).all(axis=1)]
@@ -368,12 +370,8 @@ def list_nearby(graph: JointGraph, home: FloatArray) -> FloatArray:
 
 def measure_rotation(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> FloatArray:
     """Return the rotation (3, 3) of a joint that closes a loop, at joint values (j,)."""
-    placement = graph.place(q[None])
-    A, B = (
-        (graph.get_place(placement, body) @ T)[0, :3, :3]
-        for body, T in ((joint.body_a, joint.T_a), (joint.body_b, joint.T_b))
-    )
-    return A.T @ B
+    A, B = graph.locate_ends(graph.place(q[None]), joint)
+    return A[0, :3, :3].T @ B[0, :3, :3]
 
 
 def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
@@ -383,10 +381,8 @@ def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
             return float(q[i])
     if joint.kind == "R":
         return float(geometry.log_so3(measure_rotation(graph, q, joint)) @ joint.axis)
-    placement = graph.place(q[None])
-    A = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
-    B = (graph.get_place(placement, joint.body_b) @ joint.T_b)[0]
-    return float((geometry.invert_pose(A) @ B)[:3, 3] @ joint.axis)
+    A, B = graph.locate_ends(graph.place(q[None]), joint)
+    return float((geometry.invert_pose(A) @ B)[0, :3, 3] @ joint.axis)
 
 
 def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
@@ -409,20 +405,18 @@ def approach_closure(graph: JointGraph, starts: FloatArray) -> FloatArray:
 
     Directions that hardly change the closures are left out of the steps.
     """
-    sizes = np.where(graph.turns, 1.0, graph.size)
     q = starts
     for _ in range(STARTS):
         residual, rows = graph.linearize(q)
         step = -(np.linalg.pinv(rows, rcond=WEAK) @ residual[:, :, None])[:, :, 0]
         largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
-        q = q + step * np.minimum(1.0, 0.3 / largest) * sizes
+        q = q + step * np.minimum(1.0, 0.3 / largest) * graph.units
     return q
 
 
 def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> tuple[float, float]:
     """Return the distance [m] and angle [rad] between both sides of a closing joint."""
-    A = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
-    B = (graph.get_place(placement, joint.body_b) @ joint.T_b)[0]
+    A, B = (T[0] for T in graph.locate_ends(placement, joint))
     gap = B[:3, 3] - A[:3, 3]
     if joint.kind == "S":
         return float(np.linalg.norm(gap)), 0.0
@@ -509,9 +503,7 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
     bodies in their places, and the largest rotation of an axis [rad].
     """
     placement = graph.place(q[None])
-    frames = {
-        joint: (graph.get_place(placement, joint.body_a) @ joint.T_a)[0] for joint in graph.joints
-    }
+    frames = {joint: graph.locate_ends(placement, joint)[0][0] for joint in graph.joints}
     moving = [joint for joint in graph.joints if joint.kind != "S"]
     axes = {joint: frames[joint][:3, :3] @ joint.axis for joint in moving}
     known = list(np.eye(3))
