@@ -309,3 +309,27 @@ def test_height_maps_of_two_days_are_named(capsys) -> None:
         Path(f"{name}.csv").write_text(head + titles + rows)
     assert run("import config.g --probes a.csv --probes b.csv -o p.yaml --data h.csv") == 0
     assert "are of 2026-05-04 and 2026-05-31" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("slope", "shift", "words"),
+    [
+        (4e-3, 0.0, "Check whether the bed is square to the machine before you apply values"),
+        (0.0, 4.2, "Check the zero of the probe before you apply values"),
+        (4e-3, 4.2, "Check the zero of the probe and whether the bed is square to the machine"),
+    ],
+)
+def test_values_are_not_recommended_where_bed_or_probe_explain_heights_alone(
+    slope, shift, words, capsys
+) -> None:
+    """The numbers of the firmware are right: its heights are those of the bed and of the probe."""
+    noise = np.random.default_rng(1).normal(0.0, 0.015, len(POINTS))
+    write_points(POINTS, [shift + slope * x + e for (x, _), e in zip(POINTS, noise, strict=True)])
+    line = "--probes report.txt -o printer.yaml --data heights.csv --sigma-height 0.015mm"
+    assert run(f"import m503.gcode {line}") == 0
+    assert run("calibrate printer.yaml heights.csv -o run") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert f"Recommendation: {words}" in out
+    if slope:
+        codes = {f["code"]: f for f in lc.load_run("run").result["findings"]}
+        assert codes["workflow.height-tilt"]["data"]["tilt"]["value"] == pytest.approx(4.0, abs=0.4)

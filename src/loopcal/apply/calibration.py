@@ -23,7 +23,7 @@ from loopcal.apply.verdict import (
     explains_residuals,
     report_fit,
     report_freedoms,
-    report_scale,
+    report_heights,
     report_unexplained,
     report_validation,
 )
@@ -299,6 +299,7 @@ def _report(
         listed = suggest_measurements(analysis)
         suggestions = tuple(s for s in listed if not s.combination.is_harmless)
     start = check_start_values(fit)
+    heights = map_height_errors(fit, fitted, held_out) if fit.converged else None
     comparison = None
     if options.compare_with is not None:
         from loopcal.diagnose.value_comparison import compare_with_values
@@ -322,7 +323,7 @@ def _report(
         *report_freedoms(fit, fitted),
         *report_fixed_setup(fitted),
         *(report_equal_setup(fit, fitted) if fit.converged else ()),
-        *report_scale(fit, fitted),
+        *report_heights(fit, fitted, heights),
         *report_base_targets(fitted),
         start.finding,
         *outliers,
@@ -339,7 +340,7 @@ def _report(
         conventions=conventions,
         validation=None if held_out is None else errors,
         fitted_errors=errors if held_out is None else None,
-        height_errors=map_height_errors(fit, fitted, held_out) if fit.converged else None,
+        height_errors=heights,
         findings=sort_by_importance(findings),
         budget=budget,
         examination=examination,

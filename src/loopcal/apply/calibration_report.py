@@ -15,6 +15,7 @@ from loopcal.apply.calibration_options import CalibrationOptions, DataSplit
 from loopcal.apply.validation import store_differences
 from loopcal.apply.verdict import (
     ALL_POSES,
+    CHECK_FIRST,
     FEW_POSES,
     LEAVE_OUT,
     LIMIT_MISSED,
@@ -23,6 +24,7 @@ from loopcal.apply.verdict import (
     choose_next_step,
     decide_verdict,
     explains_residuals,
+    list_checks,
     recommend_values,
 )
 from loopcal.estimate.result import Identification
@@ -220,6 +222,8 @@ class CalibrationReport(TableResult):
         is_open = advice.code.startswith(("values.apply", "values.keep-not-calibrated"))
         if is_open and outliers and fitted <= FEW_POSES:
             return report_finding(LEAVE_OUT, poses=outliers)
+        if advice.code.startswith("values.apply") and (checks := list_checks(self.findings)):
+            return report_finding(CHECK_FIRST, **checks)
         return advice
 
     @property

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -27,13 +27,16 @@ from loopcal.diagnose.row_errors import (
     compute_statistics,
 )
 from loopcal.errors import DataError
+from loopcal.estimate.residual_test import DOUBT
 from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.assembly import AXES
+from loopcal.numerics.statistics import compute_f_tail
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore_arrays
@@ -43,11 +46,18 @@ from loopcal.units import Dimension, Unit
 if TYPE_CHECKING:
     from loopcal.mechanism.model import Mechanism
 
+SHIFT_UNDECIDED, TILT_UNDECIDED = "workflow.height-shift", "workflow.height-tilt"
 PREFIX = "heights_"  # beginning of the names of the stored arrays
 FEWEST = 3  # heights that show a plane; with fewer there is no map
 LEVEL = 0.2  # largest ratio of the points' range in z to that in x, y of a level surface
 # Freedoms of a platform over whose x and y heights are mapped.
 TRANSLATIONS = tuple(AXES.index(axis) for axis in "xyz")
+# Mean height [m], and its ratio to the scatter, from which a wrong zero of the probe is as
+# probable as a wrong machine.
+SHIFTED, SHIFT_RATIO = 1e-3, 3.0
+AS_LARGE = 2.0  # ratio of variances of residuals up to which two causes explain them alike
+STEEP = 3e-3  # tilt [rad] of a bed, 0.45 mm over 150 mm, from which parts are visibly skewed
+LEAST_SHARE = 0.1  # least share of a tilted plane in the squares of heights that is reported
 UPRIGHT = 0.95  # least cosine of the angle between the z axes of the measured frame and of the base
 
 
@@ -91,6 +101,39 @@ class HeightErrors(DrawnResult):
         fitted heights [m].
         """
         return compute_statistics(np.abs(getattr(self, errors)[self.is_held_out == held_out]))
+
+    def report_alternatives(self, count: int) -> list[Finding]:
+        """Return the wrong zero of the probe, and the tilted bed, that heights cannot tell apart
+        from errors of the machine; `count` : number of fitted parameters.
+
+        A plane a + b x + c y is fitted to the errors before calibration. It explains all heights as
+        well as the calibration does where its variance is no larger: neither by the F test of the
+        other parameters, nor by the factor `AS_LARGE`, which few degrees of freedom do not show.
+        """
+        n, before = len(self.poses), self.before
+        mean, scatter, findings = float(before.mean()), float(before.std()), list[Finding]()
+        if abs(mean) > max(SHIFTED, SHIFT_RATIO * scatter):
+            sizes: dict[str, Any] = {"shift": self._quantify(mean), "rest": self._quantify(scatter)}
+            findings.append(report_finding(SHIFT_UNDECIDED, **sizes))
+        centered = self.points - self.points.mean(axis=0)
+        slope, _, rank, _ = np.linalg.lstsq(centered, before - mean)
+        left = float(((before - mean - centered @ slope) ** 2).sum())
+        own, more, degrees = float((self.after**2).sum()), count - FEWEST, n - count
+        share = 1.0 - left / (n * scatter**2 or 1.0)
+        if rank < 2 or more < 1 or degrees < 1 or not own or share < LEAST_SHARE:
+            return findings
+        gain = max(left - own, 0.0)  # prior knowledge may leave more than a plane does
+        is_as_large = left / (n - FEWEST) <= AS_LARGE * own / degrees
+        tail = float(compute_f_tail(more, degrees, gain / more / (own / degrees)))
+        tilt = float(np.linalg.norm(slope))
+        alone = tilt > STEEP and is_as_large and tail > DOUBT
+        data: dict[str, Any] = {"tilt": Quantity(1e3 * tilt, "mrad"), "share": share}
+        data["alone"] = alone
+        return [*findings, report_finding(TILT_UNDECIDED, **data)]
+
+    def _quantify(self, length: float) -> Quantity:
+        """Return a length in the unit in which all are shown."""
+        return Quantity(length / self.unit.factor_to_si, self.unit.symbol)
 
     def list_sets(self) -> Iterator[tuple[str, bool]]:
         """Yield "fitted" and "held-out" with whether they are held out, as far as there are any."""

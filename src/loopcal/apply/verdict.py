@@ -9,7 +9,12 @@ from dataclasses import replace
 from enum import Enum
 from typing import Any
 
-from loopcal.apply.height_errors import measures_only_heights
+from loopcal.apply.height_errors import (
+    SHIFT_UNDECIDED,
+    TILT_UNDECIDED,
+    HeightErrors,
+    measures_only_heights,
+)
 from loopcal.apply.validation import FEW_ROWS, Validation
 from loopcal.diagnose.fit_examination import StartCheck, StartVerdict
 from loopcal.diagnose.gauge_freedoms import report_undetermined
@@ -35,6 +40,7 @@ TOO_LITTLE_VALIDATION = {
 }
 ALL_POSES = "outliers.all-poses"  # finding on outliers before poses were held out
 LEAVE_OUT = "values.leave-out"  # recommendation to calibrate without a wrong pose
+CHECK_FIRST = "values.check-first"  # recommendation to check what heights do not show
 # Number of poses up to which one that is wrong changes the values by more than their uncertainty.
 FEW_POSES = 50
 SEARCH_LEVEL = 0.001  # probability of excluding a pose of all where none is wrong
@@ -131,14 +137,30 @@ def report_validation(errors: Validation | None, is_held_out: bool) -> list[Find
     ]
 
 
-def report_scale(fit: Identification, data: Measurements) -> list[Finding]:
-    """Return that heights do not test the fixed lengths from which x and y have their scale."""
+def report_heights(
+    fit: Identification, data: Measurements, heights: HeightErrors | None
+) -> list[Finding]:
+    """Return what heights alone do not test: the fixed lengths from which x and y have their scale,
+    and by their errors the zero of the probe and the bed.
+    """
     if not fit.converged or not measures_only_heights(data):
         return []
     table = fit.robot.parameters
     columns = zip(table.names, table.dimensions, table.free, strict=True)
     names = tuple(n for n, d, is_free in columns if not is_free and d is Dimension.LENGTH)
-    return [report_finding("workflow.undetermined-scale", names=names)] if names else []
+    findings = [] if heights is None else heights.report_alternatives(len(fit.names))
+    scale = [report_finding("workflow.undetermined-scale", names=names)] if names else []
+    return [*findings, *scale]
+
+
+def list_checks(findings: Iterable[Finding]) -> dict[str, Any]:
+    """Return which causes of heights beside the machine explain them as well: the zero of the
+    probe, the bed; empty without any.
+    """
+    data = {finding.code: finding.data for finding in findings}
+    is_tilted = bool(data.get(TILT_UNDECIDED, {}).get("alone"))
+    checks = {"is_shifted": SHIFT_UNDECIDED in data, "is_tilted": is_tilted}
+    return checks if any(checks.values()) else {}
 
 
 def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
@@ -211,6 +233,8 @@ def choose_next_step(
     repeatability : its share of the variance of the expected error, by quantity.
     """
     codes = {finding.code for finding in findings}
+    if recommendation == CHECK_FIRST:
+        return report_finding("workflow.next-check-heights", **list_checks(findings))
     is_applied = verdict is not Verdict.NOT_CALIBRATED and recommendation.startswith("values.apply")
     if is_applied and SIGN_UNDECIDED in codes:
         return report_finding("workflow.next-check-height-sign")

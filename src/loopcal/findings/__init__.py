@@ -106,9 +106,11 @@ prior.tolerances-too-narrow prior.components-inflated fit.beyond-tolerance
 model.no-expected-gain model.nothing-gained
 residuals.lack-of-fit residuals.repeatability-larger
 residuals.heavy-tailed
-noise.doubtful noise.no-degrees-of-freedom workflow.undetermined-scale
+noise.doubtful noise.no-degrees-of-freedom
+workflow.height-shift workflow.undetermined-scale
 setup.two-solutions setup.fixed
-noise.consistent noise.estimated outliers.none outliers.one-degree workflow.frame-freedoms
+noise.consistent noise.estimated outliers.none outliers.one-degree workflow.height-tilt
+workflow.frame-freedoms
 prior.machine-unchanged model.simpler-suffices model.all-needed model.expected-gain
 residuals.start-not-calibrated residuals.start-within-noise residuals.start-is-best
 prior.undetectable prior.inflation
