@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,17 @@ IntArray = NDArray[np.int64]
 
 BoolArray = NDArray[np.bool_]
 """Yes or no, element by element."""
+
+
+def find_array_type(annotation: Any) -> Any:
+    """Return the type of the entries that the annotation of an array states; None for any other.
+
+    Since NumPy 2.5 `NDArray` is an alias of its own, before it stands for `np.ndarray`.
+    """
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is np.ndarray:
+        return get_args(arguments[1])[0]
+    return arguments[0] if origin is NDArray else None
 
 
 class Progress(Protocol):

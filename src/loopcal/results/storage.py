@@ -13,6 +13,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from loopcal.results.description import Field
+from loopcal.typing import find_array_type
 
 Stored = TypeVar("Stored")
 
@@ -44,8 +45,8 @@ def _restore_value(hint: Any, value: Any) -> Any:
         return None if value is None else _restore_value(other, value)
     if hint is float:
         return math.nan if value is None else float(value)
-    if origin is np.ndarray:
-        return np.array(value, dtype=get_args(arguments[1])[0])
+    if entries := find_array_type(hint):
+        return np.array(value, dtype=entries)
     if origin is tuple:
         entries = arguments[:1] * len(value) if arguments[-1] is ... else arguments
         return tuple(map(_restore_value, entries, value))
@@ -64,7 +65,7 @@ def _list_stored(of_class: type[Any]) -> list[Field]:
     if hasattr(of_class, "FIELDS"):
         return [field for field in of_class.FIELDS if field.is_stored]
     hints = get_type_hints(of_class)
-    return [Field(name) for name, hint in hints.items() if get_origin(hint) is np.ndarray]
+    return [Field(name) for name, hint in hints.items() if find_array_type(hint)]
 
 
 def store_arrays(result: Any, prefix: str) -> dict[str, np.ndarray]:
@@ -86,6 +87,6 @@ def restore_arrays(
     hints = get_type_hints(of_class)
     for field in stored:
         attribute, array = str(field.of or field.name), arrays[prefix + field.name]
-        is_array = get_origin(hints[attribute]) is np.ndarray
+        is_array = find_array_type(hints[attribute])
         given[attribute] = array if is_array else _restore_value(hints[attribute], array.tolist())
     return of_class(**given)

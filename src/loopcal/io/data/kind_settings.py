@@ -63,7 +63,7 @@ from loopcal.io.data.columns import (
 from loopcal.mechanism.families.placement import PoseRecord
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray, find_array_type
 from loopcal.units import (
     DISPLAY_UNITS,
     EXAMPLES,
@@ -248,7 +248,7 @@ def _annotate(name: str, annotation: Any) -> Any:
     if origin in (Union, types.UnionType):
         of_members = (_annotate(name, m) for m in members if m is not types.NoneType)
         return reduce(operator.or_, of_members)
-    if origin is np.ndarray:
+    if find_array_type(annotation):
         return PoseRecord if name.startswith("T_") else NUMBERS if name in DIRECTIONS else LENGTHS
     if annotation == tuple[str, ...]:
         return NAMES
