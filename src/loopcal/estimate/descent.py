@@ -347,6 +347,7 @@ def descend(
     progress: Progress = report_no_progress,
     arrival: FloatArray | None = None,
     sufficient: float = 0.0,
+    ends_weak: bool = False,
 ) -> Descent:
     """Minimize the whitened sum of squares, filtered by the method.
 
@@ -362,6 +363,8 @@ def descend(
     sufficient : a trial has also converged where this step and all further ones together would
         change the whitened residuals by less than that, apart from the step itself, which is taken.
         They become shorter at least by the ratio of the last two.
+    ends_weak : end a trial, as one without progress, where the method must hold directions, see
+        `Method.find_weak`.
     """
     control = control or StepControl()
     z = np.array(deviation, dtype=np.float64)
@@ -371,6 +374,9 @@ def descend(
         first = replace(_clear_failed(problem.linearize(z, begin)), deviation=z)
     arrival = np.full(len(z), np.inf) if arrival is None else arrival
     run = _Run(problem, method, tolerance, control, sufficient, first, arrival)
+    if ends_weak and method.unpenalized(z.shape[1]) is not None:
+        is_weak = method.find_weak(run.point.linear_model.decomposition).any(axis=1)
+        run.status = np.where(is_weak, DescentStatus.NO_PROGRESS.value, run.status)
     deviations, costs = [z.copy()], [run.point.cost.copy()]
 
     def observe() -> None:

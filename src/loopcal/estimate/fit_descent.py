@@ -32,7 +32,7 @@ from loopcal.estimate.linearization import LinearizedPoses, Start
 from loopcal.estimate.losses import Huber, Loss, Tukey, weigh_blocks
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions
-from loopcal.estimate.penalties import MAP, LeastSquares, Method, Ridge
+from loopcal.estimate.penalties import HOLD, MAP, WEAKEST, LeastSquares, Method, Ridge
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.prior_inflation import ROUNDS, choose_methods
@@ -94,7 +94,7 @@ def fit_part_first(
     def report(done: int, total: int, what: str) -> None:
         progress(done, total, f"{what} ({count} of {problem.readings.shape[1]} poses)")
 
-    first = descend(part, deviation, method, control, tolerance, progress=report)
+    first = descend(part, deviation, method, control, tolerance, progress=report, ends_weak=True)
     if not _is_converged(first) or int(first.decomposition.rank[0]) < problem.parameters:
         return None
     left = control.iterations - int(first.iterations[0])
@@ -180,14 +180,14 @@ def fit_rows(
     method, control, tolerance = get_method(options), options.control, options.rank_tolerance
     with_prior = problem if options.prior is None else options.prior.added(problem)
     if options.begin == "kinematics":
-        return descend(with_prior, z, method, control, tolerance, start, progress)
+        return descend(with_prior, z, method, control, tolerance, start, progress, ends_weak=True)
 
     located, first = locate_measured_poses(problem), None
     if located is not None:
         coarse = replace(control, relative=max(control.relative, RELATIVE))
         first = descend(problem.at_measured_poses(located), z, method, coarse, tolerance)
         z = np.where((first.status == DescentStatus.CONVERGED)[:, None], first.deviation, z)
-    fit = descend(with_prior, z, method, control, tolerance, start, progress)
+    fit = descend(with_prior, z, method, control, tolerance, start, progress, ends_weak=True)
     if first is None:
         return fit
     is_exhausted = bool((first.status == DescentStatus.OUT_OF_ITERATIONS.value).any())
@@ -233,6 +233,13 @@ def fit_with_tolerances(
         fit, weights, weighted = fit_with_loss(problem, data, z, options, progress)
     else:
         fit, weights, weighted = first, np.ones(data.n_poses), problem
+    held = get_method(options).hold() if _find_weak(fit, get_method(options)).size else ()
+    for i, method in enumerate(held):
+        other = replace(options, method=method)
+        again, new_weights, new_problem = fit_with_loss(problem, data, z, other, progress)
+        if i == 0 or _is_converged(again):
+            fit, weights, weighted, options = again.after(fit), new_weights, new_problem, other
+            z = fit.deviation
     for _ in range(ROUNDS):
         method = choose_methods(free, fit, get_method(options)).get(0)
         if method is None:
@@ -250,8 +257,12 @@ def fit_with_tolerances(
 def repeat_trials(
     problem: Problem, fit: Descent, options: FitOptions, free: FreeParameters
 ) -> Descent:
-    """Descend again in trials whose data ask for components of the tolerances."""
-    for i, method in choose_methods(free, fit, get_method(options)).items():
+    """Descend again in trials whose data ask for components of the tolerances, or determine some
+    combination too weakly.
+    """
+    first, stated = fit, get_method(options)
+    weak = _find_weak(fit, stated)
+    for i, method in choose_methods(free, fit, stated).items():
         alone, chosen = np.array([i]), replace(options, method=method)
         own = problem.take(alone)
         again = fit_rows(own, fit.deviation[alone], None, chosen)
@@ -263,7 +274,25 @@ def repeat_trials(
             again = fit_rows(own, again.deviation, None, chosen)
         if again.status[0] == DescentStatus.CONVERGED.value:
             fit = fit.put(alone, again)
+    if weak.size:
+        own, z = problem.take(weak), first.deviation_history[0][weak]
+        chosen = [replace(options, method=method) for method in stated.hold()]
+        again = fit_rows(own, z, None, chosen[0])
+        for held in chosen[1:]:
+            again = fit_rows(own, again.deviation, None, held)
+        left = np.flatnonzero(again.status != DescentStatus.CONVERGED.value)
+        if left.size and len(chosen) > 1:
+            again = again.put(left, fit_rows(own.take(left), z[left], None, chosen[0]))
+        fit = fit.put(weak, repeat_trials(own, again, chosen[-1], free))
     return fit
+
+
+def _find_weak(fit: Descent, method: Method) -> IntArray:
+    """Return the trials whose method must hold what data determine weakly: from a limit on where
+    they did not converge, and from a higher one where they did.
+    """
+    limit = np.where(fit.status == DescentStatus.CONVERGED.value, WEAKEST, HOLD)
+    return np.flatnonzero(method.find_weak(fit.decomposition, limit).any(axis=1))
 
 
 def get_method(options: FitOptions) -> Method:

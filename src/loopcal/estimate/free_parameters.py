@@ -111,22 +111,23 @@ class FreeParameters:
         units = [self.robot.get_unit(parameter.dimension) for parameter in self.parameters]
         return np.array([unit.factor_to_si for unit in units]), tuple(u.symbol for u in units)
 
-    def findings(self) -> tuple[Finding, ...]:
-        """Return a finding on default tolerances; nothing where all tolerances are stated."""
-        count = int(self.assumed.sum())
-        if count == 0:
-            return ()
+    def list_assumed(self, factor: float = 1.0) -> tuple[Quantity, ...]:
+        """Return the default tolerance of each dimension that has one, times a factor."""
         assumed = []
         for dimension in Dimension:
             chosen = [p.dimension is dimension for p in self.parameters] & self.assumed
             if chosen.any():
-                value = self.robot.to_quantity(float(self.tolerance[chosen][0]), dimension)
+                value = self.robot.to_quantity(factor * float(self.tolerance[chosen][0]), dimension)
                 assumed.append(Quantity(value.value, "") if value.unit == "1" else value)
-        return (
-            report_finding(
-                "fit.default-tolerances", count=count, total=len(self), assumed=tuple(assumed)
-            ),
-        )
+        return tuple(assumed)
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return a finding on default tolerances; nothing where all tolerances are stated."""
+        count, assumed = int(self.assumed.sum()), self.list_assumed()
+        if count == 0:
+            return ()
+        code = "fit.default-tolerances"
+        return (report_finding(code, count=count, total=len(self), assumed=assumed),)
 
 
 def select_free_parameters(robot: Mechanism) -> FreeParameters:

@@ -29,14 +29,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from loopcal.estimate.descent import Descent
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.penalties import MAP, Method
+from loopcal.estimate.penalties import HOLD, MAP, Method
 from loopcal.estimate.posterior import INFLATION, TOLERANCES, CovariancePart, find_variance_sources
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.tolerance_components import (
@@ -330,9 +330,7 @@ SAME_FACTOR = 0.05
 """Relative change of a component's factor below which the fit is not repeated."""
 
 
-def choose_methods(
-    free: FreeParameters, fit: Descent, method: Method, trials: Sequence[int] | None = None
-) -> dict[int, MAP]:
+def choose_methods(free: FreeParameters, fit: Descent, method: Method) -> dict[int, MAP]:
     """Return the method with which a trial must be fitted again, by trial: those whose data ask for
     other components of the tolerances than those of `method`.
     """
@@ -356,7 +354,7 @@ def choose_methods(
     before = {(c.kind, c.places): c.factor for c in method.components}
     for i in asked:
         trial, unpenalized = rows.take(np.array([i])), method.unpenalized(len(free))
-        search = ComponentSearch(trial, method.correlation, unpenalized, candidates)
+        search = ComponentSearch(trial, method.covariance(len(free)), unpenalized, candidates)
         components = search.choose()
         factors = {(c.kind, c.places): c.factor for c in components}
         is_same = factors.keys() == before.keys() and all(
@@ -375,16 +373,24 @@ def run_prior_tests(
     """
     if not isinstance(method, MAP):
         return None, []
-    rows = fit.decomposition
-    if method.components:
+    rows, on_held = fit.decomposition, list[Finding]()
+    if method.components or method.held:
         stated = compute_prior_covariance(len(free), method.correlation, ())
-        rows = restate(rows, stated, method.unpenalized(len(free)))
+        rows = restate(rows, stated, np.array(method.free) if any(method.free) else None)
+    if method.held:
+        weak = method.find_weak(rows, HOLD)[0]
+        part = np.abs(rows.directions[0][:, weak][:, -1:]).max(axis=1, initial=0.0)
+        order = np.argsort(-part)[:NAMED]
+        names = tuple(free.names[i] for i in order if part[i] > MAIN_PART * part.max())
+        factor, count = method.read_inflation(fit.decomposition, fit.penalty)[0], int(weak.sum())
+        assumed = free.list_assumed(HOLD * float(factor))
+        on_held = [report_finding("fit.held", count=count, names=names, assumed=assumed)]
     rows = _divide(rows, method)
     inflation = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     conflict = assess_prior_conflict(free, rows, inflation, fit.deviation[0], method.components)
     if fit.status[0] != DescentStatus.CONVERGED.value:
-        return conflict, []
-    return conflict, [*conflict.report(), *report_undetectable(free, rows)]
+        return conflict, on_held
+    return conflict, [*on_held, *conflict.report(), *report_undetectable(free, rows)]
 
 
 def add_factor_uncertainty(result: Identification, fit: Descent) -> Identification:
@@ -403,7 +409,8 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     errors += _estimate_component_errors(fit, method, factor)
     scale = result.tolerance[:, None]
     component_rows = tuple(component.to_row(result.names) for component in method.components)
-    finding = report_finding(INFLATION, factor=factor, parts=component_rows)
+    source: dict[str, Any] = {"source": "stated or assumed"} if method.held else {}
+    finding = report_finding(INFLATION, factor=factor, parts=component_rows, **source)
     change = np.stack([error[0] for error in errors], axis=1)
     inflated = add_covariance(result, scale * change, np.inf, finding)
     uncertain = [
@@ -457,13 +464,13 @@ def _estimate_component_errors(fit: Descent, method: MAP, factor: float) -> list
     rows, p = _divide(fit.decomposition, method), len(fit.deviation[0])
     data = predict(rows, np.array([factor]))
     Q, h = data.information[0], data.score[0]
-    S = factor**2 * compute_prior_covariance(p, method.correlation, method.components)
+    S = factor**2 * compute_prior_covariance(p, method.covariance(p), method.components)
     # parameters without a tolerance follow the others
     penalized = are_penalized(rows)
     errors = []
     for component in method.components:
         others = tuple(c for c in method.components if c is not component)
-        stated = compute_prior_covariance(p, method.correlation, others)
+        stated = compute_prior_covariance(p, method.covariance(p), others)
         alone = restate(rows, stated, method.unpenalized(p))
         variance = factor**2 * component.variance
         places, is_shift = np.array([component.places]), component.kind == "shift"

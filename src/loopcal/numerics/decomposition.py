@@ -42,6 +42,11 @@ NULL_COMPONENT = 1e-8
 """
 
 
+NULL_PART = 1e-5
+"""A null direction has no part in parameters that carry less than this of it: weak directions, of
+1e-9 of the largest singular value, turn null directions by 1e-7 in double rounding."""
+
+
 def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) -> BoolArray:
     """Return which singular values (.., k), largest first, count as nonzero: the rank rule.
 
@@ -278,6 +283,20 @@ class Decomposition(TrialBatch):
         """Return the decomposition for z = root u, where this is the one for u."""
         dual = np.linalg.solve(root.T, self.inverse.swapaxes(-1, -2)).swapaxes(-1, -2)
         return replace(self, directions=root @ self.directions, dual=dual)
+
+    def separated(self, alone: BoolArray) -> Decomposition:
+        """Return the decomposition whose null directions are, as far as possible, those of the
+        parameters `alone` (p,), which count as unpenalized.
+        """
+        directions, dual, c = self.directions.copy(), self.inverse.copy(), self.projections.copy()
+        for t, is_null in enumerate(~self.used):
+            _, _, vt = np.linalg.svd(directions[t][~alone][:, is_null])
+            directions[t][:, is_null] = directions[t][:, is_null] @ vt.T
+            dual[t][is_null], c[t][is_null] = vt @ dual[t][is_null], vt @ c[t][is_null]
+        part = np.linalg.norm(directions[:, ~alone], axis=1)
+        marked = ~self.used & (part < NULL_PART * np.linalg.norm(directions, axis=1))
+        directions[marked[:, None, :] & ~alone[:, None]] = 0.0
+        return replace(self, directions=directions, dual=dual, projections=c, unpenalized=marked)
 
     def divided(self, sigma: FloatArray) -> Decomposition:
         """Return the decomposition of the rows divided by sigma (t,)."""

@@ -92,7 +92,7 @@ def inflated_tolerances(data: Data) -> str:
         others = "the others" if changes else "tolerances"
         is_near_one = 1.0 < data["factor"] < 1.005  # it would read "1 times"
         wider = "less than 0.5 % wider than" if is_near_one else "{factor} times as wide as"
-        changes.append(fill_template(f"{others} {wider} stated", **data))
+        changes.append(fill_template(f"{others} {wider} {data.get('source', 'stated')}", **data))
     return list_names(changes, len(changes))
 
 
