@@ -387,10 +387,14 @@ def view_compensation(result: Compensation) -> list[Block]:
     robot, units, uncertainty = result.robot, result.robot.shown_units, result.uncertainty
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     values: list[tuple[Column, FloatArray]] = []
+
+    def without_rounding(errors: FloatArray, size: float) -> FloatArray:
+        """Return errors, zero where they are rounding of a robot of this size."""
+        return np.where(errors < ROUNDING * size, 0.0, errors)
+
     for part, unit, size in ((slice(3, 6), length, robot.size), (slice(0, 3), angle, 1.0)):
         for name, errors in (("before", result.before), ("after", result.remaining)):
-            error = np.linalg.norm(errors[:, part], axis=1)
-            shown = np.where(error < ROUNDING * size, 0.0, error)
+            shown = without_rounding(np.linalg.norm(errors[:, part], axis=1), size)
             values.append((Column(name, unit.symbol), shown / unit.factor_to_si))
     if uncertainty is not None:
         position, orientation = uncertainty.expanded_position, uncertainty.expanded_orientation
@@ -407,9 +411,11 @@ def view_compensation(result: Compensation) -> list[Block]:
         blocks.append(str(result.residual_map))
     usable = result.usable
     if result.commands is not None and usable.any():
-        for step in range(1, len(result.residual_position)):
-            position = format_in(length, result.residual_position[step, usable].max(), 3)
-            turn = format_in(angle, result.residual_orientation[step, usable].max(), 3)
+        positions = without_rounding(result.residual_position[:, usable].max(axis=1), robot.size)
+        turns = without_rounding(result.residual_orientation[:, usable].max(axis=1), 1.0)
+        for step in range(1, len(positions)):
+            position = format_in(length, positions[step], 3)
+            turn = format_in(angle, turns[step], 3)
             blocks.append(
                 f"After step {step}: at most {position} {length} and {turn} {angle} from the best "
                 "reachable poses."
