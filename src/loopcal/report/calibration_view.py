@@ -13,7 +13,7 @@ from loopcal.apply.error_budget import LENGTHS, Source
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import add_advice, count_decimals, list_names
 from loopcal.report.validation_view import (
     READING_NOISE,
@@ -454,7 +454,9 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
     """
     analysis, useful = report.analysis, report.useful
     blocks: list[Block] = [str(finding) for finding in report.summary]
-    if report.suggestions:
+    if (verbose and report.suggestions) or any(
+        finding.severity is Severity.SUGGESTION for finding in report.summary
+    ):
         blocks.append(str(report_finding("identifiability.known-frames-assumed")))
     if verbose:
         said = {finding.code for finding in report.summary}

@@ -105,7 +105,7 @@ def identifiability(
     written = []
     if output is not None:
         written = ["", f"Written to {output}: the robot with the other parameters fixed"]
-    details = "the first combinations, the singular values and a table of all parameters"
+    details = "the first combinations, suggested measurements, singular values and all parameters"
     page = [
         *drawn,
         *view_identifiability(report, verbose),
