@@ -15,7 +15,7 @@ Classification and Regression Trees (1984).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -157,26 +157,14 @@ def cross_validate(
     """
     check_types(robot, data)
     options = merge_options(options, method)
-    if options.nuisance is not None:
-        raise EstimationError(
-            "cross_validate does not support the option nuisance; state known frames and targets "
-            "in the measurements"
-        )
-    data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
-    options = replace(options, excluded_poses=())
     labels: list[str] = []
     before, after, scores, scores_before, converged = [], [], [], [], True
-    for done, places in enumerate(draw_folds(data, count, seed)):
-        progress(done, count, "cross-validating")
-        held_out = data.take(places)
-        fitted = robot
-        if robot.parameters.free.any():
-            remaining = data.take(np.setdiff1d(np.arange(data.n_poses), places))
-            fit = identify(robot, remaining, options=options)
-            if must_converge and not fit.converged:
-                finding = report_finding("model.fold-not-converged", fold=done + 1, count=count)
-                raise EstimationError(finding)
-            fitted, converged = fit.robot, converged and fit.converged
+    folds = _fit_folds(robot, data, options, count, seed, progress)
+    for done, (fitted, has_converged, held_out) in enumerate(folds):
+        if must_converge and not has_converged:
+            finding = report_finding("model.fold-not-converged", fold=done + 1, count=count)
+            raise EstimationError(finding)
+        converged = converged and has_converged
         if held_out.n_rows:  # readings alone, of redundant actuators, have a score but no errors
             comparison = compare_predictions(robot, fitted, held_out)
             rows = comparison.data.observations
@@ -194,6 +182,34 @@ def cross_validate(
         np.array(scores_before),
         converged,
     )
+
+
+def _fit_folds(
+    robot: Mechanism,
+    data: Measurements,
+    options: FitOptions,
+    count: int,
+    seed: int,
+    progress: Progress = report_no_progress,
+) -> Iterator[tuple[Mechanism, bool, Measurements]]:
+    """Return for each fold the robot that is fitted without it, whether that fit converged, and the
+    measurements of the fold.
+    """
+    if options.nuisance is not None:
+        raise EstimationError(
+            "cross_validate does not support the option nuisance; state known frames and targets "
+            "in the measurements"
+        )
+    data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
+    options = replace(options, excluded_poses=())
+    for done, places in enumerate(draw_folds(data, count, seed)):
+        progress(done, count, "cross-validating")
+        fitted, has_converged = robot, True
+        if robot.parameters.free.any():
+            remaining = data.take(np.setdiff1d(np.arange(data.n_poses), places))
+            fit = identify(robot, remaining, options=options)
+            fitted, has_converged = fit.robot, fit.converged
+        yield fitted, has_converged, data.take(places)
 
 
 def score_leave_one_out(
@@ -265,8 +281,9 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
     """
     problem = problem_of(select_free_parameters(robot), data)
     z = problem.free.deviation(robot.values[None])
-    equations = int(problem.linearize(z, problem.start(z)).equations[0])
-    return sum_squares(problem, z) / equations if equations else np.inf
+    start = problem.start(z)
+    equations = int(problem.linearize(z, start).equations[0])
+    return sum_squares(problem, z, start) / equations if equations else np.inf
 
 
 # Names of parameters that shift an actuator reading.
@@ -633,10 +650,15 @@ def compute_regularization_curves(
         for i, method in enumerate(methods):
             progress(i, len(methods), "cross-validating")
             chosen = replace(options, method=method)
-            validation = cross_validate(robot, data, options=chosen, count=folds, seed=seed)
-            score[i] = validation.score
+            fold = np.array(
+                [
+                    _mean_square(r, held)
+                    for r, _, held in _fit_folds(robot, data, chosen, folds, seed)
+                ]
+            )
+            score[i] = fold.mean()
             if np.isfinite(score[i]):
-                error[i] = validation.standard_error
+                error[i] = fold.std(ddof=1) / np.sqrt(folds)
     n = len(lam)
     ridge = _mark("lam", lam, score[:n], error[:n], rules_lam)
     truncation = _mark("k", k.astype(float), score[n:], error[n:], rules_k)

@@ -109,9 +109,9 @@ def fit_part_first(
     return fit.after(replace(first, cost_history=costs))
 
 
-def sum_squares(problem: Problem, deviation: FloatArray) -> float:
+def sum_squares(problem: Problem, deviation: FloatArray, start: Start | None = None) -> float:
     """Return the whitened sum of squares of one trial at a deviation (1, p), without derivatives;
-    infinite where a pose that a row needs is not reached.
+    infinite where a pose that a row needs is not reached. `start`: where it is known already.
     """
     is_lost = False
 
@@ -121,7 +121,8 @@ def sum_squares(problem: Problem, deviation: FloatArray) -> float:
         is_lost |= bool(poses.is_lost(problem.poses.blocks[i].is_needed)[0])
 
     with np.errstate(over="ignore", invalid="ignore"):  # poses out of reach
-        solution = problem.solve(deviation, problem.start(deviation), derivatives=False)
+        start = problem.start(deviation) if start is None else start
+        solution = problem.solve(deviation, start, derivatives=False)
         residuals = problem.residuals(deviation, solution, observe)
         cost = sum(float(np.nansum(r.whitened**2)) for r in residuals)  # NaN: not measured
     return np.inf if is_lost else cost
