@@ -157,13 +157,13 @@ def test_exact_sigmas_are_the_limit_of_many_degrees_of_freedom():
 @pytest.mark.parametrize("size", [0.5, 0.7])
 def test_a_sigma_that_is_too_large_does_not_widen_the_uncertainty(size):
     ratios = []
-    for seed in range(15):
+    for seed in range(9):
         errors = size * draw_errors(25, 3, seed)
         _, _, result = fit_and_adjust("linear-delta", "component", errors, seed)
         if result.residual_test.exact_p_value > 0.999:
             ratios.append(result.residual_test.sigma_scale)
             assert not PATTERNS & {finding.code for finding in result.findings[-1:]}
-    assert len(ratios) >= 8
+    assert len(ratios) >= 5
     # standard deviation of a ratio with 63 degrees of freedom: 9 %, of small ones less
     assert np.mean(ratios) == pytest.approx(size, rel=0.1)
 
@@ -182,7 +182,7 @@ def test_clean_data_change_nothing(sets):
 
 def test_correlated_residuals_do_not_mean_that_sigma_is_too_large():
     codes = []
-    for seed in range(12):
+    for seed in range(6):
         errors = draw_errors(25, 3, seed, 0.95)
         _, fit, result = fit_and_adjust("linear-delta", "component", errors, seed, LeastSquares())
         before = {f.code for f in fit.findings}

@@ -244,7 +244,7 @@ def test_a_fit_of_frames_changes_no_dimension_of_the_machine():
 def test_errors_relative_to_a_pose_vanish_there_and_agree_with_a_simulation():
     truth_of = load_robot("hexapod-42")
     at = inverse(truth_of, sample_workspace(truth_of, 6, 7).coordinates).q
-    pairs = [calibrated(seed=seed) for seed in range(12)]
+    pairs = [calibrated(seed=seed) for seed in range(8)]
     predicted = pose_uncertainty(pairs[0][1], forward(pairs[0][1].robot, at), frame="relative")
     assert "relative to the pose 1" in predicted.frame
     assert not predicted.covariance[0].any()  # no rounding of 1e-19 m
@@ -358,8 +358,8 @@ def test_frames_that_are_determined_need_no_reference_poses(frame):
     ("machine", "effects", "most"),
     [
         ("five-bar, camera", Effects(), 0.99),
-        ("five-bar, camera", Effects(walk=1.0), 1.0),
         ("hexapod, tracker", Effects(walk=0.5), 1.0),
+        pytest.param("five-bar, camera", Effects(walk=1.0), 1.0, marks=pytest.mark.evidence),
     ],
 )
 def test_errors_in_the_frame_of_an_instrument_cover_the_truth(machine, effects, most):
@@ -367,7 +367,7 @@ def test_errors_in_the_frame_of_an_instrument_cover_the_truth(machine, effects, 
     that never turns, and sees the tool all the same; a walk moves the frame as the machine.
     """
     setup, covered = SETUPS[machine], []
-    for seed in range(12):
+    for seed in range(8):
         made = measure_machine(setup, seed, effects)
         fit = adjust_uncertainty(identify(load_robot(setup.robot), made.data), made.data)
         predicted = forward(fit.robot, made.readings)
@@ -376,5 +376,5 @@ def test_errors_in_the_frame_of_an_instrument_cover_the_truth(machine, effects, 
         place = (predicted.T[:, :3, 3] - frame[:3, 3]) @ frame[:3, :3]
         gap = np.linalg.norm(place - made.positions, axis=1)
         covered.append(float((gap <= stated.expanded_position).mean()))
-    # 12 machines of 95 %, whose poses share an error: the mean is uncertain by about 3 %
+    # 8 machines of 95 %, whose poses share an error: the mean is uncertain by about 4 %
     assert 0.88 <= np.mean(covered) <= most

@@ -65,7 +65,7 @@ def test_a_wrong_pose_is_found_whatever_the_stated_sigma_is(ratio, method) -> No
 
     A sigma that is known within 25 % is contradicted from a factor of about 3 on, so not by 2.
     """
-    for seed in range(2):
+    for seed in range(1):
         error = draw_normal(seed)
         error[4] += 12.0 * np.array([0.6, 0.0, -0.8])
         robot, data = measure_delta(seed, ratio * error)

@@ -98,7 +98,7 @@ def test_tolerances_that_are_right_give_the_lowest_error_near_lam_1(robot) -> No
     total: dict[float, float] = {}
     instrument = Instrument((Sensor(Position(), noise(*[2e-3] * 3)),))
     poses = sample_workspace(robot, 8, 5).coordinates
-    for seed in range(20):
+    for seed in range(10):
         truth = robot.with_values(sample_truth(robot, 1, seed)[0])
         curves = compute_regularization_curves(robot, simulate(truth, poses, instrument, seed))
         for value in (1e-2, 1.0, 1e2):

@@ -129,7 +129,7 @@ def eliminate_dense(problem, tree):
 @pytest.mark.parametrize("unseen", [0, 1, 2])
 def test_nested_elimination_equals_dense_elimination_with_unobservable_directions(unseen):
     deep = 0
-    for seed in range(60):
+    for seed in range(25):
         problem = random_problem(np.random.default_rng(seed), unseen)
         if not problem.free.any():
             continue
@@ -139,7 +139,7 @@ def test_nested_elimination_equals_dense_elimination_with_unobservable_direction
         assert result.rank[0] == rank, seed
         assert (result.is_unobservable[0] == unobservable).all(), seed
         # each unknown in the unit of its own column: 1e-9 is rounding times the worst condition of
-        # 60 problems
+        # 25 problems
         scale = np.maximum(np.linalg.norm(problem.F, axis=0), 1e-3)[:, None]
         values = np.column_stack([result.slope[0], result.shift[0]])
         assert_allclose(
@@ -160,7 +160,7 @@ def test_nested_elimination_equals_dense_elimination_with_unobservable_direction
             rest[0].T @ rest[0], left.T @ left, rtol=0, atol=1e-10 * squares, err_msg=f"{seed}"
         )
         deep += len({structure.parent for structure in tree.structures}) > 1
-    assert deep > 30, "too few of the problems are nested at all"
+    assert deep > 12, "too few of the problems are nested at all"
 
 
 def test_whitened_nuisance_columns_are_orthonormal():

@@ -133,7 +133,7 @@ def test_intervals_of_a_ridge_contain_the_truth(lam):
     """The bias is that of the stated tolerances, not of 1 / lam: coverage was 51 to 84 %."""
     robot, held = lc.load_robot("linear-delta"), []
     sensor = lc.Sensor(lc.Component(("x", "y", "z")), lc.Gaussian(np.full(3, 100 * UM)))
-    for seed in range(40):
+    for seed in range(20):
         truth = robot.with_values(sample_truth(robot, 1, seed)[0])
         commanded = lc.sample_workspace(robot, 8, seed).coordinates
         data = simulate(truth, commanded, lc.Instrument((sensor,)), seed)
@@ -162,7 +162,7 @@ def test_poses_have_the_coverage_of_six_degrees_of_freedom():
     """U of estimated noise covered 89 to 91 %: k was 2 whatever the degrees of freedom."""
     robot, held, lengths = hexapod(), [], []
     poses, result = hexapod_poses(6, seed=77), None
-    for seed in range(60):
+    for seed in range(30):
         truth = robot.with_values(sample_truth(robot, 1, seed)[0])
         data = simulate(truth, hexapod_poses(8, seed), tracker(), seed)
         options = FitOptions(LeastSquares(), noise="estimated")

@@ -154,7 +154,7 @@ def test_expected_error_before_calibration_agrees_with_drawn_robots():
 
     rng, square = np.random.default_rng(0), []
     still = forward(robot, data.readings).T
-    for _ in range(200):
+    for _ in range(60):
         drawn = robot.with_values(robot.values + 0.035e-3 * rng.standard_normal(42))
         square.append(((forward(drawn, data.readings).T - still)[:, :3, 3] ** 2).sum(axis=1).mean())
     assert np.sqrt(np.mean(square)) == pytest.approx(expected.position_before, rel=0.1)
