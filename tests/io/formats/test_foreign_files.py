@@ -73,3 +73,44 @@ def test_a_configuration_of_several_files_is_corrected(tmp_path, robots) -> None
         written = write(ExportSource(robots["klipper"]), tmp_path / "printer.cfg")
         assert written.text.startswith(text.splitlines()[0])
         assert "position_endstop" in written.text
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.cfg", "[printer]\nkinematics: rotary_delta\n", "shipped robot 'rotary-delta'"),
+        ("a.cfg", "[printer]\nkinematics: polar\n", "form no closed loop"),
+        ("a.cfg", "[printer]\nkinematics: corexy\n", "shipped robot 'core-xy'"),
+        ("a.g", "M669 K0\n", "'cartesian'"),
+        ("a.g", "M669 K6 N4 A0:1 B1:1:1 C1:1:1 D0:0:2\n", "A of M669 has 2 numbers, but 3 are"),
+        ("a.g", "M669 K6 N9\n", "write a number of 3 to 8 lines"),
+    ],
+)
+def test_a_printer_without_towers_is_told_whether_loopcal_calibrates_it(
+    tmp_path, name: str, text: str, words: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    read = FORMATS["klipper" if name == "a.cfg" else "reprap"].read
+    assert read is not None
+    with pytest.raises(FileError, match=words):
+        read(tmp_path / name, ImportOptions("r"))
+
+
+def test_anchors_of_a_hanging_printer_are_read_and_written(tmp_path) -> None:
+    """M669 as RepRapFirmware saves it; spools of 75 mm, a gear of 255:20, lines in tackles."""
+    anchors = "A0:-1610:-132 B1314:1268:-121 C-1415:744:-121 D0:0:2299"
+    spools = "R75:75:75:75 U2:2:2:4 O1:1:1:1 L20:20:20:20 H255:255:255:255"
+    (tmp_path / "config.g").write_text(f"M669 K6 N4 P500 {anchors}\nM666 A1 Q0.007 {spools}\n")
+    read, write = FORMATS["reprap"].read, FORMATS["hangprinter"].write
+    assert read is not None
+    assert write is not None
+    (tmp_path / "r.yaml").write_text(read(tmp_path / "config.g", ImportOptions("r")).robot_text)
+    robot = lc.load_robot(tmp_path / "r.yaml")
+    assert robot.actuators[3].name == "d"
+    # one turn of the motor pays out 2 pi 75 mm * 20 / 255 / 4 of the line D
+    start = lc.inverse(robot, [[0.0, 0.0, 0.0], [0.0, 0.0, -0.00924]]).q[:, 3]
+    assert start[1] - start[0] == pytest.approx(2 * 3.14159, rel=1e-3)
+    exported = write(ExportSource(robot), None)
+    assert exported.text == f"M669 K6 N4 {anchors}\n"
+    with pytest.raises(lc.DataError, match="has no anchors"):
+        write(ExportSource(lc.load_robot("linear-delta")), None)

@@ -75,6 +75,28 @@ class DeltaGeometry:
     stops: Triple
 
 
+CLOSED = {
+    **dict.fromkeys(("corexy", "hybrid_corexy", "corexyu", "corexyuv"), "core-xy"),
+    **dict.fromkeys(("winch", "hangprinter"), "cable-4"),
+    "rotary_delta": "rotary-delta",
+    "five-bar": "five-bar",
+    "deltesian": "linear-delta",
+}
+"""Kinematics of firmware with closed loops -> the shipped robot that is most like it."""
+
+KINEMATICS = (
+    *("cartesian", "corexy", "corexz", "delta", "scara", "corexyu", "hangprinter"),
+    *("polar", "corexyuv", "five-bar", "rotary_delta"),
+)
+"""Kinematics of RepRapFirmware by the number K of M669."""
+
+
+def report_kinematics(kinematics: str, sections: Sequence[str]) -> Finding:
+    """Report that a configuration is of another machine, and whether loopcal calibrates it."""
+    code, robot = "files.not-a-delta-configuration", CLOSED.get(kinematics, "")
+    return report_finding(code, kinematics=kinematics, robot=robot, sections=sections)
+
+
 COMMENTS = {
     "angles": "of the towers; the third defines the x axis and stays fixed",
     "stops": "height of the nozzle, in the center, with the carriage at its end stop",
@@ -142,7 +164,7 @@ ASIDE = re.compile(r'"[^"]*"?|;.*|\([^)]*\)?')
 CHECKSUM = re.compile(r"\*\s*\d*\s*$")
 UPPER = {ord(small): small.upper() for small in "abcdefghijklmnopqrstuvwxyz"}
 
-READ = ("M665", "M666", "M851")
+READ = ("M665", "M666", "M669", "M851")
 WITH_TEXT = ("M16", "M23", "M28", "M30", "M32", "M117", "M118")
 """Commands whose words are read, and commands that are followed by text."""
 
@@ -276,6 +298,10 @@ class DeltaFirmware(ABC):
         """
         lines = read_text(path, GcodeFile.what).splitlines(keepends=True)
         file = GcodeFile.parse(lines, path, self.is_one_in_a_line)
+        number = file.number("M669", "K", math.nan)
+        if number in range(len(KINEMATICS)) and KINEMATICS[int(number)] != "delta":
+            finding = report_kinematics(KINEMATICS[int(number)], ())
+            raise file.error(finding, "M669", "K")
         if "M665" not in file.commands:
             sentence = "no M665, the geometry of a delta, in this file; print it by M503"
             raise FileError(sentence, path)
@@ -293,7 +319,15 @@ class DeltaFirmware(ABC):
         return file
 
     def read(self, path: Path, options: ImportOptions) -> Imported:
-        """Read M665 and M666, and M851 where the firmware has it; FileError as `load`."""
+        """Read M665 and M666, and M851 where the firmware has it; FileError as `load`. The anchors
+        of a hanging printer (M669 K6) are read as `hangprinter` does.
+        """
+        lines = read_text(path, GcodeFile.what).splitlines(keepends=True)
+        hanging = GcodeFile.parse(lines, path)
+        if hanging.number("M669", "K", 0.0) == KINEMATICS.index("hangprinter"):
+            from loopcal.io.formats.hangprinter import read_config
+
+            return read_config(hanging, options)
         file = self.load(path)
         turns = zip(TOWERS, NOMINAL_ANGLES, strict=True)
         geometry = DeltaGeometry(

@@ -12,6 +12,9 @@ file, the anchors and the lengths at zero its errors. Known poses are measuremen
 `position`; an unknown pose contributes its readings alone, and n - 3 equations. A taped length at
 zero is prior knowledge: a nominal value whose tolerance is that of the tape. Source of the keys:
 the program auto-calibration-simulation-for-hangprinter.
+
+RepRapFirmware states anchors in `M669 N4 A0:-1610:-132 B..` and spools in `M666 R75:75:75:75 ..`: R
+radius, U runs of line, O lines on a spool, L motor teeth, H spool teeth.
 """
 
 from __future__ import annotations
@@ -24,16 +27,20 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.errors import FileError
+from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_json
 from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (
     MM,
+    Exported,
+    ExportSource,
     Format,
     Imported,
     ImportOptions,
+    ValueFile,
     format_head,
+    format_short,
     round_digits,
     round_length,
 )
@@ -43,6 +50,8 @@ from loopcal.units import LARGEST
 DEG = math.pi / 180.0
 FREEDOMS, MOST_LINES = 3, 26
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+ANCHORS_OF_FIRMWARE = "ABCDIJLO"
+"""Letters of the anchors in M669 of RepRapFirmware."""
 
 SAMPLES, POSITIONS, ANCHORS = "motor_pos_samp", "xyz_of_samp", "anchors"
 TAPED = "line_lengths_when_at_origin"
@@ -114,6 +123,50 @@ class Samples:
     def names(self) -> tuple[str, ...]:
         """Names of the lines."""
         return tuple(NAMES[: len(self.radius)])
+
+
+def read_config(file: ValueFile, options: ImportOptions) -> Imported:
+    """Read anchors and spools of M669 and M666; FileError where one is missing or incomplete."""
+
+    def list_numbers(command: str, letter: str, count: int) -> tuple[float, ...]:
+        numbers = file.numbers(command, letter, ":")
+        if len(numbers) != count:
+            sentence = f"{letter} of {command} has {len(numbers)} numbers, but {count} are needed"
+            raise file.error(f"{sentence}; correct it", command, letter)
+        return numbers
+
+    lines = int(file.number("M669", "N", 4.0))
+    if not FREEDOMS <= lines <= len(ANCHORS_OF_FIRMWARE):
+        raise file.error(f"N is {lines}; write a number of 3 to 8 lines", "M669", "N")
+    anchors = np.array([list_numbers("M669", name, 3) for name in ANCHORS_OF_FIRMWARE[:lines]])
+    radius, advantage, per_spool, motor, spool = (
+        np.array(list_numbers("M666", letter, lines)) for letter in "RUOLH"
+    )
+    if not (np.array([radius, advantage, per_spool, motor, spool]) > 0).all():
+        raise file.error("R, U, O, L and H of M666 must be positive; correct them", "M666", "R")
+    gear, nothing = float(motor[0] / spool[0]), np.full(lines, np.nan)
+    spools = (radius * motor / spool / gear, advantage, per_spool, gear)
+    samples = Samples(*spools, np.zeros((0, lines)), np.zeros((0, 3)), anchors, nothing, ())
+    text = format_robot(samples, anchors, file.path, options)
+    return Imported(text, None, (report_finding("files.no-samples"),))
+
+
+def write(source: ExportSource, into: Path | None) -> Exported:
+    """Return the anchors as M669 of RepRapFirmware; DataError for a robot without anchors."""
+    del into
+    values, ending = source.values(), ".anchor.x"
+    lines = [name.removesuffix(ending) for name in values if name.endswith(ending)]
+    if not FREEDOMS <= len(lines) <= len(ANCHORS_OF_FIRMWARE):
+        sentence = f"{source.robot.name} has no anchors of lines, and the format hangprinter"
+        raise DataError(f"{sentence} holds no other; use json or csv")
+    words = [f"M669 K6 N{len(lines)}"]
+    for line, letter in zip(lines, ANCHORS_OF_FIRMWARE, strict=False):
+        names = [f"{line}.anchor.{axis}" for axis in "xyz"]
+        numbers = (source.round_number(values.get(n, 0.0) / MM, n, MM, 3) for n in names)
+        words.append(letter + ":".join(format_short(number, 3) for number in numbers))
+    others = tuple(name for name in values if ".anchor." not in name)
+    finding = report_finding("files.not-expressed", format="M669", names=others)
+    return Exported(" ".join(words) + "\n", (finding,) if others else ())
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
@@ -375,9 +428,11 @@ def _is_number(value: Any) -> bool:
 
 FORMAT = Format(
     "hangprinter",
-    "samples of a hanging printer (JSON)",
+    "samples of a hanging printer (JSON); anchors as M669",
     (),
     read,
+    write,
+    takes_file=False,
     read_options={
         "sigma_line": "",
         "sigma_position": "",

@@ -25,7 +25,13 @@ import numpy as np
 from loopcal.errors import FileError
 from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.csv_table import parse_finite
-from loopcal.io.formats.delta_gcode import NOMINAL_ANGLES, DeltaGeometry, format_robot, get_geometry
+from loopcal.io.formats.delta_gcode import (
+    NOMINAL_ANGLES,
+    DeltaGeometry,
+    format_robot,
+    get_geometry,
+    report_kinematics,
+)
 from loopcal.io.formats.program_format import (
     DECIMALS,
     MM,
@@ -136,9 +142,7 @@ def read_config(path: Path) -> KlipperConfig:
     sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
     if kinematics == "delta" or (not is_stated and (cfg.includes or STEPPERS[0] in sections)):
         return cfg
-    code = "files.not-a-delta-configuration"
-    finding = report_finding(code, kinematics=kinematics, sections=sections[:4])
-    raise cfg.error(finding, "printer", "kinematics")
+    raise cfg.error(report_kinematics(kinematics, sections[:4]), "printer", "kinematics")
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
