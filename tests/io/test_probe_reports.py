@@ -11,6 +11,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
+from loopcal.geometry import align_point_sets, log_so3
 from loopcal.mechanism.solutions import forward, inverse
 
 MARLIN = "M665 L220.00 R105.00 H300.00 X0.00 Y0.00 Z0.00\nM666 X-0.10 Y0.00 Z-0.20\n"
@@ -333,3 +334,32 @@ def test_values_are_not_recommended_where_bed_or_probe_explain_heights_alone(
     if slope:
         codes = {f["code"]: f for f in lc.load_run("run").result["findings"]}
         assert codes["workflow.height-tilt"]["data"]["tilt"]["value"] == pytest.approx(4.0, abs=0.4)
+
+
+def test_values_that_turn_the_base_frame_are_named_and_others_keep_it(capsys) -> None:
+    """Two rods are wrong, which heights explain by towers that are turned against tower 3."""
+    robot, _ = make_truth("config.g")
+    names = list(robot.parameters.names)
+    wrong = robot.values.copy()
+    wrong[[names.index("arm1.length"), names.index("arm2.length")]] += [5e-3, -5e-3]
+    heights = probe(robot, robot.with_values(wrong), POINTS)
+    write_points(POINTS, heights, "report.txt", *G32)
+    write_points(POINTS, heights, "bed.g", "{}", BED)
+    line = "--probes report.txt --probes bed.g -o printer.yaml --data heights.csv"
+    assert run(f"import config.g {line}") == 0
+    assert run("calibrate printer.yaml heights.csv -o run --noise estimated") in (0, 2)
+    assert run("export run --format reprap -o new.g --force") in (0, 2)
+    assert "These values turn all of a program by 1." in " ".join(capsys.readouterr().out.split())
+    assert run("export run --format reprap -o kept.g --keep-frame --force") in (0, 2)
+    assert "no values of this robot keep" in " ".join(capsys.readouterr().out.split()).lower()
+    targets = 1e-3 * np.array([[x, y, 0.0] for x, y in POINTS])
+    readings, turns, heights = inverse(robot, targets).q, [], []
+    for name in ("new", "kept"):
+        assert run(f"import {name}.g -o {name}.yaml") == 0
+        places = forward(lc.load_robot(f"{name}.yaml"), readings).T[:, :3, 3]
+        motion = align_point_sets(places * [1, 1, 0], targets)
+        turns.append(math.degrees(log_so3(motion[:3, :3])[2]))
+        heights.append(places[:, 2])
+    assert abs(turns[0]) > 1.0
+    assert abs(turns[1]) < 0.2 * abs(turns[0])  # of the bed alone; it is zero over all heights
+    np.testing.assert_allclose(heights[0], heights[1], atol=2e-6)  # [m], M665 has 0.001 mm

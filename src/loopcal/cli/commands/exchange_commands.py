@@ -415,6 +415,10 @@ def export(
     output: Path | None = opt.path(
         "File to write; without it, --format prints what to type, with sensible digits.", "-o"
     ),
+    keep_frame: bool = opt.option(
+        "Write values of the same relative accuracy that leave programs where they are.",
+        is_flag=True,
+    ),
     force: bool = opt.force(
         "the output file", ", and write also the numbers of a calibration that failed"
     ),
@@ -449,7 +453,7 @@ def export(
     if failures and not force:
         document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
         return Output(document, list, [with_hint(failure) for failure in failures])
-    loaded = replace(load_source(source), is_for_people=output is None)
+    loaded = replace(load_source(source, keep_frame), is_for_people=output is None)
     exported = export_robot(loaded, target, into)
     if output is not None:
         write_text(output, exported.text)

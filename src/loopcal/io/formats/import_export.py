@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -73,13 +74,30 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
     return load_robot(output)
 
 
-def load_source(path: str | Path) -> ExportSource:
+def load_source(path: str | Path, keep_frame: bool = False) -> ExportSource:
     """Return the robot of a run folder, a robot file, or a shipped robot by its name, to export."""
-    return build_source(load_run_or_robot(path))
+    return build_source(load_run_or_robot(path), keep_frame)
 
 
-def build_source(run: Run) -> ExportSource:
-    """Return the robot of a run to export, with its intervals."""
+def build_source(run: Run, keep_frame: bool = False) -> ExportSource:
+    """Return the robot of a run to export, with its intervals. Where nothing measured the base
+    frame, and the values move it, a finding says so; `keep_frame` chooses values that keep it.
+
+    DataError : no values do.
+    """
+    from loopcal.apply.base_motion import find_base_motion
+
+    robot, error = run.robot, run.result.get("expected_error") or {}
+    findings: tuple[Finding, ...] = ()
+    if "base" in error.get("finding", {}).get("data", {}).get("fitted", ()):
+        is_planar = run.result.get("height_errors") is not None
+        moved = find_base_motion(run.initial_robot, robot, is_planar)
+        if moved is not None and keep_frame:
+            if moved.kept is None:
+                raise DataError(moved.finding)
+            robot = moved.kept
+            moved = find_base_motion(run.initial_robot, robot, is_planar)
+        findings = () if moved is None else (moved.finding,)
     rows = run.result.get("fit", {}).get("parameters", [])
     nulls = run.result.get("nulls", {})
     reasons = {
@@ -87,7 +105,8 @@ def build_source(run: Run) -> ExportSource:
         for i, row in enumerate(rows)
         if row["plus_minus"] is None
     }
-    return ExportSource(run.robot, {row["name"]: row["plus_minus"] for row in rows}, reasons)
+    halves = {row["name"]: row["plus_minus"] for row in rows}
+    return ExportSource(robot, halves, reasons, findings=findings)
 
 
 def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exported:
@@ -99,7 +118,8 @@ def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exp
         raise DataError(f"loopcal cannot write the format {target.name}; it writes {known}")
     if into is not None and not target.takes_file:
         raise DataError(report_finding("files.format-takes-no-file", format=target.name))
-    return target.write(source, into)
+    exported = target.write(source, into)
+    return replace(exported, findings=(*exported.findings, *source.findings))
 
 
 COLUMNS = ("name", "nominal", "value", "plus_minus", "unit", "free")

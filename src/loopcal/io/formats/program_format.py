@@ -119,12 +119,14 @@ class ExportSource:
         there is none. nulls : parameter -> reason why there is none.
     is_for_people : whether the numbers are to be read and typed: an identified value then has the
         digits that its interval supports. Files for programs have all digits.
+    findings : about these values in any controller.
     """
 
     robot: Mechanism
     plus_minus: Mapping[str, float | None] = field(default_factory=dict)
     nulls: Mapping[str, str] = field(default_factory=dict)
     is_for_people: bool = False
+    findings: tuple[Finding, ...] = ()
 
     def round_number(self, number: float, name: str, factor: float, most: int) -> float:
         """Return a number as it is written, in a unit of `factor` to SI: for people to the third
