@@ -59,6 +59,8 @@ def find_base_motion(initial: Mechanism, robot: Mechanism, is_planar: bool) -> B
     readings = probe_readings(robot)
     new, old = forward(robot, readings), forward(initial, readings)
     usable = new.converged & old.converged
+    if not usable.any():  # as where redundant readings contradict the initial values
+        return None
     readings, new, old = readings[usable], new.T[usable], old.T[usable]
     arms = np.zeros((1, 3))
     if any(axis < 3 for axis in robot.program.freedoms):  # it rotates: three more points of it
@@ -72,7 +74,7 @@ def find_base_motion(initial: Mechanism, robot: Mechanism, is_planar: bool) -> B
     level = np.array([1.0, 1.0, 0.0]) if is_planar else np.ones(3)
     M = align_point_sets(points * level, reference * level)
     moved = points @ M[:3, :3].T + M[:3, 3] - points
-    if not len(points) or np.sqrt((moved**2).sum(axis=1).mean()) < VISIBLE * robot.size:
+    if np.sqrt((moved**2).sum(axis=1).mean()) < VISIBLE * robot.size:
         return None
     for motion in (M, make_pose(M[:3, :3], np.zeros(3))):
         wanted = points @ motion[:3, :3].T + motion[:3, 3]

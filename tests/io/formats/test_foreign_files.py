@@ -19,6 +19,7 @@ OWN = {
     "urdf": ("robot.urdf", "constrained.urdf"),
     "sdf": ("robot.sdf",),
     "mjcf": ("robot.xml",),
+    "maslow": (),
 }
 """Names in SOURCES of the files of each format that corrects a file."""
 
@@ -39,6 +40,7 @@ def robots() -> dict[str, Mechanism]:
     return {name: lc.load_robot("linear-delta") for name in ("klipper", "marlin", "reprap")} | {
         "linuxcnc": lc.load_robot("hexapod-42"),
         "linuxcnc-ini": lc.load_robot("hexapod-42"),
+        "maslow": lc.load_robot("belt-4"),
         **{name: lc.load_robot("five-bar") for name in ("urdf", "sdf", "mjcf")},
     }
 

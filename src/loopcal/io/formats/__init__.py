@@ -26,6 +26,7 @@ FORMATS: Registry[Format] = Registry(
         "sdf": "loopcal.io.formats.linkages.sdf:FORMAT",
         "mjcf": "loopcal.io.formats.linkages.mjcf:FORMAT",
         "hangprinter": "loopcal.io.formats.hangprinter:FORMAT",
+        "maslow": "loopcal.io.formats.maslow:FORMAT",
         "json": "loopcal.io.formats.import_export:JSON",
         "csv": "loopcal.io.formats.import_export:CSV",
     },
