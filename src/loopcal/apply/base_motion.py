@@ -11,11 +11,14 @@ the model gives M T_i keep programs where they are, and all relative accuracy.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from loopcal.diagnose.gauge_freedoms import probe_readings
+from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.geometry import align_point_sets, log_so3, make_pose
 from loopcal.mechanism.kinematics import forward_trials
@@ -49,6 +52,27 @@ class BaseMotion:
             shift=Quantity(1e3 * float(np.linalg.norm(shift)), "mm"),
             keeps="" if self.kept is None else "both" if self.keeps_shift else "turn",
         )
+
+
+def choose_base(
+    result: Mapping[str, Any], initial: Mechanism, robot: Mechanism, keep_frame: bool
+) -> tuple[Mechanism, tuple[Finding, ...]]:
+    """Return the identified robot of a result (of its JSON), and whether its values move a base
+    frame that nothing measured; with `keep_frame` the robot with values that keep it.
+
+    DataError : no values do.
+    """
+    error = result.get("expected_error") or {}
+    if "base" not in error.get("finding", {}).get("data", {}).get("fitted", ()):
+        return robot, ()
+    is_planar = result.get("height_errors") is not None
+    moved = find_base_motion(initial, robot, is_planar)
+    if moved is not None and keep_frame:
+        if moved.kept is None:
+            raise DataError(moved.finding)
+        robot = moved.kept
+        moved = find_base_motion(initial, robot, is_planar)
+    return robot, () if moved is None else (moved.finding,)
 
 
 def find_base_motion(initial: Mechanism, robot: Mechanism, is_planar: bool) -> BaseMotion | None:

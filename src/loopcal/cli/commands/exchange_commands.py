@@ -436,10 +436,11 @@ def export(
       loopcal export run --format reprap -o config-override.g
       loopcal export run -o parameters.csv
     """
+    from loopcal.apply.base_motion import choose_base
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.formats.import_export import choose_format, export_robot, load_source
-    from loopcal.io.runs.run_folder import find_failure
+    from loopcal.io.formats.import_export import build_source, choose_format, export_robot
+    from loopcal.io.runs.run_folder import find_failure, load_run_or_robot
 
     if output is None and (format_name is None or into is not None):
         raise DataError(
@@ -453,7 +454,10 @@ def export(
     if failures and not force:
         document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
         return Output(document, list, [with_hint(failure) for failure in failures])
-    loaded = replace(load_source(source, keep_frame), is_for_people=output is None)
+    run = load_run_or_robot(source)
+    robot, moved = choose_base(run.result, run.initial_robot, run.robot, keep_frame)
+    loaded = build_source(replace(run, robot=robot))
+    loaded = replace(loaded, is_for_people=output is None, findings=moved)
     exported = export_robot(loaded, target, into)
     if output is not None:
         write_text(output, exported.text)

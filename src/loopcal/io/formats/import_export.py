@@ -24,7 +24,7 @@ from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import build_robot, load_robot
-from loopcal.io.runs.run_folder import Run, load_run_or_robot
+from loopcal.io.runs.run_folder import Run
 from loopcal.mechanism.model import Mechanism
 from loopcal.units import find_unit
 
@@ -74,30 +74,8 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
     return load_robot(output)
 
 
-def load_source(path: str | Path, keep_frame: bool = False) -> ExportSource:
-    """Return the robot of a run folder, a robot file, or a shipped robot by its name, to export."""
-    return build_source(load_run_or_robot(path), keep_frame)
-
-
-def build_source(run: Run, keep_frame: bool = False) -> ExportSource:
-    """Return the robot of a run to export, with its intervals. Where nothing measured the base
-    frame, and the values move it, a finding says so; `keep_frame` chooses values that keep it.
-
-    DataError : no values do.
-    """
-    from loopcal.apply.base_motion import find_base_motion
-
-    robot, error = run.robot, run.result.get("expected_error") or {}
-    findings: tuple[Finding, ...] = ()
-    if "base" in error.get("finding", {}).get("data", {}).get("fitted", ()):
-        is_planar = run.result.get("height_errors") is not None
-        moved = find_base_motion(run.initial_robot, robot, is_planar)
-        if moved is not None and keep_frame:
-            if moved.kept is None:
-                raise DataError(moved.finding)
-            robot = moved.kept
-            moved = find_base_motion(run.initial_robot, robot, is_planar)
-        findings = () if moved is None else (moved.finding,)
+def build_source(run: Run) -> ExportSource:
+    """Return the robot of a run to export, with its intervals."""
     rows = run.result.get("fit", {}).get("parameters", [])
     nulls = run.result.get("nulls", {})
     reasons = {
@@ -105,8 +83,7 @@ def build_source(run: Run, keep_frame: bool = False) -> ExportSource:
         for i, row in enumerate(rows)
         if row["plus_minus"] is None
     }
-    halves = {row["name"]: row["plus_minus"] for row in rows}
-    return ExportSource(robot, halves, reasons, findings=findings)
+    return ExportSource(run.robot, {row["name"]: row["plus_minus"] for row in rows}, reasons)
 
 
 def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exported:
