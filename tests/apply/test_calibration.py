@@ -176,7 +176,7 @@ def test_gauge_freedom_of_frames_is_one_finding_of_severity_info(robot):
     report = calibrate(robot, data, CalibrationOptions(hold_out=0.25))
     (freedom,) = [f for f in report.findings if f.code == "workflow.frame-freedoms"]
     assert freedom.severity is Severity.INFO
-    assert freedom.data == {"count": 6, "frames": ("base",), "still": 0}
+    assert freedom.data == {"count": 6, "frames": ("base",), "still": 0, "bodies": ()}
     assert not any(f.code == "workflow.undetermined-combinations" for f in report.findings)
     assert report.verdict is Verdict.CALIBRATED
 
@@ -273,7 +273,7 @@ GROWN = report_finding("gates.errors-grew", quantity="position", times=1.4)
 
 def test_most_severe_finding_decides_the_verdict():
     undecided = report_finding("workflow.no-held-out-poses")
-    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",), still=0)
+    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",), still=0, bodies=())
     findings = (info, UNDETERMINED, undecided, NOISE)
     verdicts = [decide_verdict(findings[:count]).name for count in (4, 3, 2, 1)]
     assert verdicts == ["NOT_CALIBRATED", "UNDECIDED", "RESERVATIONS", "CALIBRATED"]

@@ -70,7 +70,7 @@ def test_hint_follows_its_finding():
 
 
 def test_findings_are_sorted_from_failure_to_info():
-    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",), still=0)
+    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",), still=0, bodies=())
     warning = report_finding("workflow.no-held-out-poses")
     failure = report_finding("gates.limit-not-measured", quantity="position")
     assert sort_by_importance((info, warning, failure)) == (failure, warning, info)

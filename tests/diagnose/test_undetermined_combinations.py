@@ -76,6 +76,59 @@ def test_combinations_that_change_no_pose_do_not_lower_the_verdict(
         assert str(suggestion.combination.meaning) != "No pose depends on it"
 
 
+GRIPPER = """
+format: 1
+family: limbs
+name: gripper
+source: ours
+units: {length: mm, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x]
+drives:
+  motor: {reads: angle, stroke: [-20, 100], unknown: [offset], angle: {sd: 0.3}}
+bodies: [{name: disc}, {name: leftjaw}]
+limbs:
+  - name: shaft
+    to: disc
+    ending: rigid
+    chain: [{joint: R, name: shaft, actuated: motor, start: 45}]
+  - name: right
+    ending: rigid
+    chain: [{joint: P, name: rail, at: [0, 5, 0], axis: x, start: 60}]
+  - name: left
+    to: leftjaw
+    ending: rigid
+    chain: [{joint: P, name: rail, at: [0, -5, 0], axis: x, start: -60}]
+    errors: [RAIL]
+  - {name: rodr, on: disc, tip: [20, 0, 0], ending: distance, length: 50, errors: [ROD]}
+  - {name: rodl, on: disc, to: leftjaw, tip: [-20, 0, 0], ending: distance, length: 50}
+home: {x: 60, y: 5}
+workspace: {x: [50, 66]}
+""".replace("ROD", "{of: rod, shift: [length], tolerance: {sd: 0.1}}")
+
+
+@pytest.mark.parametrize(("axes", "count"), [("x", 0), ("y", 1), ("x, y", 1)])
+def test_what_moves_the_other_finger_is_not_harmless(axes, count, tmp_path):
+    """Along its axis a rail shifts nothing. Across it, the finger moves and its travel changes."""
+    path = tmp_path / "gripper.yaml"
+    path.write_text(
+        GRIPPER.replace("RAIL", f"{{of: rail, shift: [{axes}], tolerance: {{sd: 0.1}}}}")
+    )
+    robot = load_robot(path)
+    report = analyze_identifiability(robot, measure_poses(robot, 20))
+    findings = {f.code: f for f in report.summary}
+    combinations = report.analysis.unidentifiable
+    harmless = findings["identifiability.frames-only"]
+    assert harmless.data["still"] == len(combinations) == len(axes.split(","))
+    assert ("harmless" in str(harmless)) is not bool(count)
+    moved = findings.get("identifiability.moves-bodies")
+    assert (moved and dict(moved.data)) == (
+        {"count": count, "bodies": ("leftjaw",)} if count else None
+    )
+    meanings = [getattr(c.meaning, "code", "") for c in combinations]
+    assert meanings.count("identifiability.only-bodies-move") == count
+
+
 # Two slides. The direction of the second one shows only where it moves: about z it is an error of
 # squareness, and about x it turns the plane of motion, which is a motion of the base frame.
 STAGES = """

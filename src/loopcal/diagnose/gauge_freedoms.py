@@ -6,12 +6,14 @@ A direction n moves the platform by the twist D(x) n at the pose x. It is a moti
 where it equals (w, c + w x t) for one w and c at all poses, and one of the platform frame where it
 equals (R w, R c). Such a direction is a gauge freedom: it changes no dimension of the machine, only
 where its frames are placed. The poses are some of the stated workspace, and some about home. All
-statements on undetermined combinations follow from this one place. See docs/theory/gauge.md.
+statements on undetermined combinations follow from this one place. Bodies beside the platform, such
+as the other finger of a gripper, are outputs as well: what moves none but them is named with them.
+See docs/theory/gauge.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -26,9 +28,10 @@ from loopcal.estimate.null_space import Combination
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.chains import get_platforms
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.sensitivity import differentiate_platform, differentiate_pose
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import check_limits, draw_coordinates, workspace_ranges
@@ -67,6 +70,10 @@ class GaugeFreedoms:
     # frames: root mean square over poses, where every parameter deviates by its tolerance
     effect: tuple[float, float] = (0.0, 0.0)
     where: str = "the workspace"  # or "poses about home", where the robot states no workspace
+    # number of independent combinations that change no pose of the platform but move other bodies,
+    # beside their own frames, and these bodies
+    moving: int = 0
+    bodies: tuple[str, ...] = ()
 
 
 class SampledMotions(NamedTuple):
@@ -75,22 +82,27 @@ class SampledMotions(NamedTuple):
     T: FloatArray
     D: FloatArray
     in_workspace: int  # number of the poses in the stated workspace, which are the last ones
+    bodies: Mapping[str, tuple[FloatArray, FloatArray]]  # the same of every other body
 
 
 @lru_cache(maxsize=2)  # a report asks several times for one calibrated robot
 def sample_motions(robot: Mechanism) -> SampledMotions:
     """Return motions of a robot about home, and in its workspace where the robot states one."""
-    T, D = observe_motions(robot, probe_readings(robot))
+    T, D = observe_motions(robot, first := probe_readings(robot))
     try:
         ranges = workspace_ranges(robot)
     except MechanismError:
-        return SampledMotions(T, D, 0)
+        return SampledMotions(T, D, 0, observe_bodies(robot, first))
     drawn = draw_coordinates(np.random.default_rng(0), robot.controlled, ranges, PROBES)
     solution = inverse(robot, drawn)
     allowed = check_limits(robot, robot.values[None], solution.q[None], solution.state)[0][0]
-    workspace = observe_motions(robot, solution.q[solution.converged & allowed])
+    inside = solution.q[solution.converged & allowed]
+    workspace = observe_motions(robot, inside)
     return SampledMotions(
-        np.concatenate([T, workspace[0]]), np.concatenate([D, workspace[1]]), len(workspace[0])
+        np.concatenate([T, workspace[0]]),
+        np.concatenate([D, workspace[1]]),
+        len(workspace[0]),
+        observe_bodies(robot, np.concatenate([first, inside])),
     )
 
 
@@ -139,6 +151,7 @@ def find_gauge_freedoms(
     _, s, combine = np.linalg.svd(moved @ vt[changing:].T, full_matrices=False)
     moving = moved @ vt[changing:].T @ combine[s > SAME_MOTION].T
     count = moving.shape[1]
+    beside, bodies = _find_moved_bodies(robot, weighed, places, unit, null)
     frames = find_moving_frames(moving, base, platform, SAME_MOTION) if count else ()
     motion = np.linalg.lstsq(np.concatenate([base, platform], axis=1), moving, rcond=NO_MOTION)[0]
     growth = np.zeros((len(T), 6, 1))
@@ -154,7 +167,38 @@ def find_gauge_freedoms(
         changing=changing,
         effect=_measure_effect(robot, weighed, null) if changing else (0.0, 0.0),
         where="the workspace" if weighed.sample.in_workspace else "poses about home",
+        moving=beside,
+        bodies=bodies,
     )
+
+
+def _find_moved_bodies(
+    robot: Mechanism, weighed: WeighedMotions, places: IntArray, unit: FloatArray, null: FloatArray
+) -> tuple[int, tuple[str, ...]]:
+    """Return how many more independent combinations of directions (p, d) move bodies than move the
+    platform, where every body may have another frame; and these bodies.
+    """
+    if not weighed.sample.bodies:
+        return 0, ()
+    from scipy.linalg import block_diag
+
+    bodies = {"": (weighed.sample.T, weighed.sample.D), **weighed.sample.bodies}
+    each = {
+        name: weigh_motions(T, robot.size, D[:, :, places] * unit)
+        for name, (T, D) in bodies.items()
+    }
+
+    def count(names: Sequence[str]) -> int:
+        motions, base = (np.concatenate([each[n][i] for n in names]) for i in (0, 1))
+        own = np.asarray(block_diag(*[each[n][2] for n in names]), dtype=np.float64)
+        scale = np.maximum(np.linalg.norm(motions, axis=0), weighed.scale)
+        moved = (motions / scale) @ np.linalg.qr(scale[:, None] * null)[0]
+        rest = _without_span([base, own], moved)
+        return int((np.linalg.svd(rest, compute_uv=False) > SAME_MOTION).sum())
+
+    alone = count([""])
+    moved = tuple(name for name in weighed.sample.bodies if count(["", name]) > alone)
+    return (count(list(bodies)) - alone if moved else 0), moved
 
 
 def _measure_effect(
@@ -196,7 +240,11 @@ def report_undetermined(
         findings.append(report_readings_gauge(freedoms))
     if freedoms.count or freedoms.still:
         harmless: dict[str, Any] = {"count": freedoms.count, "frames": freedoms.frames}
-        findings.append(report_finding(codes[0], still=freedoms.still, **harmless))
+        harmless |= {"still": freedoms.still, "bodies": freedoms.bodies}
+        findings.append(report_finding(codes[0], **harmless))
+    if freedoms.moving:
+        beside = {"count": freedoms.moving, "bodies": freedoms.bodies}
+        findings.append(report_finding("identifiability.moves-bodies", **beside))
     if not freedoms.changing:
         return findings, ()
     changing = tuple(c for c in unidentifiable if not c.meaning)
@@ -241,6 +289,32 @@ def observe_motions(robot: Mechanism, readings: FloatArray) -> tuple[FloatArray,
     return state.T[0, usable], D[usable]
 
 
+def observe_bodies(
+    robot: Mechanism, readings: FloatArray
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return the same of the bodies beside the platform: those of `bodies:` and the platforms of
+    stages, by name.
+    """
+    values, q = robot.values[None], readings[None]
+    state = forward_trials(robot, values, q)
+    if robot.stages:
+        names = [stage.name for stage in robot.stages[:-1]]
+        poses = get_platforms(robot, state)
+        each = [
+            differentiate_platform(robot, values, q, state, end=end).parameters[0]
+            for end in range(len(names))
+        ]
+    elif robot.has_open_sums or not state.others:
+        return {}
+    else:
+        names, poses = list(robot.assembly.bodies), list(state.others)
+        twists = differentiate_pose(robot, values, q, state, nodes=1 + len(names)).parameters[0]
+        each = np.split(twists[:, 6:], len(names), axis=1)
+    usable = state.status[0] == Status.CONVERGED
+    kept = [usable & np.isfinite(D).all(axis=(1, 2)) for D in each]
+    return {n: (T[0, k], D[k]) for n, T, D, k in zip(names, poses, each, kept, strict=False)}
+
+
 def interpret_combinations(
     free: FreeParameters, combinations: tuple[Combination, ...]
 ) -> tuple[Combination, ...]:
@@ -257,6 +331,9 @@ def interpret_combinations(
         n = combination.direction
         limit = SAME_MOTION * float(np.linalg.norm(weighed.scale * n))
         motion = _describe_motion(weighed.by_parameters @ n, frames, limit, robot.size)
+        of_it = weighed, free.places, free.tolerance, n[:, None]
+        if motion is not None and (bodies := _find_moved_bodies(robot, *of_it)[1]):
+            motion = report_finding("identifiability.only-bodies-move", bodies=bodies)
         interpreted.append(replace(combination, meaning="" if motion is None else motion))
     return tuple(interpreted)
 

@@ -468,7 +468,7 @@ def find_frame_motions(
         return []
     robot, free = study.robot, study.planned.free
     null = np.stack([c.direction for c in combinations], axis=1)
-    T, D, _ = sample_motions(robot)
+    T, D, *_ = sample_motions(robot)
     moved, *frames = weigh_motions(T, robot.size, D[:, :, free.places] * free.tolerance @ null)
     motions = []
     for name, frame in zip(("base", "platform"), frames, strict=True):
