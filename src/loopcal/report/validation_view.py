@@ -48,10 +48,14 @@ READING_NOISE = (
 
 COMMANDED = (
     "These errors and the statements on limits compare predicted with measured poses at the same "
-    "readings. The actuators cannot correct all of the measured error: with the calibrated values "
-    "a controller still misses commanded poses by {errors} (rms)."
+    "readings. No reading corrects coordinates that are not commanded: with the calibrated values "
+    "they still differ from those of the geometry before calibration by {errors} (rms, without "
+    "noise)."
 )
 """Sentence for robots whose geometric errors also move what they cannot command."""
+
+NOTICEABLE = 0.01
+"""Share of the error after calibration above which such a difference is stated."""
 
 SIMILAR = 5e-3
 """Relative difference up to which two errors are called equal."""
@@ -188,15 +192,15 @@ def list_missed_quantities(validation: Validation) -> list[str]:
 
 
 def describe_commanded(validation: Validation) -> str:
-    """Return by how much commanded poses are missed after calibration, as a sentence; empty where
-    the actuators can correct all of the measured error.
+    """Return by how much coordinates that nobody commands differ after calibration, by the model
+    alone, as a sentence; empty where the actuators can correct all of the measured error.
     """
     shown = []
     for quantity in list_missed_quantities(validation):
-        statistics = validation.commanded_after.statistics(quantity)
-        unit = validation.units[quantity]
-        if statistics.count and math.isfinite(statistics.rms):
-            shown.append(f"{format_in(unit, statistics.rms, 3)} {unit.symbol} in {quantity}")
+        rms = validation.not_compensable.statistics(quantity).rms
+        unit, after = validation.units[quantity], validation.after.statistics(quantity).rms
+        if math.isfinite(rms) and rms > NOTICEABLE * after:
+            shown.append(f"{format_in(unit, rms, 3)} {unit.symbol} in {quantity}")
     return COMMANDED.format(errors=" and ".join(shown)) if shown else ""
 
 
