@@ -32,7 +32,6 @@ from loopcal.io.formats.program_format import (
     Name,
     ValueFile,
     format_head,
-    format_short,
     parse_number,
     round_digits,
     round_length,
@@ -45,8 +44,9 @@ ORIGIN = ("bl.anchor.x", "bl.anchor.y", "br.anchor.y")
 ANCHOR_SD = 30.0
 """Tolerance of anchors that were taped [mm]."""
 BLOCK = re.compile(r"CLBM:\s*\[(.*?)\]")
-WAYPOINT = re.compile(r"\{([^{}]*)\}")
-LENGTH = re.compile(r"\s*(bl|br|tr|tl)\s*:\s*(\S+)\s*$")
+WAYPOINT = re.compile(
+    r"\{" + r",\s*".join(rf"{belt}:\s*([^\s,{{}}]+)" for belt in BELTS) + r"\s*\}"
+)
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,6 @@ class MaslowConfig(ValueFile):
         """Return belt -> x, y of its anchor [mm]; FileError where one is missing."""
         return {b: [self.number("Maslow", b + axis) for axis in "XY"] for b in BELTS}
 
-    def format(self, number: float) -> str:
-        """Return a number with the decimals that its unit needs."""
-        return format_short(number, 3)
-
 
 def read(path: Path, options: ImportOptions) -> Imported:
     """Read the anchors, and the belt lengths of a log; FileError where one is missing."""
@@ -79,9 +75,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
     sigma = options.choose_noise("line") / MM
     corners = np.array(list(anchors.values()))
     low, high = corners.min(axis=0), corners.max(axis=0)
-    middle = [round_length(v) for v in (low + high) / 2]
-    longest = round_length(2.0 * float(np.linalg.norm(high - low)))
-    drive = {"reads": "length", "stroke": [0, longest], "sigma": round_digits(sigma)}
+    drive = {"reads": "length", "sigma": round_digits(sigma)}
     anchor = {"of": "base", "shift": ["x", "y"], "name": "anchor", "tolerance": {"sd": ANCHOR_SD}}
     content: dict[str, Any] = {
         "freedoms": ["x", "y"],
@@ -92,9 +86,9 @@ def read(path: Path, options: ImportOptions) -> Imported:
             | {"length": 0, "errors": [anchor]}
             for belt, place in anchors.items()
         ],
-        "home": dict(zip("xy", middle, strict=True)),
+        "home": {axis: round_length(v) for axis, v in zip("xy", (low + high) / 2, strict=True)},
         "workspace": {
-            axis: [round_length(a + 0.2 * (b - a)), round_length(b - 0.2 * (b - a))]
+            axis: [round_length(0.8 * a + 0.2 * b), round_length(0.2 * a + 0.8 * b)]
             for axis, a, b in zip("xy", low.tolist(), high.tolist(), strict=True)
         },
         "fixed": list(ORIGIN),
@@ -128,19 +122,10 @@ def _read_log(path: Path) -> list[list[float]]:
     if not blocks:
         raise FileError(report_finding("files.no-waypoints"), path)
     line, block = blocks[-1]
-    rows = []
-    for number, waypoint in enumerate(WAYPOINT.findall(block)):
-        cells = [LENGTH.match(cell) for cell in waypoint.split(",")]
-        stated = {cell[1]: cell[2] for cell in cells if cell is not None}
-        if set(stated) != set(BELTS):
-            raise FileError(
-                report_finding("files.waypoint-incomplete", waypoint=number), path, line
-            )
-        what = f"waypoint {number}"
-        rows.append([parse_number(stated[belt], what, path, line) for belt in BELTS])
-    if not rows:
-        raise FileError(report_finding("files.no-waypoints"), path)
-    return rows
+    rows = WAYPOINT.findall(block)
+    if not rows or len(rows) != block.count("{"):
+        raise FileError(report_finding("files.waypoint-incomplete"), path, line)
+    return [[parse_number(cell, "a length of CLBM", path, line) for cell in row] for row in rows]
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:

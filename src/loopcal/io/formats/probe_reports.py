@@ -57,7 +57,6 @@ TOUCHING = re.compile(r"(?<![A-Z\d])G30(?!\d)(?!.*P\s*\d).*S\s*-1(?!\d)")
 CALIBRATED = re.compile(r"Calibrated (\d+) factors using")
 HEIGHT_MAP = "RepRapFirmware height map file"
 GENERATED = re.compile(r"generated at (\d{4}-\d\d-\d\d)")
-FAILED = re.compile(r"not set|failed|Probe (?:was not|already) triggered", re.IGNORECASE)
 UNPROBED = "0"
 """Cell of a height map that was not probed."""
 
@@ -130,7 +129,14 @@ def read_reports(
     """
     texts = {path: read_text(path, "probe report") for path in paths}
     read = _read_marlin if firmware == "marlin" else _read_reprap
-    points, noted = read(texts, probe)
+    probed, touched, noted = read(texts, probe)
+    missing = tuple(letter for letter in "XY" if letter not in probe)
+    if probed and missing:
+        facts = {"letters": missing, "firmware": firmware}
+        noted.append(report_finding("files.probe-place-assumed", **facts))
+    x, y = probe.get("X", 0.0), probe.get("Y", 0.0)
+    points = [p._replace(x=p.x - x, y=p.y - y) for p in probed]
+    points += touched if firmware == "reprap" or not probed else []
     if not points:
         raise FileError(report_finding("files.no-probe-report", firmware=firmware), paths[0])
     return points, noted
@@ -171,17 +177,6 @@ def _check_heights(
     return [finding]
 
 
-def _shift_points(
-    points: Sequence[ProbedPoint], probe: Mapping[str, float], firmware: str
-) -> tuple[list[ProbedPoint], list[Finding]]:
-    """Return points with the place of the nozzle in place of that of the probe beside it."""
-    x, y = probe.get("X", 0.0), probe.get("Y", 0.0)
-    missing = tuple(letter for letter in "XY" if letter not in probe)
-    code, facts = "files.probe-place-assumed", {"letters": missing, "firmware": firmware}
-    noted = [report_finding(code, **facts)] if points and missing else []
-    return [p._replace(x=p.x - x, y=p.y - y) for p in points], noted
-
-
 def _parse_point(match: re.Match[str], path: Path, line: int) -> ProbedPoint:
     """Return the point of a line."""
     numbers = zip(("X", "Y", "Z"), match.groups(), strict=True)
@@ -191,9 +186,9 @@ def _parse_point(match: re.Match[str], path: Path, line: int) -> ProbedPoint:
 
 def _read_marlin(
     texts: Mapping[Path, str], probe: Mapping[str, float]
-) -> tuple[list[ProbedPoint], list[Finding]]:
-    """Return the points of G30 and of dry runs of G33; those of M114, which are touched by the
-    nozzle, where there are no others.
+) -> tuple[list[ProbedPoint], list[ProbedPoint], list[Finding]]:
+    """Return the points of G30 and of dry runs of G33, where the probe is; those of M114, which the
+    nozzle touched; findings.
     """
     probed: list[ProbedPoint] = []
     touched: list[ProbedPoint] = []
@@ -219,14 +214,15 @@ def _read_marlin(
                     probed.append(ProbedPoint(*place, parse_number(height, name, path, i), name))
             elif match := POSITION.match(line):
                 touched.append(_parse_point(match, path, i))
-    points, noted = _shift_points(probed, probe, "marlin")
-    return points or touched, noted
+    return probed, touched, []
 
 
 def _read_reprap(
     texts: Mapping[Path, str], probe: Mapping[str, float]
-) -> tuple[list[ProbedPoint], list[Finding]]:
-    """Return the points of height maps, of G32 with the points of bed.g, and of `G30 S-1`."""
+) -> tuple[list[ProbedPoint], list[ProbedPoint], list[Finding]]:
+    """Return the points of height maps and of G32 with the points of bed.g, where the probe is;
+    those of `G30 S-1`, where the nozzle is; findings.
+    """
     places: dict[float, tuple[float, float]] = {}
     reports: list[tuple[Path, int, str]] = []
     probed: list[ProbedPoint] = []
@@ -246,20 +242,19 @@ def _read_reprap(
                 factors = path, i, match[1]
     for path, number, cells in reports:
         probed += _read_heights(cells, places, path, number)
-    points, noted = _shift_points(probed, probe, "reprap")
-    points += _read_stops(texts, probe)
+    stopped, noted = _read_stops(texts, probe), list[Finding]()
     if factors is not None:
         path, number, count = factors
-        level = Severity.WARNING if points else Severity.REFUSAL
-        facts = {"factors": int(count), "alone": not points}
-        finding = report_finding("files.log-calibrates", level, **facts)
-        if not points:
+        alone = not probed and not stopped
+        level = Severity.REFUSAL if alone else Severity.WARNING
+        finding = report_finding("files.log-calibrates", level, factors=int(count), alone=alone)
+        if alone:
             raise FileError(finding, path, number)
         noted.append(finding)
     dates = {match[1] for text in texts.values() if (match := GENERATED.search(text))}
     if len(dates) > 1:
         noted.append(report_finding("files.reports-of-dates", dates=sorted(dates)))
-    return points, noted
+    return probed, stopped, noted
 
 
 def _read_heights(
@@ -271,7 +266,7 @@ def _read_heights(
     if not re.fullmatch(rf"(?:\s+{NUMBER})+\s*", cells):
         finding = (
             report_finding("files.g32-failed")
-            if FAILED.search(cells)
+            if re.search(r"not set|failed", cells, re.IGNORECASE)
             else report_finding("files.g32-unreadable", cells=cells.strip())
         )
     elif missing := wanted - set(places):
@@ -287,41 +282,35 @@ def _read_heights(
 
 
 def _read_stops(texts: Mapping[Path, str], probe: Mapping[str, float]) -> list[ProbedPoint]:
-    """Return the points of `G30 S-1`, at the places of the moves before it, in the same text or
-    in a macro.
+    """Return the points of `G30 S-1`, each at the place of the last moves before this command,
+    which are in the log or in a macro.
     """
     places: list[dict[str, float]] = []
-    stops: list[tuple[Path, int, float, dict[str, float]]] = []
+    stops: list[tuple[Path, int, float]] = []
     for path, text in texts.items():
         place: dict[str, float] = {}
         for i, line in enumerate(text.splitlines(), 1):
             code = line.partition(";")[0].upper()
             if match := MOVE.search(code):
                 words = ((n, re.search(rf"{n}\s*{NUMBER}", match[1])) for n in "XY")
-                place |= {n: parse_number(w[1], n, path, i) for n, w in words if w}
+                place |= {n: parse_number(word[1], n, path, i) for n, word in words if word}
             if TOUCHING.search(code):
                 places.append(dict(place))
             if match := STOPPED.search(line):
-                stops.append((path, i, parse_number(match[1], "the height", path, i), dict(place)))
-            elif stops and "triggered" in line and FAILED.search(line):
-                raise FileError(report_finding("files.g32-failed"), path, i)
+                stops.append((path, i, parse_number(match[1], "the height", path, i)))
     if not stops:
         return []
-    path, line, *_ = stops[0]
-    if places and len(places) != len(stops):
+    finding = None
+    if len(places) != len(stops):
         finding = report_finding("files.g32-too-few", count=len(stops), points=len(places))
-        raise FileError(finding, path, line)
-    if "Z" not in probe:
-        raise FileError(report_finding("files.trigger-height-missing"), path, line)
-    points = []
-    for (file, i, height, own), of_command in zip(
-        stops, places or [s[3] for s in stops], strict=True
-    ):
-        place = of_command or own
-        if len(place) < 2:
-            raise FileError(report_finding("files.probe-place-missing"), file, i)
-        points.append(ProbedPoint(place["X"], place["Y"], height - probe["Z"]))
-    return points
+    elif any(len(place) < 2 for place in places):
+        finding = report_finding("files.probe-place-missing")
+    elif "Z" not in probe:
+        finding = report_finding("files.trigger-height-missing")
+    if finding is not None:
+        raise FileError(finding, *stops[0][:2])
+    pairs = zip(places, stops, strict=True)
+    return [ProbedPoint(p["X"], p["Y"], height - probe["Z"]) for p, (*_, height) in pairs]
 
 
 def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:
