@@ -310,6 +310,9 @@ def test_next_step_of_a_good_calibration_agrees_with_the_recommendation(
         ((EXCEEDED,), {}, "improve-accuracy"),
         ((OPEN,), {}, "less-noise"),
         ((OPEN, UNDETERMINED), {}, "resolve-warnings"),
+        # an action of each warning: that of the catalog, or the last sentence of its text
+        ((OPEN, UNDETERMINED), {}, "Measure what determines"),
+        ((OPEN, UNDETERMINED), {}, "Use an instrument with less noise"),
         ((EXCEEDED, MISSING), {}, "largest source of the expected position error"),
         # what no calibration reduces
         ((EXCEEDED,), {"position": 0.83, "orientation": 0.0}, "improve-machine"),

@@ -178,6 +178,10 @@ def is_readings_alone(data: Measurements) -> bool:
     return all(isinstance(rows.kind, Closure) for rows in data.observations)
 
 
+MOST_ACTIONS = 2
+"""Actions at most that the next step states where there are several warnings."""
+
+
 class Verdict(Enum):
     """Whether the calibrated geometry can be used; the value is how people read it."""
 
@@ -259,7 +263,9 @@ def choose_next_step(
         poses = tuple(f"pose {label}" for label in outliers)
         return report_finding("workflow.next-check-outliers", poses=poses)
     if verdict is Verdict.RESERVATIONS:
-        return report_finding("workflow.next-resolve-warnings")
+        actions = dict.fromkeys(f.action for f in findings if f.code in warned)
+        stated = " ".join(list(actions)[:MOST_ACTIONS])
+        return report_finding("workflow.next-resolve-warnings", actions=stated)
     if any(code.startswith("fit.") for code in failed) or "gates.poses-unreachable" in failed:
         return report_finding("workflow.next-check-data")
     if any(code.startswith("noise.") for code in failed):

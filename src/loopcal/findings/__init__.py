@@ -56,6 +56,15 @@ class Finding:
 
         return find_entry(self.code).word(self.data)
 
+    @property
+    def action(self) -> str:
+        """What to do next: the action of the catalog, or the last sentence of the text."""
+        from loopcal.findings.catalog import find_entry
+        from loopcal.findings.wording import fill_template
+
+        action = find_entry(self.code).action
+        return fill_template(action, **self.data) if action else str(self).split(". ")[-1]
+
     def _repr_html_(self) -> str:
         """Return the sentence for notebooks."""
         from html import escape as escape_html
