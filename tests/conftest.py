@@ -78,6 +78,24 @@ def data_folder() -> Path:
     return folder
 
 
+@pytest.fixture
+def do_not_draw(monkeypatch) -> None:
+    """Leave out the layout and the drawing of figures: it takes a third of the time of a plan and
+    nine tenths of that of a report, and tests/report draws every figure.
+    """
+
+    def save(_, out, **_options) -> None:
+        if isinstance(out, str | Path):
+            Path(out).write_bytes(b"\x89PNG\r\n\x1a\n")
+        else:
+            out.write(b"\x89PNG\r\n\x1a\n")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
+    monkeypatch.setattr("matplotlib.figure.Figure.draw_without_rendering", lambda _: None)
+    empty = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 400 300"></svg>'
+    monkeypatch.setattr("loopcal.report.pictures._render_svg", lambda _: empty)
+
+
 @pytest.fixture(scope="session")
 def jax() -> ModuleType:
     """Return jax set to 64 bits, for derivatives that are independent of ours."""

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How tests run commands. Commands build their figures, but write a placeholder for each picture:
-drawing takes a third of the time of a plan, and tests/report draws every figure.
-"""
+"""How tests run commands, which write placeholders for pictures."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -12,21 +10,10 @@ import pytest
 
 from loopcal.cli.entry_point import main
 
-PLACEHOLDER = b"\x89PNG\r\n\x1a\n"
-
 
 @pytest.fixture(autouse=True)
-def do_not_draw(monkeypatch) -> None:
-    """Leave out the layout and the drawing of pictures in this process."""
-
-    def save(_, out, **_options) -> None:
-        if isinstance(out, str | Path):
-            Path(out).write_bytes(PLACEHOLDER)
-        else:
-            out.write(PLACEHOLDER)
-
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
-    monkeypatch.setattr("matplotlib.figure.Figure.draw_without_rendering", lambda _: None)
+def use_placeholders(do_not_draw) -> None:
+    """Write placeholders for pictures in all tests of this folder."""
 
 
 class Printed(NamedTuple):

@@ -14,6 +14,7 @@ from loopcal.cli.entry_point import main
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("do_not_draw")
 def test_page_runs_as_printed(root, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     page = (root / "docs" / "report.md").read_text("utf-8")

@@ -320,7 +320,7 @@ def test_drawn_iterations_are_computed_steps_that_do_not_rise_after_leaps(result
         assert (y[1:] < 1.02 * np.minimum.accumulate(y)[:-1]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_same_seed_gives_the_same_numbers(results) -> None:
     for first, again in zip(
         results.draws["3-PRS"], steps.simulate_machines(DESIGN, 0, 2), strict=True

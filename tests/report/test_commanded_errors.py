@@ -27,7 +27,7 @@ def calibrate_drawn(name: str) -> lc.CalibrationReport:
     return lc.calibrate(robot, simulate(machine, poses, instrument, 1), options)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("do_not_draw")
 def test_report_of_a_tripod_says_that_commanded_poses_are_still_missed(tmp_path) -> None:
     report = calibrate_drawn("3-prs")
     errors = report.validation
