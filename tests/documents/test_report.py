@@ -228,6 +228,7 @@ def test_limits_of_calls_are_sentences(calibration, tmp_path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("do_not_draw")
 def test_report_of_a_cable_robot_names_its_repeatability_and_judges_no_sigma_by_residuals(
     tmp_path, monkeypatch
 ) -> None:

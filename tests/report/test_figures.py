@@ -58,7 +58,11 @@ def test_figure_of_a_fit_has_units_and_no_warnings(draw, name, request) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draw", OF_FITS, ids=lambda draw: draw.__name__)
+@pytest.mark.parametrize(
+    "draw",
+    [OF_FITS[0], *(pytest.param(draw, marks=pytest.mark.evidence) for draw in OF_FITS[1:])],
+    ids=lambda draw: draw.__name__,
+)
 def test_figure_has_the_same_bytes_each_time(draw, five_bar) -> None:
     figure = draw(five_bar.fit)
     content = render_figure(figure, ".svg")
