@@ -363,3 +363,33 @@ def test_values_that_turn_the_base_frame_are_named_and_others_keep_it(capsys) ->
     assert abs(turns[0]) > 1.0
     assert abs(turns[1]) < 0.2 * abs(turns[0])  # of the bed alone; it is zero over all heights
     np.testing.assert_allclose(heights[0], heights[1], atol=2e-6)  # [m], M665 has 0.001 mm
+
+
+def test_heights_of_an_own_file_in_micrometers_are_named_as_possible(capsys) -> None:
+    robot, truth = make_truth("config.g")
+    at_zero = 1e-3 * np.array([[x, y, 0.0] for x, y in POINTS])
+    readings = inverse(robot, at_zero).q
+    heights = 1e6 * forward(truth, readings).T[:, 2, 3]
+    rows = [
+        ",".join([str(i), *(f"{1e3 * q:.5f}" for q in row), f"{h:.0f}"])
+        for i, (row, h) in enumerate(zip(readings, heights, strict=True))
+    ]
+    head = ["# kind: component", "# components: [z]", "# noise: {z: 20 um}"]
+    text = [*head, "pose,q1 [mm],q2 [mm],q3 [mm],z [mm]", *rows]
+    Path("own.csv").write_text("\n".join(text))
+    assert run("calibrate truth.yaml own.csv -o run --force") in (1, 2)
+    assert "um as mm" in " ".join(capsys.readouterr().err.split())
+
+
+def test_joined_files_of_two_days_are_named(capsys) -> None:
+    robot, truth = make_truth("m503.gcode")
+    write_points(POINTS, probe(robot, truth, POINTS))
+    assert run("import m503.gcode --probes report.txt -o p.yaml --data a.csv") == 0
+    text = Path("a.csv").read_text()
+    for name, day, start in (("b", "2026-05-04", ""), ("c", "2026-05-31", "c")):
+        head = f"# instrument: {{name: probe, measured: {day}}}\npose,"
+        new = text.replace("pose,", head, 1)
+        lines = [start + r if r[0].isdigit() else r for r in new.splitlines()]
+        Path(f"{name}.csv").write_text("\n".join(lines))
+    assert run("calibrate p.yaml b.csv c.csv -o run --allow-duplicates --verbose") in (0, 2)
+    assert "measured on 2026-05-04 and 2026-05-31" in " ".join(capsys.readouterr().out.split())

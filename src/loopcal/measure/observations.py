@@ -148,7 +148,8 @@ def list_instruments(observations: Sequence[Observations]) -> tuple[InstrumentRe
 
 
 def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
-    """Return the instruments that were not validly calibrated when they measured.
+    """Return the instruments that were not validly calibrated when they measured, and the days
+    where there are several.
 
     Dates are compared with each other, not with the clock: without the date of the measurements
     nothing can be said.
@@ -164,6 +165,9 @@ def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
             findings.append(report_finding("data.instrument-past-due", **stated))
         elif record.measured and record.measured < record.calibrated:
             findings.append(report_finding("data.instrument-calibrated-later", **stated))
+    days = sorted({record.measured for record in list_instruments(observations)} - {""})
+    if len(days) > 1:
+        findings.append(report_finding("data.several-days", days=days))
     return findings
 
 

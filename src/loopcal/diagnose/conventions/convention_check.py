@@ -342,7 +342,9 @@ def _compare_interpretations(
     if against is not None and against.misfit <= ALLOWED:
         return _contradict(misfit, against)
     find_pairs = misfit > IMPLAUSIBLE
-    chosen, tried, pairs = search_interpretations(free, thinned, stated, misfit, find_pairs)
+    chosen, tried, pairs, possible = search_interpretations(
+        free, thinned, stated, misfit, find_pairs
+    )
     # those beyond unknown frames: of the data as written or as read, whichever has fewer
     compared = (stated, None if chosen is None else chosen.comparison)
     linear = [c.linearization for c in compared if c is not None]
@@ -376,7 +378,8 @@ def _compare_interpretations(
     if not misfit > IMPLAUSIBLE or has_errors:
         return ConventionCheck(misfit)
     if has_enough:
-        finding = report_finding("conventions.unexplained", **description, tried=tried, pairs=pairs)
+        description |= {"tried": tried, "pairs": pairs, "possible": possible}
+        finding = report_finding("conventions.unexplained", **description)
         return ConventionCheck(misfit, finding=finding)
     listed = () if chosen is None else (chosen.interpretation, *chosen.alternatives)
     finding = report_finding(

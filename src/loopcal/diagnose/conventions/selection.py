@@ -231,14 +231,15 @@ class _Test(NamedTuple):
 
 def search_interpretations(
     free: FreeParameters, data: Measurements, stated: Comparison | None, misfit: float, pairs: bool
-) -> tuple[Selection | None, dict[str, int], int]:
+) -> tuple[Selection | None, dict[str, int], int, str]:
     """Search for the interpretation that fits far better than the stated one.
 
     data : as written. stated : their comparison at the poses that the robot reaches; None where it
         reaches too few. misfit : of the data as written. pairs : test pairs if no single
         interpretation explains the data.
     Returns the interpretation that explains the data, None without one; the number of single
-    interpretations that were tested by slip, and the number of pairs.
+    interpretations that were tested by slip, and the number of pairs; the unit, in words, in which
+    the data would fit where that is no evidence, because values so small fit by chance.
     """
     written = None if stated is None else stated.data
     select = partial(_select_best, free, data, written, misfit)
@@ -256,7 +257,11 @@ def search_interpretations(
         best = select(singles, misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST)
         if best is not None and best.misfit > ALLOWED and not _is_robot_far(stated, best):
             best = None
-    return best, tried, count
+    units = [test for test in singles if test.interpretation.slip == "unit"]
+    possible = min(units, key=lambda test: test.misfit, default=None)
+    if best is not None or possible is None or possible.misfit > ALLOWED:
+        return best, tried, count, ""
+    return best, tried, count, str(possible.interpretation.finding)
 
 
 def _is_robot_far(stated: Comparison | None, chosen: Selection) -> bool:
