@@ -154,6 +154,7 @@ def test_hostile_labels_are_text_in_the_scene_of_the_view(run) -> None:
     assert "alert(1)" not in text.replace(scene[1], "")
 
 
+@pytest.mark.usefixtures("do_not_draw")
 def test_what_a_run_lacks_is_stated_in_one_sentence(run) -> None:
     record = load_record(run)
     result = {k: v for k, v in record.result.items() if k not in ("split", "validation")}
@@ -297,6 +298,7 @@ def test_budget_of_a_platform_that_does_not_rotate_states_no_orientation(root) -
         assert not any("orientation" in column.title for column in table.columns)
 
 
+@pytest.mark.usefixtures("do_not_draw")
 def test_noise_floor_of_uncertain_readings_is_called_a_lower_bound(page, root) -> None:
     assert READING_NOISE not in page.read_text("utf-8")  # the readings of this example are exact
     machine = lc.load_robot("cable-4")

@@ -133,7 +133,7 @@ LABEL = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S", "Zs
 LABELS = LABEL | st.sampled_from(["#1", '"', 'a"b', "a,b", "'", "a\tb", "1e3", "yes", "-", "+x"])
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(st.lists(LABELS, min_size=3, max_size=3), LABELS, LABELS, st.booleans())
 def test_any_labels_are_read_back_or_refused(labels, session, group, is_held_out) -> None:
     """Whatever `save_measurements` accepts, `load_measurements` gives again."""

@@ -204,7 +204,7 @@ def test_changed_robot_is_read_or_refused_in_one_sentence(name: str) -> None:
     file, rng, refused = read_yaml(FILES[name], "robot file"), np.random.default_rng(0), 0
     content = {key: value for key, value in file.content.items() if key not in HEADER}
     family = FAMILIES[file.content["family"]]
-    for _ in range(60):
+    for _ in range(30):
         try:
             record = read_record(file, change(content, rng), family, read_units(file))
         except FileError as error:

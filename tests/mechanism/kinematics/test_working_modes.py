@@ -81,7 +81,9 @@ def measure_mobility_sign(robot: Mechanism, solution: Solution) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wide", [1.0, pytest.param(2.5, marks=pytest.mark.evidence), 6.0])
+@pytest.mark.parametrize(
+    "wide", [*(pytest.param(wide, marks=pytest.mark.evidence) for wide in (1.0, 2.5)), 6.0]
+)
 @pytest.mark.parametrize("name", ROBOTS)
 def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide: float) -> None:
     robot = load_cached_robot(name)
