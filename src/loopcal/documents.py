@@ -27,6 +27,7 @@ from loopcal.io.core.text_file import as_path, to_json, write_bytes, write_text
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_source, export_robot
 from loopcal.io.formats.program_format import ExportSource
+from loopcal.io.runs.certificate import Administration, load_administration
 from loopcal.io.runs.result_files import format_comparison
 from loopcal.io.runs.run_folder import Run, build_document, refuse_changed_run
 from loopcal.mechanism.model import Mechanism
@@ -49,8 +50,12 @@ GENERAL = ("json", "csv")
 """Formats that take every robot, and belong to no controller."""
 
 
-def load_record(source: CalibrationReport | Run) -> CalibrationRecord:
+def load_record(
+    source: CalibrationReport | Run, facts: str | Path | None = None
+) -> CalibrationRecord:
     """Return what a report shows, of a calibration in memory or a run folder.
+
+    facts : file with what people state beside the results.
 
     Raises
     ------
@@ -62,6 +67,7 @@ def load_record(source: CalibrationReport | Run) -> CalibrationRecord:
     else:  # as its run folder would be
         fit, result = source.identification, json.loads(to_json(build_document(source)))
         run = Run(Path(), result, fit.robot, fit.initial, arrays=source.arrays())
+    stated = Administration() if facts is None else load_administration(facts, is_complete=False)
     robot, arrays, content = run.identified_robot, run.arrays, restore_numbers(run.result)
     stored = content.get("validation")
     return CalibrationRecord(
@@ -74,6 +80,7 @@ def load_record(source: CalibrationReport | Run) -> CalibrationRecord:
         heights=restore_heights(arrays, robot),
         residuals=residuals_from_arrays(arrays),
         controllers=list_controllers(replace(build_source(run), is_for_people=True)),
+        facts=stated.list_rows(),
     )
 
 
@@ -97,7 +104,9 @@ HTML = (".html", SHORT_HTML)
 """Endings of a page's name."""
 
 
-def save_report(report: CalibrationReport | Run, path: str | Path) -> Path:
+def save_report(
+    report: CalibrationReport | Run, path: str | Path, facts: str | Path | None = None
+) -> Path:
     """Write the report of a calibration as one HTML file for people, and as JSON beside it.
 
     The HTML file loads nothing and can be printed, sent and archived. It contains one script, the
@@ -108,6 +117,8 @@ def save_report(report: CalibrationReport | Run, path: str | Path) -> Path:
     ----------
     report : of `loopcal.calibrate`, or a run from `loopcal.load_run`.
     path : of the HTML file, whose name ends in .html; the JSON file has the same name otherwise.
+    facts : file with what people state beside the results, such as customer and serial number, see
+        docs/report.md; a missing one is a line to fill in on paper.
 
     Returns
     -------
@@ -115,7 +126,7 @@ def save_report(report: CalibrationReport | Run, path: str | Path) -> Path:
 
     Raises
     ------
-    FileError : the name has another ending, or a file cannot be written.
+    FileError : the name has another ending, a file cannot be written, or a fact is wrong.
 
     Examples
     --------
@@ -128,7 +139,7 @@ def save_report(report: CalibrationReport | Run, path: str | Path) -> Path:
     path = as_path(path, "report")
     data = name_data(path)
     refuse_outputs((path, data), (), force=True)
-    document = build_calibration_document(load_record(report))
+    document = build_calibration_document(load_record(report, facts))
     html, json_text = render_html(document), to_json({"format": 1, **json_fields(document)})
     with restore_on_failure((path, data)):
         write_text(path, html)

@@ -71,7 +71,7 @@ def test_page_opens_without_requests_errors_and_javascript(browser, page) -> Non
     tab.goto(page.as_uri())
     assert asked == [page.as_uri()]
     assert logged == []
-    assert tab.locator("h2").count() == 11
+    assert tab.locator("h2").count() == 12
     assert tab.locator("figure > svg").count() == 6
     for i in range(6):
         box = tab.locator("figure > svg").nth(i).bounding_box()
@@ -164,7 +164,7 @@ def test_page_can_be_used_with_the_keyboard_alone(browser, page) -> None:
     assert tab.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     tab.keyboard.press("Tab")
     tab.keyboard.press("Enter")
-    assert tab.evaluate("location.hash") == "#determined"
+    assert tab.evaluate("location.hash") == "#verdict"
     wide = "[...document.querySelectorAll('main *')].filter(e => e.scrollWidth > e.clientWidth + 1"
     wide += " && getComputedStyle(e).overflowX === 'auto' && e.tabIndex < 0).length"
     assert tab.evaluate(wide) == 0

@@ -11,8 +11,9 @@ import pytest
 
 import loopcal as lc
 from loopcal.documents import load_record
+from loopcal.io.runs.certificate import TEMPLATE
 from loopcal.report.document.calibration_document import build_calibration_document, build_sections
-from loopcal.report.document.elements import Document, Listing, Picture, Section, list_options
+from loopcal.report.document.elements import Document, Form, Listing, Picture, Section, list_options
 from loopcal.results.tables import Table
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 
@@ -40,8 +41,10 @@ def report(robot, data) -> lc.CalibrationReport:  # noqa: F811
 
 
 @pytest.fixture(scope="module")
-def document(report) -> Document:
-    return build_calibration_document(load_record(report))
+def document(report, tmp_path_factory) -> Document:
+    path = tmp_path_factory.mktemp("facts") / "facts.yaml"
+    path.write_text(TEMPLATE.replace('serial_number: ""', 'serial_number: "0017"'), "utf-8")
+    return build_calibration_document(load_record(report, path))
 
 
 def get_section(document: Document, name: str) -> Section:
@@ -60,12 +63,20 @@ def write_text(section: Section) -> str:
             parts += [text for _, text in element.items]
         elif isinstance(element, Picture):
             parts += [element.caption, element.description, *re.findall(r">([^<>]+)<", element.svg)]
+        elif isinstance(element, Form):
+            parts += [f"{label}: {text}" for label, text in element.rows]
         else:
             parts.append(element.text)
     return "\n".join(parts)
 
 
 CONTENTS = [
+    ("summary", r"machine: five-bar\nserial number: 0017\n.*certificate D-K-15123-01"),
+    ("summary", r"environment: \n"),  # a line to fill in
+    ("summary", r"position, upper bound in the working volume.* mm +0.06 mm +conforms"),
+    ("summary", r"position, largest at \d+ held-out poses"),
+    ("summary", r"Decision rule: ISO 14253-1, JCGM 106.*at least 95 %"),
+    ("summary", r"Working volume: box x -20 mm to 20 mm, y 250 mm"),
     ("verdict", r"Scope: the verdict concerns the geometry of five-bar .*fitted.*held out"),
     ("verdict", r"Expected error over the workspace: position"),
     ("verdict", r"Share of each source in the variance"),
@@ -74,7 +85,7 @@ CONTENTS = [
         r"against the limit 0.06 mm: .*with (?:more than )?[\d.]+ % probability",
     ),  # guard-banded
     (
-        "verdict",
+        "budget",
         r"\(box x -20 mm to 20 mm, y 250 mm\), the position error is at most .*, simultaneously",
     ),
     ("verdict", r"in the volume: .* against the limit 0.06 mm"),

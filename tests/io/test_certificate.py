@@ -3,10 +3,13 @@
 
 import json
 import math
+import os
 import re
 import shutil
+from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 import loopcal as lc
@@ -36,8 +39,10 @@ RULES = {
     **dict.fromkeys(("contact", "customer"), CONTACT.replace("location?", "location")),
     **dict.fromkeys(("person", "manufacturer"), CONTACT),
     "measurementResults": "measurementResult+",
-    "measurementResult": "name usedMethods? usedSoftware? measuringEquipments? results "
-    "measurementMetaData?",
+    "measurementResult": "name usedMethods? usedSoftware? measuringEquipments? "
+    "influenceConditions? results measurementMetaData?",
+    "influenceConditions": "influenceCondition+",
+    "influenceCondition": "name data",
     "usedMethods": "usedMethod+",
     "usedMethod": "name norm*",
     "measuringEquipments": "measuringEquipment+",
@@ -45,7 +50,15 @@ RULES = {
     "results": "result+",
     "result": "name data",
     "data": "quantity+",
-    "quantity": "name noQuantity? real?",
+    "quantity": "name noQuantity? real? realListXMLList?",
+    "realListXMLList": "labelXMLList valueXMLList unitXMLList "
+    "measurementUncertaintyMultivariateXMLList",
+    "measurementUncertaintyMultivariateXMLList": "ellipsoidalRegionMUXMLList",
+    "ellipsoidalRegionMUXMLList": "covarianceMatrixXMLList coverageFactorXMLList "
+    "coverageProbabilityXMLList",
+    "covarianceMatrixXMLList": "columnXMLList+",
+    "columnXMLList": "covarianceXMLList",
+    "covarianceXMLList": "valueXMLList unitXMLList",
     "real": "value unit measurementUncertaintyUnivariate?",
     "measurementUncertaintyUnivariate": "expandedMU",
     "expandedMU": "valueExpandedMU coverageFactor coverageProbability",
@@ -67,7 +80,7 @@ VALUES = {
     "performanceLocation": "laboratory|customer|laboratoryBranch|customerBranch|other",
     "issuer": "manufacturer|calibrationLaboratory|customer|owner|other",
     "mainSigner": "true|false",
-    "unit": r"\\metre|\\radian|\\one",
+    "unit": r"\\metre|\\radian|\\one|\\degreecelsius|\\percent|\\kelvin|\\hecto\\pascal",
     **dict.fromkeys(("valueExpandedMU", "coverageFactor"), NUMBER.removeprefix("[-+]?")),
     "coverageProbability": r"0(\.\d+)?|1(\.0+)?",
     "conformity": "pass|fail|conditionalPass|conditionalFail|noPass|noFail",
@@ -141,7 +154,11 @@ def run(tmp_path_factory, robot, data):  # noqa: F811
 def write_facts(folder, name="A", **changed):
     """Write administrative data, filled in, with some lines changed."""
     text = TEMPLATE.replace('name: ""', f"name: {json.dumps(name)}")
-    text = text.replace('serial_number: ""', 'serial_number: "0017"')
+    filled = {"serial_number": '"0017"', "number": '"2026-001"', "country": "DE"}
+    filled |= dict.fromkeys(("begin", "end", "issued"), "2026-01-31")
+    filled |= {"operator": "B", "value": "20.4 degC", "plus_minus": "0.6 K"}
+    for key, value in filled.items():
+        text = text.replace(f'{key}: ""', f"{key}: {value}")
     for old, new in changed.values():
         assert old in text
         text = text.replace(old, new)
@@ -170,15 +187,21 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     assert "<script>" not in text
     numbers = [e.text for e in root.findall(".//dcc:identification/dcc:value", NAMES)]
     assert numbers == ["0017", "0750123", "D-K-15123-01"]
+    roles = [e.text for e in root.findall(".//dcc:respPerson/dcc:role", NAMES)]
+    assert roles[-1] == "operator"
+    conditions = root.findall(".//dcc:influenceCondition//si:value", NAMES)
+    assert [e.text for e in conditions] == ["20.4", "20.4"]
     rows = json.loads((run / "result.json").read_text("utf-8"))["fit"]["parameters"]
     factor = {"mm": 1e-3, "deg": math.pi / 180.0}
-    quantities = root.findall(".//dcc:quantity", NAMES)
+    quantities = root.findall(".//dcc:result//dcc:quantity", NAMES)
     for row, quantity in zip(rows, quantities, strict=False):
         assert read_text(quantity, "dcc:name/dcc:content") == row["name"]
+        half = row["plus_minus"] * factor[row["unit"]]
+        digits = read_text(quantity, ".//si:valueExpandedMU")
+        assert len(digits.replace(".", "").lstrip("0")) == 2  # JCGM 100, 7.2.6
+        assert float(digits) == pytest.approx(half, rel=0.05)
         value = float(read_text(quantity, "si:real/si:value"))
-        assert value == pytest.approx(row["estimate"] * factor[row["unit"]], rel=1e-12)
-        expanded = float(read_text(quantity, ".//si:valueExpandedMU"))
-        assert expanded == pytest.approx(row["plus_minus"] * factor[row["unit"]], rel=1e-12)
+        assert value == pytest.approx(row["estimate"] * factor[row["unit"]], abs=0.05 * half)
         unit = r"\metre" if row["unit"] == "mm" else r"\radian"
         assert read_text(quantity, "si:real/si:unit") == unit
     assert read_text(root, ".//dcc:metaData/dcc:conformity") == "pass"
@@ -198,7 +221,36 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     bounds = {read_text(q, "dcc:name/dcc:content"): q for q in quantities}
     for name in ("simultaneous", "pointwise"):
         (bound,) = (q for words, q in bounds.items() if f", {name}" in words)
-        assert float(read_text(bound, "si:real/si:value")) == stated[name]
+        shown = float(read_text(bound, "si:real/si:value"))
+        assert shown == pytest.approx(stated[name], rel=0.005)  # three digits
+    columns = root.findall(".//si:columnXMLList/*/si:valueXMLList", NAMES)
+    covariance = np.array([(e.text or "").split() for e in columns], float)
+    assert covariance == pytest.approx(lc.load_run(run).arrays["covariance"], rel=1e-9)
+    assert (np.linalg.eigvalsh(covariance) > 0.0).all()  # rounding left it a covariance
+
+
+@pytest.mark.skipif(
+    not os.environ.get("LOOPCAL_DCC_SCHEMA"),
+    reason="names the folder with PTB's dcc.xsd 3.3.0 and SI_Format.xsd 2.2",
+)
+def test_certificate_is_valid_by_the_schema_of_ptb(tmp_path, run) -> None:
+    xmlschema = pytest.importorskip("xmlschema")
+    folder = Path(os.environ["LOOPCAL_DCC_SCHEMA"]).resolve()
+    signature = Path(xmlschema.__file__).parent / "schemas" / "DSIG" / "xmldsig-core-schema.xsd"
+    kinds = tmp_path / "kinds.xsd"  # of quantities, which a certificate does not name
+    kinds.write_text(
+        '<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" targetNamespace="http://qudt.org/'
+        'vocab/"><xs:simpleType name="quantitykind"><xs:restriction base="xs:string"/>'
+        "</xs:simpleType></xs:schema>",
+        "utf-8",
+    )
+    files = [kinds, folder / "SI_Format.xsd", folder / "dcc.xsd"]
+    schema = xmlschema.XMLSchema([*map(str, [signature, *files])], allow="local")
+    facts = load_administration(write_facts(tmp_path))
+    text = format_certificate(lc.load_run(run), facts)
+    assert [str(e) for e in schema.iter_errors(text)] == []
+    for right, wrong in (("<si:unit>", "<si:unit/><si:unit>"), ("3.3.0", "3.2.0")):
+        assert not schema.is_valid(text.replace(right, wrong, 1))
 
 
 def test_rules_refuse_what_the_schema_refuses(tmp_path, run) -> None:
@@ -236,11 +288,12 @@ def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:
     ("change", "message"),
     [
         (("country: DE   ", "country: Germany"), r"'country' is 'Germany'; write two capital"),
+        (("value: 20.4 degC", "value: 20.4 C"), r"value' is '20.4 C'; write a number and its unit"),
         (("begin: 2026-01-31", "begin: 2026-02-31"), "date|day is out of range|valid YAML"),
         (("end: 2026-01-31", "end: 2025-01-31"), r"'end' is 2025-01-31, before begin"),
         (("place: laboratory ", "place: cellar "), "'place' is 'cellar'.*allowed"),
-        (('serial_number: "0017"', 'serial_number: ""'), r"facts.yaml:9: .*serial_number' is"),
-        (("machine:", "robot:"), "unknown key 'robot'|no key 'machine'"),
+        (('serial_number: "0017"', 'serial_number: ""'), r"facts.yaml:10: .*serial_number' is"),
+        (("machine:", "robot:"), "unknown key 'robot'"),
     ],
 )
 def test_wrong_facts_are_refused_at_their_line(tmp_path, change, message) -> None:
@@ -250,8 +303,10 @@ def test_wrong_facts_are_refused_at_their_line(tmp_path, change, message) -> Non
 
 def test_template_must_be_filled_in(tmp_path) -> None:
     (tmp_path / "facts.yaml").write_text(TEMPLATE, "utf-8")
-    with pytest.raises(FileError, match=r"'machine\.name' is empty; fill it in"):
+    with pytest.raises(FileError, match=r"facts.yaml:3: 'number' is empty; fill it in"):
         load_administration(tmp_path / "facts.yaml")
+    rows = load_administration(tmp_path / "facts.yaml", is_complete=False).list_rows()
+    assert not any(rows.values())  # a report leaves lines to fill in by hand
 
 
 def test_robot_files_have_no_certificate(tmp_path, robot) -> None:  # noqa: F811
@@ -263,12 +318,14 @@ def test_robot_files_have_no_certificate(tmp_path, robot) -> None:  # noqa: F811
 
 
 def test_commands_print_facts_and_certificate(tmp_path, run, capsys) -> None:
-    assert main(["certificate", "--new"]) == 0
-    assert capsys.readouterr().out == TEMPLATE
+    assert main(["new", "--report-facts", str(tmp_path / "new.yaml")]) == 0
+    assert (tmp_path / "new.yaml").read_text("utf-8") == TEMPLATE
+    capsys.readouterr()
     facts = str(write_facts(tmp_path))
     assert main(["certificate", str(run), facts]) == 0
     check_rules(ElementTree.fromstring(capsys.readouterr().out.encode()))
     assert main(["certificate", str(run), facts, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["certificate"].startswith("<?xml")
     assert main(["certificate", str(run)]) == 1
-    assert "loopcal certificate --new" in capsys.readouterr().err
+    assert main(["new", "five-bar"]) == 1
+    assert "FAMILY and -o" in capsys.readouterr().err

@@ -27,6 +27,7 @@ from loopcal.apply.verdict import (
     list_checks,
     recommend_values,
 )
+from loopcal.errors import DataError
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import name_count
@@ -41,6 +42,7 @@ from loopcal.results.storage import store_arrays
 if TYPE_CHECKING:
     from loopcal.apply.error_budget import ErrorBudget
     from loopcal.apply.height_errors import HeightErrors
+    from loopcal.apply.repeatability import Repeatability
     from loopcal.apply.validation import Validation
     from loopcal.apply.volume_accuracy import VolumeAccuracy
     from loopcal.diagnose.conventions.convention_check import ConventionCheck
@@ -135,6 +137,7 @@ class CalibrationReport(TableResult):
         Field("change", is_optional=True),
         Field("expected_error", "budget", is_optional=True),
         Field("volume", is_optional=True),
+        Field("repeatability", is_optional=True),
         Field("comparison", is_optional=True),
         Field("model_choice", is_optional=True),
         Field("examination", is_optional=True),
@@ -168,6 +171,23 @@ class CalibrationReport(TableResult):
     def failures(self) -> tuple[Finding, ...]:
         """Findings of quality gates that are not met."""
         return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
+
+    @cached_property
+    def repeatability(self) -> Repeatability | None:
+        """Pose accuracy and repeatability by ISO 9283 of the calibrated robot where poses were
+        visited several times: held-out poses, else fitted ones, whose accuracy is optimistic.
+        """
+        from loopcal.apply.repeatability import assess_repeatability
+
+        fit = self.identification
+        setup = {} if fit.nuisance is None else fit.nuisance.values
+        for data in (self.split.held_out, self.split.fitted) if fit.converged else ():
+            if data is not None and len(np.unique(data.repeats)) < data.n_poses:
+                try:
+                    return assess_repeatability(self.robot, data, setup)
+                except DataError:  # no positions or orientations
+                    continue
+        return None
 
     @property
     def instruments(self) -> tuple[InstrumentRecord, ...]:

@@ -36,6 +36,7 @@ from loopcal.errors import DataError, EstimationError, UnitError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings.catalog import word_phrase
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.instrument import make_random_stream
 from loopcal.mechanism.model import Mechanism
@@ -274,6 +275,7 @@ class VolumeAccuracy(Result):
         *fields("simultaneous", "pointwise", "worst", "points", "reachable", "spacing"),
         *fields("refinement", "extrapolated", "volume", "findings"),
         *fields(frame=lambda stated: str(stated.reference), confidence=lambda _: LEVEL),
+        *fields(words=lambda stated: word_phrase("volume", stated.findings[0].data)),
         Field("conformity", is_optional=True),
     )
 

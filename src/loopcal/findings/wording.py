@@ -40,6 +40,25 @@ def add_advice(sentence: object, advice: str | None) -> str:
     return str(sentence) if advice is None else f"{sentence} (Hint: {advice})"
 
 
+FINER = {"m": ("mm", 1e3), "mm": ("um", 1e3), "um": ("nm", 1e3), "rad": ("mrad", 1e3)}
+FINER |= {"mrad": ("urad", 1e3), "deg": ("urad", 1e6 * math.pi / 180.0)}
+"""Unit -> the next finer one, and its number of them."""
+
+SMALL = 0.01
+"""Numbers below this are read in a finer unit: 7 um instead of 0.007 mm."""
+
+
+def choose_symbol(size: float, symbol: str) -> tuple[str, float]:
+    """Return the unit in which a number of this size is read, and how many of it make up `symbol`;
+    a size of 0 keeps its unit.
+    """
+    factor = 1.0
+    while symbol in FINER and 0.0 < abs(size) * factor < SMALL:
+        symbol, finer = FINER[symbol]
+        factor *= finer
+    return symbol, factor
+
+
 class Quantity(NamedTuple):
     """A number with the symbol of its unit, such as `Quantity(0.19, "mm")`."""
 
@@ -47,10 +66,14 @@ class Quantity(NamedTuple):
     unit: str
 
     def __str__(self) -> str:
-        """Return three significant digits and the unit; whole numbers below a million."""
-        if 999.5 <= abs(self.value) < 1e6:
-            return f"{self.value:.0f} {self.unit}".rstrip()
-        return f"{round_to_digits(self.value)} {self.unit}".rstrip()
+        """Return three significant digits and a unit that suits the size; whole numbers below a
+        million.
+        """
+        symbol, factor = choose_symbol(self.value, self.unit)
+        value = factor * self.value
+        if 999.5 <= abs(value) < 1e6:
+            return f"{value:.0f} {symbol}".rstrip()
+        return f"{round_to_digits(value)} {symbol}".rstrip()
 
 
 def round_to_digits(value: float, digits: int = 3) -> str:
@@ -79,10 +102,13 @@ def name_count(count: float, singular: str, plural: str = "") -> str:
     return f"{count} {singular if count == 1 else plural or singular + 's'}"
 
 
-def count_decimals(uncertainty: float) -> int:
-    """Return the decimals that show three significant digits of a number above 0, at most 12."""
-    rounded = float(f"{uncertainty:.2e}")  # 9.996 shows as 10.0, which has one decimal less
-    return min(max(2 - math.floor(math.log10(rounded)), 0), 12)
+def count_decimals(uncertainty: float, digits: int = 2) -> int:
+    """Return the decimals that show so many significant digits of a number above 0, at most 12.
+
+    Two are those of an uncertainty (JCGM 100, 7.2.6).
+    """
+    rounded = float(f"{uncertainty:.{digits - 1}e}")  # 9.96 shows as 10, which has one decimal less
+    return min(max(digits - 1 - math.floor(math.log10(rounded)), 0), 12)
 
 
 def list_names(names: Sequence[Any], shown: int = SHOWN_NAMES) -> str:

@@ -28,6 +28,7 @@ from loopcal.results.tables import (
     Column,
     Table,
     build_table,
+    choose_unit,
     format_exact_beside,
     format_in,
     format_list,
@@ -76,7 +77,7 @@ def build_height_map(heights: HeightErrors) -> Table | str:
         return f"The errors of {count:,} heights are too many for a table."
     errors = np.stack([heights.before, heights.after], axis=1) / unit.factor_to_si
     largest = float(np.abs(errors).max())
-    decimals = count_decimals(largest) if largest > 0.0 else 0
+    decimals = count_decimals(largest, 3) if largest > 0.0 else 0
     places = np.round(heights.points / unit.factor_to_si, 1) + 0.0  # 0.0 in place of -0.0
     rows = [
         (
@@ -301,9 +302,15 @@ MEANING = (
 )
 
 
-def view_budget(budget: Mapping[str, Any], robot: Mechanism) -> list[Block]:
-    """Return the page of a budget; robot : for its units."""
-    return [str(budget["finding"]["text"]), "", build_budget_table(budget, robot)]
+def view_budget(
+    budget: Mapping[str, Any], robot: Mechanism, volume: Mapping[str, Any] | None = None
+) -> list[Block]:
+    """Return the page of a budget, and the statement on a working volume.
+
+    robot : for its units. volume : of a run.
+    """
+    stated = [finding["text"] for finding in (volume or {}).get("findings", ())]
+    return [str(budget["finding"]["text"]), "", build_budget_table(budget, robot), *stated]
 
 
 def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
@@ -311,9 +318,11 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     platform does not rotate.
     """
     worst, table, units = budget["worst_parameter"], robot.parameters, robot.shown_units
-    shown = {kind: units[LENGTHS[kind]] for kind in _list_kinds(budget)}
+    total = {**{kind: budget[kind]["rms"] for kind in LENGTHS}, **budget["parameters"]}
+    shown = {k: choose_unit(units[LENGTHS[k]], [total[k]]) for k in _list_kinds(budget)}
     if worst:
-        shown[worst] = robot.get_unit(table.entries[table.index(worst)].dimension)
+        unit = robot.get_unit(table.entries[table.index(worst)].dimension)
+        shown[worst] = choose_unit(unit, [total[worst]])
 
     def list_cells(
         words: str, evaluation: str, degrees: float | None, *errors: Mapping[str, float | None]
@@ -336,7 +345,6 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
         errors = {k: None if square is None else math.sqrt(square) for k, square in squares.items()}
         fixed = (_name_source(line), line["evaluation"], line["degrees"])
         rows.append(list_cells(*fixed, errors, left))
-    total = {**{kind: budget[kind]["rms"] for kind in LENGTHS}, **budget["parameters"]}
     rows.append(list_cells("all sources", "", None, total, {}))
     columns = [
         Column(f"{before}{kind}", unit.symbol)

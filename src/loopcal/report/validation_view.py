@@ -20,6 +20,7 @@ from loopcal.results.tables import (
     Block,
     Column,
     Table,
+    choose_unit,
     format_in,
     format_list,
     format_number,
@@ -128,8 +129,9 @@ def _build_error_summary(validation: Validation, caption: str, with_before: bool
         name = f"{quantity} {' '.join(measured)}" if is_part else quantity
         for key in SUMMARY:
             values = (before[key], after[key], floor.metrics.get(key, {}).get(quantity, math.nan))
-            shown = (format_in(unit, x, 3) for x in values)
-            rows.append([name, METRICS[key].words, str(after.count), *shown, unit.symbol])
+            fine = choose_unit(unit, values)
+            shown = (format_in(fine, x, 3) for x in values)
+            rows.append([name, METRICS[key].words, str(after.count), *shown, fine.symbol])
     return _build_error_table(caption, "quantity", rows, with_before)
 
 
@@ -170,7 +172,8 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
     rows = []
     for name, error in errors.items():
         for quantity in validation.quantities:
-            statistics, unit = error.statistics(quantity), validation.units[quantity]
+            statistics = error.statistics(quantity)
+            unit = choose_unit(validation.units[quantity], [statistics[key] for key in METRICS])
             cells = (format_in(unit, statistics[key], 3) for key in METRICS)
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
     numbers = map(Column, ("count", *(metric.words for metric in METRICS.values())))
@@ -239,7 +242,8 @@ def view_repeatability(result: Repeatability, robot: Mechanism | None = None) ->
     units = DISPLAY_UNITS if robot is None else robot.shown_units
     blocks: list[Block] = []
     for quantity, poses in result.poses.items():
-        unit, rows = units[DIMENSIONS[quantity]], []
+        sizes = (e.value for p in poses for e in (*p.accuracies, *p.repeatabilities))
+        unit, rows = choose_unit(units[DIMENSIONS[quantity]], sizes), []
         for pose in poses:  # the whole position, then its components
             named = list(zip(pose.components, pose.accuracies, pose.repeatabilities, strict=True))
             if pose.accuracy is not None and pose.repeatability is not None and len(named) > 1:

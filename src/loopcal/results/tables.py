@@ -13,10 +13,10 @@ from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
-from loopcal.findings.wording import count_decimals, write_small
+from loopcal.findings.wording import choose_symbol, count_decimals, write_small
 from loopcal.plain_text import escape
 from loopcal.results.description import Field, look_up
-from loopcal.units import Dimension, Unit
+from loopcal.units import UNITS, Dimension, Unit
 
 GAP = 2
 """Blanks between two columns of text."""
@@ -246,8 +246,17 @@ def format_in(unit: Unit, value: float, digits: int = 6) -> str:
     return write_small(format_number(float(value) / unit.factor_to_si, digits))
 
 
+def choose_unit(unit: Unit, values: Iterable[float | None]) -> Unit:
+    """Return the unit of a column with these numbers [SI]: `unit`, or a finer one that suits the
+    largest of them.
+    """
+    sizes = [abs(x) / unit.factor_to_si for x in values if x is not None and math.isfinite(x)]
+    largest = max(sizes, default=0.0)
+    return UNITS[choose_symbol(largest, unit.symbol)[0]] if largest >= ROUNDING else unit
+
+
 def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -> str:
-    """Return a value to the third significant digit of its uncertainty.
+    """Return a value to the second significant digit of its uncertainty.
 
     A value below a hundredth of its uncertainty is 0. Without a finite uncertainty above 0 the
     value has `digits` significant digits.
@@ -269,7 +278,7 @@ def format_exact_beside(value: float, uncertainty: float) -> str:
 
 
 def format_uncertainty(uncertainty: float) -> str:
-    """Return an uncertainty with three significant digits, or a word where it has no number."""
+    """Return an uncertainty with two significant digits, or a word where it has no number."""
     if math.isnan(uncertainty):
         return "not given"
     if math.isinf(uncertainty):

@@ -12,7 +12,6 @@ from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for, list_hints, with_hint
 from loopcal.cli.terminal import Output
-from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
@@ -152,8 +151,8 @@ def budget(run: Path = opt.RUN) -> Output:
     from loopcal.report.calibration_view import view_budget
 
     calibrated = lc.load_run(run)
-    content = calibrated.load_budget()
-    return Output(content, lambda: view_budget(content, calibrated.robot))
+    content, volume = calibrated.load_budget(), calibrated.result.get("volume")
+    return Output(content, lambda: view_budget(content, calibrated.robot, volume))
 
 
 @opt.command()
@@ -321,29 +320,19 @@ def compensate(
 
 
 @opt.command()
-def certificate(
-    run: Path | None = opt.argument("[RUN]", type=opt.FILE, required=False),
-    facts: Path | None = opt.argument("[FACTS]", type=opt.FILE, required=False),
-    new: bool = opt.flag("Print a file FACTS to fill in."),
-) -> Output:
+def certificate(run: Path = opt.RUN, facts: Path = opt.argument("FACTS", type=opt.FILE)) -> Output:
     """Print a digital calibration certificate of RUN: XML by PTB's schema DCC 3.3.0.
 
     FACTS is a YAML file with what a run does not know: laboratory, customer, dates, serial number.
     Instruments are those that the measurement files state.
 
     Examples:
-      loopcal certificate --new > facts.yaml
+      loopcal new --report-facts facts.yaml
       loopcal certificate run facts.yaml > certificate.xml
     """
-    from loopcal.io.runs.certificate import TEMPLATE, format_certificate, load_administration
+    from loopcal.io.runs.certificate import format_certificate, load_administration
     from loopcal.io.runs.run_folder import load_run_or_robot
 
-    if new:
-        if run is not None:
-            raise DataError("--new prints a file to fill in; leave out RUN and FACTS")
-        return Output({"facts": TEMPLATE}, lambda: TEMPLATE)
-    if run is None or facts is None:
-        raise DataError("RUN and FACTS are needed; loopcal certificate --new prints a file FACTS")
     text = format_certificate(load_run_or_robot(run), load_administration(facts))
     return Output({"certificate": text}, lambda: text)
 
@@ -435,19 +424,24 @@ def report(
     pdf: bool = opt.flag(
         "Also print the report to a PDF file beside it, by an installed Chromium."
     ),
+    facts: Path | None = opt.path(
+        "What to state beside the results: customer, serial number, ... `loopcal new "
+        "--report-facts` writes a file to fill in."
+    ),
     force: bool = opt.force("the output files"),
 ) -> Output:
     """Write the report of RUN, a run folder, as one HTML file that needs no network.
 
-    It contains the verdict with its scope, what the data do not determine, errors at held-out
-    poses, residuals, accuracy over the workspace, parameters, the uncertainty budget, values for
-    the controller, and provenance.
+    The first page is for signature: machine, customer, instrument, result over the working volume,
+    decision rule. Facts that are missing are lines to fill in on paper. Tables of errors,
+    uncertainty budget and parameters follow, then what the data do not determine, residuals, values
+    for the controller, and provenance.
 
     The exit code is 2 where the calibration failed; the report is written and says so.
 
     Examples:
       loopcal report run
-      loopcal report run -o hexapod.html --pdf
+      loopcal report run -o hexapod.html --pdf --facts facts.yaml
     """
     from loopcal.documents import check_browser, name_data, print_pdf
     from loopcal.io.core.outputs import refuse_outputs
@@ -458,7 +452,7 @@ def report(
     if pdf:
         check_browser(files[-1])
     with terminal.TerminalProgress("writing the report") as progress:
-        lc.save_report(calibrated, output)
+        lc.save_report(calibrated, output, facts)
         if pdf:
             progress(0, 1, "printing the report")
             print_pdf(output, files[-1])

@@ -12,6 +12,7 @@ from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.hints import suggest_command
 from loopcal.cli.terminal import Output
+from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
@@ -28,9 +29,13 @@ SCHEMAS = {
 
 @opt.command()
 def new(
-    family: str = opt.argument("FAMILY"),
-    output: Path = opt.path("Robot file to write; the robot gets its name.", "-o", required=True),
+    family: str | None = opt.argument("[FAMILY]", required=False),
+    output: Path | None = opt.path("Robot file to write; the robot gets its name.", "-o"),
     measurements: Path | None = opt.path("Also write a measurement file with columns but no rows."),
+    report_facts: Path | None = opt.path(
+        "Write a file to fill in with what reports and certificates state beside the results, such "
+        "as customer and serial number. Needs no FAMILY."
+    ),
     unknown: dict[str, Any] = opt.UNKNOWN,
     instrument: dict[str, Any] = opt.INSTRUMENT,
     force: bool = opt.force("an output file"),
@@ -47,6 +52,7 @@ def new(
           --kind component --components z
       loopcal new gough -o my-hexapod.yaml --measurements tracker.csv \\
           --kind position --targets SMR1,SMR2,SMR3 --frames base --sigma-position 15um
+      loopcal new --report-facts facts.yaml
     """
     from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.limits import make_name
@@ -55,33 +61,39 @@ def new(
     from loopcal.io.core.yaml_file import parse_yaml
     from loopcal.io.data.measurement_writer import format_template
     from loopcal.io.robot.robot_file import EDITOR_SCHEMA, build_robot, format_new_robot
+    from loopcal.io.runs.certificate import TEMPLATE
 
     stated = unknown | instrument
     opt.make_instrument(stated)  # refuses wrong options before anything is written
-    refuse_outputs((output, measurements), (), force)
-    robot_text = format_new_robot(family, make_name(output.stem))
-    robot = build_robot(parse_yaml(robot_text, output, "robot file"))
-    template = format_template(robot, opt.make_instrument(stated, robot))
-    if measurements is not None:
-        refuse_settings_beside(measurements)
-    schema_file = output.with_name(EDITOR_SCHEMA)
-    with restore_on_failure((output, measurements)):
-        write_text(output, robot_text)
+    refuse_outputs((output, measurements, report_facts), (), force)
+    texts: dict[Path, str] = {}
+    page: list[Block] = []
+    if family is not None and output is not None:
+        texts[output] = format_new_robot(family, make_name(output.stem))
+        robot = build_robot(parse_yaml(texts[output], output, "robot file"))
+        template = format_template(robot, opt.make_instrument(stated, robot))
+        schema_file = output.with_name(EDITOR_SCHEMA)
         if not schema_file.exists():
-            write_text(schema_file, to_json(opt.look_up(SCHEMAS["robot"])()))
+            texts[schema_file] = to_json(opt.look_up(SCHEMAS["robot"])())
+        page.append(f"{output}: a complete robot. Replace its numbers with yours.")
+        page.append(f"{schema_file}: the keys of robot files, which editors complete and check.")
+        page.append(suggest_command("check", output))
         if measurements is not None:
-            write_text(measurements, template)
-    page = [
-        f"{output}: a complete robot. Replace its numbers with yours.",
-        f"{schema_file}: the keys of robot files, which editors complete and check.",
-        suggest_command("check", output),
-    ]
-    if measurements is not None:
-        page += [
-            f"{measurements}: columns without rows. Fill in your measurements.",
-            suggest_command("calibrate", output, measurements, "-o", "run"),
-        ]
-    return Output({"robot": output, "measurements": measurements}, lambda: page)
+            refuse_settings_beside(measurements)
+            texts[measurements] = template
+            page.append(f"{measurements}: columns without rows. Fill in your measurements.")
+            page.append(suggest_command("calibrate", output, measurements, "-o", "run"))
+    elif family or output or measurements or report_facts is None:
+        raise DataError("a new robot file needs FAMILY and -o; give both")
+    if report_facts is not None:
+        texts[report_facts] = TEMPLATE
+        page.append(f"{report_facts}: facts for reports and certificates. Fill in what you know.")
+        page.append(suggest_command("report", "run", "--facts", report_facts, "--pdf"))
+    with restore_on_failure(tuple(texts)):
+        for path, text in texts.items():
+            write_text(path, text)
+    written = {"robot": output, "measurements": measurements, "report_facts": report_facts}
+    return Output(written, lambda: page)
 
 
 @opt.command()

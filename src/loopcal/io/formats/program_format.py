@@ -137,7 +137,7 @@ class ExportSource:
             return number
         table = self.robot.parameters
         unit = self.robot.get_unit(table.entries[table.index(name)].dimension)
-        return round(number, min(count_decimals(half * unit.factor_to_si / factor), most))
+        return round(number, min(count_decimals(half * unit.factor_to_si / factor, 3), most))
 
     def values(self) -> dict[str, float]:
         """Return parameter -> value [SI]."""

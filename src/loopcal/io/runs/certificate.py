@@ -11,59 +11,86 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from xml.etree.ElementTree import Element, indent, register_namespace, tostring
 
+import numpy as np
+
 from loopcal.errors import DataError
 from loopcal.findings.catalog.phrases import conformity_probability
 from loopcal.io.core.records import read_record
-from loopcal.io.core.yaml_file import read_yaml
+from loopcal.io.core.yaml_file import Location, name_location, read_yaml
 from loopcal.io.runs.run_folder import refuse_changed_run
 from loopcal.measure.observations import is_date
+from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.plain_text import escape
-from loopcal.units import Dimension, find_unit
+from loopcal.results.tables import format_number, format_uncertainty, format_with_uncertainty
+from loopcal.units import NUMBER, Dimension, find_unit
 
 if TYPE_CHECKING:
     from loopcal.io.runs.run_folder import Run
 
 TEMPLATE = """\
-# What a digital calibration certificate states beside the results. Fill in every text.
-number: "2026-001"            # unique identifier of the certificate
+# What documents of a calibration state beside its results: the first page of a report, which leaves
+# a line to fill in by hand for each missing text, and the digital certificate, which needs them.
+number: ""                    # unique identifier of the certificate, such as 2026-001
 language: en                  # ISO 639, two lower-case letters
-country: DE                   # where it is issued, ISO 3166, two capitals
+country: ""                   # where it is issued, ISO 3166, two capitals: DE
 place: laboratory             # laboratory, customer, laboratoryBranch, customerBranch or other
-begin: 2026-01-31             # first and last day of the calibration, and day of issue
-end: 2026-01-31
-issued: 2026-01-31
+begin: ""                     # first and last day of the calibration, and day of issue: 2026-01-31
+end: ""
+issued: ""
 machine: {name: "", manufacturer: "", model: "", serial_number: ""}
-laboratory: {name: "", city: "", country: DE, street: "", post_code: "", email: ""}
-customer: {name: "", city: "", country: DE, street: "", post_code: "", email: ""}
+laboratory: {name: "", city: "", country: "", street: "", post_code: "", email: ""}
+customer: {name: "", city: "", country: "", street: "", post_code: "", email: ""}
+operator: ""                  # who measured
 persons:                      # who answers for it; the signer first
   - {name: "", role: ""}
+environment:                  # value and expanded uncertainty (k = 2) in degC, K, % or hPa
+  - {name: air temperature, value: "", plus_minus: ""}     # 20.4 degC, 0.6 K
+  - {name: relative humidity, value: "", plus_minus: ""}   # 45 %, 5 %
 """
 """The file to fill in."""
 
+CONDITION_UNITS = {
+    "degC": r"\degreecelsius",
+    "K": r"\kelvin",
+    "%": r"\percent",
+    "hPa": r"\hecto\pascal",
+}
+"""Unit of a condition of the environment -> unit in the D-SI."""
+
+CONDITION = re.compile(rf"({NUMBER.pattern})\s*({'|'.join(CONDITION_UNITS)})", NUMBER.flags)
 
 FORMS: Mapping[str, tuple[Callable[[str], Any], str]] = {
     "country": (re.compile("[A-Z]{2}").fullmatch, "two capital letters, as DE"),
     "language": (re.compile("[a-z]{2}").fullmatch, "two lower-case letters, as en"),
     **dict.fromkeys(("begin", "end", "issued"), (is_date, "a date as 2026-01-31")),
+    **dict.fromkeys(
+        ("value", "plus_minus"), (CONDITION.fullmatch, "a number and its unit, 20 degC")
+    ),
 }
 """Key -> whether a text has its form, and the form in words."""
+
+NEEDED: tuple[Location, ...] = (
+    *((key,) for key in ("number", "country", "begin", "end")),
+    *((key, "name") for key in ("machine", "laboratory", "customer")),
+    *(("machine", "serial_number"), ("laboratory", "country"), ("customer", "country")),
+    ("persons", 0, "name"),
+)
+"""Texts without which there is no certificate."""
 
 
 @dataclass(frozen=True)
 class _Texts:
-    """A record whose texts have the form of their key; those without a default are not empty."""
+    """A record whose texts are empty or have the form of their key."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.default is MISSING and (not value or not str(value).strip()):
-                raise ValueError(f"{field.name} is empty; fill it in")
             is_right, form = FORMS.get(field.name, (bool, ""))
             if form and value and not is_right(value):
                 raise ValueError(f"{field.name} is {value!r}; write {form}")
@@ -73,8 +100,8 @@ class _Texts:
 class CalibratedMachine(_Texts):
     """The machine that was calibrated."""
 
-    name: str
-    serial_number: str
+    name: str = ""
+    serial_number: str = ""
     manufacturer: str = ""
     model: str = ""
 
@@ -83,53 +110,106 @@ class CalibratedMachine(_Texts):
 class Contact(_Texts):
     """A laboratory or a customer."""
 
-    name: str
-    country: str
+    name: str = ""
+    country: str = ""
     city: str = ""
     street: str = ""
     post_code: str = ""
     email: str = ""
+
+    def __str__(self) -> str:
+        """Return name and address on one line."""
+        town = f"{self.country} {self.post_code} {self.city}".strip() if self.city else ""
+        return ", ".join(text for text in (self.name, self.street, town) if text)
 
 
 @dataclass(frozen=True)
 class Person(_Texts):
     """A person who answers for the certificate."""
 
-    name: str
+    name: str = ""
     role: str = ""
+
+    def __str__(self) -> str:
+        return ", ".join(text for text in (self.name, self.role) if text)
+
+
+@dataclass(frozen=True)
+class Condition(_Texts):
+    """A condition of the environment, such as 20.4 degC with the expanded uncertainty 0.6 K."""
+
+    name: str
+    value: str = ""
+    plus_minus: str = ""
+
+    def __str__(self) -> str:
+        range_ = f" ± {self.plus_minus}" if self.plus_minus else ""
+        return f"{self.name} {self.value}{range_}" if self.value else ""
 
 
 @dataclass(frozen=True)
 class Administration(_Texts):
     """Administrative data of a certificate; dates as 2026-01-31."""
 
-    number: str
-    country: str
-    begin: str
-    end: str
-    machine: CalibratedMachine
-    laboratory: Contact
-    customer: Contact
-    persons: tuple[Person, ...]
+    number: str = ""
+    country: str = ""
+    begin: str = ""
+    end: str = ""
+    machine: CalibratedMachine = CalibratedMachine()
+    laboratory: Contact = Contact()
+    customer: Contact = Contact()
+    persons: tuple[Person, ...] = ()
     language: str = "en"
     place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = (
         "laboratory"
     )
     issued: str = ""
+    operator: str = ""
+    environment: tuple[Condition, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.end < self.begin:
+        if self.begin and self.end and self.end < self.begin:
             raise ValueError(f"end is {self.end}, before begin, {self.begin}; correct one")
 
+    def list_rows(self) -> dict[str, str]:
+        """Return what a report shows, by the words that people read; a missing text is empty."""
+        machine, days = self.machine, dict.fromkeys(filter(None, (self.begin, self.end)))
+        made = " ".join(filter(None, (machine.manufacturer, machine.model)))
+        at = self.customer if self.place.startswith("customer") else self.laboratory
+        site = "" if self.place == "other" else ", ".join(filter(None, (at.name, at.city)))
+        return {
+            "certificate": self.number,
+            "date": " to ".join(days),
+            "customer": str(self.customer),
+            "laboratory": str(self.laboratory),
+            "machine": ", ".join(filter(None, (machine.name, made))),
+            "serial number": machine.serial_number,
+            "place": f"branch of {site}" if site and self.place.endswith("Branch") else site,
+            "operator": self.operator,
+            "environment": ", ".join(filter(None, map(str, self.environment))),
+            "signed by": str(self.persons[0]) if self.persons else "",
+            "issued": self.issued,
+        }
 
-def load_administration(path: str | Path) -> Administration:
+
+def load_administration(path: str | Path, is_complete: bool = True) -> Administration:
     """Read the administrative data of a certificate.
 
-    FileError : a key is missing or unknown, a text is empty, or not a date or code, at its line.
+    is_complete : whether the texts that a certificate needs must be there.
+
+    FileError : a key is unknown, a needed text is empty, or a text is not a date or code, at its
+        line.
     """
-    file = read_yaml(path, "certificate file", has_names=False)
-    return read_record(file, file.content, Administration, None)
+    file = read_yaml(path, "file of report facts", has_names=False)
+    facts = read_record(file, file.content, Administration, None)
+    for location in NEEDED if is_complete else ():
+        text: Any = facts
+        for step in location:
+            text = getattr(text, step) if isinstance(step, str) else (text or (Person(),))[step]
+        if not text.strip():
+            raise file.error(f"{name_location(location)!r} is empty; fill it in", location)
+    return facts
 
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
@@ -203,7 +283,10 @@ def format_certificate(run: Run, administration: Administration) -> str:
         "usedMethods": {"usedMethod": {"name": method, "norm": "JCGM 100:2008"}},
         "usedSoftware": software,
         "measuringEquipments": {"measuringEquipment": instruments},
-        "results": {"result": list(_list_results(run.result))},
+        "influenceConditions": {
+            "influenceCondition": list(map(_describe_condition, administration.environment))
+        },
+        "results": {"result": list(_list_results(run))},
         "measurementMetaData": {"metaData": list(_list_statements(run.result))},
     }
     administrative = {"dccSoftware": software, **_describe_administration(administration)}
@@ -256,6 +339,9 @@ def _describe_administration(facts: Administration) -> Content:
         }
         for i, person in enumerate(facts.persons)
     ]
+    if facts.operator:
+        operator = {"person": {"name": facts.operator}, "role": "operator", "mainSigner": "false"}
+        persons.append(operator)
     return {
         "coreData": {
             "countryCodeISO3166_1": facts.country,
@@ -300,15 +386,27 @@ def _describe_instrument(facts: Mapping[str, str]) -> Content:
     }
 
 
-def _list_results(content: Mapping[str, Any]) -> Iterator[Content]:
-    """Yield the parameters, and the errors at held-out poses."""
+def _describe_condition(condition: Condition) -> Content:
+    """Return a condition of the environment; nothing without a value."""
+    stated = [CONDITION.fullmatch(text) for text in (condition.value, condition.plus_minus)]
+    if stated[0] is None:
+        return {}
+    unit, half = CONDITION_UNITS[stated[0][2]], stated[1][1] if stated[1] else ""
+    quantity = _state(condition.name, unit, stated[0][1], half, "2")
+    return {"name": condition.name, "data": {"quantity": [quantity]}}
+
+
+def _list_results(run: Run) -> Iterator[Content]:
+    """Yield the parameters with their covariance, and errors in a volume and at held-out poses."""
+    content = run.result
     parameters = []
     for row in content["fit"]["parameters"]:
         unit = find_unit(row["unit"] or "1")
         values = (row["estimate"], row["plus_minus"], row["sd"])
         scaled = (None if x is None else x * unit.factor_to_si for x in values)
         parameters.append(_quantity(row["name"], UNITS.get(unit.dimension, r"\one"), *scaled))
-    yield {"name": "Identified parameters", "data": {"quantity": parameters}}
+    covariance = _describe_covariance(run.arrays.get("covariance"), parameters)
+    yield {"name": "Identified parameters", "data": {"quantity": [*parameters, *covariance]}}
     if volume := content.get("volume"):
         bound = "upper bound of the position error with 95 % confidence"
         bounds = [
@@ -332,6 +430,53 @@ def _list_results(content: Mapping[str, Any]) -> Iterator[Content]:
         yield {"name": name, "data": {"quantity": quantities}}
 
 
+def _describe_covariance(
+    covariance: np.ndarray | None, parameters: Sequence[Content]
+) -> list[Content]:
+    """Return the parameters of finite variance as one list with their covariance (p, p) [SI].
+
+    Rounded to two digits of an uncertainty, a matrix of correlated parameters has negative
+    eigenvalues, so covariances have ten digits (JCGM 102, 7.2.6 asks for enough of them).
+    """
+    if covariance is None:
+        return []
+    variance = np.diag(covariance)
+    kept = np.flatnonzero(np.isfinite(variance) & (variance > 0.0)).tolist()
+    if len(kept) < 2:
+        return []
+    stated = [parameters[i]["si:real"] for i in kept]
+    units = [real["si:unit"] for real in stated]
+    columns = [
+        {
+            "si:covarianceXMLList": {
+                "si:valueXMLList": " ".join(f"{x:.10g}" for x in covariance[kept, k]),
+                "si:unitXMLList": " ".join(_multiply_units(unit, units[j]) for unit in units),
+            }
+        }
+        for j, k in enumerate(kept)
+    ]
+    factor = float(compute_chi_square_quantile(len(kept), 1.0 - PROBABILITY)) ** 0.5
+    region = {
+        "si:covarianceMatrixXMLList": {"si:columnXMLList": columns},
+        "si:coverageFactorXMLList": f"{factor:.3g}",
+        "si:coverageProbabilityXMLList": repr(PROBABILITY),
+    }
+    values = {
+        "si:labelXMLList": " ".join(parameters[i]["name"] for i in kept),
+        "si:valueXMLList": " ".join(real["si:value"] for real in stated),
+        "si:unitXMLList": " ".join(units),
+        "si:measurementUncertaintyMultivariateXMLList": {"si:ellipsoidalRegionMUXMLList": region},
+    }
+    return [{"name": "Covariance of the identified parameters", "si:realListXMLList": values}]
+
+
+def _multiply_units(first: str, second: str) -> str:
+    """Return the product of two units in the D-SI."""
+    if first == second:
+        return first if first == r"\one" else rf"{first}\tothe{{2}}"
+    return f"{first}{second}".replace(r"\one", "")
+
+
 def _quantity(
     name: str,
     unit: str,
@@ -342,14 +487,21 @@ def _quantity(
     """Return a value [SI] with its expanded uncertainty; a text where it is not determined."""
     if value is None or not math.isfinite(value):
         return {"name": name, "noQuantity": "not determined by the measurements"}
-    real: dict[str, Any] = {"si:value": repr(float(value)), "si:unit": unit}
-    if expanded and sd:
-        uncertainty = {
-            "si:valueExpandedMU": repr(float(expanded)),
-            "si:coverageFactor": repr(float(expanded / sd)),
-            "si:coverageProbability": repr(PROBABILITY),
-        }
-        real["si:measurementUncertaintyUnivariate"] = {"si:expandedMU": uncertainty}
+    if not (expanded and sd and math.isfinite(expanded)):
+        return _state(name, unit, format_number(value, 3))
+    shown = format_with_uncertainty(value, expanded), format_uncertainty(expanded)
+    return _state(name, unit, *shown, format_number(expanded / sd, 3))
+
+
+def _state(name: str, unit: str, value: str, expanded: str = "", factor: str = "") -> Content:
+    """Return a value as written, with its expanded uncertainty, if any, and coverage factor."""
+    uncertainty = {
+        "si:valueExpandedMU": expanded,
+        "si:coverageFactor": factor,
+        "si:coverageProbability": repr(PROBABILITY),
+    }
+    univariate = {"si:expandedMU": uncertainty} if expanded else {}
+    real = {"si:value": value, "si:unit": unit, "si:measurementUncertaintyUnivariate": univariate}
     return {"name": name, "si:real": real}
 
 

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from loopcal.apply.error_budget import LENGTHS
 from loopcal.apply.verdict import Verdict
 from loopcal.errors import DataError, suggest_names
+from loopcal.findings.wording import list_names, name_count
 from loopcal.report.calibration_view import (
     build_budget_table,
     build_height_map,
@@ -22,6 +25,7 @@ from loopcal.report.document.elements import (
     Code,
     Document,
     Element,
+    Form,
     Listing,
     Section,
     list_options,
@@ -34,7 +38,16 @@ from loopcal.report.validation_view import (
     view_error_statistics,
     view_errors,
 )
-from loopcal.results.tables import ABSENT, format_number, make_table, word_column
+from loopcal.results.tables import (
+    ABSENT,
+    Column,
+    choose_unit,
+    format_in,
+    format_number,
+    make_table,
+    word_column,
+)
+from loopcal.units import Dimension
 
 Describe = Callable[[CalibrationRecord], Iterator[Element | None]]
 SECTIONS: dict[str, tuple[str, Describe]] = {}
@@ -73,6 +86,115 @@ def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Sec
             elements += draw_figures(name, record) if element is None else [element]
         sections.append(Section(name, title, tuple(elements)))
     return tuple(section for section in sections if section.elements)
+
+
+# The page to sign: what was calibrated, by whom and how, the result, and the decision rule.
+
+RULE = (
+    "Decision rule: {rule}. Conformity is stated where the largest error keeps the limit with a "
+    "probability of at least {level:.3g} %, nonconformity where it exceeds the limit with this "
+    "probability, and neither otherwise."
+)
+NO_RULE = "No limit was stated, so this document states no conformity."
+NO_VOLUME = "No working volume was stated, so the result holds for the measured poses."
+NO_RESULT = (
+    "No pose was held out of the fit and no working volume was stated, so the document states no "
+    "error of the calibrated machine."
+)
+VALIDITY = (
+    "The result holds for the geometry of the machine under the conditions of the measurement, not "
+    "for other loads, temperatures or speeds. Uncertainties have a coverage probability of 95 %."
+)
+SIGNATURE = ("signed by", "issued")
+"""Facts at the end of the page."""
+
+
+@describes_section("summary", "Calibration result")
+def describe_summary(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the page to sign."""
+    facts, volume = record.facts, record.result.get("volume") or {}
+    instruments = record.result.get("instruments") or ()
+    kinds = list_names(tuple(dict.fromkeys(rows.kind for rows in record.residuals)))
+    fitted, held_out = (
+        name_count(len(labels), "pose") for labels in (record.fitted_labels, record.held_out_labels)
+    )
+    method = f"{name_count(len(record.result['fit']['parameters']), 'geometric parameter')} "
+    method += f"identified from measurements ({kinds or 'unknown'}) at {fitted}, "
+    method += f"validated at {held_out} that were not fitted; uncertainty by JCGM 100 (GUM)"
+    stated = {
+        **{name: text for name, text in facts.items() if name not in SIGNATURE},
+        "machine": facts.get("machine") or record.robot.name,
+        "instrument": "; ".join(map(_name_instrument, instruments)),
+        "method": method,
+    }
+    yield Form(tuple(stated.items()))
+    columns = ("error", *map(Column, ("before", "after", "limit")), "decision")
+    result = make_table("Result", columns, _list_results(record))
+    yield result if result.rows else NO_RESULT
+    judged = [each for each in (volume, record.result.get("validation") or {}) if each]
+    rules = [rule for each in judged for rule in _list_rules(each.get("conformity"))]
+    where = f"Working volume: {volume.get('words', '')}; {volume['frame']}." if volume else ""
+    yield where or NO_VOLUME
+    yield RULE.format(**rules[0]) if rules else NO_RULE
+    yield VALIDITY
+    yield Form((*((name, facts.get(name, "")) for name in SIGNATURE), ("signature", "")))
+
+
+def _list_rules(conformity: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
+    """Return the decision rules of a statement, or of statements by quantity."""
+    if not conformity:
+        return []
+    each = [conformity] if "rule" in conformity else conformity.values()
+    return [{"rule": one["rule"], "level": 100.0 * one["level"]} for one in each]
+
+
+def _name_instrument(facts: Mapping[str, str]) -> str:
+    """Return an instrument with its serial number and certificate."""
+    made = " ".join(filter(None, (facts.get("manufacturer"), facts.get("model"))))
+    known = {"serial number ": "serial_number", "certificate ": "certificate", "of ": "laboratory"}
+    known |= {"calibrated ": "calibrated", "due ": "due"}
+    texts = [f"{words}{facts[key]}" for words, key in known.items() if facts.get(key)]
+    return ", ".join([made or facts.get("name") or "instrument", *texts])
+
+
+def _list_results(record: CalibrationRecord) -> Iterator[tuple[str, ...]]:
+    """Yield error, before, after, limit and decision, in the order of what they tell of the use."""
+
+    def write(value: float | None, quantity: str = "position") -> str:
+        is_number = value is not None and math.isfinite(value)
+        return str(record.robot.to_quantity(value, LENGTHS[quantity])) if is_number else ABSENT
+
+    def judge(stated: Mapping[str, Any] | None, quantity: str = "position") -> tuple[str, str]:
+        return (
+            (write(stated["limit"], quantity), stated["decision"]) if stated else (ABSENT, ABSENT)
+        )
+
+    if volume := record.result.get("volume"):
+        words = "position, upper bound in the working volume (95 % confidence)"
+        yield words, ABSENT, write(volume["simultaneous"]), *judge(volume.get("conformity"))
+    errors = record.result.get("validation") or {}
+    poses = name_count(len(record.held_out_labels), "held-out pose")
+    for quantity in LENGTHS:
+        if quantity in errors.get("after", ()):
+            before, after = (errors[when][quantity] for when in ("before", "after"))
+            decision = judge((errors.get("conformity") or {}).get(quantity), quantity)
+            for key, words, judged in (
+                ("max", "largest", decision),
+                ("rms", "root mean square", (ABSENT, ABSENT)),
+            ):
+                shown = (write(each[key], quantity) for each in (before, after))
+                yield f"{quantity}, {words} at {poses}", *shown, *judged
+    repeated = record.result.get("repeatability") or {}
+    for symbol, words in ISO_9283.items():
+        poses_visited = repeated.get("position") or ()
+        values = [pose[symbol]["value"] for pose in poses_visited if symbol in pose]
+        if values:
+            name = f"{words}, largest of {len(values)} (ISO 9283)"
+            yield name, ABSENT, write(max(values)), *judge(None)
+
+
+ISO_9283 = {"AP_p": "pose accuracy AP of positions", "RP_l": "pose repeatability RP of positions"}
+"""Key of a characteristic of visited poses -> words."""
 
 
 # Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
@@ -125,8 +247,6 @@ def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
     if budget and result.get("states_expected_error"):
         yield budget["finding"]["text"]
         yield build_share_table(budget)
-    stated = (result.get("volume") or {}).get("findings", ())
-    yield from (f["text"] for f in stated if not f["code"].startswith(CONFORMITY))
     judged = [f for f in record.findings if f["code"].startswith(CONFORMITY)]
     yield from list_findings(judged)
     if judged and record.validation is not None:
@@ -157,37 +277,6 @@ def list_findings(findings: Iterable[Mapping[str, Any]]) -> list[Element]:
 def select_findings(record: CalibrationRecord, codes: tuple[str, ...]) -> list[Element]:
     """Return the findings whose codes begin so as an element."""
     return list_findings(f for f in record.findings if f["code"].startswith(codes))
-
-
-def _describe_undetermined(record: CalibrationRecord) -> str:
-    """Return how much the data determine."""
-    fit = record.result["fit"]
-    count, rank = len(fit["parameters"]), fit["rank"]
-    if not record.converged:
-        return "The fit did not converge, so it does not state what the data determine."
-    if rank == count:
-        return f"The data determine all {count} parameters."
-    return f"The data determine {rank} of {count} combinations of the parameters."
-
-
-@describes_section("determined", "What the data do not determine")
-def describe_open_combinations(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield what the data do not determine, and which measurement would determine it."""
-    yield _describe_undetermined(record)
-    yield from select_findings(record, OPEN)
-    for suggestion in record.result.get("remedies") or ():
-        yield f"Suggested measurement: {suggestion['finding']['text']}"
-
-
-@describes_section("outliers", "Outlying rows")
-def describe_outliers(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield which rows do not fit, and which poses were excluded."""
-    stated = select_findings(record, OUTLYING)
-    yield from stated
-    if excluded := record.result["fit"].get("dropped"):
-        yield f"Excluded from the fit by its options: {', '.join(excluded)}."
-    elif not stated:
-        yield "Outlying rows were not searched for, because the fit did not converge."
 
 
 # Errors at held-out poses, and the accuracy over the workspace.
@@ -245,17 +334,29 @@ def describe_heights(record: CalibrationRecord) -> Iterator[Element | None]:
         yield build_height_map(record.heights)
 
 
-@describes_section("residuals", "Residuals of the fit")
-def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
-    """Yield the residuals against the noise, in words and as a figure."""
-    fit = record.result["fit"]
-    if record.converged and fit["degrees"]:
-        square, degrees = (format_number(fit[key], 4) for key in ("chi_square", "degrees"))
-        p_value = format_number(fit["p_value"], 2)
-        yield f"Chi-square is {square} with {degrees} degrees of freedom (p = {p_value})."
-    yield None
-    of_residuals = (f for f in record.findings if not f["code"].startswith(OF_PARAMETERS))
-    yield from list_findings(f for f in of_residuals if f["code"].startswith(OF_RESIDUALS))
+@describes_section("repeatability", "Pose accuracy and repeatability")
+def describe_repeatability(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield AP and RP by ISO 9283 of positions, where poses were visited several times."""
+    stated = record.result.get("repeatability") or {}
+    visited = [pose for pose in stated.get("position") or () if ISO_9283.keys() <= pose.keys()]
+    if not visited:
+        return
+    sizes = [value for pose in visited for symbol in ISO_9283 for value in pose[symbol].values()]
+    unit = choose_unit(record.robot.shown_units[Dimension.LENGTH], sizes)
+    held_out = set(record.held_out_labels)
+    where = "held-out" if visited[0]["pose"] in held_out else "fitted, so AP is optimistic"
+    columns = [Column(f"{name} [{unit}]") for name in ("AP", "from", "to", "RP", "from", "to")]
+    rows = (
+        (
+            pose["pose"],
+            pose["target"] or ABSENT,
+            str(pose["visits"]),
+            *(format_in(unit, value, 3) for symbol in ISO_9283 for value in pose[symbol].values()),
+        )
+        for pose in visited
+    )
+    caption = f"ISO 9283 with intervals of 95 %, {stated['frame']}. Poses: {where}."
+    yield make_table(caption, ("pose", "target", Column("visits"), *columns), rows)
 
 
 @describes_section("workspace", "Measured poses and accuracy over the workspace")
@@ -285,6 +386,32 @@ NOT_TRACEABLE = (
 NO_BUDGET = "This fit has no intervals, so there is no uncertainty budget."
 
 
+@describes_section("budget", "Uncertainty budget")
+def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the uncertainty budget by source, and the stated facts of each instrument."""
+    budget = record.result.get("expected_error")
+    if not budget or budget.get("sources") is None:
+        yield NO_BUDGET
+    else:
+        yield BUDGET_TERMS
+        if not record.result.get("states_expected_error"):
+            yield (
+                "The residuals exceed the stated noise, so these numbers are not the expected "
+                "error of the machine."
+            )
+        yield build_budget_table(budget, record.robot)
+    stated = (record.result.get("volume") or {}).get("findings", ())
+    yield from (f["text"] for f in stated if not f["code"].startswith(CONFORMITY))
+    instruments = record.result.get("instruments") or ()
+    if not instruments:
+        yield NOT_TRACEABLE
+        return
+    names = dict.fromkeys(name for facts in instruments for name in facts)
+    columns = (word_column(name.replace("_", " "), wraps=True) for name in names)
+    rows = ((facts.get(name, ABSENT) for name in names) for facts in instruments)
+    yield make_table("Instruments and their calibration, as stated with the data", columns, rows)
+
+
 @describes_section("parameters", "Parameters")
 def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the parameters, the setup parameters, figures of shifts and correlations, and what was
@@ -304,28 +431,51 @@ def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
     yield from select_findings(record, OF_PARAMETERS)
 
 
-@describes_section("budget", "Uncertainty budget")
-def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield the uncertainty budget by source, and the stated facts of each instrument."""
-    budget = record.result.get("expected_error")
-    if not budget or budget.get("sources") is None:
-        yield NO_BUDGET
-    else:
-        yield BUDGET_TERMS
-        if not record.result.get("states_expected_error"):
-            yield (
-                "The residuals exceed the stated noise, so these numbers are not the expected "
-                "error of the machine."
-            )
-        yield build_budget_table(budget, record.robot)
-    instruments = record.result.get("instruments") or ()
-    if not instruments:
-        yield NOT_TRACEABLE
-        return
-    names = dict.fromkeys(name for facts in instruments for name in facts)
-    columns = (word_column(name.replace("_", " "), wraps=True) for name in names)
-    rows = ((facts.get(name, ABSENT) for name in names) for facts in instruments)
-    yield make_table("Instruments and their calibration, as stated with the data", columns, rows)
+# What the data leave open: undetermined combinations, outlying rows and residuals.
+
+
+def _describe_undetermined(record: CalibrationRecord) -> str:
+    """Return how much the data determine."""
+    fit = record.result["fit"]
+    count, rank = len(fit["parameters"]), fit["rank"]
+    if not record.converged:
+        return "The fit did not converge, so it does not state what the data determine."
+    if rank == count:
+        return f"The data determine all {count} parameters."
+    return f"The data determine {rank} of {count} combinations of the parameters."
+
+
+@describes_section("determined", "What the data do not determine")
+def describe_open_combinations(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield what the data do not determine, and which measurement would determine it."""
+    yield _describe_undetermined(record)
+    yield from select_findings(record, OPEN)
+    for suggestion in record.result.get("remedies") or ():
+        yield f"Suggested measurement: {suggestion['finding']['text']}"
+
+
+@describes_section("outliers", "Outlying rows")
+def describe_outliers(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield which rows do not fit, and which poses were excluded."""
+    stated = select_findings(record, OUTLYING)
+    yield from stated
+    if excluded := record.result["fit"].get("dropped"):
+        yield f"Excluded from the fit by its options: {', '.join(excluded)}."
+    elif not stated:
+        yield "Outlying rows were not searched for, because the fit did not converge."
+
+
+@describes_section("residuals", "Residuals of the fit")
+def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
+    """Yield the residuals against the noise, in words and as a figure."""
+    fit = record.result["fit"]
+    if record.converged and fit["degrees"]:
+        square, degrees = (format_number(fit[key], 4) for key in ("chi_square", "degrees"))
+        p_value = format_number(fit["p_value"], 2)
+        yield f"Chi-square is {square} with {degrees} degrees of freedom (p = {p_value})."
+    yield None
+    of_residuals = (f for f in record.findings if not f["code"].startswith(OF_PARAMETERS))
+    yield from list_findings(f for f in of_residuals if f["code"].startswith(OF_RESIDUALS))
 
 
 # Values for controllers, where the result comes from, and the poses that it uses.

@@ -65,7 +65,14 @@ class Code:
     text: str
 
 
-Element = str | Table | Picture | Listing | Code
+@dataclass(frozen=True)
+class Form:
+    """Facts by the words that people read; an empty one is a line to fill in on paper."""
+
+    rows: tuple[tuple[str, str], ...]
+
+
+Element = str | Table | Picture | Listing | Code | Form
 
 
 @dataclass(frozen=True)
@@ -116,6 +123,8 @@ def _describe(element: Element) -> dict[str, Any]:
         return {"picture": element.caption, "description": element.description}
     if isinstance(element, Listing):
         return {"list": [{"label": label, "text": text} for label, text in element.items]}
+    if isinstance(element, Form):
+        return {"form": dict(element.rows)}
     return {"code": element.title, "text": element.text}
 
 
@@ -126,6 +135,10 @@ FOLDER = Path(__file__).parent
 
 WIDEST = 6
 """Columns from which a table is set in a smaller font."""
+
+
+SHORTEST = 16
+"""Rows up to which a table stays on one page of paper."""
 
 
 def render_html(document: Document) -> str:
@@ -142,6 +155,7 @@ def render_html(document: Document) -> str:
         script=script,
         policy=f"{policy}; base-uri 'none'; form-action 'none'",
         widest=WIDEST,
+        shortest=SHORTEST,
     )
 
 
@@ -206,6 +220,7 @@ class CalibrationRecord:
     heights : errors of measured heights; None without any.
     residuals : of every kind; none where an older version wrote the run.
     controllers : the values for controllers that can store them.
+    facts : what people state beside the results, such as the customer, by the words for it.
     """
 
     result: Mapping[str, Any] = field(repr=False)
@@ -217,6 +232,7 @@ class CalibrationRecord:
     heights: HeightErrors | None
     residuals: tuple[KindResiduals, ...]
     controllers: tuple[ControllerValues, ...]
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Verdict:

@@ -506,7 +506,7 @@ def _draw_heights(axes: Axes, heights: HeightErrors, name: str, limit: float) ->
         drawn = axes.scatter(*places, c=errors[chosen], marker=marker, ec=DARK, lw=0.7, **style)
         rms.append(f"{of_set} {heights.statistics(name, is_held_out).rms / factor:.3g}")
     if len(errors) <= MOST_NUMBERS:
-        decimals = count_decimals(limit)
+        decimals = count_decimals(limit, 3)
         above: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": SMALL}
         for *place, value in zip(x, y, errors.tolist(), strict=True):
             number = f"{round(value, decimals) + 0.0:+.{decimals}f}"
