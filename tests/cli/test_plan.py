@@ -173,7 +173,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(loopcal,
         ("--kind locked", "none of the 9 free parameters of linear-delta"),
         ("--accuracy 10urad --kind position --candidates 30", "does not turn"),
         ("--like robot.yaml", "is a YAML file"),
-        ("--accuracy=-5um", "the accuracy goal is -0.005 mm"),
+        ("--accuracy=-5um", "the accuracy goal is -5 um"),
         ("--groups 3", "belong to --measure plane-line"),
         *(
             (f"--measure plane-line {option}", f"{option.split()[0]} cannot be combined with --mea")

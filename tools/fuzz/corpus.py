@@ -318,7 +318,7 @@ def _build_sources() -> Iterator[Machine]:
             1 export hexapod-42 --format linuxcnc --into hexapod.hal -o corrected.hal
             1 new limbs -o new.yaml --measurements new.csv --kind position,inclination
             1 new gough -o new.yaml
-            0.2 certificate --new
+            0.2 new --report-facts new-facts.yaml
             0.2 completion bash
             0.2 example cable-robot -o out
             0.5 reproduce
