@@ -22,7 +22,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_page_has_one_line_for_each_source_and_fits_a_screen(loopcal, run):
     said = ("Expected error", "instrument: pose", "tolerances", "all sources", "halved:")
-    lines = loopcal(f"budget {run}", *said, "[mm]", "[deg]").out.splitlines()
+    lines = loopcal(f"budget {run}", *said, "[um]", "[urad]").out.splitlines()
     assert len(lines) < 40
     assert max(map(len, lines)) <= 132
 

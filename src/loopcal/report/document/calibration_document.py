@@ -161,8 +161,9 @@ def _list_results(record: CalibrationRecord) -> Iterator[tuple[str, ...]]:
     """Yield error, before, after, limit and decision, in the order of what they tell of the use."""
 
     def write(value: float | None, quantity: str = "position") -> str:
-        is_number = value is not None and math.isfinite(value)
-        return str(record.robot.to_quantity(value, LENGTHS[quantity])) if is_number else ABSENT
+        if value is None or not math.isfinite(value):
+            return ABSENT
+        return str(record.robot.to_quantity(value, LENGTHS[quantity]))
 
     def judge(stated: Mapping[str, Any] | None, quantity: str = "position") -> tuple[str, str]:
         return (
