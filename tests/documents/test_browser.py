@@ -234,6 +234,7 @@ def test_picture_stays_where_a_browser_has_no_webgl(program, page) -> None:
     started.close()
 
 
+@pytest.mark.usefixtures("do_not_draw")
 def test_option_pdf_prints_at_most_12_pages(run, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["report", str(run.path), "--pdf"]) == 0
