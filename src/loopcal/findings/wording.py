@@ -53,7 +53,7 @@ def choose_symbol(size: float, symbol: str) -> tuple[str, float]:
     a size of 0 keeps its unit.
     """
     factor = 1.0
-    while symbol in FINER and 0.0 < abs(size) * factor < SMALL:
+    while symbol in FINER and 0.0 < round(abs(size) * factor, 12) < SMALL:  # 0.01 may be rounded
         symbol, finer = FINER[symbol]
         factor *= finer
     return symbol, factor
