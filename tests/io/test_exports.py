@@ -156,6 +156,21 @@ def test_lines_of_several_targets_share_a_row_and_repeats_get_another(tmp_path) 
     assert found.misfits == ((6, "the target 'c' is not one of a, b"),)
 
 
+def test_one_line_holds_the_columns_of_all_targets(tmp_path) -> None:
+    profile = PROFILE.replace(
+        "kind: position, noise: {x: 1 um, y: 1 um, z: 1 um}", "kind: position, targets: [a, b]"
+    )
+    for name in "XYZ":
+        profile = profile.replace(f"from: {name},", f"from: '{{target}} {name}',")
+    head = "Name;a X;a Y;a Z;b X;b Y;b Z\n"
+    lines = ["P1;1;1;1;2;2;2", "P2;3;3;3;;;", "P3;4;4;4;5;oops;5"]
+    found = convert(tmp_path, head + "\n".join(lines), profile)
+    assert read_rows(found.text) == ["P1,1,1,1,2,2,2", "P2,3,3,3,,,"]
+    assert [number for number, _ in found.misfits] == [4]  # not in part
+    with pytest.raises(FileError, match=r"'b Z'"):
+        convert(tmp_path, head.replace("b Z", "c Z") + "\n".join(lines), profile)
+
+
 BAD_EXPORTS = {
     "an empty file": (" \n", "export.txt: this export is empty; export it again"),
     "a preamble alone": ("Liste\n", ("export.txt:1: no line names the columns Name, X, Y, Z of "

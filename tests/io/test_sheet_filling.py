@@ -91,6 +91,17 @@ def write_leica(path: Path, points: Points) -> Path:
     return path
 
 
+def write_wide(path: Path, points: Points) -> Path:
+    """Write a line for each pose, with the columns of all targets."""
+    poses: dict[str, list[str]] = {}
+    names = [name.split("_")[1] for name, _ in points[:3]]
+    for name, xyz in points:
+        poses.setdefault(name.split("_")[0], []).extend(f"{v:.5f}" for v in xyz)
+    head = ["Name", *(f"{name} {axis}" for name in names for axis in "XYZ")]
+    path.write_text("\n".join(map(",".join, [head, *([p, *v] for p, v in poses.items())])))
+    return path
+
+
 def write_faro(path: Path, points: Points, separator: str = ",") -> Path:
     """Write a header below two lines, and columns in another order."""
     lines = ["CAM2 Measure", "", separator.join(["Label", "Name", "Z", "Y", "X", "RMS"])]
@@ -122,7 +133,7 @@ def rename(points: Points, names: dict[str, str]) -> Points:
     return [(names.get(name, name), xyz) for name, xyz in points]
 
 
-@pytest.mark.parametrize("name", ["faro", "leica", "spatial-analyzer"])
+@pytest.mark.parametrize("name", ["faro", "leica", "spatial-analyzer", "wide"])
 def test_shipped_profile_reads_and_states_its_source(name) -> None:
     path = find_profile_file(name)
     assert read_profile(path).kind is not None
@@ -130,11 +141,13 @@ def test_shipped_profile_reads_and_states_its_source(name) -> None:
 
 
 def test_unknown_profile_is_refused_with_the_shipped_ones() -> None:
-    with pytest.raises(FileError, match=r"did you mean 'faro'.*faro, leica and spatial-analyzer"):
+    with pytest.raises(
+        FileError, match=r"did you mean 'faro'.*faro, leica, spatial-analyzer and wide"
+    ):
         find_profile_file("farro")
 
 
-@pytest.mark.parametrize("form", ["windows", "inches", "leica", "faro", "faro-comma"])
+@pytest.mark.parametrize("form", ["windows", "inches", "leica", "faro", "faro-comma", "wide"])
 def test_every_format_fills_the_sheet_with_the_same_points(
     form, robot, sheet, points, tmp_path
 ) -> None:
@@ -146,6 +159,8 @@ def test_every_format_fills_the_sheet_with_the_same_points(
         filled = fill(robot, sheet, export, unit="in")
     elif form == "leica":
         filled = fill(robot, sheet, write_leica(path, points), profile="leica", comma=True)
+    elif form == "wide":
+        filled = fill(robot, sheet, write_wide(path, points), profile="wide")
     else:
         export = write_faro(path, points, ";" if form == "faro-comma" else ",")
         filled = fill(robot, sheet, export, profile="faro", comma=form == "faro-comma")
@@ -325,7 +340,7 @@ def test_command_prints_what_is_filled_in_and_what_is_not(
     assert "the export lacks 3 of the 42 points of the sheet: 1_SMR1, 1_SMR2 and 1_SMR3" in said
     assert "points.txt:44 does not match: it names the pose 'floor', but no target" in said
     assert main([*words.split(), "--force", "--profile", "leicca"]) == 1
-    assert "faro, leica and spatial-analyzer" in capsys.readouterr().err
+    assert "faro, leica, spatial-analyzer and wide" in capsys.readouterr().err
 
 
 def test_import_takes_a_shipped_profile_and_a_unit(points, tmp_path, monkeypatch, capsys) -> None:

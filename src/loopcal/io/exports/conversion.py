@@ -78,7 +78,8 @@ def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[
     and those that the profile skips. FileError : unreadable, empty, or without the header.
     """
     record = profile.record
-    sources = [place for source in profile.columns.values() for place in source.places]
+    by_target = profile.columns_by_target.values()
+    sources = [p for columns in by_target for source in columns.values() for p in source.places]
     named = {place for place in (*sources, *record.matrix) if isinstance(place, str)}
     lines: list[Line] = []
     header, nearest, skipped = None, None, 0
@@ -364,7 +365,11 @@ def convert_export(
     for line in read:
         try:
             check_count(line, profile.delimiter)
-            fitting.append((line, _parse_row(line, profile, clock)))
+            of_targets = {
+                target: _parse_row(line, profile, columns, clock)
+                for target, columns in profile.columns_by_target.items()
+            }
+            fitting += [(line, r | {"target": t} if t else r) for t, r in of_targets.items()]
         except Misfit as error:
             misfits.append((line.number, str(error)))
     rows, others, findings = _join_rows(fitting, profile)
@@ -401,10 +406,12 @@ def save_converted(text: str, path: str | Path) -> None:
     write_text(path, text)
 
 
-def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:
+def _parse_row(
+    line: Line, profile: Profile, columns: Mapping[str, ColumnSource], clock: PatternClock
+) -> Row:
     """Return column -> cell of one line, with `target` where the name states it; raise Misfit."""
     row: Row = {}
-    for name, source in profile.columns.items():
+    for name, source in columns.items():
         cells = [_get_cell(line, place) for place in source.places]
         if source.symbol is not None:
             number = _parse_number(cells[0], profile, name)

@@ -124,6 +124,10 @@ def _normalize_places(places: Iterable[Place]) -> tuple[Place, ...]:
     return tuple(normalize_name(p) if isinstance(p, str) else p for p in places)
 
 
+TARGET = "{target}"
+"""Part of a name in the header that stands for each target."""
+
+
 @dataclass(frozen=True)
 class ColumnSource:
     """The source of one column of the measurement file.
@@ -131,6 +135,7 @@ class ColumnSource:
     Parameters
     ----------
     from_ : name in the export's header, or place counted from 1; several are joined by blanks.
+        `{target}` in a name stands for each target, where a line has the columns of all of them.
     unit : unit of a number.
     factor : of a sigma: number by which it is multiplied, such as 0.5 for an expanded uncertainty
         U(95) with k = 2.
@@ -151,6 +156,11 @@ class ColumnSource:
     def places(self) -> tuple[Place, ...]:
         """Names in the export's header, or places counted from 1."""
         return _normalize_places(self.from_ if isinstance(self.from_, tuple) else (self.from_,))
+
+    def of_target(self, target: str) -> ColumnSource:
+        """Return the source of one target in a line of several."""
+        places = (p.replace(TARGET, target) if isinstance(p, str) else p for p in self.places)
+        return replace(self, from_=tuple(places))
 
     @property
     def symbol(self) -> str | None:
@@ -239,6 +249,18 @@ class Profile:
     def columns(self) -> Mapping[str, ColumnSource]:
         """Sources of all columns, readings included."""
         return {**self.record.columns, **self.record.readings}
+
+    @cached_property
+    def columns_by_target(self) -> Mapping[str, Mapping[str, ColumnSource]]:
+        """Sources of the columns of each target, where a line has those of all targets; otherwise
+        one entry without a name.
+        """
+        if not any(TARGET in str(p) for source in self.columns.values() for p in source.places):
+            return {"": self.columns}
+        return {
+            target: {name: source.of_target(target) for name, source in self.columns.items()}
+            for target in self.targets
+        }
 
     @cached_property
     def missing(self) -> tuple[str, ...]:
@@ -390,9 +412,11 @@ def check_columns(profile: Profile) -> None:
             )
             raise file.error(f"{sentence}; correct it", ("columns",))
     pattern = record.columns["pose"].pattern if "pose" in record.columns else None
-    if len(profile.targets) > 1 and (pattern is None or "target" not in pattern.groupindex):
+    has_target = "" not in profile.columns_by_target  # each line has the columns of all
+    has_target |= pattern is not None and "target" in pattern.groupindex
+    if len(profile.targets) > 1 and not has_target:
         sentence = "the kind has several targets, each with a line of its own"
-        act = "add (?P<target>..) to 'match' of 'pose'"
+        act = "add (?P<target>..) to 'match' of 'pose', or {target} to names in 'from'"
         raise file.error(f"{sentence}; {act}", ("columns", "pose"))
 
 
