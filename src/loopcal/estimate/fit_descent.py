@@ -292,6 +292,8 @@ def _find_weak(fit: Descent, method: Method) -> IntArray:
     """Return the trials whose method must hold what data determine weakly: from a limit on where
     they did not converge, and from a higher one where they did.
     """
+    if method.unpenalized(fit.deviation.shape[1]) is None:  # no decomposition is needed
+        return np.zeros(0, dtype=np.int64)
     limit = np.where(fit.status == DescentStatus.CONVERGED.value, WEAKEST, HOLD)
     return np.flatnonzero(method.find_weak(fit.decomposition, limit).any(axis=1))
 
