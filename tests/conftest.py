@@ -78,8 +78,7 @@ def data_folder() -> Path:
     return folder
 
 
-@pytest.fixture
-def do_not_draw(monkeypatch) -> None:
+def leave_out_drawing(patch: pytest.MonkeyPatch) -> None:
     """Leave out the layout and the drawing of figures: it takes a third of the time of a plan and
     nine tenths of that of a report, and tests/report draws every figure.
     """
@@ -90,10 +89,16 @@ def do_not_draw(monkeypatch) -> None:
         else:
             out.write(b"\x89PNG\r\n\x1a\n")
 
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
-    monkeypatch.setattr("matplotlib.figure.Figure.draw_without_rendering", lambda _: None)
+    patch.setattr("matplotlib.figure.Figure.savefig", save)
+    patch.setattr("matplotlib.figure.Figure.draw_without_rendering", lambda _: None)
     empty = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 400 300"></svg>'
-    monkeypatch.setattr("loopcal.report.pictures._render_svg", lambda _: empty)
+    patch.setattr("loopcal.report.pictures._render_svg", lambda _: empty)
+
+
+@pytest.fixture
+def do_not_draw(monkeypatch) -> None:
+    """Write placeholders for pictures in one test."""
+    leave_out_drawing(monkeypatch)
 
 
 @pytest.fixture(scope="session")

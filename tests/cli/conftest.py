@@ -2,18 +2,22 @@
 """How tests run commands, which write placeholders for pictures."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
 from loopcal.cli.entry_point import main
+from tests.conftest import leave_out_drawing
 
 
-@pytest.fixture(autouse=True)
-def use_placeholders(do_not_draw) -> None:
-    """Write placeholders for pictures in all tests of this folder."""
+@pytest.fixture(autouse=True, scope="module")
+def use_placeholders() -> Iterator[None]:
+    """Write placeholders for pictures in all tests of this folder and their fixtures."""
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_drawing(patch)
+        yield
 
 
 class Printed(NamedTuple):
