@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units of files and tables. Inside loopcal everything is in SI (meter, radian).
+"""Units of files and tables. Inside loopcal everything is in SI (meter, radian, second), but
+temperatures, which are in degrees Celsius.
 
 A record annotates its numbers with `Length`, `Angle` or `Ratio`; the reader of files multiplies
 them by the factor of the stated unit, the writer divides by it.
@@ -23,6 +24,8 @@ class Dimension(Enum):
     LENGTH = "length"
     ANGLE = "angle"
     RATIO = "ratio"
+    TEMPERATURE = "temperature"
+    TIME = "time"
 
 
 LARGEST = 1e9
@@ -66,6 +69,8 @@ UNITS: Mapping[str, Unit] = {
         Unit("1", Dimension.RATIO, 1.0),
         Unit("ppm", Dimension.RATIO, 1e-6),
         Unit("um/m", Dimension.RATIO, 1e-6),
+        Unit("degC", Dimension.TEMPERATURE, 1.0),
+        Unit("s", Dimension.TIME, 1.0),
     )
 }
 
@@ -73,6 +78,8 @@ SI_SYMBOLS: Mapping[Dimension, str] = {
     Dimension.LENGTH: "m",
     Dimension.ANGLE: "rad",
     Dimension.RATIO: "1",
+    Dimension.TEMPERATURE: "degC",
+    Dimension.TIME: "s",
 }
 
 # Units of tables if the robot file states no others.
@@ -80,6 +87,8 @@ DISPLAY_UNITS: Mapping[Dimension, Unit] = {
     Dimension.LENGTH: UNITS["mm"],
     Dimension.ANGLE: UNITS["deg"],
     Dimension.RATIO: UNITS["1"],
+    Dimension.TEMPERATURE: UNITS["degC"],
+    Dimension.TIME: UNITS["s"],
 }
 
 # Examples of quantities, for messages.
@@ -87,6 +96,8 @@ EXAMPLES: Mapping[Dimension, str] = {
     Dimension.LENGTH: "0.02mm",
     Dimension.ANGLE: "0.01deg",
     Dimension.RATIO: "1.5 1",
+    Dimension.TEMPERATURE: "21.5degC",
+    Dimension.TIME: "60s",
 }
 
 
@@ -95,7 +106,13 @@ def list_symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
     return tuple(s for s, u in UNITS.items() if dimension is None or u.dimension is dimension)
 
 
-ARTICLES = {Dimension.LENGTH: "a length", Dimension.ANGLE: "an angle", Dimension.RATIO: "a ratio"}
+ARTICLES = {
+    Dimension.LENGTH: "a length",
+    Dimension.ANGLE: "an angle",
+    Dimension.RATIO: "a ratio",
+    Dimension.TEMPERATURE: "a temperature",
+    Dimension.TIME: "a time",
+}
 
 
 def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:

@@ -25,6 +25,7 @@ from loopcal.engine.program import Program as Program
 from loopcal.engine.program import Reached as Reached
 from loopcal.engine.program import Slot as Slot
 from loopcal.engine.program import State as State
+from loopcal.engine.program import Sums as Sums
 from loopcal.engine.program import Target as Target
 from loopcal.engine.program import Task as Task
 from loopcal.engine.program import TwistRows as TwistRows

@@ -38,6 +38,17 @@ Task = Callable[[FloatArray, np.ndarray], tuple[FloatArray, FloatArray]]
 """Conditions on the pose: T (N, 3, 4), rows (N,) -> residual (N, c) [m], its slopes (N, c, 6)."""
 
 
+class Sums(NamedTuple):
+    """Weighted sums of driven joints, r of them, that are given in place of the joints.
+
+    weights : (t | 1, r, n_joints). values : (t | 1, n | 1, r) [m]; the weight of an angle is a
+    length.
+    """
+
+    weights: FloatArray
+    values: FloatArray
+
+
 class Slot(NamedTuple):
     """A displacement that parameters can move, in every limb of a group.
 
@@ -90,6 +101,11 @@ class Group:
         """Whether the nominal links 0..J + 1 do not turn in any limb."""
         return tuple(np.all(self.links[:, :, :3, :3] == np.eye(3), axis=(0, 2, 3)).tolist())
 
+    @cached_property
+    def driven_joints(self) -> list[int]:
+        """The actuated joints, the rod among them."""
+        return np.flatnonzero(self.actuator[:, 0] >= 0).tolist()
+
     def unknown_joints(self, free: bool) -> list[int]:
         """Return the joints that closure determines: passive ones, and if `free` actuated ones."""
         driven = self.actuator[:, 0] >= 0
@@ -133,6 +149,11 @@ class Program:
     def nodes(self) -> tuple[tuple[int, ...], ...]:
         """Freedoms of all nodes, those of the platform first."""
         return (self.freedoms, *self.others)
+
+    @cached_property
+    def widths(self) -> tuple[int, ...]:
+        """Numbers of unknowns of all nodes; behind them of driven joints whose sums are given."""
+        return (*map(len, self.nodes), self.n_joints)
 
     @cached_property
     def unknown_twists(self) -> list[tuple[int, int]]:

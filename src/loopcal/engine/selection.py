@@ -25,6 +25,7 @@ from loopcal.engine.program import (
     Program,
     Reached,
     State,
+    Sums,
     Target,
     Task,
     TwistRows,
@@ -170,6 +171,7 @@ def solve(
     free: bool = False,
     max_iterations: int = 60,
     goal: State | None = None,
+    sums: Sums | None = None,
 ) -> State:
     """Find the pose and the joints that close every loop.
 
@@ -178,14 +180,19 @@ def solve(
     start : first guess, (t | 1, n | 1) rows.
     task : conditions on the pose, as many as the freed actuators leave open.
     free : solve for the actuated joints too.
+    sums : solve for the actuated joints too, of which these sums are given; NumPy computes it.
     goal : solutions (t, n); a row ends as NEAR_GOAL as soon as its next step leads close to its
         goal, to which further steps would converge. Its coordinates are those before that step.
 
     Rows that fail are marked in `status`; nothing is raised. The closure sign is that of the limbs
     that constrain the platform: a limb whose joints only follow it may pass its own singularities.
     """
-    current = _get_engine_for(program)
-    state = current.solve(program, e, q, start, task, free, max_iterations, goal)
+    if sums is None:
+        current = _get_engine_for(program)
+        state = current.solve(program, e, q, start, task, free, max_iterations, goal)
+    else:
+        current = _make_numpy_engine()
+        state = current.solve(program, e, q, start, task, free, max_iterations, goal, sums)
     if not program.idle_groups:
         return state
     joints = tuple(state.joints[i] for i in program.idle_groups)

@@ -119,7 +119,8 @@ def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Ge
     numbers only.
 
     purpose : separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3
-        effects, 4 errors of the readings of held-out poses, 5 setup parameters.
+        effects, 4 errors of the readings of held-out poses, 5 setup parameters, 6
+        conditions.
     """
     if isinstance(seed, BlockStream):
         counter = np.array([0, purpose, trial, seed.block], dtype=np.uint64)

@@ -56,7 +56,7 @@ class Disturbance:
 
 
 NO_DISTURBANCE = Disturbance()
-NOISE, TRUTH, READING, SETUP = 0, 1, 2, 5  # purposes of a trial's random streams
+NOISE, TRUTH, READING, SETUP, CONDITIONS = 0, 1, 2, 5, 6  # purposes of a trial's random streams
 STEPS = 20  # corrections of a commanded position; each leaves the share of the geometry's errors
 EXACT = 1e-6  # share of the noise to which a gap is reached
 # Parameters of a surface that move it along the residuals of its points, in their order.
@@ -251,7 +251,7 @@ def simulate_trials(
         raise DataError("truth has no row; give the parameter values of at least one machine")
     geometry = robot.nominal if controller is None else controller
     commanded = solve_commanded_poses(geometry, poses, *pose_names)
-    readings, n = commanded.q, len(commanded.q)
+    readings, n = _draw_conditions(robot, commanded.q, seed), len(commanded.q)
     given = None if reading_sigma is None else broadcast_reading_sigma(reading_sigma, readings)
     check_closure(robot, kinds, given, n)
     mounted = instrument.with_tool(robot)
@@ -285,6 +285,15 @@ def simulate_trials(
     recorded = _record_readings(robot, shown, reading_sigma, len(values), seed)
     columns = tuple(measured)
     return Trials(assigned, robot.name, readings, columns, values, T, reached, nuisance, *recorded)
+
+
+def _draw_conditions(robot: Mechanism, readings: FloatArray, seed: Seed) -> FloatArray:
+    """Return readings (n, a) with conditions drawn from their ranges, for all trials the same."""
+    out, stream = np.array(readings), make_random_stream(seed, 0, CONDITIONS)
+    for i, actuator in enumerate(robot.actuators):
+        if actuator.reference is not None and actuator.stroke is not None:
+            out[:, i] = stream.uniform(*actuator.stroke, len(out))
+    return out
 
 
 def _draw_setup(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from loopcal.mechanism.limb_rows import (
     name_passive_joints,
     select_block,
     stack_closure_rows,
+    stack_displacement_columns,
     stack_driven_columns,
 )
 from loopcal.mechanism.model import Mechanism, ParameterUnits
@@ -27,13 +28,17 @@ from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import (
     apply_weights,
     differentiate_sums,
+    distribute_readings,
+    evaluate_references,
     evaluate_sums,
+    find_fixed_rows,
     invert_weights,
     joint_slopes,
     joints_from_readings,
     readings_from_joints,
     select_weights,
 )
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import FloatArray
 
 
@@ -92,6 +97,34 @@ def drive_sums(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenSum
     assert weights is not None
     with np.errstate(invalid="ignore"):  # as in `drive_joints`
         return DrivenSums(e, evaluate_sums(q, tau, robot.slots.constants), weights)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenSums:
+    """Sums of driven joints: how many of them, the first ones, commanded readings choose, and the
+    values (t | 1, 1, r) [m, rad] of the others; weights : (t | 1, r, J).
+    """
+
+    chosen: int
+    fixed: FloatArray
+    weights: FloatArray
+
+    def complete(self, u: FloatArray) -> FloatArray:
+        """Return all sums (t, n, r) of readings' own ones (t, n, u), fixed ones behind them."""
+        fixed = np.broadcast_to(self.fixed, (*u.shape[:2], self.fixed.shape[2]))
+        return np.concatenate([u[..., : self.chosen], fixed], axis=2)
+
+    def read(self, joints: FloatArray) -> FloatArray:
+        """Return the sums (t, n, chosen) of joint values (t, n, J)."""
+        return apply_weights(self.weights[:, : self.chosen], joints)
+
+
+def list_open_sums(robot: Mechanism, values: FloatArray) -> OpenSums:
+    """Return the sums for values (t | 1, p), conditions at their references."""
+    (_, tau), constants = robot.slots(values), robot.slots.constants
+    weights, chosen = select_weights(tau, constants), int((~find_fixed_rows(constants)).sum())
+    assert weights is not None
+    return OpenSums(chosen, evaluate_references(tau, constants)[..., chosen:], weights)
 
 
 # Redundant actuation with a prescribed pose: readings and passive joints follow limb by limb.
@@ -159,10 +192,24 @@ def _differentiate_joints_at_pose(robot: Mechanism, values: FloatArray, state: S
     return out
 
 
-# Summed drives: s(q) = W l, with l the values of the driven joints.
+# Driven joints l whose sums are given, s(q) = W l, where the sums of readings and of couplings
+# alone do not determine them. Closure determines l with the nodes.
 
-ITERATIONS = 25
+ITERATIONS = 60
 """Newton steps of a pose; those within reach need fewer than ten."""
+
+
+def measure_sums(program: Program, weights: FloatArray) -> FloatArray:
+    """Return lengths (r,) [m] that a unit of each sum counts for: the motion of the joint that has
+    most of it, an angle at the size of the robot.
+    """
+    units = np.ones(program.n_joints)
+    for group in program.groups:
+        for j in group.driven_joints:
+            if group.joints[j : j + 1] == "R":
+                units[group.actuator[j]] = program.size
+    with np.errstate(divide="ignore"):
+        return (1.0 / (np.abs(weights[0]) / units).max(axis=1)).clip(max=1e12)
 
 
 def solve_open_sums(
@@ -172,54 +219,74 @@ def solve_open_sums(
     sums: FloatArray,
     begin: State,
     max_iterations: int = ITERATIONS,
+    task: engine.Task | None = None,
 ) -> State:
-    """Return the states (t, n) at which the weighted sums (t | 1, n, a) of driven joints are given,
-    by Newton's method from `begin` (t | 1, n | 1).
+    """Return the states (t, n) at which the weighted sums (t | 1, n, r) of driven joints are given,
+    and the conditions of a task, by Newton's method from `begin` (t | 1, n | 1).
     """
-    t = max(len(e), len(weights), len(sums), begin.T.shape[0])
-    n = max(sums.shape[1], begin.T.shape[1])
-    wanted = np.broadcast_to(sums, (t, n, sums.shape[2]))
-    turns = np.zeros(program.n_joints, dtype=bool)
-    for group in program.groups:
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                turns[columns] = group.joints[j : j + 1] == "R"
-    # sums of angles count as lengths at the size of the robot
-    is_angle = (weights[0] != 0.0)[:, turns].any(axis=1)
-    units = np.where(is_angle, program.size, 1.0)
-
-    def compare(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        trial, pose = np.divmod(rows, n)
-        own = e if len(e) == 1 else e[trial]
-        start = begin.select((t, n), trial, pose)
-        platform = np.broadcast_to(np.eye(4), (len(rows), 1, 4, 4)).copy()
-        platform[:, 0, :3] = T
-        start = replace(start, T=platform)
-        guess = program.list_drives(start.joints)
-        closed = engine.solve(program.with_fixed_platform, own, guess, start, free=True)
-        W = weights if len(weights) == 1 else weights[trial]
-        lengths = program.list_drives(closed.joints)
-        residual = apply_weights(W, lengths)[:, 0] - wanted[trial, pose]
-        slopes = np.zeros((len(rows), residual.shape[1], 6))
-        by_freedoms = differentiate_lengths(program, own, replace(closed, T=platform))
-        slopes[..., list(program.freedoms)] = np.matmul(W, by_freedoms[:, 0])
-        return residual * units, slopes * units[:, None]
-
-    guess = np.broadcast_to(program.list_drives(begin.joints), (t, n, program.n_joints))
-    return engine.solve(program, e, guess, begin, compare, True, max_iterations)
+    units = measure_sums(program, weights)
+    own = engine.Sums(weights * units[:, None], sums * units)
+    q = program.list_drives(begin.joints)
+    return engine.solve(program, e, q, begin, task, False, max_iterations, sums=own)
 
 
-def differentiate_lengths(program: Program, e: FloatArray, state: State) -> FloatArray:
-    """Return the derivatives (t, n, J, m) of the driven joints by the platform's freedoms.
+def stack_sum_rows(
+    program: Program, blocks: engine.ClosureBlocks, weights: FloatArray
+) -> FloatArray:
+    """Return closure rows, then sums (t, n, c + r, M + J) against the freedoms of all nodes and the
+    driven joints.
+    """
+    A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
+    own = np.broadcast_to(weights[:, None], (*A.shape[:2], *weights.shape[1:]))
+    none = np.zeros((*own.shape[:3], A.shape[3]))
+    top, low = np.concatenate([A, Q], axis=3), np.concatenate([none, own], axis=3)
+    return np.concatenate([top, low], axis=2)
 
-    Each limb has one driven joint and one closure equation: dl = -A dy / Q.
+
+def differentiate_unknowns_by_sums(
+    program: Program, e: FloatArray, state: State, weights: FloatArray
+) -> FloatArray:
+    """Return the derivatives (t, n, M + J, r) of all nodes' freedoms and of driven joints by their
+    weighted sums.
     """
     blocks = engine.linearize(program, e, program.list_drives(state.joints), state)
-    A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
-    columns = np.concatenate([g.actuator[g.actuator[:, 0] >= 0][0] for g in program.groups])
-    out = np.empty_like(A)
-    with np.errstate(all="ignore"):
-        out[:, :, columns] = -A / Q.sum(axis=-1, keepdims=True)
+    rows = stack_sum_rows(program, blocks, weights)
+    return invert_rows(rows)[..., rows.shape[2] - weights.shape[1] :]
+
+
+def invert_rows(rows: FloatArray) -> FloatArray:
+    """Return the inverses of rows (.., c, m), c >= m, those of least squares with more rows, NaN
+    where one is singular or not finite.
+    """
+    c, m = rows.shape[-2:]
+    if c == m:
+        return invert_weights(rows)
+    orthogonal, triangle = np.linalg.qr(np.nan_to_num(rows))
+    is_finite = np.isfinite(rows).all(axis=(-1, -2), keepdims=True)
+    product = np.matmul(invert_weights(triangle), np.swapaxes(orthogonal, -1, -2))
+    return np.where(is_finite, product, np.nan)
+
+
+def _differentiate_open(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> FloatArray:
+    """Return the derivatives (t, n, M + J, p + a) of all nodes' freedoms and of driven joints by
+    parameters in SI and by readings.
+    """
+    program, p = robot.program, len(robot.parameters)
+    unknown = len(program.unknown_twists) + program.n_joints
+    out = np.empty((*state.T.shape[:2], unknown, p + len(robot.actuators)))
+    displacements = differentiate_displacements(robot, values)
+    for rows, blocks in linearize_limbs(robot, values, state):
+        own, readings = select_block(values, rows[:1]), select_block(q, rows)
+        block = map_arrays(lambda a, rows=rows: a[rows], state)
+        weights, moved = _differentiate_sums(robot, own, readings, block)
+        inverse = invert_rows(stack_sum_rows(program, blocks, weights[:, 0]))
+        E = stack_displacement_columns(program, blocks)
+        opened = np.matmul(E, select_block(displacements, rows[:1])[:, None])
+        c = opened.shape[2]
+        out[rows] = np.matmul(inverse[..., c:], np.concatenate(moved, axis=3))
+        out[rows][..., :p] -= np.matmul(inverse[..., :c], opened)
     return out
 
 
@@ -229,40 +296,30 @@ def differentiate_open_sums(
     q: FloatArray,
     state: State,
     columns: ParameterUnits | None = None,
+    nodes: int = 1,
 ) -> Derivatives:
-    """Return the derivatives of the twist of the platform, (t, n, 6, p) and (t, n, 6, a), by
-    `columns`, all parameters in SI without it.
+    """Return the derivatives of the twists of the first nodes, (t, n, 6 nodes, p) and (t, n, 6
+    nodes, a), by `columns`, all parameters in SI without it.
     """
     chosen = robot.all_parameters if columns is None else columns
-    at_pose = np.split(
-        _differentiate_joints_at_pose(robot, values, state), [len(robot.parameters)], axis=3
-    )
-    by_parameters = at_pose[0][..., chosen.places] * chosen.units
-    weights, moved = _differentiate_sums(robot, values, q, state)
-    moved = Derivatives(moved.parameters[..., chosen.places] * chosen.units, moved.readings)
-    inverse = invert_weights(np.matmul(weights, at_pose[1]))
-    own = moved.parameters - np.matmul(weights, by_parameters)
-    shape, freedoms = state.T.shape[:2], list(robot.program.freedoms)
-    out = []
-    for right in (own, moved.readings):
-        twist = np.zeros((*shape, 6, right.shape[-1]))
-        twist[:, :, freedoms] = np.matmul(inverse, right)
-        out.append(twist)
-    return Derivatives(*out)
+    own = [(i, 6 * k + f) for i, (k, f) in enumerate(robot.program.unknown_twists) if k < nodes]
+    sources, targets = map(list, zip(*own, strict=True))
+    moved = _differentiate_open(robot, values, q, state)[:, :, sources]
+    twist = np.zeros((*moved.shape[:2], 6 * nodes, moved.shape[3]))
+    twist[:, :, targets] = moved
+    by_parameters, by_readings = np.split(twist, [len(robot.parameters)], axis=3)
+    return Derivatives(by_parameters[..., chosen.places] * chosen.units, by_readings)
 
 
 def differentiate_driven_joints(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, platform: Derivatives
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> FloatArray:
     """Return the derivatives (t | 1, n | 1, J, p + a) of the driven joints by all parameters in SI
-    and readings, of those of the platform's twist.
+    and readings.
     """
     if robot.has_open_sums:
-        p, freedoms = len(robot.parameters), list(robot.program.freedoms)
-        at_pose = _differentiate_joints_at_pose(robot, values, state)
-        joints = np.matmul(at_pose[..., p:], np.concatenate(platform, axis=3)[:, :, freedoms])
-        joints[..., :p] += at_pose[..., :p]
-        return joints
+        M = len(robot.program.unknown_twists)
+        return _differentiate_open(robot, values, q, state)[:, :, M:]
     return differentiate_transmissions(robot, values, q)
 
 
@@ -274,7 +331,8 @@ def differentiate_joints_by_readings(
     weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
     slopes = joint_slopes(q, tau, robot.slots.constants)
-    return invert_weights(weights)[:, None] * slopes[:, :, None]
+    by_readings = distribute_readings(slopes, robot.slots.constants)
+    return np.matmul(invert_weights(weights)[:, None], by_readings)
 
 
 def _differentiate_sums(
@@ -291,5 +349,8 @@ def _differentiate_sums(
     of_terms = of_terms.reshape(len(of_terms), *slots.terms.shape, -1)
     by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
     slopes = joint_slopes(q, tau, slots.constants)
-    by_readings = slopes[..., None] * np.eye(slopes.shape[-1])
-    return weights[:, None], Derivatives(by_parameters, by_readings)
+    by_readings = distribute_readings(slopes, slots.constants)
+    shapes = by_parameters.shape[:2], by_readings.shape[:2], lengths.shape[:2]
+    lead = np.broadcast_shapes(*shapes)
+    both = (np.broadcast_to(a, (*lead, *a.shape[2:])) for a in (by_parameters, by_readings))
+    return weights[:, None], Derivatives(*both)

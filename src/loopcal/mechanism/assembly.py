@@ -165,6 +165,10 @@ class Actuator:
         weight * joint value. Without them it gives the value of the joint of its own name.
     points : readings of its table, whose values are the terms table1, table2, ..; between them it
         is `linear` or `cubic`.
+    column : of a coupling, the name of the condition that it has as its reading, "" for none; None
+        of a drive, which reads its own name.
+    reference : of a condition, a reading such as a temperature that is never commanded, its value
+        in inverse kinematics; None for others.
     """
 
     name: str
@@ -176,10 +180,14 @@ class Actuator:
     weights: Mapping[str, float] = field(default_factory=dict)
     points: tuple[float, ...] = ()
     interpolation: str = "linear"
+    column: str | None = None
+    reference: float | None = None
 
     @property
     def driven_joints(self) -> tuple[str, ...]:
         """Names of the driven joints that it reads: its own, or those of its sum."""
+        if self.reference is not None:
+            return ()
         return tuple(self.weights) or (self.name,)
 
     @property
@@ -192,7 +200,8 @@ class Actuator:
 class Assembly:
     """A mechanism as the `expand` method of a family returns it.
 
-    name, source : for people. limbs, actuators : in the order of readings and tables.
+    name, source : for people. limbs, actuators : in the order of readings and tables; conditions
+        are the last actuators.
     freedoms : those of the platform, of AXES in base axes. controlled : coordinates in which the
         machine is commanded.
     home : (4, 4) T_base_platform of the home pose; only its controlled coordinates must be exact.
@@ -206,6 +215,7 @@ class Assembly:
     bodies : name -> first guess (4, 4) of the home pose in the base, of each body beside base and
         platform that limbs join. They have the freedoms of the platform.
     held : of a chain, the actuators that inverse kinematics leaves at their present readings.
+    couplings : rows of driven joints beside those of actuators, without a reading of their own.
     """
 
     name: str
@@ -226,6 +236,12 @@ class Assembly:
     closure: str = "exact"
     bodies: Mapping[str, FloatArray] = field(default_factory=dict)
     held: tuple[str, ...] = ()
+    couplings: tuple[Actuator, ...] = ()
+
+    @cached_property
+    def rows(self) -> tuple[Actuator, ...]:
+        """The rows that determine the driven joints: commanded actuators, then couplings."""
+        return (*(a for a in self.actuators if a.reference is None), *self.couplings)
 
     @cached_property
     def numbers(self) -> Mapping[str, int]:
@@ -235,17 +251,22 @@ class Assembly:
 
     @cached_property
     def driven_joints(self) -> tuple[str, ...]:
-        """Names of the driven joints: those of the actuators, of summed drives those of sums."""
-        return tuple(dict.fromkeys(name for a in self.actuators for name in a.driven_joints))
+        """Names of the driven joints: those of the actuators, of sums and couplings theirs."""
+        return tuple(dict.fromkeys(name for a in self.rows for name in a.driven_joints))
 
     @cached_property
     def passive_joints(self) -> tuple[tuple[Limb, Joint], ...]:
-        """Joints whose value is no reading, with their limbs: passive ones, and pins of triangles
-        that a linear actuator turns.
+        """Joints whose value is no reading, with their limbs: passive ones, also in couplings, and
+        pins of triangles that a linear actuator turns.
         """
-        read = {name for a in self.actuators if not a.is_triangle for name in a.driven_joints}
+        read = {name for a in self.rows if not a.is_triangle for name in a.driven_joints}
         pairs = ((limb, joint) for limb in self.limbs for joint in limb.joints)
-        return tuple((limb, joint) for limb, joint in pairs if joint.actuator not in read)
+        return tuple(
+            (limb, joint)
+            for limb, joint in pairs
+            if joint.actuator not in read
+            or f".{limb.name}.{joint.name}".endswith(f".{joint.actuator}")
+        )
 
     @cached_property
     def limb_by_parameter(self) -> Mapping[str, str]:
@@ -253,7 +274,7 @@ class Assembly:
         limb_of = {drive: limb.name for limb in reversed(self.limbs) for drive in limb.drives}
         limb_of |= {limb.name: limb.name for limb in self.limbs}
         owners: dict[str, set[str]] = {}
-        for actuator in self.actuators:
+        for actuator in self.rows:
             # the terms of a sum belong to the limbs of its joints
             limbs = {limb_of[name] for name in actuator.driven_joints}
             limb_of.setdefault(actuator.name, next(iter(limbs)) if len(limbs) == 1 else "")
@@ -283,8 +304,10 @@ class AttachedStage:
 
 
 def is_serial(assembly: Assembly) -> bool:
-    """Return whether the pose is the product of driven joints: one limb without passive joints."""
-    if assembly.stages or assembly.bodies or len(assembly.limbs) != 1:
+    """Return whether the pose is the product of driven joints: one limb without passive joints, or
+    couplings.
+    """
+    if assembly.stages or assembly.bodies or assembly.couplings or len(assembly.limbs) != 1:
         return False
     if len(assembly.freedoms) < len(AXES):
         return False

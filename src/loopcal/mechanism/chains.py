@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
+from loopcal.mechanism.actuation import OpenSums, list_open_sums
 from loopcal.mechanism.limb_rows import follow_limb, measure_rod, place_links, sum_displacements
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
@@ -28,6 +29,7 @@ from loopcal.mechanism.platform_coordinates import (
 from loopcal.mechanism.states import Status, driven_values, without_poses
 from loopcal.mechanism.transmission import (
     apply_weights,
+    find_fixed_rows,
     find_reversed,
     find_triangles,
     joints_from_readings,
@@ -165,13 +167,14 @@ def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
 
 def find_carrying_actuators(robot: Mechanism) -> IntArray:
     """Return the places of the actuators that move the end platform and are not held."""
-    places = np.arange(len(robot.actuators))
+    places = np.flatnonzero([a.reference is None for a in robot.actuators])
     if not robot.stages:
         return places
     stages = [robot.stages[i] for i in list_carrying_stages(robot)]
-    names = [actuator.name for actuator in robot.actuators]
-    carrying = np.concatenate([places[stage.actuators] for stage in stages])
-    return np.array([i for i in carrying if names[i] not in robot.assembly.held], int)
+    names, own = [actuator.name for actuator in robot.actuators], np.arange(len(robot.actuators))
+    carrying = np.concatenate([own[stage.actuators] for stage in stages])
+    held = robot.assembly.held
+    return np.array([i for i in carrying if i in places and names[i] not in held], int)
 
 
 def has_spare_drives(robot: Mechanism) -> bool:
@@ -412,8 +415,8 @@ class _Rows:
 
     A robot of one stage is a chain of itself.
 
-    values : (1 | R, p). target : (R, c) controlled coordinates. e, weights, terms : displacements,
-        weights of open sums, and transmissions of each stage, (1 | R, ..).
+    values : (1 | R, p). target : (R, c) controlled coordinates. e, sums, terms : displacements,
+        open sums, and transmissions of each stage, (1 | R, ..).
     sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
     units : (u,) lengths that a unit of each drive counts for: the robot's size for an angle.
     spans : (u,) strokes of the drives, of which steps take equal shares with more drives than
@@ -425,7 +428,7 @@ class _Rows:
     values: FloatArray
     target: FloatArray
     e: tuple[FloatArray, ...]
-    weights: tuple[FloatArray | None, ...]
+    sums: tuple[OpenSums | None, ...]
     terms: tuple[FloatArray, ...]
     sign: FloatArray
     serial: _SerialJoints
@@ -443,7 +446,7 @@ class _Rows:
 
         chosen_arrays = {
             name: map_arrays(chosen, getattr(self, name))
-            for name in ("values", "e", "weights", "terms")
+            for name in ("values", "e", "sums", "terms")
         }
         serial = self.serial._replace(
             **{name: chosen(getattr(self.serial, name)) for name in self.serial._fields[2:]}
@@ -459,9 +462,10 @@ class _Rows:
         loops, ok = [], np.isfinite(u).all(axis=1)
         for i, start in zip(self._list_loops(), begin, strict=True):
             stage, own = self.stages[i], u[:, None, self.stages[i].actuators]
-            part = self.close(
-                stage.robot, self.e[i], own, start, follow=False, weights=self.weights[i]
-            )
+            weights, sums = None, self.sums[i]
+            if sums is not None:
+                weights, own = sums.weights, sums.complete(own)
+            part = self.close(stage.robot, self.e[i], own, start, follow=False, weights=weights)
             ok &= part.status[:, 0] == CONVERGED
             loops.append(part)
         with np.errstate(invalid="ignore"):
@@ -522,12 +526,17 @@ class _Rows:
                 pieces.append((i, base, T, part))
             ends.append(T)
         T = np.broadcast_to(ends[-1], (len(u), 4, 4))
-        for i, base, own, part in pieces:
-            place = self.stages[i].actuators
-            by_drive = self.differentiate(
-                self.stages[i].robot, self.e[i], u[:, None, place], part, self.weights[i]
-            )[:, 0]
-            arm = np.matmul(np.swapaxes(base[..., :3, :3], -1, -2), (T - own)[:, :3, 3:])[..., 0]
+        for i, base, at, part in pieces:
+            stage, sums = self.stages[i], self.sums[i]
+            place = stage.actuators
+            robot, e, own = stage.robot, self.e[i], u[:, None, place]
+            if sums is None:
+                by_drive = self.differentiate(robot, e, own, part, None)[:, 0]
+            else:
+                by_drive = np.zeros((len(u), 6, own.shape[2]))
+                by_sum = self.differentiate(robot, e, sums.complete(own), part, sums.weights)
+                by_drive[..., : sums.chosen] = by_sum[:, 0, :, : sums.chosen]
+            arm = np.matmul(np.swapaxes(base[..., :3, :3], -1, -2), (T - at)[:, :3, 3:])[..., 0]
             D[..., place] = geometry.transport_matrix(arm, base[..., :3, :3]) @ by_drive
         axis, arm = F[:, :3, 2], T[:, :3, 3, None] - F[:, :3, 3]
         turn, across = self.serial.turn[:, None] * axis, axis[:, NEXT] * arm[:, LAST]
@@ -546,7 +555,7 @@ class _Rows:
             if len(triangles):
                 u = now.u[:, None, stage.actuators]
                 weights = select_weights(tau, stage.robot.slots.constants)
-                if weights is not None and not stage.robot.has_open_sums:
+                if weights is not None and weights.shape[2] == u.shape[2]:
                     u = apply_weights(weights, u)
                 beyond |= find_reversed(u, tau, triangles)[:, 0].any(axis=1)
         return beyond
@@ -657,9 +666,11 @@ def _make_rows(
         stages = (Stage(robot.name, -1, np.eye(4), robot, *whole),)
     slots = [stage.robot.slots(values[:, stage.parameters]) for stage in stages]
     e = tuple(own for own, _ in slots)
-    weights = tuple(
-        select_weights(tau, stage.robot.slots.constants) if stage.robot.has_open_sums else None
-        for stage, (_, tau) in zip(stages, slots, strict=True)
+    sums = tuple(
+        list_open_sums(stage.robot, values[:, stage.parameters])
+        if stage.robot.has_open_sums or stage.robot.assembly.couplings
+        else None
+        for stage in stages
     )
     turns: list[bool] = []
     for stage in stages:
@@ -667,7 +678,7 @@ def _make_rows(
         joints = (joint for limb in assembly.limbs for joint in limb.joints)
         turning = {joint.actuator for joint in joints if joint.kind == "R"}
         drives = [(name,) for name in assembly.driven_joints]
-        if stage.robot.has_open_sums:
+        if stage.robot.has_open_sums or assembly.couplings:
             drives = [actuator.driven_joints for actuator in assembly.actuators]
         turns += [not turning.isdisjoint(names) for names in drives]
     return _Rows(
@@ -676,7 +687,7 @@ def _make_rows(
         values,
         target,
         e,
-        weights,
+        sums,
         tuple(tau for _, tau in slots),
         np.zeros(len(target)),
         _place_serial_joints(stages, e),
@@ -696,8 +707,11 @@ def _measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
         strokes = np.array([actuator.stroke or (np.nan, np.nan) for actuator in robot.actuators])
         has_all = len(turns) == robot.program.n_joints  # else readings are open sums
         convert = joints_from_readings if has_all else transmit_readings
-        ends = convert(strokes.T[None], tau, robot.slots.constants)[0]
-        stated = np.abs(ends[1] - ends[0])
+        constants = robot.slots.constants
+        ends = convert(strokes.T[None], tau, constants)[0][:, ~find_fixed_rows(constants)]
+        commanded = [a.reference is None for a in robot.actuators]
+        stated = np.full(len(turns), np.nan)
+        stated[commanded] = np.abs(ends[1] - ends[0])
         spans = np.where(stated > 0.0, stated, spans)
     return spans
 
@@ -706,9 +720,13 @@ def _begin(rows: _Rows, first: State) -> _Iterate:
     """Return the iterates of a state (R, 1)."""
     u, loops, robot = [], [], rows.robot
     states = split_stage_states(robot, first) if robot.stages else [first]
-    for stage, own, weights in zip(rows.stages, states, rows.weights, strict=True):
+    for stage, own, sums in zip(rows.stages, states, rows.sums, strict=True):
         joints = driven_values(stage.robot.program, own)
-        u.append(joints if weights is None else apply_weights(weights, joints))
+        if sums is not None:  # a condition has no sum of its own
+            joints = sums.read(joints)
+            spare = len(stage.robot.actuators) - sums.chosen
+            joints = np.pad(joints, [(0, 0), (0, 0), (0, spare)])
+        u.append(joints)
         if not stage.robot.is_serial:
             loops.append(own)
     return rows.evaluate(np.concatenate(u, axis=2)[:, 0], tuple(loops))

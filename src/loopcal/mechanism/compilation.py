@@ -50,6 +50,7 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import driven_values, is_closed, make_start
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
+    SOURCE,
     count_points,
     list_constants,
     name_terms,
@@ -167,7 +168,7 @@ def _close_at_home(
     if idle:
         groups, places, count = _group_limbs(assembly, slots, idle)
         guess = _make_first_guess(assembly, groups)
-    _check_sums(assembly, groups, freedoms)
+    _check_sums(assembly, freedoms)
     findings = []
     for limb, joint in ((assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]):
         locked = limb.joints[joint]
@@ -229,7 +230,7 @@ def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
     addresses.
     """
     limbs = {limb.name: limb for limb in assembly.limbs}
-    actuators, terms = {a.name for a in assembly.actuators}, name_terms(assembly.actuators)
+    actuators, terms = {a.name for a in assembly.rows}, name_terms(assembly.rows)
     slots: dict[str, dict[Address, Slot]] = {name: {} for name in limbs}
     addresses = dict.fromkeys(m.address for m in assembly.maps)
     addresses |= dict.fromkeys(a for s in assembly.shared for a in s.outputs)
@@ -269,8 +270,10 @@ def _find_slot(limb: Limb, address: Address) -> Slot | None:
 
 def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> None:
     """Refuse a limb whose drive moves nothing but the limb itself."""
+    coupled = {name for row in assembly.couplings for name in row.driven_joints}
     for i, limb in enumerate(assembly.limbs):
         joints = len(limb.joints) + bool(limb.actuator) - len(idle.get(i, ()))
+        joints -= len(coupled.intersection(limb.drives))
         equations = len(select_rows(limb.ending, assembly.freedoms))
         if limb.drives and joints > equations:
             excess = name_count(joints - equations, "joint")
@@ -339,10 +342,18 @@ def _weigh_actuators(
     """Return relative standard deviations of redundant actuators, the largest one 1; None without
     them.
     """
-    if len(assembly.actuators) <= len(freedoms):
+    if assembly.couplings or len(assembly.actuators) <= len(freedoms):
         return None
     what = f"{len(assembly.actuators)} actuators for {len(freedoms)} freedoms"
-    _refuse_other_limbs(assembly, groups, what, "redundant actuation")
+    for group in groups:
+        rows = len(group.rows) - len(group.unknown_joints(False))
+        driven = int((group.actuator[:, 0] >= 0).sum())
+        if rows != driven or driven != 1:
+            limb = assembly.limbs[group.limbs[0]].name
+            raise MechanismError(
+                f"{assembly.name} has {what}, and limb {limb!r} has {driven} of them and {rows} "
+                "closure equations; redundant actuation needs limbs with one of each"
+            )
     sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.actuators]
     if len({a.sigma is None for a in assembly.actuators}) > 1 or min(sigma) <= 0:
         raise MechanismError(
@@ -352,9 +363,9 @@ def _weigh_actuators(
     return tuple(s / max(sigma) for s in sigma)
 
 
-def _check_sums(assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]) -> None:
+def _check_sums(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
     """Refuse sums whose numbers of readings, joints and freedoms do not fit."""
-    if not any(a.weights for a in assembly.actuators):
+    if assembly.couplings or not any(a.weights for a in assembly.actuators):
         return
     a, joints, m = len(assembly.actuators), len(assembly.driven_joints), len(freedoms)
     if a > m:
@@ -362,45 +373,27 @@ def _check_sums(assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[i
             f"{assembly.name} has {a} readings for {m} freedoms, and some of them are sums; leave "
             "out readings, because redundant readings cannot be sums"
         )
-    if a == joints:
-        return
-    if a < m:
+    if a < m and a != joints:
         raise MechanismError(
             f"{assembly.name} has {a} readings of {joints} driven joints for {m} freedoms, so its "
             "sums do not hold the platform; state one reading for every freedom"
         )
-    what = f"{a} readings of {joints} driven joints"
-    _refuse_other_limbs(assembly, groups, what, "a sum of more joints than there are readings")
-
-
-def _refuse_other_limbs(
-    assembly: Assembly, groups: tuple[Group, ...], what: str, subject: str
-) -> None:
-    """Refuse limbs that have not one actuator and one closure equation each."""
-    for group in groups:
-        rows = len(group.rows) - len(group.unknown_joints(False))
-        driven = int((group.actuator[:, 0] >= 0).sum())
-        if rows != driven or driven != 1:
-            limb = assembly.limbs[group.limbs[0]].name
-            raise MechanismError(
-                f"{assembly.name} has {what}, and limb {limb!r} has {driven} of them and {rows} "
-                f"closure equations; {subject} needs limbs with one of each"
-            )
 
 
 def _map_slots(
     assembly: Assembly, table: ParameterTable, places: dict[Address, int], count: int
 ) -> SlotMap:
     """Return the linear maps as one matrix and the shared maps with their places."""
-    actuators = {a.name: i for i, a in enumerate(assembly.actuators)}
-    names = name_terms(assembly.actuators)
+    actuators = {a.name: i for i, a in enumerate(assembly.rows)}
+    names = name_terms(assembly.rows)
 
     def place(address: Address) -> int:
         if address in places:
             return places[address]
         return count + terms.shape[1] * actuators[address.owner] + names.index(address.axis)
 
-    terms, constants = nominal_terms(assembly.actuators), list_constants(assembly.actuators)
+    terms = nominal_terms(assembly.rows)
+    constants = list_constants(assembly.rows, assembly.actuators)
     matrix = np.zeros((count + terms.size, len(table)))
     for entry in assembly.maps:
         matrix[place(entry.address), table.index(entry.parameter)] += entry.coefficient
@@ -424,7 +417,7 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
 def _find_home(robot: Mechanism) -> State:
     """Return the closed state at the controlled coordinates of the home pose."""
     program, values = robot.program, robot.values[None]
-    shared = program.shared_drive_count
+    shared = program.shared_drive_count + len(robot.assembly.couplings)
     movable = len(program.unknown_twists) - program.count_equations(free=True) - shared
     if len(robot.controlled) < movable:
         raise MechanismError(
@@ -435,6 +428,12 @@ def _find_home(robot: Mechanism) -> State:
     target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
+        if robot.assembly.couplings and movable < len(robot.controlled):
+            raise MechanismError(
+                f"{robot.name} has {len(robot.assembly.couplings)} couplings, which leave it "
+                f"{max(movable, 0)} freedoms for {len(robot.controlled)} controlled coordinates; "
+                "leave out couplings"
+            )
         refuse_free_bodies(robot, robot.home_state)
         _refuse_singular_start(robot, target)
         if not shared:
@@ -569,27 +568,31 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
     """Return the maps of all stages: first the displacements of all, then their transmissions."""
     maps = [stage.robot.slots for stage in stages]
     displacements = sum(own.n_displacements for own in maps)
-    actuators = sum(len(own.terms) for own in maps)
+    count = sum(len(own.terms) for own in maps)
     points = [count_points(own.constants) for own in maps]
     first_weight = len(ALL_TERMS) + max(points)
     k = max(own.terms.shape[1] for own in maps) if not any(points) else first_weight
     has_sums = any(stage.robot.has_sums for stage in stages)
     if has_sums:
         k = first_weight + sum(stage.robot.program.n_joints for stage in stages)
-    matrix = np.zeros((displacements + actuators * k, len(nominal)))
+    matrix = np.zeros((displacements + count * k, len(nominal)))
     shared, first, term, joint = [], 0, displacements, 0
-    terms = np.zeros((actuators, k))
-    constants = np.full((actuators, max(own.constants.shape[1] for own in maps)), np.nan)
+    terms = np.zeros((count, k))
+    constants = np.full((count, max(own.constants.shape[1] for own in maps)), np.nan)
     for stage, own in zip(stages, maps, strict=True):
         d = own.n_displacements
         a, width = own.terms.shape
         own_first = len(ALL_TERMS) + count_points(own.constants)
         columns = np.arange(width)
         columns[own_first:] += first_weight - own_first + joint  # the weights of its own joints
-        terms[stage.actuators, columns] = own.terms
-        constants[stage.actuators, : own.constants.shape[1]] = own.constants
+        row = (term - displacements) // k
+        rows = slice(row, row + a)
+        terms[rows, columns] = own.terms
+        constants[rows, : own.constants.shape[1]] = own.constants
+        read = own.constants[:, SOURCE] >= 0
+        constants[row + np.flatnonzero(read), SOURCE] += stage.actuators.start
         if has_sums and width <= own_first:
-            terms[stage.actuators, first_weight + joint + np.arange(a)] = np.eye(a)
+            terms[rows, first_weight + joint + np.arange(a)] = np.eye(a)
         joint += stage.robot.program.n_joints
         of_terms = (np.arange(a)[:, None] * k + columns).ravel()
         places = np.concatenate([np.arange(d) + first, of_terms + term])

@@ -19,8 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import engine
-from loopcal.engine import Program, State
-from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums, solve_open_sums
+from loopcal.engine import State
+from loopcal.mechanism.actuation import (
+    DrivenJoints,
+    drive_joints,
+    drive_sums,
+    list_open_sums,
+    solve_open_sums,
+)
 from loopcal.mechanism.chains import (
     ChainState,
     each_stage,
@@ -43,6 +49,7 @@ from loopcal.mechanism.transmission import (
     TERMS,
     apply_weights,
     find_triangles,
+    invert_weights,
     measure_excess,
     readings_from_joints,
     select_weights,
@@ -66,7 +73,10 @@ def is_square(robot: Mechanism) -> bool:
     """Return whether closure with locked actuators has as many equations as freedoms."""
     if robot.stages:
         return all(is_square(stage.robot) for stage in robot.stages)
-    return robot.program.is_square or robot.has_open_sums
+    if not robot.has_open_sums:
+        return robot.program.is_square
+    rows = robot.program.count_equations(free=False) + len(robot.assembly.rows)
+    return rows == len(robot.program.unknown_twists) + robot.program.n_joints
 
 
 def clear_sign(robot: Mechanism, state: State) -> State:
@@ -100,7 +110,8 @@ class Loops(NamedTuple):
         """Return states (t, n) at joint values or sums (t | 1, n, a)."""
         program = self.robot.program
         if self.weights is not None:
-            return solve_open_sums(program, self.e, self.weights, values, begin)
+            state = solve_open_sums(program, self.e, self.weights, values, begin)
+            return clear_sign(self.robot, state)
         return clear_sign(self.robot, engine.solve(program, self.e, values, begin, goal=goal))
 
     def read(self, state: State) -> FloatArray:
@@ -245,6 +256,8 @@ def close_at_joints(
     begin = clear_sign(robot, start or robot.home_state)
     if robot.is_serial:
         return solve_serial(robot, e, joints, begin.T.shape[:2])
+    if weights is not None and not robot.has_open_sums:
+        joints, weights = apply_weights(invert_weights(weights), joints), None
     loops = Loops(robot, e, weights)
     state = loops.solve(joints, begin, goal)
     wrong = find_wrong_rows(robot, state, begin)
@@ -284,7 +297,7 @@ def inverse_trials(
     `compute_readings` gives the readings of the states.
     """
     state = close_at_coordinates(robot, values, target, start)
-    if needs_readings(robot.program):
+    if needs_readings(robot):
         return state
     return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
@@ -307,7 +320,7 @@ def close_at_coordinates(
     if robot.stages:
         functions = close_at_joints, differentiate_by_drives
         return solve_by_drives(robot, values, target, begin, *functions, follow=follow)
-    if needs_readings(robot.program):
+    if needs_readings(robot):
         return _inverse_by_readings(robot, values, target, begin, follow)
     return _close_with_free_actuators(robot, values, target, begin, start, max_iterations)
 
@@ -336,9 +349,13 @@ def _close_with_free_actuators(
     def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
         return compare_coordinates(T, flat[rows], names, size)
 
-    guess = np.broadcast_to(guess, (t, n, len(robot.actuators)))
     T = np.broadcast_to(T if start is None else start.T, (t, n, 4, 4))
     begin = replace(begin, T=T)
+    if robot.assembly.couplings:
+        sums = list_open_sums(robot, values)
+        own = sums.weights[:, sums.chosen :], sums.fixed
+        return solve_open_sums(robot.program, e, *own, begin, max_iterations, command)
+    guess = np.broadcast_to(guess, (t, n, robot.program.n_joints))
     return engine.solve(robot.program, e, guess, begin, command, True, max_iterations)
 
 
@@ -346,7 +363,7 @@ def determine_platform(robot: Mechanism) -> bool:
     """Return whether the controlled coordinates state the whole pose, and each limb has as many
     unknown joints as equations.
     """
-    if not robot.program.has_square_limbs:
+    if robot.assembly.couplings or not robot.program.has_square_limbs:
         return False
     if len(robot.controlled) == 6:
         return True
@@ -386,11 +403,13 @@ def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> Floa
     return readings_from_joints(joints, tau, robot.slots.constants)
 
 
-def needs_readings(program: Program) -> bool:
+def needs_readings(robot: Mechanism) -> bool:
     """Return whether the inverse solution is one for readings: freed, joints with a shared drive
-    would part, and an actuator of loops that may stay open would take a part of the gap.
+    and coupled ones would part, and an actuator of loops that may stay open would take a part of
+    the gap.
     """
-    return program.may_stay_open or program.shared_drive_count > 0
+    program = robot.program
+    return program.may_stay_open or program.shared_drive_count > 0 or bool(robot.assembly.couplings)
 
 
 def _inverse_by_readings(
@@ -422,7 +441,7 @@ def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, sta
     """Return states with every joint free at targets (R, c), (1, R) or (R, 1); with shared drives,
     other coordinates are those of the start.
     """
-    if not robot.program.shared_drive_count:
+    if robot.assembly.couplings or not robot.program.shared_drive_count:
         shaped = target.reshape(*start.T.shape[:2], -1)
         return _close_with_free_actuators(robot, values, shaped, start, start)
     e, _ = robot.slots(values)

@@ -14,7 +14,7 @@ from loopcal import engine
 from loopcal.engine import ENDINGS
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.mechanism.actuation import differentiate_lengths
+from loopcal.mechanism.actuation import list_open_sums, measure_sums, stack_sum_rows
 from loopcal.mechanism.assembly import (
     AXES,
     MOST_ACTUATORS,
@@ -81,7 +81,13 @@ def check_mobility(robot: Mechanism) -> None:
             freedoms=m,
         )
         raise MechanismError(finding)
-    _, both, W = np.linalg.svd(np.concatenate([A, Q], axis=1), full_matrices=True)
+    rows = np.concatenate([A, Q], axis=1)
+    if robot.assembly.couplings:
+        sums = list_open_sums(robot, robot.values[None])
+        a, coupled = sums.chosen, sums.weights[:, sums.chosen :]
+        coupled = coupled[0] * measure_sums(program, coupled)[:, None]
+        rows = np.concatenate([rows, np.pad(coupled, [(0, 0), (m, 0)])])
+    _, both, W = np.linalg.svd(rows, full_matrices=True)
     # motions with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
     independent = count_rank(both)
     motions = W[independent:, :m]
@@ -103,13 +109,15 @@ def check_mobility(robot: Mechanism) -> None:
             f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
             f"{movable}"
         )
-    # freedoms per actuated joint (m, a), and the controlled coordinates by them
+    # freedoms per actuated joint (m, a), or motion, and the controlled coordinates by them
     D = scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0]
+    if robot.assembly.couplings:
+        D = scale[:, None] * motions.T
     rates = np.linalg.svd(_differentiate_controlled(robot, robot.home) @ D, compute_uv=False)
     if count_rank(rates) < movable:
         raise MechanismError(_word_dependent(robot, movable))
     if robot.has_open_sums:
-        _check_open_sums(robot, scale)
+        _check_open_sums(robot, blocks)
 
 
 def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
@@ -137,17 +145,27 @@ def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
         raise MechanismError(finding)
 
 
-def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
-    """Refuse sums that leave the platform free at home; scale : (m,) of its freedoms."""
-    e, tau = robot.slots(robot.values[None])
+def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> None:
+    """Refuse sums that leave the platform free at home, or that are too many for its loops."""
+    program, (_, tau) = robot.program, robot.slots(robot.values[None])
     weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
-    slope = differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
-    if count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
+    rows = stack_sum_rows(program, blocks, weights * measure_sums(program, weights)[:, None])[0, 0]
+    scale = [1 / robot.twist_scale[f] for _, f in program.unknown_twists]
+    rows[:, : len(scale)] *= scale
+    closure = len(rows) - weights.shape[1]
+    unknown, sums = rows.shape[1], len(robot.assembly.rows)
+    if count_rank(np.linalg.svd(rows, compute_uv=False)) < unknown:
         raise MechanismError(
-            f"{robot.name}: the sums of its readings do not hold the platform at home, where it "
-            "can move while all sums are constant; correct the weights of `sum:`, or state another "
-            "`home:`"
+            f"{robot.name}: the sums of its readings and couplings do not hold the platform at "
+            "home, where it can move while all sums are constant; correct the weights of `sum:`, "
+            "or state another `home:`"
+        )
+    free = unknown - count_rank(np.linalg.svd(rows[:closure], compute_uv=False))
+    if sums > free:
+        raise MechanismError(
+            f"{robot.name} has {sums} readings and couplings, but only {free} freedoms without "
+            f"them; leave out {sums - free}, because redundant ones cannot be sums"
         )
 
 
@@ -275,8 +293,9 @@ def check_assembly(assembly: Assembly, *, is_stage: bool = False) -> None:
 
 def _check_names(assembly: Assembly) -> None:
     """Refuse duplicate names, and drives or actuators without their counterpart."""
-    limbs, actuators = [limb.name for limb in assembly.limbs], [a.name for a in assembly.actuators]
-    for kind, names in (("limb", limbs), ("actuator", actuators)):
+    limbs, rows = [limb.name for limb in assembly.limbs], [a.name for a in assembly.couplings]
+    actuators = [a.name for a in assembly.actuators]
+    for kind, names in (("limb", limbs), ("actuator", actuators), ("coupling", rows)):
         for name in names:
             if names.count(name) > 1:
                 raise MechanismError(f"two {kind}s are called {name!r}; give each its own name")

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.engine import MapPattern, ParameterMap, Program, State
-from loopcal.errors import MechanismError
+from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
 from loopcal.mechanism.transmission import (
+    REFERENCE,
+    SOURCE,
     differentiate_sums,
     find_triangles,
     invert_weights,
@@ -360,15 +362,13 @@ class Mechanism(DrawnResult):
 
     @cached_property
     def has_sums(self) -> bool:
-        """Whether a reading is a weighted sum of joint values."""
-        return any(actuator.weights for actuator in self.actuators)
+        """Whether a reading is a weighted sum of joint values, or joints are coupled."""
+        return any(row.weights for row in self.assembly.rows)
 
     @cached_property
     def has_open_sums(self) -> bool:
-        """Whether its readings are sums of more lengths than there are readings, so that only the
-        pose determines each length.
-        """
-        return not self.stages and self.program.n_joints > len(self.actuators)
+        """Whether only closure determines the driven joints, because their sums are fewer."""
+        return not self.stages and self.program.n_joints > len(self.assembly.rows)
 
     @cached_property
     def all_parameters(self) -> ParameterUnits:
@@ -380,6 +380,38 @@ class Mechanism(DrawnResult):
     def nominal(self) -> Mechanism:
         """The same robot at its nominal values."""
         return self.with_values(self.parameters.nominal)
+
+    def with_conditions(self, values: Mapping[str, float]) -> Mechanism:
+        """Return the same robot with other references of conditions [degC, s], such as today's
+        temperature, at which inverse kinematics holds them.
+
+        Raises MechanismError: an unknown condition.
+        """
+        known = [a.name for a in self.actuators if a.reference is not None]
+        for name in values:
+            if name not in known:
+                raise MechanismError(
+                    f"{self.name} has no condition {name!r}{suggest_names(name, known)}; "
+                    f"it has {', '.join(known) or 'none'}"
+                )
+        actuators = tuple(
+            replace(a, reference=values.get(a.name, a.reference)) for a in self.actuators
+        )
+        constants = self.slots.constants.copy()
+        for i, actuator in enumerate(actuators):
+            if actuator.reference is not None:
+                constants[constants[:, SOURCE] == i, REFERENCE] = actuator.reference
+        stages = []
+        for stage in self.stages:
+            names = {a.name for a in stage.robot.actuators}
+            own = {name: value for name, value in values.items() if name in names}
+            stages.append(replace(stage, robot=stage.robot.with_conditions(own)))
+        return replace(
+            self,
+            assembly=replace(self.assembly, actuators=actuators),
+            slots=replace(self.slots, constants=constants),
+            stages=tuple(stages),
+        )
 
     def with_values(self, values: ArrayLike) -> Mechanism:
         """Return the same robot with other parameter values (p,) [SI].

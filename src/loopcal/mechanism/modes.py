@@ -21,7 +21,12 @@ from loopcal.errors import DataError, MechanismError
 from loopcal.mechanism.actuation import solve_open_sums
 from loopcal.mechanism.assembly import BASE
 from loopcal.mechanism.chains import each_stage, has_spare_drives, join_stage_states, solve_serial
-from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings, inverse_trials
+from loopcal.mechanism.kinematics import (
+    clear_sign,
+    compute_closure_sign,
+    compute_readings,
+    inverse_trials,
+)
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
@@ -194,7 +199,8 @@ def _close(robot: Mechanism, values: FloatArray, q: FloatArray, start: State | N
     if robot.has_open_sums:
         weights = select_weights(tau, robot.slots.constants)
         assert weights is not None
-        return solve_open_sums(robot.program, e, weights, evaluate_sums(q, tau, w), begin)
+        sums = evaluate_sums(q, tau, w)
+        return clear_sign(robot, solve_open_sums(robot.program, e, weights, sums, begin))
     joints = joints_from_readings(q, tau, w)
     if robot.is_serial:
         return solve_serial(robot, e, joints, begin.T.shape[:2])
@@ -210,8 +216,8 @@ def _flatten_poses(robot: Mechanism, state: State) -> FloatArray:
 
 def _subtract_turns(robot: Mechanism, state: State) -> State:
     """Return the state with driven joints moved by full turns to the middle of their strokes."""
-    if robot.has_open_sums:
-        return state  # of lengths, which do not repeat
+    if robot.has_open_sums or robot.assembly.couplings:
+        return state  # of lengths, which do not repeat, or of joints that turn together
     middle = np.array(
         [
             np.mean(a.stroke) if a.stroke and np.isfinite(a.stroke).all() else 0.0

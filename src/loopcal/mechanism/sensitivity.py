@@ -25,8 +25,8 @@ from loopcal.mechanism.actuation import (
     DrivenJoints,
     differentiate_driven_joints,
     differentiate_joints_by_readings,
-    differentiate_lengths,
     differentiate_open_sums,
+    differentiate_unknowns_by_sums,
     drive_joints,
 )
 from loopcal.mechanism.chains import (
@@ -43,7 +43,7 @@ from loopcal.mechanism.least_squares_closure import (
 from loopcal.mechanism.limb_rows import move_passive_joints, name_passive_joints
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
-from loopcal.mechanism.transmission import joints_from_readings
+from loopcal.mechanism.transmission import apply_weights, invert_weights, joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
 
 
@@ -65,7 +65,7 @@ def differentiate_pose(
     if robot.stages:
         return differentiate_platform(robot, values, q, state, columns)
     if robot.has_open_sums:
-        derivatives = differentiate_open_sums(robot, values, q, state, columns)
+        derivatives = differentiate_open_sums(robot, values, q, state, columns, nodes)
     else:
         e, tau = robot.slots(values)
         joints = joints_from_readings(q, tau, robot.slots.constants)
@@ -123,13 +123,19 @@ def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> Deri
 def differentiate_by_drives(
     robot: Mechanism, e: FloatArray, u: FloatArray, state: State, weights: FloatArray | None
 ) -> FloatArray:
-    """Return the twists (t, n, 6, u) per unit of driven joints u (t, n, u), or of their sums with
-    `weights` (t | 1, u, J), of a robot without stages at displacements e (t | 1, d).
+    """Return twists (t, n, 6, u) per unit of driven joints u (t, n, u), or (t, n, 6, r) of their
+    sums with `weights` (t | 1, r, J), of a robot without stages at displacements e (t | 1, d).
     """
+    if weights is not None and not robot.has_open_sums:
+        inverse = invert_weights(weights)
+        joints = apply_weights(inverse, u)
+        by_joints = differentiate_by_drives(robot, e, joints, state, None)
+        return np.matmul(by_joints, inverse[:, None])
     if weights is not None:
-        by_freedoms = np.matmul(weights[:, None], differentiate_lengths(robot.program, e, state))
-        out = np.zeros((*u.shape[:2], 6, u.shape[2]))
-        out[:, :, list(robot.program.freedoms)] = np.linalg.pinv(by_freedoms)
+        freedoms = list(robot.program.freedoms)
+        out = np.zeros((*u.shape[:2], 6, weights.shape[1]))
+        moved = differentiate_unknowns_by_sums(robot.program, e, state, weights)
+        out[:, :, freedoms] = moved[:, :, : len(freedoms)]
         return out
     is_open = robot.program.may_stay_open
     differentiate = differentiate_open if is_open else engine.differentiate
@@ -194,7 +200,7 @@ def differentiate_passive_joints(
     platform = differentiate_pose(robot, values, q, state, nodes=nodes)
     freedoms = [6 * node + f for node, f in robot.program.unknown_twists]
     twists = np.concatenate(platform, axis=3)[:, :, freedoms]
-    driven = differentiate_driven_joints(robot, values, q, state, platform)
+    driven = differentiate_driven_joints(robot, values, q, state)
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
     if robot.program.may_stay_open and not robot.has_sums:
         places, exact = _differentiate_open_joints(robot, values, q, state, names)

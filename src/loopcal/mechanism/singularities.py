@@ -24,7 +24,7 @@ from loopcal import engine
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism.actuation import differentiate_lengths
+from loopcal.mechanism.actuation import differentiate_unknowns_by_sums
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.chains import find_carrying_actuators, split_stage_states, transport_to_end
 from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings
@@ -35,7 +35,7 @@ from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coo
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
 from loopcal.mechanism.states import driven_values, join_states
-from loopcal.mechanism.transmission import invert_weights, select_weights
+from loopcal.mechanism.transmission import find_fixed_rows, invert_weights, select_weights
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -237,13 +237,13 @@ def _compute_margins(
     if robot.has_sums:
         A, Q = _sum_rows(robot, state, A, Q)
     A = A / robot.twist_scale[list(program.freedoms)]
-    Q = Q / np.where(turning, robot.size, 1.0)
+    Q = Q / np.where(turning[: Q.shape[2]], robot.size, 1.0)
     good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
     A, Q = np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0)
     _, s, V = np.linalg.svd(A)
     _, r, W = np.linalg.svd(Q)
     margin, drive_margin = (np.where(good, x[:, -1], np.nan) for x in (s, r))
-    return margin, V[:, -1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
+    return margin, V[:, s.shape[1] - 1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
 
 
 def _sum_rows(
@@ -251,15 +251,20 @@ def _sum_rows(
 ) -> tuple[FloatArray, FloatArray]:
     """Return closure rows against freedoms (n, c, m) and against sums (n, c, a) of a state (1, n).
 
-    A, Q : against freedoms and joints. The rows of open sums are W L_y dy - ds = 0.
+    A, Q : against freedoms and joints. The rows of open sums are dy/ds^+ dy - ds = 0, with the
+    sums of commanded readings.
     """
     e, tau = robot.slots(robot.values[None])
     weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
     if robot.has_open_sums:
-        rows = np.matmul(weights, differentiate_lengths(robot.program, e, state)[0])
-        return rows, np.tile(-np.eye(len(robot.actuators)), (len(rows), 1, 1))
-    return A, np.matmul(Q, invert_weights(weights))
+        moved = differentiate_unknowns_by_sums(robot.program, e, state, weights)[0]
+        chosen = ~find_fixed_rows(robot.slots.constants)
+        by_sums = moved[:, : A.shape[2]][..., chosen]
+        rows = np.linalg.pinv(np.where(np.isfinite(by_sums), by_sums, 0.0))
+        return rows, np.tile(-np.eye(rows.shape[1]), (len(rows), 1, 1))
+    chosen = ~find_fixed_rows(robot.slots.constants)
+    return A, np.matmul(Q, invert_weights(weights))[..., chosen]
 
 
 def _compute_chain_margins(

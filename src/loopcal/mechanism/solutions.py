@@ -272,7 +272,7 @@ def has_one_solution(robot: Mechanism) -> bool:
 
 def has_bends(robot: Mechanism) -> bool:
     """Return whether limbs that are closed one by one at a pose may have several readings there."""
-    if robot.stages or robot.is_serial or needs_readings(robot.program):
+    if robot.stages or robot.is_serial or needs_readings(robot):
         return False
     return determine_platform(robot) and not has_one_solution(robot)
 
@@ -295,7 +295,7 @@ def reach_coordinates(
     pose; where these are not None, the states have closure signs.
     """
     values, target = robot.values[None], target[None]
-    is_plain = not (robot.stages or robot.is_serial or needs_readings(robot.program))
+    is_plain = not (robot.stages or robot.is_serial or needs_readings(robot))
     is_plain &= not robot.program.idle_groups
     if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
         return close_at_coordinates(robot, values, target, start), None
@@ -834,7 +834,7 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     flat = state.T.reshape(-1, 4, 4)
     _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
     columns = columns.reshape(t, n, len(names), 6)
-    if robot.stages or needs_readings(robot.program):
+    if robot.stages or needs_readings(robot):
         q = compute_readings(robot, values, state)
         D = differentiate_pose(robot, values, q, state).readings
         return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))

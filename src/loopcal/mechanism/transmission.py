@@ -16,6 +16,10 @@ Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind th
 of tables with up to K points follow, (t, a, 18 + K). Where a drive reads a sum of joint values, the
 weights W of the J driven joints follow, (t, a, 18 + K + J), and the formula gives the sums s = W
 joints. What no parameter changes are the constants of `list_constants`.
+
+Tau and constants have a row for each commanded reading and each coupling. A coupling is such a row
+without a reading, s = offset, or with one that is never commanded, such as a temperature; several
+couplings may have the same one. Derivation: docs/theory/summed-drives.md.
 """
 
 from __future__ import annotations
@@ -209,8 +213,9 @@ TABLE = "table"
 """What the name of the term of a table begins with; the number of its point follows."""
 WEIGHT = "weight."
 """What the name of the term of a weight begins with; the name of a driven joint follows."""
-FIXED = 2
-"""Constants of a drive before the points of its table: frequency, and whether it is cubic."""
+SOURCE, REFERENCE, FIXED = 2, 3, 4
+"""Constants of a row before the points of its table: frequency, whether it is cubic, the number of
+its reading, -1 for none, and the reference of that reading, NaN where it is commanded."""
 
 # Tables: a correction, or all of the motion of a cam, between points.
 
@@ -263,7 +268,7 @@ def _sum_tables(
     q: FloatArray, tau: FloatArray, constants: FloatArray, derivative: int = 0
 ) -> FloatArray:
     """Return what tables add to joint values (t, n, a), or to their slopes."""
-    r, _ = split_readings(q, len(constants))
+    r, _ = split_readings(q, constants)
     values = select_table(tau, constants)[:, None]
     return (_weigh_tables(r, constants, derivative) * values).sum(axis=-1)
 
@@ -292,7 +297,8 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
                 f"actuator {actuator.name!r} has an unknown term {wrong[0]!r}; allowed are "
                 f"{', '.join(TERMS)}"
             )
-        if actuator.terms.get("gain", 1.0) == 0.0 and not actuator.points:
+        is_plain = actuator.column is None and not actuator.points
+        if actuator.terms.get("gain", 1.0) == 0.0 and is_plain:
             raise MechanismError(
                 f"actuator {actuator.name!r} has a gain of 0, so its reading moves nothing; "
                 "state a gain other than 0"
@@ -305,31 +311,54 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
     return np.array(rows, dtype=float).reshape(-1, len(terms))
 
 
-def list_constants(actuators: Sequence[Actuator]) -> FloatArray:
-    """Return what no parameter changes (a, 2 + K): the angular frequency of the harmonics [rad per
-    unit of reading], 0 for none, whether a table is cubic, and the readings at its points, NaN
-    behind the last one.
+def list_constants(
+    actuators: Sequence[Actuator], readings: Sequence[Actuator] | None = None
+) -> FloatArray:
+    """Return what no parameter changes (a, 4 + K): the angular frequency of the harmonics [rad per
+    unit of reading], 0 for none, whether a table is cubic, the number of the reading among
+    `readings` (default: each row has its own), its reference, and the readings at the points of
+    the table, NaN behind the last one.
     """
     points = max((len(a.points) for a in actuators), default=0)
     constants = np.full((len(actuators), FIXED + points), np.nan)
+    known = {a.name: (i, a.reference) for i, a in enumerate(readings or actuators)}
     for row, a in zip(constants, actuators, strict=True):
-        row[:FIXED] = 2 * np.pi / a.period if a.period else 0.0, a.interpolation == "cubic"
+        column = a.name if a.column is None else a.column
+        source, reference = known.get(column, (-1, None))
+        row[:SOURCE] = 2 * np.pi / a.period if a.period else 0.0, a.interpolation == "cubic"
+        row[SOURCE:FIXED] = source, np.nan if reference is None else reference
         row[FIXED : FIXED + len(a.points)] = a.points
     return constants
+
+
+def find_fixed_rows(constants: FloatArray) -> BoolArray:
+    """Return which rows (a,) inverse kinematics cannot choose: those without a reading, and those
+    whose reading is never commanded.
+    """
+    return (constants[:, SOURCE] < 0) | np.isfinite(constants[:, REFERENCE])
+
+
+def evaluate_references(tau: FloatArray, constants: FloatArray) -> FloatArray:
+    """Return what the transmissions give (t | 1, 1, a) at the references of readings, and at zero
+    of those without one.
+    """
+    own = constants.copy()
+    own[:, SOURCE] = np.arange(len(own))
+    return evaluate_sums(np.nan_to_num(constants[None, None, :, REFERENCE]), tau, own)
 
 
 def term_derivatives(
     q: FloatArray, tau: FloatArray, constants: FloatArray, terms: Sequence[int] | None = None
 ) -> list[FloatArray]:
-    """Return the derivative of the joint values in each of the terms, or in some of them, arrays
-    (t | 1, n, a).
+    """Return the derivative of what the transmissions give in each of the terms, or in some of
+    them, arrays (t | 1, n, a).
     """
     end = len(ALL_TERMS) + count_points(constants)
     chosen = range(min(tau.shape[-1], end)) if terms is None else terms
     triangles = find_triangles(tau)
     if not len(triangles):
         return _evaluate_shapes(q, constants, chosen)
-    arm, by_term = _differentiate_triangles(joints_from_readings(q, tau, constants), tau, triangles)
+    arm, by_term = _differentiate_triangles(transmit_readings(q, tau, constants), tau, triangles)
     results = []
     for term, shape in zip(chosen, _evaluate_shapes(q, constants, chosen), strict=True):
         column = np.array(np.broadcast_to(shape, (*arm.shape[:2], len(constants))))
@@ -348,7 +377,7 @@ def _evaluate_shapes(
     """Return what each of the terms adds per unit to what the transmissions give, (t | 1, n, a); a
     dimension of a triangle adds nothing.
     """
-    r, approach = split_readings(q, len(constants))
+    r, approach = split_readings(q, constants)
     first, w = len(ALL_TERMS), constants[:, 0]
     of_points: FloatArray | None = None
     if any(term >= first for term in terms):
@@ -393,7 +422,7 @@ def joint_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Float
     slopes, triangles = _evaluate_slopes(q, tau, constants), find_triangles(tau)
     if not len(triangles):
         return slopes
-    arm, _ = _differentiate_triangles(joints_from_readings(q, tau, constants), tau, triangles)
+    arm, _ = _differentiate_triangles(transmit_readings(q, tau, constants), tau, triangles)
     slopes = np.array(np.broadcast_to(slopes, (*arm.shape[:2], len(constants))))
     with np.errstate(divide="ignore", invalid="ignore"):
         slopes[..., triangles] /= arm
@@ -402,10 +431,21 @@ def joint_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Float
 
 def readings_from_joints(joints: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return the readings (t, n, a) of joint values, without backlash; Newton's method adds what is
-    not linear.
+    not linear. Readings that are never commanded have their reference.
     """
     if (weights := select_weights(tau, constants)) is not None:
         joints = apply_weights(weights, joints)
+    if (fixed := find_fixed_rows(constants)).any():
+        own = constants[~fixed, :FIXED], tau[:, ~fixed, : len(ALL_TERMS)]
+        if count_points(constants):
+            own = constants[~fixed], tau[:, ~fixed, : len(ALL_TERMS) + count_points(constants)]
+        readings = readings_from_joints(joints[..., ~fixed], own[1], own[0])
+        source = constants[:, SOURCE].astype(int)
+        last = np.full((*readings.shape[:2], source.max() + 1), np.nan)
+        last[..., source[~fixed]] = readings
+        is_given = fixed & (source >= 0)
+        last[..., source[is_given]] = constants[is_given, REFERENCE]
+        return last
     triangles = find_triangles(tau)
     if len(triangles):
         shape = np.broadcast_shapes(joints.shape, (len(tau), 1, 1))
@@ -469,10 +509,9 @@ def differentiate_sums(
 ) -> FloatArray:
     """Return d (s - W joints) / d tau at constant readings and joints (t, n, J), (t, n, a, k)."""
     first = len(ALL_TERMS) + count_points(constants)
-    r, _ = split_readings(q, len(constants))
-    shape = np.broadcast_shapes(r.shape, (*joints.shape[:2], len(constants)))
-    slopes = np.zeros((*shape, tau.shape[-1]))
-    for i, column in enumerate(_evaluate_shapes(q, constants, range(first))):
+    t, n = (max(sizes) for sizes in zip(q.shape[:2], joints.shape[:2], strict=True))
+    slopes = np.zeros((max(t, len(tau)), n, *tau.shape[1:]))
+    for i, column in enumerate(term_derivatives(q, tau, constants)):
         slopes[..., i] = column
     slopes[..., first:] = -joints[:, :, None]
     return slopes
@@ -500,7 +539,7 @@ def evaluate_sums(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Floa
     """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
     has_tables = count_points(constants) > 0
     if not tau[..., 2 : len(TERMS)].any() and not has_tables:
-        readings = q[..., : len(constants)]
+        readings, _ = split_readings(q, constants)
         if len(tau) in (1, len(q)) and (tau[..., :2] == (0.0, 1.0)).all():
             return readings + 0.0  # no offset and no gain: one pass, with the same bits
         return tau[:, None, :, 0] + readings * tau[:, None, :, 1]
@@ -517,7 +556,7 @@ def _evaluate_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> F
     has_tables = count_points(constants) > 0
     if not tau[..., 2:7].any() and not has_tables:
         return tau[:, None, :, 1]
-    r, _ = split_readings(q, len(constants))
+    r, _ = split_readings(q, constants)
     slopes = sum(
         (
             shape.slope(r, constants[:, 0]) * tau[:, None, :, i]
@@ -549,6 +588,23 @@ def find_reversed(joints: FloatArray, tau: FloatArray, triangles: IntArray) -> B
     return np.sin(joints[..., triangles] - gamma) * triangle[..., 8] < 0.0
 
 
-def split_readings(q: FloatArray, a: int) -> tuple[FloatArray, FloatArray]:
-    """Return readings and directions of approach, the latter 0 where none are given."""
-    return q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])
+def split_readings(q: FloatArray, constants: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the reading and the direction of approach of each row (.., a), 0 where none are
+    given.
+    """
+    source = constants[:, SOURCE].astype(int)
+    a = int(source.max(initial=-1)) + 1
+    parts = q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])
+    if len(source) == a and bool((source == np.arange(a)).all()):
+        return parts
+    none = np.zeros((*q.shape[:-1], 1))  # what a row with the number -1 reads
+    r, approach = (np.concatenate([part, none], axis=-1)[..., source] for part in parts)
+    return r, approach
+
+
+def distribute_readings(slopes: FloatArray, constants: FloatArray) -> FloatArray:
+    """Return the derivatives (t, n, a, readings) of rows by readings, of slopes (t, n, a) by the
+    reading of each row.
+    """
+    source = constants[:, SOURCE]
+    return slopes[..., None] * (source[:, None] == np.arange(source.max(initial=-1) + 1))

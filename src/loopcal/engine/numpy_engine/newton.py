@@ -37,7 +37,7 @@ from loopcal.engine.numpy_engine.householder import (
 from loopcal.engine.numpy_engine.nodes import (
     Front,
     factor_nodes,
-    gather_twists,
+    gather_unknowns,
     list_pairs,
     solve_nodes,
 )
@@ -51,6 +51,7 @@ from loopcal.engine.program import (
     Group,
     Program,
     State,
+    Sums,
     Task,
 )
 from loopcal.typing import BoolArray, FloatArray
@@ -189,23 +190,33 @@ def solve(
     free: bool = False,
     max_iterations: int = 60,
     goal: State | None = None,
+    sums: Sums | None = None,
 ) -> State:
     """Find the pose and the joints that close every loop; see `loopcal.engine.solve`."""
     if not program.freedoms and free and have_closed_form(program):
         return close_limbs(program, e, q, start)
     t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
+    if sums is not None:
+        t, n = max(t, *map(len, sums)), max(n, sums.values.shape[1])
+        whole = np.broadcast_to(sums.values, (t, n, sums.values.shape[2]))
+        sums = Sums(sums.weights, whole.reshape(t * n, -1))
     links = [place_links(g, e) for g in program.groups]
     unknown = [g.unknown_joints(free) for g in program.groups]
     redundant = program.sigma is not None and not free
     begin = list_coordinates(program, q, start, (t, n))
     has_one_start = len(e) == 1 and start.T.shape[:2] == (1, 1)
-    together = has_one_start and has_driven_rods(program) and not free and task is None
+    together = has_one_start and has_driven_rods(program) and not free
+    together = together and task is None and sums is None
     goals = None if goal is None else goal.T.reshape(t * n, 4, 4)[:, :3].transpose(1, 2, 0)
     chunks = []
     for part in divide_rows(t * n) or [slice(0)]:
         rows = np.arange(t * n)[part]
         placed = [p.select(rows // n) for p in links]
-        equations = _Equations(program, unknown, redundant, placed, task, rows)
+        own = None
+        if sums is not None:
+            weights = sums.weights[rows // n if len(sums.weights) > 1 else [0]]
+            own = Sums(weights, sums.values[part])
+        equations = _Equations(program, unknown, redundant, placed, task, rows, own)
         goal_rows = None if goals is None else goals[..., part]
         chunks.append(_iterate(equations, begin[:, part], max_iterations, goal_rows, together))
     whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True)))
@@ -296,6 +307,7 @@ class _Equations:
 
     unknown : joints that closure determines, group by group. redundant : whether the residual is
         weighted by the standard deviations of redundant actuators. rows : (N,) numbers for `task`.
+    sums : of each row, weights (1 | N, r, n_joints) and values (N, r).
     """
 
     program: Program
@@ -304,10 +316,24 @@ class _Equations:
     links: list[PlacedLinks]
     task: Task | None
     rows: np.ndarray
+    sums: Sums | None = None
 
     def select(self, keep: np.ndarray) -> _Equations:
         """Return the equations of these rows."""
-        return replace(self, links=[p.select(keep) for p in self.links], rows=self.rows[keep])
+        links, sums = [p.select(keep) for p in self.links], self.sums
+        if sums is not None:
+            weights = sums.weights if len(sums.weights) == 1 else sums.weights[keep]
+            sums = Sums(weights, sums.values[keep])
+        return replace(self, links=links, rows=self.rows[keep], sums=sums)
+
+    def compare_sums(self, limbs: list[FloatArray]) -> FloatArray:
+        """Return what the sums of driven joints lack or exceed (r, N), of all joint values."""
+        assert self.sums is not None
+        q = np.zeros((self.program.n_joints, len(self.rows)))
+        for group, theta in zip(self.program.groups, limbs, strict=True):
+            for j in group.driven_joints:
+                q[group.actuator[j]] = theta[j]
+        return np.einsum("Nrj,jN->rN", self.sums.weights, q) - self.sums.values.T
 
     def evaluate(self, coordinates: FloatArray, together: bool = False) -> Iterate:
         """Return the Newton step at these coordinates and its measures.
@@ -326,6 +352,11 @@ class _Equations:
             demand = [slopes[..., list(program.freedoms)], residual[..., None]]
             rows = np.concatenate(demand, axis=2).transpose(1, 2, 0)
             fronts.append(Front((PLATFORM,), rows))
+        if self.sums is not None:
+            weights = self.sums.weights.transpose(1, 2, 0)
+            gap = self.compare_sums(limbs)[:, None]
+            rows = np.concatenate([np.broadcast_to(weights, (*weights.shape[:2], N)), gap], axis=1)
+            fronts.append(Front((len(program.nodes),), rows))
         sides = N if together else 1
         inner = np.zeros(N)
         for top in tops:
@@ -333,7 +364,7 @@ class _Equations:
                 inner += add_terms(add_terms(top[:, -1] ** 2))
         right = np.concatenate([front.rows[:, -sides:] for front in fronts])
         norm = np.sqrt(inner + add_terms(right**2).reshape(N))
-        factored, sign = factor_nodes(program, fronts, sides)
+        factored, sign = factor_nodes(program, fronts, sides, self.sums is not None)
         removable = np.concatenate([front.rows[:, -sides:] for front in factored])
         reducible = np.sqrt(inner + add_terms(removable**2).reshape(N))
         y = {node: part.reshape(-1, N) for node, part in solve_nodes(program, factored, sides)}
@@ -344,11 +375,12 @@ class _Equations:
         turns = [top[:, -1] for top in tops]
         for i, (group, top) in enumerate(zip(program.groups, tops, strict=True)):
             if u := len(top):
-                own = gather_twists(group, y)
+                own = gather_unknowns(program, group, y)
                 rest = turns[i] + np.add.reduce(top[:, u : u + len(own)] * own, axis=1)
                 turns[i] = back_substitute(top[:, :u], -rest[:, None])[:, 0]
-        step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns)])
-        length = self._length(twist, turns)
+        driven = y.get(len(program.nodes), np.zeros((0, N)))
+        step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns), driven])
+        length = self._length(twist, turns, driven)
         return Iterate(coordinates, step, norm, reducible, length, sign, pivot)
 
     def measure(self, coordinates: FloatArray, of: np.ndarray) -> FloatArray:
@@ -368,6 +400,8 @@ class _Equations:
         if self.task is not None:
             residual, _ = self.task(bodies[0].transpose(2, 0, 1), equations.rows)
             square += np.add.reduce(residual**2, axis=1)
+        if self.sums is not None:
+            square += np.add.reduce(equations.compare_sums(values) ** 2, axis=0)
         out[of] = np.sqrt(square)
         return out
 
@@ -384,6 +418,8 @@ class _Equations:
         chain, u = Chain(group, self.links[i], bodies, theta, program.size), len(unknown)
         columns = [chain.rows_of_joint(j) for j in unknown]
         columns += chain.list_slopes(program)
+        if self.sums is not None:
+            columns += [self._list_drive(chain, column) for column in range(program.n_joints)]
         if self.redundant:
             j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
             sigma = np.array(program.sigma)[group.actuator[j], None]
@@ -401,8 +437,9 @@ class _Equations:
             largest = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)
             pivot = (np.abs(diagonal).min(axis=-1) / largest).min(axis=0)
         low = rows[u:, u:].transpose(2, 0, 1, 3)  # limb by limb
+        joints = () if self.sums is None else (len(program.nodes),)
         fronts = [
-            Front(nodes, low[limbs].reshape(-1, *low.shape[2:]))
+            Front(nodes + joints, low[limbs].reshape(-1, *low.shape[2:]))
             for nodes, limbs in list_pairs(group)
         ]
         if self.redundant:
@@ -414,7 +451,15 @@ class _Equations:
             ]
         return rows[:u], fronts, sign, pivot
 
-    def _length(self, twist: FloatArray, turns: list[FloatArray]) -> FloatArray:
+    def _list_drive(self, chain: Chain, column: int) -> FloatArray:
+        """Return the rows of the driven joints of one column of q."""
+        group, rows = chain.group, np.zeros((1, 1, 1))
+        for j in group.driven_joints:
+            share = group.actuator[j] == column
+            rows = rows + chain.rows_of_joint(j) * share[:, None]
+        return rows
+
+    def _length(self, twist: FloatArray, turns: list[FloatArray], driven: FloatArray) -> FloatArray:
         """Return the length of a step [m]: its largest part, an angle times the robot's size."""
         size = self.program.size
         parts = np.abs(twist).reshape(-1, 2, 3, twist.shape[1])
@@ -423,6 +468,10 @@ class _Equations:
         for group, unknown, turn in zip(self.program.groups, self.unknown, turns, strict=True):
             for j, part in zip(unknown, turn, strict=True):
                 unit = size if group.joints[j : j + 1] == "R" else 1.0
+                length = np.maximum(length, np.abs(part).max(axis=0) * unit)
+            for j in group.driven_joints if len(driven) else ():
+                unit = size if group.joints[j : j + 1] == "R" else 1.0
+                part = driven[group.actuator[j]]
                 length = np.maximum(length, np.abs(part).max(axis=0) * unit)
         return length
 
@@ -450,6 +499,11 @@ class _Equations:
             if unknown:
                 theta[unknown] += fraction * now.step[first:last].reshape(-1, *theta.shape[1:])
             first = last
+        driven = fraction * now.step[first:]
+        limbs = split_joints(self.program, out) if len(driven) else []
+        for group, theta in zip(self.program.groups, limbs, strict=False):
+            for j in group.driven_joints:
+                theta[j] += driven[group.actuator[j]]
         return out
 
 

@@ -42,14 +42,16 @@ def list_pairs(group: Group) -> list[tuple[tuple[int, ...], list[int] | slice]]:
 
 
 def factor_nodes(
-    program: Program, fronts: Sequence[Front], sides: int
+    program: Program, fronts: Sequence[Front], sides: int, has_sums: bool = False
 ) -> tuple[list[Front], FloatArray]:
     """Eliminate the nodes in the order of the program; return the triangular rows of each, and the
-    sign of the determinant (N,).
+    sign of the determinant (N,). has_sums : driven joints are unknown too, as a node behind those
+    of the program.
     """
     factored, left, sign = [], list(fronts), np.ones(())
-    for node in program.elimination_order:
-        m = len(program.nodes[node])
+    *first, last = program.elimination_order
+    for node in (*first, *[len(program.nodes)] * has_sums, last):
+        m = program.widths[node]
         nodes, rows = _join(program, node, [f for f in left if node in f.nodes], sides, left[0])
         count = count_reflections(len(rows), m)
         rows = triangularize(rows, m, overwrite=True)
@@ -64,15 +66,15 @@ def factor_nodes(
 def _join(program: Program, node: int, fronts: Sequence[Front], sides: int, like: Front) -> Front:
     """Return fronts as one, `node` first, with at least as many rows as its freedoms."""
     nodes = (node, *sorted({other for f in fronts for other in f.nodes} - {node}))
-    first = np.cumsum([0, *(len(program.nodes[other]) for other in nodes)])
-    width, N, m = first[-1] + sides, like.rows.shape[-1], len(program.nodes[node])
+    first = np.cumsum([0, *(program.widths[other] for other in nodes)])
+    width, N, m = first[-1] + sides, like.rows.shape[-1], program.widths[node]
     parts = []
     for front in fronts:
         part = front.rows
         if front.nodes != nodes:
             part, begin = np.zeros((len(part), width, N)), 0
             for other in front.nodes:
-                end, place = begin + len(program.nodes[other]), first[nodes.index(other)]
+                end, place = begin + program.widths[other], first[nodes.index(other)]
                 part[:, place : place + end - begin] = front.rows[:, begin:end]
                 begin = end
             part[:, first[-1] :] = front.rows[:, begin:]
@@ -88,7 +90,7 @@ def solve_nodes(
     """Yield each node with the solutions (m, sides, N) of its freedoms, the platform first."""
     known: dict[int, FloatArray] = {}
     for (node, *others), rows in reversed(factored):
-        m = first = len(program.nodes[node])
+        m = first = program.widths[node]
         right = -rows[:, -sides:] if sides else rows[:, :0]
         for other in others:
             y = known[other]
@@ -99,12 +101,16 @@ def solve_nodes(
         yield node, known[node]
 
 
-def gather_twists(group: Group, y: Mapping[int, FloatArray]) -> FloatArray:
-    """Return the freedoms (c, 1 | k, N) of the bodies at which the limbs begin, then end."""
+def gather_unknowns(program: Program, group: Group, y: Mapping[int, FloatArray]) -> FloatArray:
+    """Return the freedoms (c, 1 | k, N) of the bodies at which the limbs begin, then end, and
+    unknown driven joints.
+    """
     parts = []
     for ends in (group.on, group.to):
         if ends[0] != BASE:
             chosen = ends[:1] if len(set(ends)) == 1 else ends
             parts.append(np.stack([y[node] for node in chosen], axis=1))
+    if (joints := y.get(len(program.nodes))) is not None:
+        parts.append(joints[:, None])
     k = max(part.shape[1] for part in parts)
     return np.concatenate([np.broadcast_to(part, (len(part), k, part.shape[2])) for part in parts])

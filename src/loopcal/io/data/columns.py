@@ -12,7 +12,7 @@ import re
 import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import permutations
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -283,9 +283,12 @@ def _number(name: str, dimension: Dimension) -> NumberColumn:
     return NumberColumn(name, dimension, DISPLAY_UNITS[dimension].symbol)
 
 
-def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[NumberColumn]:
+def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
     del kinds
     for a in robot.actuators:
+        if a.reference is not None:
+            yield ContextColumn(a.name)
+            continue
         yield NumberColumn(a.name, a.dimension, robot.units[a.dimension])
 
 
@@ -332,8 +335,8 @@ RULES: tuple[ColumnRule, ...] = (
         "that is not trusted",
         lambda robot, kinds: [
             *(
-                replace(reading, name=SIGMA + reading.name, allows_infinity=True)
-                for reading in _readings(robot, kinds)
+                NumberColumn(SIGMA + a.name, a.dimension, robot.units[a.dimension], True)
+                for a in robot.actuators
             ),
             *(
                 _number(SIGMA + name_measured(column.name, robot), column.dimension)

@@ -33,7 +33,7 @@ from loopcal.io.data.columns import (
     LINK,
     POSE_COLUMNS,
     SIGMA,
-    NumberColumn,
+    Column,
     PoseColumn,
     TextColumn,
     list_columns,
@@ -233,7 +233,7 @@ def _collect_pose_context(files: Sequence[_File], n: int) -> dict[str, FloatArra
 
 def _has_readings(table: Table, robot: Mechanism) -> bool:
     """Return whether a file has columns of readings, or of commanded coordinates."""
-    names = {actuator.name for actuator in robot.actuators}
+    names = {actuator.name for actuator in robot.actuators if actuator.reference is None}
     return any(column in names or column.startswith(COMMANDED) for column in table.names)
 
 
@@ -305,7 +305,7 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
     empty = set(np.flatnonzero(absent.all(axis=1)).tolist())
     unread = frozenset(name for name, row in file.first.items() if row in empty)
     read = frozenset(file.first) - unread
-    readings = rows
+    readings, known = rows, list_columns(robot, ())
     if controller is not None:
         readings = np.full(file.readings.shape, np.nan)
         chosen = [row for name, row in file.first.items() if name in read]
@@ -313,6 +313,9 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
             poses, places = [names[row] for row in chosen], table.places(chosen)
             solution = solve_commanded_poses(controller, rows[chosen], poses, places)
             readings[chosen] = solution.q
+        for i, actuator in enumerate(robot.actuators):
+            if actuator.reference is not None and actuator.name in table.units:
+                readings[:, i] = known[actuator.name].parse(table)
     sigma = _read_reading_sigma(table, robot, readings)
     unread = unread if may_be_absent else frozenset[str]()
     return replace(file, readings=readings, sigma=sigma, read=read, unread=unread)
@@ -320,7 +323,7 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
 
 def _list_reading_columns(
     table: Table, robot: Mechanism, controller: Mechanism | None
-) -> list[NumberColumn]:
+) -> list[Column]:
     """Return the columns of the readings, or of the coordinates of the controller."""
     readings = [actuator.name for actuator in robot.actuators]
     if controller is None:
@@ -328,13 +331,14 @@ def _list_reading_columns(
     else:
         names = [COMMANDED + name for name in controller.controlled]
         why = f"a commanded coordinate of {controller.name}"
-        both = next((name for name in readings if name in table.units), None)
+        own = [a.name for a in robot.actuators if a.reference is None]
+        both = next((name for name in own if name in table.units), None)
         if both is not None:
             sentence = f"this file has readings ({both!r}) and commanded coordinates"
             raise table.header_error(f"{sentence}; remove one of the two")
     require_columns(table, names, why)
     known = list_columns(robot, ()) | list_columns(controller or robot, ())
-    return [column for name in names if isinstance(column := known[name], NumberColumn)]
+    return [known[name] for name in names]
 
 
 def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:

@@ -212,7 +212,8 @@ def build_robot(file: YamlFile) -> Mechanism:
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file, record)
         robot = build(_assemble(record, file), symbols, origin)
-        for actuator in robot.actuators:  # measurement files have them as columns
+        commanded = [actuator for actuator in robot.actuators if actuator.reference is None]
+        for actuator in commanded:  # measurement files have them as columns
             if fault := find_column_fault(actuator.name, "actuator"):
                 raise file.error(fault, _find_drives(file, ("drives", actuator.name)))
         for i, limb in enumerate(robot.assembly.limbs):

@@ -8,9 +8,9 @@ mechanism/transmission.py. How to write it: docs/robots.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -62,6 +62,13 @@ class DriveError(RecordError):
 
     def __init__(self, sentence: str, name: str) -> None:
         super().__init__(sentence, "drives", name)
+
+
+class CouplingError(RecordError):
+    """An impossible coupling; `name` is the one under which a file states it."""
+
+    def __init__(self, sentence: str, name: str) -> None:
+        super().__init__(sentence, "couplings", name)
 
 
 class StrokeError(DriveError):
@@ -249,6 +256,53 @@ class NamedTriangleDrive(TriangleDrive):
 Drive = LengthDrive | AngleDrive | SpoolDrive | ScrewDrive | TriangleDrive
 
 
+@dataclass(frozen=True, kw_only=True)
+class Condition:
+    """A column of the data that is never commanded: `temperature`, `temperature.PLACE` [degC] or
+    `time` [s]. Where none is given it has its `reference`; simulations draw it from its `range`.
+    """
+
+    reference: Ratio = 0.0
+    range: tuple[Ratio, Ratio] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngleCoupling(Sum):
+    """Gears, a belt or a differential between rotary joints: the sum of weight * joint value is
+    the `offset`. Joints are drives, or passive joints `limb.joint`; `unknown` names weights and
+    offset. With a `condition` it is offset + slope * (condition - reference), the slope in units
+    of the sum per degC or second.
+    """
+
+    of: Literal["angle"] = "angle"
+    offset: Angle = 0.0
+    condition: str = ""
+    slope: Angle = 0.0
+    unknown: tuple[str, ...] = ()
+    angle: AngleTolerance | None = None
+    slopes: AngleTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LengthCoupling(Sum):
+    """A coupling of slides, and of rotary joints by a `radius` (joint -> length per radian), as of
+    a pinion on a rack. Unknown radii have the tolerance `radii`.
+    """
+
+    of: Literal["length"]
+    radius: Mapping[str, Length] = field(default_factory=dict)
+    offset: Length = 0.0
+    condition: str = ""
+    slope: Length = 0.0
+    unknown: tuple[str, ...] = ()
+    length: LengthTolerance | None = None
+    slopes: LengthTolerance | None = None
+    radii: LengthTolerance | None = None
+
+
+Coupling = AngleCoupling | LengthCoupling
+
+
 # Drives at their joints: actuators, and their unknowns.
 
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)
@@ -276,6 +330,11 @@ class DrivenJoint:
     turns: bool
     rotation: FloatArray
     start: float
+
+    @property
+    def is_passive(self) -> bool:
+        """Whether it is a passive joint in a sum or coupling, which the name of its limb shows."""
+        return self.name.startswith(f"{self.limb}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,6 +432,191 @@ class PlacedDrive:
         return terms
 
 
+@dataclass(frozen=True, eq=False)
+class PlacedCoupling:
+    """A coupling of joints by the names of their drives; weights in m and rad. reference : of its
+    condition.
+    """
+
+    name: str
+    drive: Coupling
+    weights: Mapping[str, float]
+    reference: float = 0.0
+    sense: ClassVar[float] = 1.0
+
+    @property
+    def dimension(self) -> Dimension:
+        """Dimension of the sum."""
+        return Dimension(self.drive.of)
+
+    @property
+    def actuator(self) -> Actuator:
+        """The row of joints, whose only reading is a condition."""
+        slope = self.drive.slope
+        terms = {"offset": self.drive.offset - slope * self.reference, "gain": slope}
+        column = self.drive.condition
+        return Actuator(self.name, self.dimension, None, terms, weights=self.weights, column=column)
+
+
+def list_conditions(stated: Mapping[str, Condition]) -> Iterator[Actuator]:
+    """Yield the conditions of a file as readings."""
+    for name, condition in stated.items():
+        dimension = Dimension.TIME if name == Dimension.TIME.value else Dimension.TEMPERATURE
+        if dimension.value != name.partition(".")[0]:
+            raise RecordError(
+                f"the condition {name!r} is no column of times or temperatures; call it "
+                "temperature, temperature.PLACE or time",
+                "conditions",
+                name,
+            )
+        yield Actuator(name, dimension, condition.range, reference=condition.reference)
+
+
+def couple_joints(
+    limbs: Iterable[PlacedLimb],
+    drives: Mapping[str, Drive],
+    stated: Mapping[str, Coupling],
+    conditions: Mapping[str, Condition],
+) -> tuple[tuple[PlacedLimb, ...], tuple[PlacedCoupling, ...]]:
+    """Return the couplings of a file, and its limbs with `limb.joint` as the drive of each passive
+    joint that a coupling, or the sum of a drive, names.
+
+    A coupling of limbs that are copied is one for each copy. Raises MechanismError: unknown joints,
+    and couplings of unlike ones.
+    """
+    limbs = tuple(limbs)
+    known, turning = dict[str, list[str]](), dict[str, bool]()
+    for limb in limbs:
+        copy = limb.name.removeprefix(limb.stem)
+        for joint in limb.limb.joints:
+            name = joint.actuator or f"{limb.name}.{joint.name}"
+            turning[name] = joint.kind == "R"
+            for alias in (f"{limb.name}.{joint.name}", f"{limb.stem}.{joint.name}"):
+                known.setdefault(alias, []).append(name)
+            for alias in {name, name.removesuffix(copy)} if joint.actuator else ():
+                known.setdefault(alias, []).append(name)
+        if limb.limb.actuator:
+            name, turning[limb.limb.actuator] = limb.limb.actuator, False
+            for alias in {name, name.removesuffix(copy)}:
+                known.setdefault(alias, []).append(name)
+    known = {alias: list(dict.fromkeys(names)) for alias, names in known.items()}
+    couplings: list[PlacedCoupling] = []
+    for key, coupling in stated.items():
+        name = coupling.condition
+        if name and name not in conditions:
+            raise CouplingError(
+                f"coupling {key!r} names the condition {name!r}, which the file does not state"
+                f"{suggest_names(name, list(conditions))}; add it to `conditions:`",
+                key,
+            )
+        reference = conditions[name].reference if name else 0.0
+        couplings += _place_coupling(key, coupling, known, turning, reference)
+    for name in conditions:
+        if all(coupling.condition != name for coupling in stated.values()):
+            raise RecordError(
+                f"the condition {name!r} is in no coupling; name it there, or leave it out",
+                "conditions",
+                name,
+            )
+    used = {joint for coupling in couplings for joint in coupling.weights}
+    used |= {joint for drive in drives.values() for joint in getattr(drive, "sum", ())}
+    placed = []
+    for limb in limbs:
+        names = [joint.actuator or f"{limb.name}.{joint.name}" for joint in limb.limb.joints]
+        joints = tuple(
+            replace(joint, actuator=name) if name in used else joint
+            for joint, name in zip(limb.limb.joints, names, strict=True)
+        )
+        placed.append(limb._replace(limb=replace(limb.limb, joints=joints)))
+    return tuple(placed), tuple(couplings)
+
+
+def _place_coupling(
+    key: str,
+    coupling: Coupling,
+    known: Mapping[str, Sequence[str]],
+    turning: Mapping[str, bool],
+    reference: float,
+) -> Iterator[PlacedCoupling]:
+    """Yield a coupling, or those of all copies. known : alias -> names of driven joints."""
+    radius: Mapping[str, float] = getattr(coupling, "radius", {})
+    weights = {**coupling.sum, **radius}
+    for alias in coupling.sum:
+        if alias in radius:
+            raise CouplingError(
+                f"coupling {key!r} has {alias!r} under both `sum:` and `radius:`; list it once", key
+            )
+    for alias, weight in weights.items():
+        if alias not in known:
+            raise CouplingError(
+                f"coupling {key!r} names {alias!r}, which is no drive and no joint of a limb"
+                f"{suggest_names(alias, list(known))}; write limb.joint or the name of a drive",
+                key,
+            )
+        is_angle = coupling.of == "angle" or alias not in coupling.sum
+        if turning[known[alias][0]] != is_angle:
+            raise CouplingError(
+                f"coupling {key!r} adds {'angles' if is_angle else 'lengths'}, but {alias!r} "
+                + ("slides; state `of: length`" if is_angle else "turns; list it under `radius:`"),
+                key,
+            )
+        if not np.isfinite(weight):
+            raise CouplingError(
+                f"the weight of {alias!r} in coupling {key!r} is {weight:g}; state a finite number",
+                key,
+            )
+    if not any(weights.values()):
+        raise CouplingError(
+            f"coupling {key!r} has no weight other than 0, so it couples nothing; state one", key
+        )
+    counts = {len(known[alias]) for alias in weights} - {1}
+    if len(counts) > 1:
+        raise CouplingError(
+            f"coupling {key!r} names joints of limbs with {' and '.join(map(str, sorted(counts)))} "
+            "copies; name single copies",
+            key,
+        )
+    count = counts.pop() if counts else 0
+    for i in range(max(count, 1)):
+        name = f"{key}{i + 1}" if count else key
+        own = {known[a][i if len(known[a]) > 1 else 0]: w for a, w in weights.items()}
+        yield PlacedCoupling(name, coupling, own, reference)
+
+
+def coupling_errors(placed: PlacedCoupling) -> ErrorModel:
+    """Return the unknown offset, weights and radii of a coupling, as `gear.weight.arm.pin`."""
+    name, coupling = placed.name, placed.drive
+    of_radii = getattr(coupling, "radius", {})
+    own = dict(zip({**coupling.sum, **of_radii}, placed.weights, strict=True))
+    spread = coupling.angle if isinstance(coupling, AngleCoupling) else coupling.length
+    terms: dict[str, tuple[Dimension, float, Tolerance, str]]
+    terms = {"offset": (placed.dimension, coupling.offset, spread, "offset")}
+    if coupling.condition:
+        terms["slope"] = placed.dimension, coupling.slope, coupling.slopes, "gain"
+    for key, joints, dimension, tolerance in (
+        (WEIGHT, coupling.sum, Dimension.RATIO, coupling.weights),
+        ("radius", of_radii, Dimension.LENGTH, getattr(coupling, "radii", None)),
+    ):
+        for alias, weight in joints.items():
+            terms[f"{key}.{alias}"] = dimension, weight, tolerance, f"{WEIGHT}.{own[alias]}"
+    errors = []
+    for stated in coupling.unknown:
+        chosen = [term for term in terms if stated in (term, term.partition(".")[0])]
+        if not chosen:
+            hint = f"{suggest_names(stated, list(terms))}; allowed are {', '.join(terms)}"
+            raise CouplingError(f"coupling {name!r} has no term {stated!r}{hint}", name)
+        for term in chosen:
+            dimension, nominal, tolerance, axis = terms[term]
+            parameter = f"{name}.{term}"
+            sd = standard_deviation(tolerance, parameter)
+            maps = [LinearMap(parameter, Address(name, "transmission", axis))]
+            if axis == "gain":  # the slope turns about the reference
+                offset = Address(name, "transmission", "offset")
+                maps.append(LinearMap(parameter, offset, -placed.reference))
+            errors.append(single_error(parameter, dimension, nominal, sd, *maps))
+    return join_errors(errors)
+
+
 def list_driven_joints(limb: PlacedLimb) -> Iterator[DrivenJoint]:
     """Yield the driven joints of a limb, the rod last."""
     placed, suffix = limb.limb, limb.name.removeprefix(limb.stem)
@@ -386,18 +630,24 @@ def list_driven_joints(limb: PlacedLimb) -> Iterator[DrivenJoint]:
 
 
 def place_drives(
-    limbs: Iterable[PlacedLimb], stated: Mapping[str, Drive], own: Iterable[Actuator] = ()
+    limbs: Iterable[PlacedLimb],
+    stated: Mapping[str, Drive],
+    own: Iterable[Actuator] = (),
+    couplings: Iterable[PlacedCoupling] = (),
 ) -> dict[str, PlacedDrive]:
     """Return the drives by name, in the order of the readings, with their joints.
 
     A drive that several limbs name is one drive. stated : the drives of the file; one that is not
-    listed reads the joint itself. own : what the family knows of its drives.
+    listed reads the joint itself. own : what the family knows of its drives. couplings : of their
+    joints, those of `couple_joints`.
     Raises MechanismError: a drive without a joint, or of another kind than its joint.
     """
     joints: dict[str, DrivenJoint] = {}
     for joint in (joint for limb in limbs for joint in list_driven_joints(limb)):
         joints.setdefault(joint.name, joint)
     known, drives = {actuator.name: actuator for actuator in own}, dict[str, PlacedDrive]()
+    rows = {coupling.name: coupling.weights for coupling in couplings}
+    limb_of = {name: joint.limb for name, joint in joints.items()}
 
     def place(name: str, drive: Drive | None, joint: DrivenJoint) -> PlacedDrive:
         plain = AngleDrive(reads="angle") if joint.turns else LengthDrive(reads="length")
@@ -410,15 +660,19 @@ def place_drives(
         named = {name: joint.stated for name, joint in joints.items()}
         turning = {name: joint.turns for name, joint in joints.items()}
         readings = list_readings(stated, named)
-        limb_of = {name: joint.limb for name, joint in joints.items()}
-        check_sums({name: weights for name, (_, weights) in readings.items()}, turning, limb_of)
+        for name, (_, weights) in readings.items():
+            _check_sum(name, weights, turning)
+        check_rows({**{name: w for name, (_, w) in readings.items()}, **rows}, limb_of)
         for name, (key, weights) in readings.items():
             own_joint = tuple(weights) == (name,) and weights[name] == 1.0
             placed = place(name, stated[key], joints[next(iter(weights))])
             drives[name] = replace(placed, weights={} if own_joint else weights)
     else:
         for name, joint in joints.items():
-            drives[name] = place(name, stated.get(name) or stated.get(joint.stated), joint)
+            if not joint.is_passive:
+                drives[name] = place(name, stated.get(name) or stated.get(joint.stated), joint)
+        if rows:
+            check_rows({name: {name: 1.0} for name in drives} | rows, limb_of)
     if strokes := {name: words for name in drives if (words := _word_stroke(drives[name]))}:
         raise StrokeError(strokes)
     refuse_idle_drives(stated, drives, {joint.stated for joint in joints.values()})
@@ -550,9 +804,17 @@ def check_motion(name: str, drive: Drive, turns: bool) -> None:
     raise DriveError(f"actuator {name!r} drives a joint that {motion}; state {allowed}", name)
 
 
-def complete_drives(drives: Mapping[str, PlacedDrive], spread: ErrorTolerances) -> ErrorModel:
-    """Return the offset of every drive and the dimensions of its triangle as parameters."""
-    errors = []
+def complete_drives(
+    drives: Mapping[str, PlacedDrive], couplings: Iterable[PlacedCoupling], spread: ErrorTolerances
+) -> ErrorModel:
+    """Return the offset of every drive and coupling and the dimensions of triangles as
+    parameters.
+    """
+    errors = [
+        offset_error(f"{c.name}.offset", c.name, d, c.drive.offset, spread.select(d))
+        for c in couplings
+        for d in [c.dimension]
+    ]
     for name, placed in drives.items():
         tolerance = spread.select(placed.dimension)
         errors.append(
@@ -718,28 +980,24 @@ def list_readings(
     return readings
 
 
-def check_sums(
-    sums: Mapping[str, Mapping[str, float]], turning: Mapping[str, bool], known: Mapping[str, str]
-) -> None:
-    """Refuse sums, readings by name with the weights of their joints, that are no readings of the
-    driven joints. turning : whether each of them is rotary. known : driven joint -> its limb.
+def check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str]) -> None:
+    """Refuse sums, readings and couplings by name with the weights of their joints, that leave a
+    driven joint out or repeat each other. known : driven joint -> its limb.
     """
-    for name, weights in sums.items():
-        _check_sum(name, weights, turning)
     read = {joint for weights in sums.values() for joint, w in weights.items() if w != 0.0}
-    unread = [joint for joint in turning if joint not in read]
+    unread = [joint for joint in known if joint not in read]
     if unread:
         raise DriveError(
             f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so no reading states "
             f"it; add it to a `sum:`, or list {unread[0]!r} among the actuators",
             next(iter(sums)),
         )
-    W = np.array([[weights.get(joint, 0.0) for joint in turning] for weights in sums.values()])
+    W = np.array([[weights.get(joint, 0.0) for joint in known] for weights in sums.values()])
     a, joints = W.shape
     if a > joints:
         raise DriveError(
             f"{a} readings ({', '.join(sums)}) are sums of {joints} joints "
-            f"({', '.join(turning)}); leave out readings",
+            f"({', '.join(known)}); leave out readings",
             list(sums)[-1],
         )
     for i in range(a):

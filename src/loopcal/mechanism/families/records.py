@@ -14,7 +14,17 @@ from typing import ClassVar
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import Actuator, Assembly
-from loopcal.mechanism.families.drives import Drive, complete_drives, drive_errors, place_drives
+from loopcal.mechanism.families.drives import (
+    Condition,
+    Coupling,
+    Drive,
+    complete_drives,
+    couple_joints,
+    coupling_errors,
+    drive_errors,
+    list_conditions,
+    place_drives,
+)
 from loopcal.mechanism.families.named_parameters import NamedParameter, named_error
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
@@ -52,7 +62,7 @@ class CommonErrorRecord:
         """Return the common error of the parameters that match; raises MechanismError for unlike
         parameters, a single one, or one without a tolerance of its own.
         """
-        stated = {d: getattr(self, d.value) for d in Dimension if getattr(self, d.value)}
+        stated = {d: t for d in Dimension if (t := getattr(self, d.value, None)) is not None}
         if len(stated) != 1:
             raise MechanismError(
                 f"common error {self.name!r} states {len(stated)} tolerances; give one, such as "
@@ -136,7 +146,8 @@ class RobotRecord:
     common_errors : errors that several parameters share, such as those of one batch of parts or of
         a common zero.
     drives : by name; in limbs that are numbered, `q` means q1, q2, .. One that is not listed reads
-        the joint value. parameters : of one's own, with maps onto limbs and drives.
+        the joint value. couplings : of driven and passive joints, by name. conditions : data
+        columns in them. parameters : of one's own, with maps onto limbs and drives.
     """
 
     OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = {"actuators": (dict, "drives")}
@@ -154,6 +165,8 @@ class RobotRecord:
     stored_parameters: tuple[str, ...] = ()
     common_errors: tuple[CommonErrorRecord, ...] = ()
     drives: Mapping[str, Drive] = field(default_factory=dict, hash=False)
+    couplings: Mapping[str, Coupling] = field(default_factory=dict, hash=False)
+    conditions: Mapping[str, Condition] = field(default_factory=dict, hash=False)
     parameters: tuple[NamedParameter, ...] = ()
 
     def expand(self) -> Assembly:
@@ -176,22 +189,26 @@ class RobotRecord:
         errors : the unknowns of the family. own : what the family knows of its drives. complete :
         tolerances of the errors of every link and drive, which are unknown, too, where stated.
         """
-        limbs = tuple(limbs)
-        drives = place_drives(limbs, self.drives, own)
+        limbs, couplings = couple_joints(limbs, self.drives, self.couplings, self.conditions)
+        drives = place_drives(limbs, self.drives, own, couplings)
+        rows = {**drives, **{coupling.name: coupling for coupling in couplings}}
         errors = join_errors(
             (
                 errors,
                 *(drive_errors(drive) for drive in drives.values()),
-                *(named_error(named, limbs, drives) for named in self.parameters),
+                *(coupling_errors(coupling) for coupling in couplings),
+                *(named_error(named, limbs, rows) for named in self.parameters),
             )
         )
         if complete is not None:
-            all_errors = complete_limbs(limbs, complete) + complete_drives(drives, complete)
+            all_errors = complete_limbs(limbs, complete) + complete_drives(
+                drives, couplings, complete
+            )
             errors = all_errors.without_effects_of(errors) + errors
         return Assembly(
             self.name,
             tuple(limb.limb for limb in limbs),
-            tuple(drive.actuator for drive in drives.values()),
+            (*(drive.actuator for drive in drives.values()), *list_conditions(self.conditions)),
             freedoms,
             controlled,
             self.home.matrix,
@@ -201,6 +218,7 @@ class RobotRecord:
             self.tool.matrix,
             self.workspace.ranges,
             self.source,
+            couplings=tuple(coupling.actuator for coupling in couplings),
         )
 
     def assembly(self, expanded: Assembly | None = None) -> Assembly:

@@ -326,6 +326,12 @@ class PlacedStages(Stages):
                 "has a `family:`",
                 "parameters",
             )
+        if self.couplings or self.conditions:
+            raise RecordError(
+                f"{self.name} couples joints of different stages; describe these stages as one "
+                "robot of family limbs, and state `couplings:` there",
+                "couplings" if self.couplings else "conditions",
+            )
         if self.home != PoseRecord():
             raise MechanismError(
                 f"{self.name} states `home:`, but the home of a chain is that of its stages; state "

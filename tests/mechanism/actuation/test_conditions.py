@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints that a temperature or time of the data moves, against closed forms."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.apply.compensation import compensate
+from loopcal.errors import FileError, MechanismError
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
+from tests.mechanism.derivatives import check_pose_derivatives
+from tests.robot_texts import load_text
+from tests.zoo import load_cached_robot
+
+BEAM = """format: 1
+family: limbs
+name: beam
+units: {length: mm, angle: deg}
+freedoms: [x]
+controlled: [x]
+drives:
+  screw: {reads: length, stroke: [-100, 100]}
+conditions:
+  time: {reference: 60}
+  temperature: {reference: 20}
+couplings:
+  drift: {of: length, sum: {beam.drift: 1}, condition: time, slope: 0.001, offset: 0.1, unknown: [slope, offset], slopes: {sd: 0.0005}, length: {sd: 0.1}}
+  growth: {of: length, sum: {beam.growth: 1}, condition: temperature, slope: 0.002}
+limbs:
+  - {name: beam, ending: rigid, chain: [{joint: P, name: drift, axis: x}, {joint: P, name: way, axis: x, actuated: screw}, {joint: P, name: growth, axis: x}]}
+workspace: {x: [-50, 50]}
+"""  # noqa: E501
+INSTRUMENT = Instrument((Sensor(Pose(), Gaussian(np.repeat([50e-6, 5e-6], 3))),))
+
+
+def draw_readings(robot: Mechanism, count: int) -> np.ndarray:
+    """Return readings of reachable poses at drawn conditions."""
+    q = sample_workspace(robot, count, seed=3).solution.q
+    rng = np.random.default_rng(4)
+    for i, actuator in enumerate(robot.actuators):
+        if actuator.reference is not None:
+            q[:, i] = rng.uniform(*(actuator.stroke or (0.0, 30.0)), count)
+    return q
+
+
+def test_a_delta_grows_with_its_temperatures_as_its_closure_states() -> None:
+    nominal = load_cached_robot("warm-delta")
+    robot = nominal.with_values(sample_truth(nominal, 1, 2)[0])
+    q = draw_readings(robot, 100)
+    solved = forward(robot, q)
+    assert solved.converged.all()
+    rise = q[:, 3:] - 20.0
+
+    def get(name: str) -> float:
+        return float(robot.values[robot.parameters.index(name)])
+
+    for i in range(3):
+        angle, turn = q[:, i] + get(f"q{i + 1}.offset"), 2 * np.pi * i / 3
+        arm = get(f"arm{i + 1}.upper.x") + get(f"upper{i + 1}.slope") * rise[:, 1]
+        x = get(f"arm{i + 1}.base.x") + get(f"base{i + 1}.slope") * rise[:, 0] + arm * np.cos(angle)
+        y, z = get(f"arm{i + 1}.base.y"), get(f"arm{i + 1}.base.z") - arm * np.sin(angle)
+        tip = [np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y, z]
+        ball = solved.T[:, :3, 3] + [0.04 * np.cos(turn), 0.04 * np.sin(turn), 0.0]
+        rod = np.linalg.norm(ball - np.stack(tip, axis=1), axis=1)
+        assert_allclose(rod, get(f"arm{i + 1}.length"), rtol=0, atol=1e-9)
+
+
+def test_derivatives_by_slopes_and_conditions_agree_with_differences(tmp_path: Path) -> None:
+    for robot in (load_cached_robot("warm-delta"), load_text(tmp_path, BEAM)):
+        machine = robot.with_values(sample_truth(robot, 1, 2)[0])
+        check_pose_derivatives(machine, draw_readings(machine, 2)[None])
+
+
+def test_a_beam_drifts_and_grows_and_is_commanded_at_its_references(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, BEAM)
+    assert [a.name for a in robot.actuators] == ["screw", "time", "temperature"]
+    x = forward(robot, np.array([[0.01, 160.0, 30.0]])).T[0, 0, 3]
+    assert x == pytest.approx(0.01 + 100 * 1e-6 + 1e-4 + 10 * 2e-6, abs=1e-12)
+    assert_allclose(inverse(robot, [[0.01]]).q, [[0.0099, 60.0, 20.0]], rtol=0, atol=1e-12)
+    warm = robot.with_conditions({"temperature": 30.0})
+    assert_allclose(inverse(warm, [[0.01]]).q, [[0.00988, 60.0, 30.0]], rtol=0, atol=1e-12)
+    with pytest.raises(MechanismError, match="no condition 'temperatur'"):
+        robot.with_conditions({"temperatur": 30.0})
+
+
+def test_a_file_states_conditions_in_their_units(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, BEAM)
+    path = tmp_path / "data.csv"
+    path.write_text(
+        "# format: 1\n# kind: component\n# components: [x]\n# noise: {x: 0.01mm}\n"
+        "pose,screw [mm],time [min],temperature [K],x [mm]\n"
+        "1,10,2,303.15,10.18\n2,20,3,293.15,20.22\n",
+        "utf-8",
+    )
+    data = load_measurements(path, robot)
+    assert_allclose(data.readings, [[0.01, 120, 30], [0.02, 180, 20]], rtol=0, atol=1e-12)
+
+
+def test_slopes_of_simulated_machines_are_as_accurate_as_stated() -> None:
+    robot = load_cached_robot("warm-delta")
+    scores = []
+    for seed in range(20):
+        machine = robot.with_values(sample_truth(robot, 1, seed)[0])
+        poses = sample_workspace(robot, 25, seed=seed + 100).solution.T
+        fit = identify(robot, simulate(machine, poses, INSTRUMENT, seed), MAP())
+        deviation = (fit.robot.values - machine.values)[fit.free_parameters.places]
+        scores.append(deviation / fit.standard_deviations)
+    # 480 values of a standard normal distribution
+    assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.1
+    warm = {"temperature.base": 27.0, "temperature.arms": 40.0}
+    machine, model = machine.with_conditions(warm), fit.robot.with_conditions(warm)
+    q = compensate(model, poses[:5]).readings
+    assert_allclose(q[:, 3:], np.tile([27.0, 40.0], (5, 1)))
+    assert_allclose(forward(machine, q).T[:, :3, 3], poses[:5, :3, 3], rtol=0, atol=3e-5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("temperature", "heat", "call it temperature"),
+        ("condition: time", "condition: tim", "did you mean 'time'"),
+        ("condition: time, ", "", "is in no coupling"),
+    ],
+)
+def test_impossible_conditions_are_refused(tmp_path, old, new, said):
+    changed = BEAM.replace(old, new)
+    with pytest.raises((FileError, MechanismError)) as refused:
+        load_text(tmp_path, changed)
+    assert said in str(refused.value)

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints that gears, racks and belts couple, against closure equations in numpy."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+
+from loopcal.apply.compensation import compensate
+from loopcal.errors import FileError, MechanismError
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.readings import select_joint_values
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.sensitivity import differentiate_passive_joints
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
+from tests.jacobians import check_jacobian
+from tests.mechanism.derivatives import check_pose_derivatives
+from tests.robot_texts import load_text
+
+Array = NDArray[np.float64]
+
+HEAD = """format: 1
+family: limbs
+units: {length: mm, angle: deg}
+"""
+
+GEARED = f"""{HEAD}name: geared-five-bar
+freedoms: [x, y]
+controlled: [x]
+drives:
+  motor: {{reads: angle, stroke: [60, 150], unknown: [offset], angle: {{sd: 0.3}}}}
+couplings:
+  gears: {{sum: {{motor: 2, b.pin: 1}}, offset: 290, unknown: [offset, weight.motor], angle: {{sd: 0.3}}, weights: {{sd: 0.01}}}}
+limbs:
+  - {{name: a, chain: [{{joint: R, name: pin, at: [-100, 0, 0], axis: z, actuated: motor, start: 110}}], tip: [100, 0, 0], ending: distance, length: 200, errors: [{{of: rod, shift: [length], tolerance: {{sd: 0.1}}}}]}}
+  - {{name: b, chain: [{{joint: R, name: pin, at: [100, 0, 0], axis: z, start: 70}}], tip: [100, 0, 0], ending: distance, length: 200, errors: [{{of: tip, shift: [x], tolerance: {{sd: 0.1}}}}]}}
+home: {{y: 240}}
+workspace: {{x: [-15, 10]}}
+"""  # noqa: E501
+
+TRAIN = f"""{HEAD}name: passive-gears
+freedoms: [x, y]
+controlled: [y]
+drives:
+  rod: {{reads: length, unknown: [offset], length: {{sd: 0.2}}}}
+couplings:
+  gears: {{sum: {{a.pin: 1, b.pin: 1.2}}, offset: 194, unknown: [offset, weight.b.pin], angle: {{sd: 0.3}}, weights: {{sd: 0.01}}}}
+limbs:
+  - {{name: a, chain: [{{joint: R, name: pin, at: [-100, 0, 0], start: 110}}], tip: [100, 0, 0], ending: distance, length: 200}}
+  - {{name: b, chain: [{{joint: R, name: pin, at: [100, 0, 0], start: 70}}], tip: [100, 0, 0], ending: distance, length: 200, errors: [{{of: tip, shift: [x], tolerance: {{sd: 0.1}}}}]}}
+  - {{name: c, tip: [0, -50, 0], ending: distance, actuated: rod}}
+home: {{y: 240}}
+workspace: {{y: [225, 250]}}
+"""  # noqa: E501
+
+RACK = f"""{HEAD}name: rack
+freedoms: [x, y, rz]
+controlled: [x]
+drives:
+  slide: {{reads: length, stroke: [-50, 50], unknown: [gain], ratio: {{sd: 0.001}}}}
+couplings:
+  rack: {{of: length, sum: {{slide: 1}}, radius: {{arm.pinion: -12}}, offset: 2, unknown: [offset, radius], length: {{sd: 0.1}}, radii: {{sd: 0.05}}}}
+limbs:
+  - {{name: arm, ending: rigid, chain: [{{joint: P, name: way, axis: x, actuated: slide}}, {{joint: R, name: pinion, axis: z}}], attach: [-100, 0, 0]}}
+workspace: {{x: [-40, 40]}}
+"""  # noqa: E501
+
+GRIPPER = f"""{HEAD}name: gripper
+freedoms: [x, y, rz]
+controlled: [y]
+drives:
+  motor: {{reads: angle, stroke: [-20, 60], unknown: [offset], angle: {{sd: 0.3}}}}
+bodies: [{{name: other, home: {{x: 59, y: -30}}}}]
+couplings:
+  mimic: {{sum: {{drvo.pin: 1, motor: -0.5}}, unknown: [weight.motor], weights: {{sd: 0.01}}}}
+limbs:
+  - {{name: drv, ending: ball, chain: [{{joint: R, name: pin, at: [0, 20, 0], axis: z, actuated: motor, start: 20}}], tip: [60, 0, 0], errors: [{{of: tip, shift: [x], tolerance: {{sd: 0.1}}}}]}}
+  - {{name: fol, ending: ball, chain: [{{joint: R, name: pin, at: [20, 20, 0], axis: z, start: 20}}], tip: [60, 0, 0], attach: [20, 0, 0]}}
+  - {{name: drvo, to: other, ending: ball, chain: [{{joint: R, name: pin, at: [0, -20, 0], axis: -z, start: 10}}], tip: [60, 0, 0]}}
+  - {{name: folo, to: other, ending: ball, chain: [{{joint: R, name: pin, at: [20, -20, 0], axis: -z, start: 10}}], tip: [60, 0, 0], attach: [20, 0, 0]}}
+home: {{x: 56, y: 40}}
+workspace: {{y: [25, 60]}}
+"""  # noqa: E501
+
+
+def draw_errors(robot: Mechanism, seed: int) -> Mechanism:
+    """Return a machine with drawn errors of all parameters."""
+    return robot.with_values(sample_truth(robot, 1, seed)[0])
+
+
+def get(robot: Mechanism, name: str) -> float:
+    """Return the value of a parameter [SI]."""
+    return float(robot.values[robot.parameters.index(name)])
+
+
+def draw_readings(robot: Mechanism, count: int) -> Array:
+    """Return readings of reachable poses."""
+    return sample_workspace(robot, count, seed=3).solution.q
+
+
+def point_at(x: float, length: float | Array, angle: Array) -> Array:
+    """Return the end (.., 2) of a crank on the x axis."""
+    return np.stack([x + length * np.cos(angle), length * np.sin(angle)], axis=-1)
+
+
+def test_a_crank_that_gears_turn_agrees_with_its_drawing(tmp_path: Path) -> None:
+    robot = draw_errors(load_text(tmp_path, GEARED), 1)
+    q = draw_readings(robot, 100)
+    solved = forward(robot, q)
+    assert solved.converged.all()
+    first = q[:, 0] + get(robot, "motor.offset")
+    second = get(robot, "gears.offset") - get(robot, "gears.weight.motor") * first
+    a, b = point_at(-0.1, 0.1, first), point_at(0.1, get(robot, "b.tip.x"), second)
+    center = solved.T[:, :2, 3]
+    gaps = np.linalg.norm(center - a, axis=1) - get(robot, "a.length")
+    assert np.abs(gaps).max() < 1e-9
+    assert np.abs(np.linalg.norm(center - b, axis=1) - 0.2).max() < 1e-9
+    assert_allclose(inverse(robot, solved.T).q, q, rtol=0, atol=1e-9)
+
+
+def test_gears_between_passive_joints_agree_with_their_drawing(tmp_path: Path) -> None:
+    robot = draw_errors(load_text(tmp_path, TRAIN), 1)
+    q = draw_readings(robot, 100)
+    solved = forward(robot, q)
+    center = solved.T[:, :2, 3]
+    rod = np.linalg.norm(center - [0.0, -0.05], axis=1)
+    assert_allclose(rod, q[:, 0] + get(robot, "rod.offset"), rtol=0, atol=1e-9)
+
+    def turn(x: float, crank: float, side: float) -> Array:
+        arm = center - [x, 0.0]
+        square = (arm**2).sum(axis=1)
+        cosine = (square + crank**2 - 0.04) / (2 * crank * np.sqrt(square))
+        return np.arctan2(arm[:, 1], arm[:, 0]) + side * np.arccos(cosine)
+
+    first, second = turn(-0.1, 0.1, 1.0), turn(0.1, get(robot, "b.tip.x"), -1.0)
+    total = first + get(robot, "gears.weight.b.pin") * second
+    assert_allclose(total, get(robot, "gears.offset"), rtol=0, atol=1e-8)
+    assert_allclose(inverse(robot, solved.T).q, q, rtol=0, atol=1e-9)
+
+
+def test_a_pinion_turns_by_the_path_of_its_rack(tmp_path: Path) -> None:
+    robot = draw_errors(load_text(tmp_path, RACK), 2)
+    q = draw_readings(robot, 100)
+    path = q[:, 0] * get(robot, "slide.gain")
+    radius = get(robot, "rack.radius.arm.pinion")
+    assert radius == pytest.approx(-0.012, abs=3e-4)
+    angle = (get(robot, "rack.offset") - path) / radius
+    T = forward(robot, q).T
+    assert_allclose(np.arctan2(T[:, 1, 0], T[:, 0, 0]), angle, rtol=0, atol=1e-12)
+    assert_allclose(T[:, 0, 3], path + 0.1 * np.cos(angle), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("text", [GEARED, TRAIN, RACK])
+def test_poses_of_coupled_joints_are_differentiated_by_all_terms(tmp_path: Path, text: str) -> None:
+    robot = draw_errors(load_text(tmp_path, text), 3)
+    check_pose_derivatives(robot, draw_readings(robot, 3)[None])
+
+
+@pytest.mark.parametrize("text", [GEARED, TRAIN, RACK])
+def test_calibration_finds_the_ratio_of_gears(tmp_path: Path, text: str) -> None:
+    robot = load_text(tmp_path, text)
+    truth = draw_errors(robot, 4)
+    instrument = Instrument((Sensor(Pose(), Gaussian(np.repeat([1e-5, 1e-6], 3))),))
+    poses = sample_workspace(robot, 40, seed=5).coordinates
+    fit = identify(robot, simulate(truth, poses, instrument, 6), MAP())
+    score = (fit.robot.values - truth.values)[fit.free_parameters.places] / fit.standard_deviations
+    assert np.sqrt(np.mean(score**2)) < 2.0
+    places = [i for i, name in enumerate(robot.parameters.names) if "gears.weight" in name]
+    assert (
+        np.abs(fit.robot.values - truth.values)[places].max(initial=0.0) < 2.5e-3
+    )  # a quarter of the tolerance
+    reached = forward(truth, compensate(fit.robot, poses[:10]).readings).T
+    moved = read_coordinates(reached, robot.controlled)
+    assert_allclose(moved, poses[:10], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("text", [GEARED, TRAIN, GRIPPER])
+def test_passive_joints_are_differentiated_also_where_they_are_coupled(tmp_path, text):
+    robot = draw_errors(load_text(tmp_path, text), 5)
+    values, q = robot.values[None], draw_readings(robot, 2)
+    state = forward_trials(robot, values, q[None])
+    known = differentiate_passive_joints(robot, values, q[None], state)
+    coupled = {"b.pin", "drvo.pin"} & set(known.names)
+    assert coupled
+
+    def move(x: Array) -> Array:
+        solved = forward_trials(robot, x, q[None], state)
+        joints = select_joint_values(robot, known.names, q[None], solved)
+        return np.stack([joints[name] for name in known.names], axis=2)
+
+    check_jacobian(
+        move,
+        known.parameters[0],
+        robot.values,
+        scale=0.01,
+        atol=1e-8,
+        atol_reason="[rad] Newton's own accuracy over the smallest step",
+        is_batched=True,
+    )
+
+
+def test_two_fingers_on_one_motor_agree_with_their_drawing(tmp_path: Path) -> None:
+    robot = draw_errors(load_text(tmp_path, GRIPPER), 6)
+    q = draw_readings(robot, 100)
+    state = forward_trials(robot, robot.values[None], q[None])
+    assert (state.status == Status.CONVERGED).all()
+    angle = q[:, 0] + get(robot, "motor.offset")
+    second = get(robot, "mimic.weight.motor") * angle  # its nominal value is negative
+    finger, other = state.T[0, :, :2, 3], state.others[0][0, :, :2, 3]
+    first = get(robot, "drv.tip.x")
+    assert_allclose(finger, np.add(point_at(0, first, angle), [0, 0.02]), rtol=0, atol=1e-9)
+    assert_allclose(other, np.add(point_at(0, 0.06, second), [0, -0.02]), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "said"),
+    [
+        (GEARED, "b.pin: 1", "b.pn: 1", "did you mean 'b.pin'"),
+        (GEARED, "motor: 2, b.pin: 1", "motor: 0, b.pin: 0", "no weight other than 0"),
+        (GEARED, "unknown: [offset, weight.motor]", "unknown: [weight.b]", "no term 'weight.b'"),
+        (GEARED, "{motor: 2, b.pin: 1}", "{motor: 2, b.pin: .inf}", "b.pin"),
+        (GEARED, "gears:", "other: {sum: {motor: 1, b.pin: 1}}\n  gears:", "leave out"),
+        (TRAIN, "gears:", "other: {sum: {a.pin: 2, b.pin: 2.4}}\n  gears:", "nothing new"),
+        (
+            TRAIN,
+            "gears:",
+            "other: {sum: {a.pin: 2, b.pin: 1}, offset: 290}\n  gears:",
+            "leave it 0 freedoms",
+        ),
+        (RACK, "sum: {slide: 1}", "sum: {slide: 1, arm.pinion: 2}", "under both"),
+        (RACK, "radius: {arm.pinion: -12}", "radius: {arm.way: -12}", "'arm.way' slides"),
+        (
+            RACK,
+            "of: length, sum: {slide: 1}, radius: {arm.pinion: -12}",
+            "of: length, sum: {arm.pinion: 1}",
+            "list it under `radius:`",
+        ),
+    ],
+)
+def test_impossible_couplings_are_refused(tmp_path, text, old, new, said):
+    changed = text.replace(old, new)
+    assert changed != text
+    with pytest.raises((FileError, MechanismError)) as refused:
+        load_text(tmp_path, changed)
+    assert said in str(refused.value)
