@@ -23,7 +23,7 @@ FINE = Instrument((Sensor(Pose(), Gaussian(np.repeat([5e-6, 2e-6], 3))),))
 LEFT_FINGER = Sensor(JointSensor(joints=("left.rail",)), Gaussian(np.array([20e-6])))
 ROBOTS = (
     "six-bar", "jansen-leg", "parallelogram-delta", "h4", "klann-leg", "gripper", "biped-leg",
-    "telescopic-delta", "cable-camera", "orthoglide",
+    "telescopic-delta", "cable-camera", "orthoglide", "par4", "warm-delta",
 )  # fmt: skip
 
 

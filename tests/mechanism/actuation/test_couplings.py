@@ -26,6 +26,7 @@ from loopcal.mechanism.workspace import sample_workspace
 from tests.jacobians import check_jacobian
 from tests.mechanism.derivatives import check_pose_derivatives
 from tests.robot_texts import load_text
+from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
 
@@ -253,3 +254,49 @@ def test_impossible_couplings_are_refused(tmp_path, text, old, new, said):
     with pytest.raises((FileError, MechanismError)) as refused:
         load_text(tmp_path, changed)
     assert said in str(refused.value)
+
+
+def test_the_gears_of_par4_turn_its_tool_as_its_closure_states() -> None:
+    nominal = load_cached_robot("par4")
+    robot = draw_errors(nominal, 7)
+    q = draw_readings(nominal, 100)
+    state = forward_trials(robot, robot.values[None], q[None])
+    assert (state.status == Status.CONVERGED).all()
+    front, back, bar = (T[0] for T in state.others)
+    tool = state.T[0]
+
+    def yaw(T: Array) -> Array:
+        return np.arctan2(T[:, 1, 0], T[:, 0, 0])
+
+    for half, name in ((front, "front"), (back, "back")):
+        at_bar = [get(robot, f"hinge-{name}.bar.{axis}") for axis in "xy"]
+        gap = half @ [0, 0.06, 0, 1] - bar @ [*at_bar, 0.0, 1.0]
+        assert np.abs(gap).max() < 1e-9
+    turn = get(robot, "gears.offset") - get(robot, "gears.weight.hinge-front.pin") * (
+        yaw(bar) - yaw(front)
+    )
+    assert_allclose(yaw(tool) - yaw(bar), turn, rtol=0, atol=1e-9)
+    assert_allclose(tool[:, :3, 3], bar[:, :3, 3], rtol=0, atol=1e-9)
+    motors = {1: (0.2, 0.2, 45), 2: (0.2, -0.2, -45), 3: (-0.2, -0.2, -135), 4: (-0.2, 0.2, 135)}
+    for name, half, elbow, ball in (
+        ("arm1a", front, 0.04, [1.7157, 88.2843]),
+        ("arm1b", front, -0.04, [58.2843, 31.7157]),
+        ("arm2", front, 0.0, [30, -60]),
+        ("arm3a", back, 0.04, [-1.7157, -88.2843]),
+        ("arm3b", back, -0.04, [-58.2843, -31.7157]),
+        ("arm4", back, 0.0, [-30, 60]),
+    ):
+        number = int(name[3])
+        x, y, heading = motors[number]
+        angle = q[:, number - 1] + get(robot, f"q{number}.offset")
+        c, s = np.cos(np.deg2rad(heading)), np.sin(np.deg2rad(heading))
+        reach = 0.3 * np.cos(angle)
+        tip = [x + c * reach - s * elbow, y + s * reach + c * elbow, -0.3 * np.sin(angle)]
+        end = half @ [ball[0] * 1e-3, ball[1] * 1e-3, 0.0, 1.0]
+        rod = np.linalg.norm(end[:, :3] - np.stack(tip, axis=1), axis=1)
+        assert_allclose(rod, get(robot, f"{name}.length"), rtol=0, atol=1e-9)
+
+
+def test_poses_of_par4_are_differentiated_by_all_terms() -> None:
+    robot = draw_errors(load_cached_robot("par4"), 3)
+    check_pose_derivatives(robot, draw_readings(robot, 2)[None])
