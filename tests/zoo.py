@@ -39,8 +39,8 @@ MM = 1e-3
 
 RELATIVES = {
     "3-rps", "6-pus", "cable-4", "cable-camera", "hexapod-nategh-agheli", "hexapod-octahedral",
-    "klann-leg", "linear-delta-6", "orthoglide", "palletizer", "pulley-3", "rotary-delta",
-    "solar-tracker", "telescopic-delta", "tricept",
+    "klann-leg", "linear-delta-6", "orthoglide", "palletizer", "par4", "pulley-3", "rotary-delta",
+    "solar-tracker", "telescopic-delta", "tricept", "warm-delta",
 }  # fmt: skip
 """Shipped robots whose closure another shipped robot has, too; here the evidence tests them."""
 

@@ -59,8 +59,9 @@ def make_case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
             [np.tile([s.axis not in (0, 1) for s in g.slots], len(g.limbs)) for g in p.groups]
         )
     steps = [0.03 * p.size if a.dimension.value == "length" else 0.05 for a in robot.actuators]
-    # sums of more lengths than there are readings
-    step = np.array([0.03 * p.size] * p.n_joints if robot.has_open_sums else steps)
+    # sums of more lengths than there are readings, or coupled joints
+    is_by_joint = robot.has_open_sums or bool(robot.assembly.couplings)
+    step = np.array([0.03 * p.size] * p.n_joints if is_by_joint else steps)
     q = actuated_joint_values(p, robot.home_state) + rng.uniform(-1, 1, (t, n, p.n_joints)) * step
     return Case(robot.name, p, e, q, robot.home_state)
 

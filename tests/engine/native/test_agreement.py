@@ -127,6 +127,8 @@ def test_inverse_solutions_agree_with_numpy_and_between_instruction_sets(name):
 def test_limbs_of_a_given_platform_agree_with_numpy_and_between_instruction_sets(name, t, n):
     case = make_robot_case(name, t, n)
     limbs = case.program.with_fixed_platform
+    if any(len(g.unknown_joints(True)) > len(g.rows) for g in limbs.groups):
+        pytest.skip("temperatures move joints of its limbs, which no platform determines")
     given = NUMPY.solve(case.program, case.e, case.q, case.home)
     given = replace(case.home, T=given.T)
     arguments = limbs, case.e, case.home_q, given, None, True
