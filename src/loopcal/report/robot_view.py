@@ -92,18 +92,24 @@ def _build_triangle_table(robot: Mechanism) -> Table:
 
 
 def _build_sum_table(robot: Mechanism) -> Table:
-    """Return what each reading is a sum of; no rows where each is a joint value."""
-    is_sum = any(a.weights for a in robot.actuators)
+    """Return what each reading is a sum of, and each coupling; no rows where each reading is a
+    joint value.
+    """
+    sums, couplings = robot.assembly.rows, robot.assembly.couplings
+    is_sum = any(row.weights for row in sums)
     rows = [
-        (a.name, format_sum(a.weights or dict.fromkeys(a.driven_joints, 1.0)))
-        for a in robot.actuators
+        (row.name, format_sum(row.weights or dict.fromkeys(row.driven_joints, 1.0)))
+        for row in sums
         if is_sum
     ]
     caption = "Sums: what the transmission of a reading gives"
-    if is_sum and robot.has_open_sums:
+    if couplings:
+        caption = "Sums: what readings give, and what couplings hold"
+    elif is_sum and robot.has_open_sums:
         count = f"{len(robot.actuators)} of {robot.program.n_joints} joints"
         caption = f"Sums: {count}, each of which the pose determines"
-    return make_table(caption, ("reading", word_column("sum of joint values", wraps=True)), rows)
+    title = "reading or coupling" if couplings else "reading"
+    return make_table(caption, (title, word_column("sum of joint values", wraps=True)), rows)
 
 
 def format_sum(weights: Mapping[str, float]) -> str:
@@ -209,9 +215,9 @@ def _build_ending_table(robot: Mechanism, units: Units) -> Table:
 def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
     """Return the terms that are not zero."""
     rows = []
-    for actuator in robot.actuators:
+    for actuator in robot.assembly.rows:
         joint_unit = units[_joint_dimension(robot, actuator.name)]
-        reading = units[actuator.dimension]
+        reading = units[_find_reading(robot, actuator.name)]
         limbs, driven = robot.assembly.limbs, actuator.driven_joints
         named = ((limb.name, joint) for limb in limbs for joint in limb.joints)
         joints = [f"{limb}/{joint.name}" for limb, joint in named if joint.actuator in driven]
@@ -228,7 +234,10 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
                     at = f" at {_format(point, reading)} {reading}"
                 rows.append((*first, term + at, format_number(number, DIGITS), unit))
         for joint, weight in actuator.weights.items():
-            rows.append((*first, f"{WEIGHT}{joint}", format_number(weight, DIGITS), "1"))
+            number, unit = weight, "1"
+            if _is_radius(robot, actuator.name, joint):
+                number, unit = weight / joint_unit.factor_to_si, f"{joint_unit}/rad"
+            rows.append((*first, f"{WEIGHT}{joint}", format_number(number, DIGITS), unit))
     drives = word_column("drives", wraps=True)
     columns = ("actuator", drives, "term", Column("value"), "unit")
     return make_table("Transmissions: from reading to joint value", columns, rows)
@@ -283,9 +292,10 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
     """Return factor to SI and symbol of what an address changes."""
     length = units[Dimension.LENGTH]
     if address.element == "transmission":
-        reading = units[next(a.dimension for a in robot.actuators if a.name == address.owner)]
+        reading = units[_find_reading(robot, address.owner)]
         if address.axis.startswith(WEIGHT):
-            return 1.0, "1"
+            is_radius = _is_radius(robot, address.owner, address.axis.removeprefix(WEIGHT))
+            return (length.factor_to_si, f"{length}/rad") if is_radius else (1.0, "1")
         if address.axis in ("skew.x", "skew.y"):
             return units[Dimension.ANGLE].factor_to_si, units[Dimension.ANGLE].symbol
         joint, power = units[_joint_dimension(robot, address.owner)], POWERS.get(address.axis, 0)
@@ -297,11 +307,27 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
     return unit.factor_to_si, unit.symbol
 
 
+def _find_reading(robot: Mechanism, name: str) -> Dimension:
+    """Return the dimension of the reading of a drive, or of the condition of a coupling; without
+    one that of its sum.
+    """
+    row = next(row for row in robot.assembly.rows if row.name == name)
+    return next((a.dimension for a in robot.actuators if a.name == row.column), row.dimension)
+
+
+def _is_radius(robot: Mechanism, name: str, joint: str) -> bool:
+    """Return whether a weight is a length per radian: that of an angle in a sum of lengths."""
+    turning = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
+    return joint in turning and _joint_dimension(robot, name) is Dimension.LENGTH
+
+
 def _joint_dimension(robot: Mechanism, name: str) -> Dimension:
     """Return the dimension of what the transmission of an actuator gives: a joint or a sum of
     joints, or the length of a triangle.
     """
-    actuator = next(a for a in robot.actuators if a.name == name)
+    actuator = next(row for row in robot.assembly.rows if row.name == name)
+    if actuator.column is not None:
+        return actuator.dimension
     joints = (joint for limb in robot.assembly.limbs for joint in limb.joints)
     driving = (j.kind for j in joints if j.actuator in actuator.driven_joints)
     return Dimension.LENGTH if actuator.is_triangle else JOINTS[next(driving, "P")][1]

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from loopcal.apply.compensation import compensate
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError, MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP
@@ -300,3 +301,33 @@ def test_the_gears_of_par4_turn_its_tool_as_its_closure_states() -> None:
 def test_poses_of_par4_are_differentiated_by_all_terms() -> None:
     robot = draw_errors(load_cached_robot("par4"), 3)
     check_pose_derivatives(robot, draw_readings(robot, 2)[None])
+
+
+def test_a_stage_of_a_chain_has_couplings_of_its_own(tmp_path: Path) -> None:
+    own = GEARED.partition("name: geared-five-bar\n")[2].partition("workspace:")[0]
+    text = """format: 1
+family: stages
+name: cell
+units: {length: mm, angle: deg}
+controlled: [x, z]
+stages:
+  - {name: lift, joint: {kind: P, axis: z, stroke: [-100, 100]}}
+  - name: bars
+    family: limbs
+""" + "".join(f"    {line}\n" for line in own.splitlines())
+    cell, bars = load_text(tmp_path, text), load_text(tmp_path, GEARED)
+    assert "bars.gears.weight.motor" in cell.parameters.names
+    inner = draw_readings(bars, 20)
+    q = np.column_stack([np.linspace(-0.05, 0.05, 20), inner])
+    machine = draw_errors(cell, 3)
+    alone = bars.with_values(machine.values[-len(bars.parameters) :])
+    T, expected = forward(machine, q).T, forward(alone, inner).T
+    assert_allclose(T[:, :2, 3], expected[:, :2, 3], rtol=0, atol=1e-12)
+    assert_allclose(inverse(machine, T).q, q, rtol=0, atol=1e-9)
+    check_pose_derivatives(machine, q[None, :2])
+
+
+@pytest.mark.parametrize("name", ["par4", "warm-delta"])
+def test_the_check_of_a_robot_lists_its_couplings(name, capsys):
+    assert main(["check", name, "--expand"]) == 0
+    assert "what couplings hold" in capsys.readouterr().out

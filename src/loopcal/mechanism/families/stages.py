@@ -176,6 +176,7 @@ def join_stages(record: Stages, stages: Sequence[AttachedStage]) -> Assembly:
         ),
         tuple(stages),
         held=record.held,
+        couplings=tuple(row for _, part in assemblies for row in part.couplings),
     )
 
 
@@ -189,7 +190,8 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
                 "make it part of the mount of the next stage",
                 i,
             )
-        own = dict.fromkeys(n for a in stage.assembly.actuators for n in (a.name, *a.driven_joints))
+        rows = (*stage.assembly.actuators, *stage.assembly.couplings)
+        own = dict.fromkeys(name for row in rows for name in (row.name, *row.driven_joints))
         for drive in own:
             if drive in owner:
                 raise StageError(
@@ -202,7 +204,7 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
 
 def _rename_address(prefix: str, part: Assembly, address: Address) -> Address:
     """Return an address with the names of the chain; actuators keep theirs."""
-    if address.element == "transmission" and address.owner in {a.name for a in part.actuators}:
+    if address.element == "transmission" and address.owner in {a.name for a in part.rows}:
         return address
     return replace(address, owner=f"{prefix}.{address.owner}")
 
