@@ -260,12 +260,16 @@ class Assembly:
         pins of triangles that a linear actuator turns.
         """
         read = {name for a in self.rows if not a.is_triangle for name in a.driven_joints}
+        own = {a.name for a in self.actuators}
         pairs = ((limb, joint) for limb in self.limbs for joint in limb.joints)
         return tuple(
             (limb, joint)
             for limb, joint in pairs
             if joint.actuator not in read
-            or f".{limb.name}.{joint.name}".endswith(f".{joint.actuator}")
+            or (
+                joint.actuator not in own
+                and f".{limb.name}.{joint.name}".endswith(f".{joint.actuator}")
+            )
         )
 
     @cached_property

@@ -11,6 +11,7 @@ from loopcal.apply.compensation import compensate
 from loopcal.errors import FileError, MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP
+from loopcal.estimate.result import Identification
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
@@ -106,22 +107,32 @@ def test_a_file_states_conditions_in_their_units(tmp_path: Path) -> None:
     assert_allclose(data.readings, [[0.01, 120, 30], [0.02, 180, 20]], rtol=0, atol=1e-12)
 
 
+def fit_machine(robot: Mechanism, seed: int) -> tuple[Mechanism, Identification]:
+    """Return a machine with drawn errors, and the fit of its measurements."""
+    machine = robot.with_values(sample_truth(robot, 1, seed)[0])
+    poses = sample_workspace(robot, 25, seed=seed + 100).solution.T
+    return machine, identify(robot, simulate(machine, poses, INSTRUMENT, seed), MAP())
+
+
 def test_slopes_of_simulated_machines_are_as_accurate_as_stated() -> None:
     robot = load_cached_robot("warm-delta")
     scores = []
     for seed in range(20):
-        machine = robot.with_values(sample_truth(robot, 1, seed)[0])
-        poses = sample_workspace(robot, 25, seed=seed + 100).solution.T
-        fit = identify(robot, simulate(machine, poses, INSTRUMENT, seed), MAP())
+        machine, fit = fit_machine(robot, seed)
         deviation = (fit.robot.values - machine.values)[fit.free_parameters.places]
         scores.append(deviation / fit.standard_deviations)
     # 480 values of a standard normal distribution
     assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.1
-    warm = {"temperature.base": 27.0, "temperature.arms": 40.0}
-    machine, model = machine.with_conditions(warm), fit.robot.with_conditions(warm)
-    q = compensate(model, poses[:5]).readings
+
+
+def test_compensation_holds_todays_temperatures() -> None:
+    robot = load_cached_robot("warm-delta")
+    machine, fit = fit_machine(robot, 1)
+    poses = sample_workspace(robot, 5, seed=2).solution.T
+    today = {"temperature.base": 27.0, "temperature.arms": 40.0}
+    q = compensate(fit.robot.with_conditions(today), poses).readings
     assert_allclose(q[:, 3:], np.tile([27.0, 40.0], (5, 1)))
-    assert_allclose(forward(machine, q).T[:, :3, 3], poses[:5, :3, 3], rtol=0, atol=3e-5)
+    assert_allclose(forward(machine, q).T[:, :3, 3], poses[:, :3, 3], rtol=0, atol=3e-5)
 
 
 @pytest.mark.parametrize(

@@ -368,15 +368,17 @@ def load_changed_robot(
 # ------------------------------------------------------------------------
 @pytest.mark.parametrize("name", LIMBS)
 def test_shipped_limbs_files_load_with_the_complete_model(tmp_path: Path, name: str) -> None:
-    """Named parameters keep their names, actuators have one offset, no column is duplicated."""
+    """Named parameters keep their names, drives and couplings have one offset, no column is
+    duplicated.
+    """
     ideal, complete = (
         load_robot(name),
         load_changed_robot(tmp_path, name, more="error_model: complete"),
     )
     assert set(ideal.parameters.names) <= set(complete.parameters.names)
     assert len(complete.parameters) > len(ideal.parameters)
-    for actuator in complete.actuators:
-        assert complete.parameters.names.count(f"{actuator.name}.offset") == 1
+    for row in complete.assembly.rows:
+        assert complete.parameters.names.count(f"{row.name}.offset") == 1
     matrix = complete.slots.matrix / np.linalg.norm(complete.slots.matrix, axis=0)
     assert np.linalg.matrix_rank(matrix) == len(complete.parameters)
 

@@ -8,7 +8,7 @@ mechanism/transmission.py. How to write it: docs/robots.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
@@ -331,11 +331,6 @@ class DrivenJoint:
     rotation: FloatArray
     start: float
 
-    @property
-    def is_passive(self) -> bool:
-        """Whether it is a passive joint in a sum or coupling, which the name of its limb shows."""
-        return self.name.startswith(f"{self.limb}.")
-
 
 @dataclass(frozen=True, eq=False)
 class PlacedDrive:
@@ -477,9 +472,9 @@ def couple_joints(
     drives: Mapping[str, Drive],
     stated: Mapping[str, Coupling],
     conditions: Mapping[str, Condition],
-) -> tuple[tuple[PlacedLimb, ...], tuple[PlacedCoupling, ...]]:
+) -> tuple[tuple[PlacedLimb, ...], tuple[PlacedCoupling, ...], frozenset[str]]:
     """Return the couplings of a file, and its limbs with `limb.joint` as the drive of each passive
-    joint that a coupling, or the sum of a drive, names.
+    joint that a coupling, or the sum of a drive, names; also these names.
 
     A coupling of limbs that are copied is one for each copy. Raises MechanismError: unknown joints,
     and couplings of unlike ones.
@@ -520,15 +515,17 @@ def couple_joints(
             )
     used = {joint for coupling in couplings for joint in coupling.weights}
     used |= {joint for drive in drives.values() for joint in getattr(drive, "sum", ())}
-    placed = []
+    placed, passive = [], set[str]()
     for limb in limbs:
         names = [joint.actuator or f"{limb.name}.{joint.name}" for joint in limb.limb.joints]
         joints = tuple(
             replace(joint, actuator=name) if name in used else joint
             for joint, name in zip(limb.limb.joints, names, strict=True)
         )
+        own = zip(limb.limb.joints, names, strict=True)
+        passive |= {name for joint, name in own if not joint.actuator and name in used}
         placed.append(limb._replace(limb=replace(limb.limb, joints=joints)))
-    return tuple(placed), tuple(couplings)
+    return tuple(placed), tuple(couplings), frozenset(passive)
 
 
 def _place_coupling(
@@ -634,12 +631,13 @@ def place_drives(
     stated: Mapping[str, Drive],
     own: Iterable[Actuator] = (),
     couplings: Iterable[PlacedCoupling] = (),
+    passive: Collection[str] = (),
 ) -> dict[str, PlacedDrive]:
     """Return the drives by name, in the order of the readings, with their joints.
 
     A drive that several limbs name is one drive. stated : the drives of the file; one that is not
-    listed reads the joint itself. own : what the family knows of its drives. couplings : of their
-    joints, those of `couple_joints`.
+    listed reads the joint itself. own : what the family knows of its drives. couplings, passive :
+    of `couple_joints`.
     Raises MechanismError: a drive without a joint, or of another kind than its joint.
     """
     joints: dict[str, DrivenJoint] = {}
@@ -669,7 +667,7 @@ def place_drives(
             drives[name] = replace(placed, weights={} if own_joint else weights)
     else:
         for name, joint in joints.items():
-            if not joint.is_passive:
+            if name not in passive:
                 drives[name] = place(name, stated.get(name) or stated.get(joint.stated), joint)
         if rows:
             check_rows({name: {name: 1.0} for name in drives} | rows, limb_of)

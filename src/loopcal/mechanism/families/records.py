@@ -189,8 +189,9 @@ class RobotRecord:
         errors : the unknowns of the family. own : what the family knows of its drives. complete :
         tolerances of the errors of every link and drive, which are unknown, too, where stated.
         """
-        limbs, couplings = couple_joints(limbs, self.drives, self.couplings, self.conditions)
-        drives = place_drives(limbs, self.drives, own, couplings)
+        placed = couple_joints(limbs, self.drives, self.couplings, self.conditions)
+        limbs, couplings, passive = placed
+        drives = place_drives(limbs, self.drives, own, couplings, passive)
         rows = {**drives, **{coupling.name: coupling for coupling in couplings}}
         errors = join_errors(
             (
