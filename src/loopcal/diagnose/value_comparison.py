@@ -32,7 +32,8 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.geometry import align_point_sets, log_so3
 from loopcal.measure.instrument import make_random_stream
-from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.inverse import inverse_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
 from loopcal.mechanism.states import Status

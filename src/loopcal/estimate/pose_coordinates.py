@@ -34,7 +34,8 @@ from loopcal.estimate.observation_rows import ObservationRows, whiten
 from loopcal.findings import report_finding
 from loopcal.mechanism.actuation import DrivenJoints, differentiate_at_pose, solve_at_pose
 from loopcal.mechanism.assembly import Actuator
-from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.inverse import inverse_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import differentiate_by_coordinates, inverse

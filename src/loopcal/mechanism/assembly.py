@@ -241,6 +241,8 @@ class Assembly:
     @cached_property
     def rows(self) -> tuple[Actuator, ...]:
         """The rows that determine the driven joints: commanded actuators, then couplings."""
+        if self.stages:
+            return tuple(row for stage in self.stages for row in stage.assembly.rows)
         return (*(a for a in self.actuators if a.reference is None), *self.couplings)
 
     @cached_property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forward kinematics and derivatives of chains; those of a single stage are handed over.
+"""Chains of stages: their states from those of the stages, and the transport of twists.
 
 With T_s = T_parent M_s X_s(q_s), M_s the mount and X_s the pose of stage s in its own base, the
 twist of the end platform is the sum of the twists of the stages that carry it, each transported:
@@ -8,36 +8,17 @@ omega = R_s omega_s, v = R_s v_s + omega x (p_end - p_s). Derivation: docs/theor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
-from loopcal.mechanism.actuation import OpenSums, list_open_sums
-from loopcal.mechanism.limb_rows import follow_limb, measure_rod, place_links, sum_displacements
+from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
 from loopcal.mechanism.model import Mechanism, Stage
-from loopcal.mechanism.platform_coordinates import (
-    POSITION,
-    compare_coordinates,
-    pose_from_coordinates,
-    read_coordinates,
-)
-from loopcal.mechanism.states import Status, driven_values, without_poses
-from loopcal.mechanism.transmission import (
-    apply_weights,
-    find_fixed_rows,
-    find_reversed,
-    find_triangles,
-    joints_from_readings,
-    select_weights,
-    transmit_readings,
-)
-from loopcal.numerics.trial_batch import map_arrays
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray
 
 # States of a chain: those of its stages, joined, and the frames of its platforms.
 
@@ -61,8 +42,10 @@ class ChainState(State):
     signs: tuple[NDArray[np.int8], ...] = ()
 
 
-def join_stage_states(robot: Mechanism, states: Sequence[State]) -> ChainState:
-    """Return the state of a chain (t, n) whose stages have these states (t, n)."""
+def join_stage_states(robot: Mechanism, states: Sequence[State]) -> State:
+    """Return the state (t, n) of a robot whose blocks have these states (t, n)."""
+    if not robot.stages:
+        return states[0]
     poses = tuple(state.T for state in states)
 
     def rank(status: NDArray[np.int8]) -> NDArray[np.int8]:
@@ -88,7 +71,9 @@ def join_stage_states(robot: Mechanism, states: Sequence[State]) -> ChainState:
 
 
 def split_stage_states(robot: Mechanism, state: State) -> list[State]:
-    """Return the states of the stages of a chain; each has the status of the chain."""
+    """Return the states of the blocks of a robot; those of a chain have its status."""
+    if not robot.stages:
+        return [state]
     assert isinstance(state, ChainState)
     counts = [len(stage.robot.program.others) for stage in robot.stages]
     first = np.cumsum([0, *counts])
@@ -146,9 +131,9 @@ NO_READINGS = np.zeros((1, 1, 0))
 def each_stage(
     robot: Mechanism, values: FloatArray, state: State, q: FloatArray = NO_READINGS
 ) -> Iterator[StagePart]:
-    """Yield the stages of a chain with their own values, states and readings."""
+    """Yield the blocks of a robot with their own values, states and readings."""
     count = len(robot.actuators)
-    for stage, own in zip(robot.stages, split_stage_states(robot, state), strict=True):
+    for stage, own in zip(robot.blocks, split_stage_states(robot, state), strict=True):
         readings = q[..., :count][..., stage.actuators]
         if q.shape[-1] > count:
             directions = q[..., count:][..., stage.actuators]
@@ -158,19 +143,17 @@ def each_stage(
 
 def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
     """Return the stages that carry the platform of a stage (default: the end), from the base on."""
-    carrying, i = [], end % len(robot.stages)
+    carrying, i = [], end % len(robot.blocks)
     while i >= 0:
         carrying.append(i)
-        i = robot.stages[i].parent
+        i = robot.blocks[i].parent
     return carrying[::-1]
 
 
 def find_carrying_actuators(robot: Mechanism) -> IntArray:
     """Return the places of the actuators that move the end platform and are not held."""
     places = np.flatnonzero([a.reference is None for a in robot.actuators])
-    if not robot.stages:
-        return places
-    stages = [robot.stages[i] for i in list_carrying_stages(robot)]
+    stages = [robot.blocks[i] for i in list_carrying_stages(robot)]
     names, own = [actuator.name for actuator in robot.actuators], np.arange(len(robot.actuators))
     carrying = np.concatenate([own[stage.actuators] for stage in stages])
     held = robot.assembly.held
@@ -213,599 +196,3 @@ def select_platform_entries(robot: Mechanism, state: State) -> dict[str, FloatAr
         numbers = np.moveaxis(T[..., :3, :].reshape(*T.shape[:-2], 12), -1, 0)
         entries |= dict(zip(name_platform_entries(stage.name), numbers, strict=True))
     return entries
-
-
-# A sphere that the platform cannot leave, from the lengths of the links.
-
-ROUNDING = 1e-9
-"""Excess, relative to the robot's size, of a target at the bound itself."""
-
-
-def measure_target_excess(robot: Mechanism, values: FloatArray, target: FloatArray) -> FloatArray:
-    """Return how far (R,) coordinates (R, c) lie beyond what links can span [m]; at most 0 within.
-
-    values : (1 | R, p). Coordinates of the position that are not controlled are free.
-    """
-    columns = [i for i, name in enumerate(robot.controlled) if name in POSITION]
-    if not columns:
-        return np.full(len(target), -np.inf)
-    center, radius = bound_platform(robot, values)
-    axes = [POSITION.index(robot.controlled[i]) for i in columns]
-    far = np.linalg.norm(target[:, columns] - center[:, axes], axis=1)
-    return far - radius - ROUNDING * robot.size
-
-
-def bound_platform(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return center (t, 3) and radius (t,) of a sphere around all positions of the platform [m].
-
-    values : (t, p). The radius is infinite where no limb bounds it.
-    """
-    if not robot.stages:
-        return _bound_by_limbs(robot, values)
-    whole, first = np.zeros(len(values)), np.zeros((len(values), 3))
-    for number, i in enumerate(list_carrying_stages(robot)):
-        stage = robot.stages[i]
-        center, radius = bound_platform(stage.robot, values[:, stage.parameters])
-        center = center @ stage.mount[:3, :3].T + stage.mount[:3, 3]
-        if number:  # both turn with the platform before
-            whole = whole + np.linalg.norm(center, axis=1)
-        else:
-            first = center
-        whole = whole + radius
-    return first, whole
-
-
-def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the smallest sphere (t, 3), (t,) about the first joint of a limb."""
-    center, radius = np.zeros((len(values), 3)), np.full(len(values), np.inf)
-    is_exact = robot.is_serial or (robot.program.is_square and not robot.program.may_stay_open)
-    if not is_exact:  # loops of redundant actuators, among others, may stay open
-        return center, radius
-    e, _ = robot.slots(values)
-    for group in robot.program.groups:
-        displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
-        for k in range(len(group.limbs)):
-            if (group.on[k], group.to[k]) != (BASE, PLATFORM):
-                continue
-            slides = "P" in group.joints or bool(group.pitch[k].any()) or group.actuator[-1, k] >= 0
-            if slides or any(slot.axis == PITCH for slot in group.slots):
-                continue  # a joint changes the distance of its neighbors
-            move, _ = sum_displacements(group, k, displacements[:, k])
-            links = group.links[k]
-            origins = links[:, :3, 3] + np.matmul(links[:, :3, :3], move[..., 3:, None])[..., 0]
-            length = np.linalg.norm(origins[:, 1:], axis=-1).sum(axis=1)
-            length = length + measure_rod(group, k, displacements[:, k])
-            shorter = length < radius
-            center = np.where(shorter[:, None], origins[:, 0], center)
-            radius = np.where(shorter, length, radius)
-    return center, radius
-
-
-# Inverse kinematics by the forward one: Newton's method on the driven joints, c(T(u)) = c*.
-
-STEPS = 60
-"""Newton steps of a row."""
-CLOSE, CLOSE_ON_PATH = 1e-12, 1e-4
-"""Distance from the target coordinates, relative to the robot's size, of a solved row, and of one
-that only begins the next step of its path.
-
-A forward solution is known to 1e-13 of the size.
-"""
-LONGEST_STEP = 0.5
-"""Longest step of a joint: in radians, or relative to the robot's size."""
-SHORTEST_SHARE = 1e-3
-"""Share of a step that must bring a row closer to its target; below it the target is not
-reachable from here."""
-PROGRESS, PROGRESS_STEPS, PROGRESS_ON_PATH = 0.5, 10, 5
-"""Share of its distance from the target that a row must lose in so many steps, else it has stalled;
-fewer on a path, whose targets are near.
-
-In ten steps the longest ones turn a joint by 5 rad. Steps close to a stretched arm gain less.
-"""
-NEXT, LAST = (1, 2, 0), (2, 0, 1)
-"""Components of a cross product: a x b = a[NEXT] b[LAST] - a[LAST] b[NEXT]."""
-PATH_STEPS = 8
-"""Steps of the path from the start's pose to a target."""
-
-
-LoopSolver = Callable[..., State]
-"""Closes loops at driven joints or sums u (t | 1, n, u), as `close_at_joints` does."""
-LoopDerivative = Callable[..., FloatArray]
-"""Differentiates the pose of loops by joints or sums, as `differentiate_by_drives` does."""
-Proposal = Callable[[FloatArray, FloatArray, State], State]
-"""Returns states near targets (R, c), whose readings are only almost right, from the values and a
-start; states are (R, 1), like the start.
-"""
-
-
-@dataclass(frozen=True, eq=False)
-class _Iterate:
-    """R rows: their driven joints u, the states (R, 1) of the stages with loops, and the rest.
-
-    u : (R, u) values of joints, of a stage with open sums these sums [m, rad].
-    T : (R, 4, 4) end platform [m]. D : (R, 6, u) its twists by the drives, NaN with open loops.
-    gap : (R,) distance from the target [m].
-    step : (R, u) Newton step. sign : (R,) of det(C D), 1 with more drives than coordinates.
-    status, count : (R,) of the iteration.
-    """
-
-    u: FloatArray
-    loops: tuple[State, ...]
-    T: FloatArray
-    D: FloatArray
-    gap: FloatArray
-    step: FloatArray
-    sign: FloatArray
-    status: NDArray[np.int8]
-    count: IntArray
-
-    def take(self, rows: IntArray) -> _Iterate:
-        """Return some rows."""
-        return map_arrays(lambda a: a[rows], self)
-
-    def put(self, rows: IntArray, new: _Iterate) -> _Iterate:
-        """Return the same rows with some replaced."""
-
-        def replaced(old: np.ndarray, part: np.ndarray) -> np.ndarray:
-            out = np.array(old)
-            out[rows] = part
-            return out
-
-        return map_arrays(replaced, self, new)
-
-
-class _SerialJoints(NamedTuple):
-    """The joints of the serial stages of a chain, between displaced links.
-
-    places : the joints of each stage. column : (E,) the place of each among the drives.
-    turn, advance : (1 | R, E) radians and metres of motion per unit of the joint; that of a stage
-        without joints does not move.
-    before, after : (1 | R, E, 4, 4) links on both sides; after the last joint of a stage only.
-    """
-
-    places: tuple[range, ...]
-    column: IntArray
-    turn: FloatArray
-    advance: FloatArray
-    before: FloatArray
-    after: FloatArray
-
-    def move(self, u: FloatArray) -> FloatArray:
-        """Return the motions (R, E, 4, 4) from before the links to behind them."""
-        value = u[:, self.column]
-        angle = self.turn * value
-        M = np.zeros((*value.shape, 4, 4))
-        M[..., 0, 0] = M[..., 1, 1] = np.cos(angle)
-        M[..., 1, 0] = np.sin(angle)
-        M[..., 0, 1] = -M[..., 1, 0]
-        M[..., 2, 2] = M[..., 3, 3] = 1.0
-        M[..., 2, 3] = self.advance * value
-        return self.before @ M @ self.after
-
-
-def _place_serial_joints(stages: Sequence[Stage], e: Sequence[FloatArray]) -> _SerialJoints:
-    """Return the joints of the serial stages for the displacements (t, d) of each stage."""
-    serial = [stage for stage in stages if stage.robot.is_serial]
-    counts = [max(len(stage.robot.program.groups[0].joints), 1) for stage in serial]
-    shape = len(e[0]), sum(counts)
-    before, after = np.zeros((2, *shape, 4, 4)) + np.eye(4)
-    turn, advance = np.zeros((2, *shape))
-    column, places = np.zeros(shape[1], int), list[range]()
-    last = 0
-    for own, displacements in zip(stages, e, strict=True):
-        first = last
-        if own.robot.is_serial:
-            (group,) = own.robot.program.groups
-            J = len(group.joints)
-            last = first + max(J, 1)
-            links, pitch = place_links(group, 0, displacements)
-            place = slice(first, first + J)
-            before[:, place] = links[:, :J]
-            after[:, last - 1] = links[:, J] @ geometry.invert_pose(links[:, -1])
-            turn[:, place] = [letter == "R" for letter in group.joints]
-            advance[:, place] = np.where(turn[:, place] > 0.0, pitch, 1.0)
-            column[place] = own.actuators.start + group.actuator[:J, 0]
-        places.append(range(first, last))
-    return _SerialJoints(tuple(places), column, turn, advance, before, after)
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """R rows of a robot: what the parameter values make of it, and their targets.
-
-    A robot of one stage is a chain of itself.
-
-    values : (1 | R, p). target : (R, c) controlled coordinates. e, sums, terms : displacements,
-        open sums, and transmissions of each stage, (1 | R, ..).
-    sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
-    units : (u,) lengths that a unit of each drive counts for: the robot's size for an angle.
-    spans : (u,) strokes of the drives, of which steps take equal shares with more drives than
-        coordinates; a full turn or the size without a stroke, and where the step is unique.
-    """
-
-    robot: Mechanism
-    stages: tuple[Stage, ...]
-    values: FloatArray
-    target: FloatArray
-    e: tuple[FloatArray, ...]
-    sums: tuple[OpenSums | None, ...]
-    terms: tuple[FloatArray, ...]
-    sign: FloatArray
-    serial: _SerialJoints
-    units: FloatArray
-    spans: FloatArray
-    moving: IntArray
-    close: LoopSolver
-    differentiate: LoopDerivative
-
-    def select(self, rows: IntArray) -> _Rows:
-        """Return some rows."""
-
-        def chosen(a: np.ndarray) -> np.ndarray:
-            return a if len(a) == 1 else a[rows]
-
-        chosen_arrays = {
-            name: map_arrays(chosen, getattr(self, name))
-            for name in ("values", "e", "sums", "terms")
-        }
-        serial = self.serial._replace(
-            **{name: chosen(getattr(self.serial, name)) for name in self.serial._fields[2:]}
-        )
-        own = self.target[rows], self.sign[rows]
-        return replace(self, target=own[0], sign=own[1], serial=serial, **chosen_arrays)
-
-    def evaluate(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
-        """Return the iterate at driven joints u (R, u); its gap is infinite where a loop stays
-        open.
-        """
-        R = len(u)
-        loops, ok = [], np.isfinite(u).all(axis=1)
-        for i, start in zip(self._list_loops(), begin, strict=True):
-            stage, own = self.stages[i], u[:, None, self.stages[i].actuators]
-            weights, sums = None, self.sums[i]
-            if sums is not None:
-                weights, own = sums.weights, sums.complete(own)
-            part = self.close(stage.robot, self.e[i], own, start, follow=False, weights=weights)
-            ok &= part.status[:, 0] == CONVERGED
-            loops.append(part)
-        with np.errstate(invalid="ignore"):
-            T, D = self._move(u, loops)
-        D[~ok] = np.nan
-        none = np.zeros(R)
-        status = none.astype(np.int8)
-        return self.aim(
-            _Iterate(u, tuple(loops), T, D, none, none[:, None], none, status, none.astype(int))
-        )
-
-    def aim(self, now: _Iterate) -> _Iterate:
-        """Return an iterate with the distance from the target and the step towards it."""
-        with np.errstate(invalid="ignore"):
-            residual, columns = compare_coordinates(
-                now.T, self.target, self.robot.controlled, self.robot.size
-            )
-            slope = np.matmul(columns, now.D)[..., self.moving] * self.spans[self.moving]
-        ok = np.isfinite(slope).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
-        if not ok.all():
-            slope[~ok], residual[~ok] = np.eye(*slope.shape[1:]), 0.0
-        is_square = slope.shape[1] == slope.shape[2]
-        sign = np.sign(np.linalg.det(slope)) if is_square else np.ones(len(ok))
-        inverse = np.linalg.inv(slope) if is_square and sign.all() else np.linalg.pinv(slope)
-        step = np.zeros_like(now.u)
-        step[:, self.moving] = -np.matmul(inverse, residual[..., None])[..., 0]
-        step *= self.spans
-        # no joint moves farther than the longest step: in radians, or sizes of the robot
-        length = np.abs(step * self.units).max(axis=1, initial=0.0) / self.robot.size
-        longest = np.maximum(length, LONGEST_STEP)
-        return replace(
-            now,
-            gap=np.where(ok, np.linalg.norm(residual, axis=1), np.inf),
-            step=step * (LONGEST_STEP / longest)[:, None],
-            sign=np.where(ok, sign, 0.0),
-        )
-
-    def _list_loops(self) -> list[int]:
-        """Return the stages with loops."""
-        return [i for i, stage in enumerate(self.stages) if not stage.robot.is_serial]
-
-    def _move(self, u: FloatArray, loops: Sequence[State]) -> tuple[FloatArray, FloatArray]:
-        """Return the end platform (R, 4, 4) and its twists by the drives (R, 6, u)."""
-        X = self.serial.move(u)
-        ends: list[FloatArray] = []
-        F = np.empty((len(u), 4, 4, len(self.serial.column)))  # frames whose z axes are the joints
-        D = np.zeros((len(u), 6, u.shape[1]))
-        pieces, parts = [], iter(loops)
-        for i, stage in enumerate(self.stages):
-            T = stage.mount if stage.parent < 0 else ends[stage.parent] @ stage.mount
-            if stage.robot.is_serial:
-                for k in self.serial.places[i]:
-                    F[..., k] = T @ self.serial.before[:, k]
-                    T = T @ X[:, k]
-            else:
-                part = next(parts)
-                base, T = T, T @ part.T[:, 0]
-                pieces.append((i, base, T, part))
-            ends.append(T)
-        T = np.broadcast_to(ends[-1], (len(u), 4, 4))
-        for i, base, at, part in pieces:
-            stage, sums = self.stages[i], self.sums[i]
-            place = stage.actuators
-            robot, e, own = stage.robot, self.e[i], u[:, None, place]
-            if sums is None:
-                by_drive = self.differentiate(robot, e, own, part, None)[:, 0]
-            else:
-                by_drive = np.zeros((len(u), 6, own.shape[2]))
-                by_sum = self.differentiate(robot, e, sums.complete(own), part, sums.weights)
-                by_drive[..., : sums.chosen] = by_sum[:, 0, :, : sums.chosen]
-            arm = np.matmul(np.swapaxes(base[..., :3, :3], -1, -2), (T - at)[:, :3, 3:])[..., 0]
-            D[..., place] = geometry.transport_matrix(arm, base[..., :3, :3]) @ by_drive
-        axis, arm = F[:, :3, 2], T[:, :3, 3, None] - F[:, :3, 3]
-        turn, across = self.serial.turn[:, None] * axis, axis[:, NEXT] * arm[:, LAST]
-        moved = self.serial.turn[:, None] * (across - axis[:, LAST] * arm[:, NEXT])
-        moved += self.serial.advance[:, None] * axis
-        D[..., self.serial.column] += np.concatenate([turn, moved], axis=1)
-        return T, D
-
-    def is_in_other_mode(self, now: _Iterate) -> BoolArray:
-        """Return the rows (R,) beyond a singularity, of which an open start knows none, or beyond
-        the dead center of a triangle drive.
-        """
-        beyond = (now.sign != self.sign) & (self.sign != 0.0)
-        for stage, tau in zip(self.stages, self.terms, strict=True):
-            triangles = find_triangles(tau)
-            if len(triangles):
-                u = now.u[:, None, stage.actuators]
-                weights = select_weights(tau, stage.robot.slots.constants)
-                if weights is not None and weights.shape[2] == u.shape[2]:
-                    u = apply_weights(weights, u)
-                beyond |= find_reversed(u, tau, triangles)[:, 0].any(axis=1)
-        return beyond
-
-    def iterate(self, start: _Iterate, on_path: bool = False) -> _Iterate:
-        """Return the last iterates from a start; a row has arrived if its gap is small.
-
-        The status of a row that has not arrived in its mode says why.
-        """
-        size, R = self.robot.size, len(start.u)
-        close = (CLOSE_ON_PATH if on_path else CLOSE) * size
-        period = PROGRESS_ON_PATH if on_path else PROGRESS_STEPS
-        done = now = start
-        rows, alive, share = self, np.arange(R), np.ones(R)
-        before = now.gap
-        for count in range(STEPS + 1):
-            arrived = now.gap <= close
-            broken = ~np.isfinite(now.gap)
-            end = arrived | broken | (share < SHORTEST_SHARE)
-            if count % period == 0 and count:
-                end |= now.gap > PROGRESS * before
-                before = now.gap
-            if end.any() or count == STEPS:
-                status = np.where(end, np.int8(STALLED), np.int8(EXHAUSTED))
-                status[broken], status[arrived] = NOT_FINITE, CONVERGED
-                now = replace(now, status=status, count=np.full(len(end), count))
-                done = now if len(alive) == R else done.put(alive, now)
-                keep = np.flatnonzero(~end)
-                if not len(keep) or count == STEPS:
-                    break
-                rows, now = rows.select(keep), now.take(keep)
-                alive, share, before = alive[keep], share[keep], before[keep]
-            trial = rows.evaluate(now.u + share[:, None] * now.step, now.loops)
-            better = trial.gap <= np.maximum((1 - 1e-4 * share) * now.gap, close)
-            share = np.where(better, np.minimum(1.0, 4 * share), 0.25 * share)
-            if better.all():
-                now = trial
-            elif better.any():
-                chosen = np.flatnonzero(better)
-                now = now.put(chosen, trial.take(chosen))
-        is_other = (done.status == CONVERGED) & self.is_in_other_mode(done)
-        return replace(done, status=np.where(is_other, np.int8(Status.OTHER_MODE), done.status))
-
-    def list_states(self, now: _Iterate) -> list[State]:
-        """Return the states (R, 1) of all stages at an iterate."""
-        parts = iter(now.loops)
-        return [
-            solve_serial(stage.robot, e, now.u[:, None, stage.actuators])
-            if stage.robot.is_serial
-            else next(parts)
-            for stage, e in zip(self.stages, self.e, strict=True)
-        ]
-
-
-def solve_by_drives(
-    robot: Mechanism,
-    values: FloatArray,
-    target: FloatArray,
-    begin: State,
-    close: LoopSolver,
-    differentiate: LoopDerivative,
-    propose: Proposal | None = None,
-    follow: bool = True,
-) -> State:
-    """Return states (t, n) at controlled coordinates (t | 1, n, c); marks rows that fail.
-
-    With `propose`, rows begin at the states that it returns, if these converged. Without `follow`,
-    rows that fail are not solved again along a path.
-    """
-    t, n = max(len(values), len(target)), target.shape[1]
-    if not n:
-        return without_poses(begin, t)
-    wanted = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
-    own = values if len(values) == 1 else np.repeat(values, n, axis=0)
-    rows = _make_rows(robot, own, wanted, close, differentiate)
-    first = map_arrays(
-        lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])).reshape(t * n, 1, *a.shape[2:]), begin
-    )
-    start = _begin(rows, first)
-    rows = replace(rows, sign=start.sign)
-    last = _solve_within_reach(rows, start, first, propose, follow)
-    status = np.where(np.isfinite(wanted).all(axis=1), last.status, np.int8(NOT_FINITE))
-    states = rows.list_states(last)
-    state = join_stage_states(robot, states) if robot.stages else states[0]
-    left = np.linalg.norm(
-        compare_coordinates(last.T, wanted, robot.controlled, robot.size)[0], axis=1
-    )
-    state = replace(
-        state,
-        status=status[:, None],
-        residual=np.where(status == CONVERGED, 0.0, left)[:, None],
-        iterations=last.count[:, None],
-    )
-    return map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
-
-
-def _make_rows(
-    robot: Mechanism,
-    values: FloatArray,
-    target: FloatArray,
-    close: LoopSolver,
-    differentiate: LoopDerivative,
-) -> _Rows:
-    """Return rows with values (1 | R, p) and targets (R, c)."""
-    stages = robot.stages
-    if not stages:
-        whole = slice(len(robot.parameters)), slice(0, len(robot.actuators)), slice(None)
-        stages = (Stage(robot.name, -1, np.eye(4), robot, *whole),)
-    slots = [stage.robot.slots(values[:, stage.parameters]) for stage in stages]
-    e = tuple(own for own, _ in slots)
-    sums = tuple(
-        list_open_sums(stage.robot, values[:, stage.parameters])
-        if stage.robot.has_open_sums or stage.robot.assembly.couplings
-        else None
-        for stage in stages
-    )
-    turns: list[bool] = []
-    for stage in stages:
-        assembly = stage.robot.assembly
-        joints = (joint for limb in assembly.limbs for joint in limb.joints)
-        turning = {joint.actuator for joint in joints if joint.kind == "R"}
-        drives = [(name,) for name in assembly.driven_joints]
-        if stage.robot.has_open_sums or assembly.couplings:
-            drives = [actuator.driven_joints for actuator in assembly.actuators]
-        turns += [not turning.isdisjoint(names) for names in drives]
-    return _Rows(
-        robot,
-        stages,
-        values,
-        target,
-        e,
-        sums,
-        tuple(tau for _, tau in slots),
-        np.zeros(len(target)),
-        _place_serial_joints(stages, e),
-        np.where(turns, robot.size, 1.0),
-        _measure_spans(robot, np.array(turns)),
-        find_carrying_actuators(robot),
-        close,
-        differentiate,
-    )
-
-
-def _measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
-    """Return the `spans` of the drives (u,) of a robot."""
-    spans = np.where(turns, 2 * np.pi, robot.size)
-    if has_spare_drives(robot):
-        _, tau = robot.slots(robot.values[None])
-        strokes = np.array([actuator.stroke or (np.nan, np.nan) for actuator in robot.actuators])
-        has_all = len(turns) == robot.program.n_joints  # else readings are open sums
-        convert = joints_from_readings if has_all else transmit_readings
-        constants = robot.slots.constants
-        ends = convert(strokes.T[None], tau, constants)[0][:, ~find_fixed_rows(constants)]
-        commanded = [a.reference is None for a in robot.actuators]
-        stated = np.full(len(turns), np.nan)
-        stated[commanded] = np.abs(ends[1] - ends[0])
-        spans = np.where(stated > 0.0, stated, spans)
-    return spans
-
-
-def _begin(rows: _Rows, first: State) -> _Iterate:
-    """Return the iterates of a state (R, 1)."""
-    u, loops, robot = [], [], rows.robot
-    states = split_stage_states(robot, first) if robot.stages else [first]
-    for stage, own, sums in zip(rows.stages, states, rows.sums, strict=True):
-        joints = driven_values(stage.robot.program, own)
-        if sums is not None:  # a condition has no sum of its own
-            joints = sums.read(joints)
-            spare = len(stage.robot.actuators) - sums.chosen
-            joints = np.pad(joints, [(0, 0), (0, 0), (0, spare)])
-        u.append(joints)
-        if not stage.robot.is_serial:
-            loops.append(own)
-    return rows.evaluate(np.concatenate(u, axis=2)[:, 0], tuple(loops))
-
-
-def _solve_within_reach(
-    rows: _Rows, start: _Iterate, first: State, propose: Proposal | None, follow: bool
-) -> _Iterate:
-    """Return the last iterates of rows from their start, the state `first`; rows with a target
-    beyond what the links span stay at the start.
-    """
-    is_near = measure_target_excess(rows.robot, rows.values, rows.target) <= 0.0
-    solved = replace(start, status=np.full_like(start.status, STALLED))
-    near = np.flatnonzero(is_near)
-    if not len(near):
-        return solved
-    own, begin = rows.select(near), start.take(near)
-    if propose is not None:
-        begin = _begin_near_targets(own, begin, map_arrays(lambda a: a[near], first), propose)
-    solved = solved.put(near, own.iterate(begin))
-    wrong = near[solved.status[near] != CONVERGED]
-    if not (follow and len(wrong)):
-        return solved
-    return solved.put(wrong, _follow_path(rows.select(wrong), start.take(wrong)))
-
-
-def _begin_near_targets(rows: _Rows, start: _Iterate, first: State, propose: Proposal) -> _Iterate:
-    """Return the iterates at which rows begin: the proposed ones, or the first."""
-    near = propose(rows.values, rows.target, first)
-    good = np.flatnonzero(near.status[:, 0] == CONVERGED)
-    if not len(good):
-        return start
-    # the start selects the side of the singularities
-    near = replace(near, closure_sign=first.closure_sign)
-    own = _begin(rows.select(good), map_arrays(lambda a: a[good], near))
-    return start.put(good, own)
-
-
-def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:
-    """Return the last iterates of rows solved along the straight path of poses from their start."""
-    controlled, now = rows.robot.controlled, start
-    goal = pose_from_coordinates(rows.target, controlled, start.T)
-    twist = geometry.pose_difference(goal, start.T)
-    alive = np.arange(len(goal))
-    for i in range(1, PATH_STEPS + 1):
-        via = geometry.apply_twist(start.T[alive], (i / PATH_STEPS) * twist[alive])
-        part = replace(rows.select(alive), target=read_coordinates(via, controlled))
-        moved = part.iterate(part.aim(now.take(alive)), i < PATH_STEPS)
-        now = now.put(alive, moved)
-        alive = alive[moved.status == CONVERGED]
-        if not len(alive):
-            break
-    return now
-
-
-# Forward kinematics of a single limb whose joints are all driven: the product of its links.
-
-
-def solve_serial(
-    robot: Mechanism, e: FloatArray, driven: FloatArray, shape: tuple[int, ...] = (1, 1)
-) -> State:
-    """Return the state (t, n) at driven joint values (t | 1, n, a) and displacements e (t | 1, d).
-
-    Rows whose joint values are not finite are marked. `shape` : (t, n) of the start, 1 broadcasts.
-    """
-    (group,) = robot.program.groups
-    t, n = max(len(e), len(driven), shape[0]), max(driven.shape[1], shape[1])
-    joints = np.zeros((t, n, len(group.actuator)))
-    joints[..., : len(group.joints)] = driven[..., group.actuator[: len(group.joints), 0]]
-    with np.errstate(invalid="ignore"):
-        frames, attachment = follow_limb(group, 0, e, joints)
-        T = np.broadcast_to(frames[-1] @ geometry.invert_pose(attachment), (t, n, 4, 4))
-    finite = np.isfinite(joints).all(axis=2)
-    zero = np.zeros((t, n))
-    return State(
-        np.array(T),
-        (joints[:, :, None],),
-        np.where(finite, np.int8(CONVERGED), np.int8(NOT_FINITE)),
-        np.where(finite, zero, np.nan),
-        zero.astype(np.int64),
-        np.ones((t, n), np.int8),
-    )

@@ -24,14 +24,9 @@ from loopcal.mechanism.assembly import (
     Limb,
     select_rows,
 )
-from loopcal.mechanism.chains import (
-    ChainState,
-    find_carrying_actuators,
-    join_stage_states,
-    locate_stage_bases,
-    solve_serial,
-)
-from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials, inverse_trials
+from loopcal.mechanism.chains import find_carrying_actuators, join_stage_states, locate_stage_bases
+from loopcal.mechanism.inverse import inverse_trials
+from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials, solve_serial
 from loopcal.mechanism.mobility import (
     STRETCHED,
     check_assembly,
@@ -49,9 +44,6 @@ from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coo
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import driven_values, is_closed, make_start
 from loopcal.mechanism.transmission import (
-    ALL_TERMS,
-    SOURCE,
-    count_points,
     list_constants,
     name_terms,
     nominal_terms,
@@ -225,6 +217,12 @@ def compute_characteristic_length(assembly: Assembly) -> float:
     return float(np.sqrt(np.mean(np.square(lengths)))) or DEFAULT_SIZE
 
 
+def _list_addresses(assembly: Assembly) -> tuple[Address, ...]:
+    """Return the addresses that parameters change."""
+    single = (entry.address for entry in assembly.maps)
+    return tuple(dict.fromkeys([*single, *(a for s in assembly.shared for a in s.outputs)]))
+
+
 def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
     """Return the slots of the addresses that parameters change, limb by limb; refuse unknown
     addresses.
@@ -232,10 +230,8 @@ def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
     limbs = {limb.name: limb for limb in assembly.limbs}
     actuators, terms = {a.name for a in assembly.rows}, name_terms(assembly.rows)
     slots: dict[str, dict[Address, Slot]] = {name: {} for name in limbs}
-    addresses = dict.fromkeys(m.address for m in assembly.maps)
-    addresses |= dict.fromkeys(a for s in assembly.shared for a in s.outputs)
     unknown = []
-    for address in addresses:
+    for address in _list_addresses(assembly):
         is_term = address.element == "transmission" and address.axis in terms
         if is_term and address.owner in actuators:
             continue
@@ -481,12 +477,16 @@ def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any
     table = ParameterTable(assembly.parameters, assembly.common_errors)
     size = _compute_chain_size(stages)
     program = _join_programs(stages, size)
+    # displacements in any order: an engine computes those of the stages
+    limbs = {limb.name for limb in assembly.limbs}
+    moved = [address for address in _list_addresses(assembly) if address.owner in limbs]
+    places = {address: i for i, address in enumerate(moved)}
     robot = Mechanism(
         assembly,
         table,
         table.nominal,
         program,
-        _join_slots(stages, table.nominal),
+        _map_slots(assembly, table, places, len(places)),
         size,
         stages[-1].robot.home_state,
         {d: unit.symbol for d, unit in DISPLAY_UNITS.items()} | dict(units),
@@ -564,47 +564,7 @@ def _join_programs(stages: Sequence[Stage], size: float) -> Program:
     return Program(tuple(groups), tuple(range(len(AXES))), size, first, joints, others=others)
 
 
-def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
-    """Return the maps of all stages: first the displacements of all, then their transmissions."""
-    maps = [stage.robot.slots for stage in stages]
-    displacements = sum(own.n_displacements for own in maps)
-    count = sum(len(own.terms) for own in maps)
-    points = [count_points(own.constants) for own in maps]
-    first_weight = len(ALL_TERMS) + max(points)
-    k = max(own.terms.shape[1] for own in maps) if not any(points) else first_weight
-    has_sums = any(stage.robot.has_sums for stage in stages)
-    if has_sums:
-        k = first_weight + sum(stage.robot.program.n_joints for stage in stages)
-    matrix = np.zeros((displacements + count * k, len(nominal)))
-    shared, first, term, joint = [], 0, displacements, 0
-    terms = np.zeros((count, k))
-    constants = np.full((count, max(own.constants.shape[1] for own in maps)), np.nan)
-    for stage, own in zip(stages, maps, strict=True):
-        d = own.n_displacements
-        a, width = own.terms.shape
-        own_first = len(ALL_TERMS) + count_points(own.constants)
-        columns = np.arange(width)
-        columns[own_first:] += first_weight - own_first + joint  # the weights of its own joints
-        row = (term - displacements) // k
-        rows = slice(row, row + a)
-        terms[rows, columns] = own.terms
-        constants[rows, : own.constants.shape[1]] = own.constants
-        read = own.constants[:, SOURCE] >= 0
-        constants[row + np.flatnonzero(read), SOURCE] += stage.actuators.start
-        if has_sums and width <= own_first:
-            terms[rows, first_weight + joint + np.arange(a)] = np.eye(a)
-        joint += stage.robot.program.n_joints
-        of_terms = (np.arange(a)[:, None] * k + columns).ravel()
-        places = np.concatenate([np.arange(d) + first, of_terms + term])
-        matrix[places, stage.parameters] = own.matrix
-        for function, inputs, outputs in own.shared:
-            values = tuple(i + stage.parameters.start for i in inputs)
-            shared.append((function, values, tuple(int(places[o]) for o in outputs)))
-        first, term = first + d, term + a * k
-    return SlotMap(matrix, tuple(shared), nominal, displacements, terms, constants)
-
-
-def _check_chain(robot: Mechanism, home: ChainState) -> None:
+def _check_chain(robot: Mechanism, home: State) -> None:
     """Refuse a chain whose actuators do not set the controlled coordinates one by one."""
     names = [actuator.name for actuator in robot.actuators]
     for held in robot.assembly.held:

@@ -1,48 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinematics of many trials: forward and inverse solutions as engine states (t, n).
+"""Forward kinematics of many trials, as engine states (t, n), and frames along limbs.
 
 Arrays are (t, n, ..), where t or n may be 1 and then broadcast. The layers above compute with these
 functions; `loopcal.forward` and `loopcal.inverse` wrap them for a single robot.
 
-Where one actuator drives joints of several limbs, as a carriage with two rods does, the inverse
-solution cannot free each joint: they would part. It solves for the readings instead, as that of
-chains does. Source: docs/theory/kinematics.md.
+Source: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import engine
+from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism.actuation import (
-    DrivenJoints,
-    drive_joints,
-    drive_sums,
-    list_open_sums,
-    solve_open_sums,
-)
-from loopcal.mechanism.chains import (
-    ChainState,
-    each_stage,
-    join_stage_states,
-    locate_stage_bases,
-    solve_by_drives,
-    solve_serial,
-)
+from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums, solve_open_sums
+from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
 from loopcal.mechanism.limb_rows import follow_limb
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import (
-    compare_coordinates,
-    pose_from_coordinates,
-    read_coordinates,
-)
-from loopcal.mechanism.sensitivity import differentiate_by_drives
 from loopcal.mechanism.states import Status, driven_values, list_bodies, replace_rows, without_poses
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
@@ -55,7 +33,6 @@ from loopcal.mechanism.transmission import (
     select_weights,
     turn_head,
 )
-from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
 # Loops closed at joint values or their sums, and along straight paths of these from a start.
@@ -192,11 +169,6 @@ def _take_steps(
     return current
 
 
-ITERATIONS = 60
-"""Newton steps of an inverse solution, each at most half of the robot's size."""
-ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
-
-
 def forward_trials(
     robot: Mechanism,
     values: FloatArray,
@@ -269,6 +241,32 @@ def close_at_joints(
     return follow_path(loops, joints, begin, state, wrong)
 
 
+def solve_serial(
+    robot: Mechanism, e: FloatArray, driven: FloatArray, shape: tuple[int, ...] = (1, 1)
+) -> State:
+    """Return the state (t, n) at driven joint values (t | 1, n, a) and displacements e (t | 1, d).
+
+    Rows whose joint values are not finite are marked. `shape` : (t, n) of the start, 1 broadcasts.
+    """
+    (group,) = robot.program.groups
+    t, n = max(len(e), len(driven), shape[0]), max(driven.shape[1], shape[1])
+    joints = np.zeros((t, n, len(group.actuator)))
+    joints[..., : len(group.joints)] = driven[..., group.actuator[: len(group.joints), 0]]
+    with np.errstate(invalid="ignore"):
+        frames, attachment = follow_limb(group, 0, e, joints)
+        T = np.broadcast_to(frames[-1] @ geometry.invert_pose(attachment), (t, n, 4, 4))
+    finite = np.isfinite(joints).all(axis=2)
+    zero = np.zeros((t, n))
+    return State(
+        np.array(T),
+        (joints[:, :, None],),
+        np.where(finite, np.int8(engine.CONVERGED), np.int8(engine.NOT_FINITE)),
+        np.where(finite, zero, np.nan),
+        zero.astype(np.int64),
+        np.ones((t, n), np.int8),
+    )
+
+
 def step_towards_closure(
     robot: Mechanism, values: FloatArray, q: FloatArray, begin: State
 ) -> State:
@@ -287,91 +285,6 @@ def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray)
     home's side of every singularity, (t, n).
     """
     return forward_trials(robot, values, q, follow=False).status == Status.CONVERGED.value
-
-
-def inverse_trials(
-    robot: Mechanism, values: FloatArray, target: FloatArray, start: State | None = None
-) -> State:
-    """Solve inverse kinematics for controlled coordinates (t | 1, n, c), every actuator free.
-
-    `compute_readings` gives the readings of the states.
-    """
-    state = close_at_coordinates(robot, values, target, start)
-    if needs_readings(robot):
-        return state
-    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
-
-
-def close_at_coordinates(
-    robot: Mechanism,
-    values: FloatArray,
-    target: FloatArray,
-    start: State | None = None,
-    follow: bool = True,
-    max_iterations: int = ITERATIONS,
-) -> State:
-    """Solve inverse kinematics like `inverse_trials`, without the closure sign of the states.
-
-    Without `follow`, and with few iterations, rows that fail cost less.
-    """
-    begin = start or robot.home_state
-    if not target.shape[1]:
-        return without_poses(robot.home_state, max(len(values), len(target)))
-    if robot.stages:
-        functions = close_at_joints, differentiate_by_drives
-        return solve_by_drives(robot, values, target, begin, *functions, follow=follow)
-    if needs_readings(robot):
-        return _inverse_by_readings(robot, values, target, begin, follow)
-    return _close_with_free_actuators(robot, values, target, begin, start, max_iterations)
-
-
-def _close_with_free_actuators(
-    robot: Mechanism,
-    values: FloatArray,
-    target: FloatArray,
-    begin: State,
-    start: State | None,
-    max_iterations: int = ITERATIONS,
-) -> State:
-    """Return states (t, n) at controlled coordinates, with every actuated joint free, from `start`
-    as given.
-    """
-    e, _ = robot.slots(values)
-    names, size = robot.controlled, robot.size
-    T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
-    if determine_platform(robot):
-        limbs = robot.program.with_fixed_platform
-        start = replace(begin, T=T)
-        return engine.solve(limbs, e, guess, start, free=True, max_iterations=max_iterations)
-    t, n = max(len(values), len(target)), target.shape[1]
-    flat = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
-
-    def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        return compare_coordinates(T, flat[rows], names, size)
-
-    T = np.broadcast_to(T if start is None else start.T, (t, n, 4, 4))
-    begin = replace(begin, T=T)
-    if robot.assembly.couplings:
-        sums = list_open_sums(robot, values)
-        own = sums.weights[:, sums.chosen :], sums.fixed
-        return solve_open_sums(robot.program, e, *own, begin, max_iterations, command)
-    guess = np.broadcast_to(guess, (t, n, robot.program.n_joints))
-    return engine.solve(robot.program, e, guess, begin, command, True, max_iterations)
-
-
-def determine_platform(robot: Mechanism) -> bool:
-    """Return whether the controlled coordinates state the whole pose, and each limb has as many
-    unknown joints as equations.
-    """
-    if robot.assembly.couplings or not robot.program.has_square_limbs:
-        return False
-    if len(robot.controlled) == 6:
-        return True
-    if set(robot.controlled) != {ANGLES.get(freedom, freedom) for freedom in robot.freedoms}:
-        return False
-    at_home = read_coordinates(robot.home, robot.controlled)
-    same = pose_from_coordinates(at_home, robot.controlled, robot.home)
-    return bool(np.abs(same - robot.home).max() < 1e-12)
 
 
 def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> NDArray[np.int8]:
@@ -401,61 +314,6 @@ def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> Floa
     _, tau = robot.slots(values)
     joints = driven_values(robot.program, state)
     return readings_from_joints(joints, tau, robot.slots.constants)
-
-
-def needs_readings(robot: Mechanism) -> bool:
-    """Return whether the inverse solution is one for readings: freed, joints with a shared drive
-    and coupled ones would part, and an actuator of loops that may stay open would take a part of
-    the gap.
-    """
-    program = robot.program
-    return program.may_stay_open or program.shared_drive_count > 0 or bool(robot.assembly.couplings)
-
-
-def _inverse_by_readings(
-    robot: Mechanism, values: FloatArray, target: FloatArray, begin: State, follow: bool
-) -> State:
-    """Return states (t, n) at controlled coordinates (t | 1, n, c) by their readings.
-
-    Newton's method begins with each joint free, which is almost right where loops may stay open,
-    and at the start where the orientation follows the position.
-    """
-    if not begin.closure_sign.any():
-        # the guess of a home that is searched for has no sign yet
-        t, n = max(len(values), len(begin.T)), begin.T.shape[1]
-        whole = map_arrays(lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])), begin)
-        begin = replace(whole, closure_sign=compute_closure_sign(robot, values, whole))
-    return solve_by_drives(
-        robot,
-        values,
-        target,
-        begin,
-        close_at_joints,
-        differentiate_by_drives,
-        partial(_propose_state, robot),
-        follow,
-    )
-
-
-def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, start: State) -> State:
-    """Return states with every joint free at targets (R, c), (1, R) or (R, 1); with shared drives,
-    other coordinates are those of the start.
-    """
-    if robot.assembly.couplings or not robot.program.shared_drive_count:
-        shaped = target.reshape(*start.T.shape[:2], -1)
-        return _close_with_free_actuators(robot, values, shaped, start, start)
-    e, _ = robot.slots(values)
-    names = tuple(ANGLES.get(freedom, freedom) for freedom in robot.freedoms)
-    T = pose_from_coordinates(target, robot.controlled, start.T.reshape(-1, 4, 4))
-    whole = read_coordinates(T, names)
-
-    def command(current: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        return compare_coordinates(current, whole[rows], names, robot.size)
-
-    begin = replace(start, T=T.reshape(start.T.shape))
-    return engine.solve(
-        robot.program, e, driven_values(robot.program, begin), begin, command, free=True
-    )
 
 
 # Frames of the links along each limb, for limits of joints and for pictures.

@@ -355,6 +355,13 @@ class Mechanism(DrawnResult):
         """T_base_platform (4, 4) of the home pose."""
         return self.home_state.T[0, 0]
 
+    @property
+    def blocks(self) -> tuple[Stage, ...]:
+        """The stages of a chain; any other robot is the only stage of its own."""
+        counts = len(self.parameters), len(self.actuators), len(self.program.groups)
+        whole = (slice(0, count) for count in counts)
+        return self.stages or (Stage(self.name, -1, np.eye(4), self, *whole),)
+
     @cached_property
     def is_serial(self) -> bool:
         """Whether the pose is the product of driven joints: one limb without passive joints."""

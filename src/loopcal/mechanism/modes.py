@@ -20,12 +20,13 @@ from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
 from loopcal.mechanism.actuation import solve_open_sums
 from loopcal.mechanism.assembly import BASE
-from loopcal.mechanism.chains import each_stage, has_spare_drives, join_stage_states, solve_serial
+from loopcal.mechanism.chains import each_stage, has_spare_drives, join_stage_states
+from loopcal.mechanism.inverse import inverse_trials
 from loopcal.mechanism.kinematics import (
     clear_sign,
     compute_closure_sign,
     compute_readings,
-    inverse_trials,
+    solve_serial,
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution

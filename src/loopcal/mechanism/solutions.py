@@ -20,16 +20,14 @@ from loopcal.engine import NEAR_GOAL, State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
-from loopcal.mechanism.chains import join_stage_states, split_stage_states
+from loopcal.mechanism.chains import split_stage_states
+from loopcal.mechanism.inverse import close_at_coordinates, determine_platform, moves_by_drives
 from loopcal.mechanism.kinematics import (
     clear_sign,
-    close_at_coordinates,
     close_at_joints,
     compute_closure_sign,
     compute_readings,
-    determine_platform,
     forward_trials,
-    needs_readings,
 )
 from loopcal.mechanism.limb_rows import name_passive_joints, reduce_to_platform
 from loopcal.mechanism.model import Mechanism
@@ -272,7 +270,7 @@ def has_one_solution(robot: Mechanism) -> bool:
 
 def has_bends(robot: Mechanism) -> bool:
     """Return whether limbs that are closed one by one at a pose may have several readings there."""
-    if robot.stages or robot.is_serial or needs_readings(robot):
+    if robot.is_serial or moves_by_drives(robot):
         return False
     return determine_platform(robot) and not has_one_solution(robot)
 
@@ -295,7 +293,7 @@ def reach_coordinates(
     pose; where these are not None, the states have closure signs.
     """
     values, target = robot.values[None], target[None]
-    is_plain = not (robot.stages or robot.is_serial or needs_readings(robot))
+    is_plain = not (robot.is_serial or moves_by_drives(robot))
     is_plain &= not robot.program.idle_groups
     if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
         return close_at_coordinates(robot, values, target, start), None
@@ -345,15 +343,15 @@ def judge_modes(
 
 def _judge_stages(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
     """Return what `judge_modes` returns, of a chain: another mode is one of any of its stages."""
-    is_other, judged = np.zeros(state.T.shape[1], bool), []
+    is_other, signs = np.zeros(state.T.shape[1], bool), list[NDArray[np.int8]]()
     parts = robot.stages, split_stage_states(robot, state), split_stage_states(robot, begin)
     for stage, own, first in zip(*parts, strict=True):
         machine = stage.robot.with_values(robot.values[stage.parameters])
         part, is_part_other = judge_modes(machine, own, first)
-        judged.append(part)
+        signs.append(part.closure_sign)
         is_other |= is_part_other
-    whole = join_stage_states(robot, judged)
-    return replace(state, closure_sign=whole.closure_sign, signs=whole.signs), is_other
+    whole = np.multiply.reduce(signs, dtype=np.int8)
+    return replace(state, closure_sign=whole, signs=tuple(signs)), is_other
 
 
 def _judge_by_readings(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
@@ -834,7 +832,7 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     flat = state.T.reshape(-1, 4, 4)
     _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
     columns = columns.reshape(t, n, len(names), 6)
-    if robot.stages or needs_readings(robot):
+    if moves_by_drives(robot):
         q = compute_readings(robot, values, state)
         D = differentiate_pose(robot, values, q, state).readings
         return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))

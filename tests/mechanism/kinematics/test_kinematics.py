@@ -18,11 +18,11 @@ from loopcal import engine, geometry
 from loopcal.errors import DataError
 from loopcal.findings.catalog import load_catalog
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
-from loopcal.mechanism import chains as chain_inverse
+from loopcal.mechanism import inverse as inverse_kinematics
 from loopcal.mechanism import kinematics as reading_paths
 from loopcal.mechanism.assembly import Address, LinearMap
-from loopcal.mechanism.chains import bound_platform
 from loopcal.mechanism.compilation import build
+from loopcal.mechanism.inverse import bound_platform
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
@@ -446,7 +446,7 @@ def test_targets_beyond_the_sphere_take_a_single_evaluation(monkeypatch):
     robot = load_cached_robot("arm-6r")
     target = sample_workspace(robot, 3, seed=1).coordinates
     far = target + np.array([8.0, 0, 0, 0, 0, 0])
-    calls = count_calls(monkeypatch, chain_inverse._Rows, "evaluate")
+    calls = count_calls(monkeypatch, inverse_kinematics._Rows, "evaluate")
     solution = inverse(robot, np.concatenate([far, target]))
     reached = len(calls)
     assert (solution.status[:3] == Status.UNREACHABLE).all()
@@ -465,7 +465,7 @@ NEAR_BASE = {"excavator": [0.3, 0.2, 0.5, 1.0], "tricept": [0.1, 0.1, -1.5, 0.0,
 def test_a_row_out_of_reach_takes_at_most_ten_times_the_evaluations(name, monkeypatch):
     robot = load_cached_robot(name)
     target = sample_workspace(robot, 1, seed=1).coordinates
-    calls = count_calls(monkeypatch, chain_inverse._Rows, "evaluate")
+    calls = count_calls(monkeypatch, inverse_kinematics._Rows, "evaluate")
     assert inverse(robot, target).converged.all()
     reached = len(calls)
     calls.clear()

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.apply.compensation import Reach, compensate
-from loopcal.mechanism.kinematics import compute_readings, inverse_trials
+from loopcal.mechanism.inverse import inverse_trials
+from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, forward, inverse, jacobian

@@ -15,12 +15,8 @@ from loopcal.apply.compensation import Reach, compensate
 from loopcal.engine import NEAR_GOAL
 from loopcal.errors import DataError
 from loopcal.measure.readings import solve_commanded_poses
-from loopcal.mechanism.kinematics import (
-    clear_sign,
-    compute_readings,
-    forward_trials,
-    inverse_trials,
-)
+from loopcal.mechanism.inverse import inverse_trials
+from loopcal.mechanism.kinematics import clear_sign, compute_readings, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.modes import find_working_modes
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates

@@ -203,7 +203,7 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
 
 
 def _rename_address(prefix: str, part: Assembly, address: Address) -> Address:
-    """Return an address with the names of the chain; actuators keep theirs."""
+    """Return an address with the names of the chain; actuators and couplings keep theirs."""
     if address.element == "transmission" and address.owner in {a.name for a in part.rows}:
         return address
     return replace(address, owner=f"{prefix}.{address.owner}")

@@ -54,7 +54,8 @@ from loopcal.measure.instrument import Gaussian, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.simulation import Trials
-from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.inverse import inverse_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.mechanism.sensitivity import differentiate_pose
