@@ -199,6 +199,11 @@ class CalibrationReport(TableResult):
         """The two or three most important findings; all failures among them."""
         return self.findings[: max(TOP, len(self.failures))]
 
+    @property
+    def top_warnings(self) -> tuple[Finding, ...]:
+        """The most important findings that ask for an action."""
+        return tuple(f for f in self.top_findings if f.severity is not Severity.INFO)
+
     def list_outliers(self, level: float = 1.0) -> tuple[str, ...]:
         """Return labels of poses that do not fit the other fitted poses, or all other poses.
 
@@ -268,7 +273,7 @@ class CalibrationReport(TableResult):
     def __str__(self) -> str:
         """Return verdict, expected and validated errors, findings, recommendation and next step."""
         errors = self.validation or self.fitted_errors
-        lines = [self.headline, *([str(self.budget)] if self.states_expected_error else [])]
+        lines = [self.headline, *([str(self.budget.summary)] if self.states_expected_error else [])]
         lines += [] if self.volume is None else map(str, self.volume.findings)
         if errors is not None:
             lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]

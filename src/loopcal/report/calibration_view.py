@@ -51,8 +51,10 @@ if TYPE_CHECKING:
     from loopcal.typing import FloatArray
 
 
-MOST_POINTS, MOST_LINES = 200, 25
-"""Heights that a table lists, and up to which the page of a calibration has this table."""
+MOST_POINTS, MOST_LINES, MOST_MOVED = 200, 25, 10
+"""Heights that a table lists; heights and parameters up to which the page of a calibration has a
+table of all; parameters that the table of many has.
+"""
 
 
 def build_height_summary(heights: HeightErrors) -> Table:
@@ -122,13 +124,15 @@ def view_calibration(
 ) -> list[Block]:
     """Return the page of a calibration.
 
-    Verdict, expected error and its sources, errors with the noise floor, the most important
-    findings, the recommendation, the next step, and the parameters. With `verbose` also every
-    finding and table.
+    Verdict, typical error, errors with the noise floor, warnings, the recommendation, the next
+    step, and the parameters, of many those that moved most. With `verbose` also every finding and
+    table.
     """
     fit = report.identification
     stated = fit.to_dict()
-    task = ["", str(report.budget)] if report.states_expected_error else []
+    task: list[Block] = []
+    if report.budget is not None and report.states_expected_error:
+        task = ["", str(report.budget if verbose else report.budget.summary)]
     task += [] if report.volume is None else [str(f) for f in report.volume.findings]
     blocks: list[Block] = [report.headline, *task]
     if report.validation is not None:
@@ -139,7 +143,7 @@ def view_calibration(
     if errors is not None and report.reading_errors is not None:
         blocks.append(READING_NOISE)
     blocks += view_heights(report.height_errors, verbose)
-    selected = report.findings if verbose else report.top_findings
+    selected = report.findings if verbose else report.top_warnings
     blocks += ["", *format_list([(f.severity.value, add_advice(f, hint(f))) for f in selected])]
     if more := len(report.findings) - len(selected):
         blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")
@@ -151,10 +155,22 @@ def view_calibration(
     if advice := hint(report.next_step):
         blocks.append(f"Hint: {advice}")
     if fit.converged:
-        blocks += _view_parameters(fit, "Parameters", stated["parameters"])
+        shown, caption = stated["parameters"], "Parameters"
+        if not verbose and len(shown) > MOST_LINES:
+            shown = _select_moved(shown)
+            others = len(stated["parameters"]) - len(shown)
+            caption = f"Parameters that moved most; {others} others are in the run and its report"
+        blocks += _view_parameters(fit, caption, shown)
     elif verbose:
         blocks.append(build_last_value_table(stated["parameters"]))
     return [*blocks, *_view_details(report, stated)] if verbose else blocks
+
+
+def _select_moved(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the rows of the parameters that moved most in their tolerances, in their order."""
+    moved = [abs(row["estimate"] - row["nominal"]) / row["tolerance"] for row in rows]
+    kept = np.sort(np.argsort(np.negative(moved), kind="stable")[:MOST_MOVED])
+    return [rows[i] for i in kept]
 
 
 def _view_details(report: CalibrationReport, stated: Mapping[str, Any]) -> list[Block]:

@@ -129,7 +129,7 @@ def _build_error_summary(validation: Validation, caption: str, with_before: bool
         name = f"{quantity} {' '.join(measured)}" if is_part else quantity
         for key in SUMMARY:
             values = (before[key], after[key], floor.metrics.get(key, {}).get(quantity, math.nan))
-            fine = choose_unit(unit, values)
+            fine = choose_unit(unit, values[1:])  # errors before may be far larger
             shown = (format_in(fine, x, 3) for x in values)
             rows.append([name, METRICS[key].words, str(after.count), *shown, fine.symbol])
     return _build_error_table(caption, "quantity", rows, with_before)

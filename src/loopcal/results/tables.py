@@ -235,9 +235,13 @@ ABSENT = "-"
 
 
 def format_number(value: float, digits: int = 6) -> str:
-    """Return a number with `digits` significant digits; a dash where it is not finite."""
+    """Return a number with `digits` significant digits, below a million all before the decimal
+    point; a dash where it is not finite.
+    """
     if not math.isfinite(value):
         return ABSENT
+    if 10.0**digits <= abs(value) + 0.5 < 1e6:
+        return f"{value:.0f}"
     return f"{0.0 if abs(value) < ROUNDING else value:.{digits}g}"
 
 
