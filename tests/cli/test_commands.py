@@ -59,7 +59,7 @@ def test_calibrate_without_a_folder_shows_the_same_result_and_writes_nothing(
 def test_calibrate_estimates_the_truth_and_writes_a_complete_run_folder(loopcal, tmp_path) -> None:
     loopcal(
         "calibrate hexapod-42 measurements.csv -o out/run --hold-out 0.25",
-        "leg6.length",
+        "leg6.base.x",
         "Errors at 10 held-out poses",
     )
     assert sorted(p.name for p in (tmp_path / "out" / "run").iterdir()) == [

@@ -30,6 +30,7 @@ from loopcal.apply.verdict import (
 from loopcal.errors import DataError
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings.catalog import find_entry
 from loopcal.findings.wording import name_count
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import InstrumentRecord, list_instruments
@@ -196,13 +197,11 @@ class CalibrationReport(TableResult):
 
     @property
     def top_findings(self) -> tuple[Finding, ...]:
-        """The two or three most important findings; all failures among them."""
-        return self.findings[: max(TOP, len(self.failures))]
-
-    @property
-    def top_warnings(self) -> tuple[Finding, ...]:
-        """The most important findings that ask for an action."""
-        return tuple(f for f in self.top_findings if f.severity is not Severity.INFO)
+        """The two or three most important findings; all failures among them, none that says that
+        all is well.
+        """
+        notable = tuple(f for f in self.findings if not find_entry(f.code).routine)
+        return notable[: max(TOP, len(self.failures))]
 
     def list_outliers(self, level: float = 1.0) -> tuple[str, ...]:
         """Return labels of poses that do not fit the other fitted poses, or all other poses.

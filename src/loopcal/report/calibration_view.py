@@ -143,7 +143,7 @@ def view_calibration(
     if errors is not None and report.reading_errors is not None:
         blocks.append(READING_NOISE)
     blocks += view_heights(report.height_errors, verbose)
-    selected = report.findings if verbose else report.top_warnings
+    selected = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, add_advice(f, hint(f))) for f in selected])]
     if more := len(report.findings) - len(selected):
         blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")

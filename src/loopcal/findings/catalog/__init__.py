@@ -5,6 +5,7 @@
     failure = "The iteration ..."      # severity = text, a template (`loopcal.findings.wording`)
     when = "Every shortened step ..."  # when it is reported, if the text does not say it
     action = "Check for wrong rows."   # what to do next, if the text does not say it
+    routine = true                     # said where all is well: left out of short pages
     example = { iterations = 12 }      # data of one case, for tests and documentation
 
 An example is needed where the text depends on its data, and where the data have more than the text
@@ -62,7 +63,7 @@ class Entry:
     ----------
     code : `subject.what`. severity : how much it matters. text : the sentence, a template.
     when : when it is reported. action : what to do next. Both are empty where the text says it.
-    example : data of one case.
+    example : data of one case. routine : whether short pages leave it out, as all is well.
     """
 
     code: str
@@ -71,6 +72,7 @@ class Entry:
     when: str = ""
     action: str = ""
     example: Mapping[str, Any] = field(default_factory=dict)
+    routine: bool = False
 
     def word(self, data: Mapping[str, Any]) -> str:
         """Return the sentence for these data."""
@@ -157,7 +159,9 @@ def _make_entry(code: str, keys: Mapping[str, Any]) -> Entry:
     (severity,) = texts.keys() - {"when", "action"}
     text = texts.pop(severity)
     example = _convert(keys.get("example", {}))
-    return Entry(code, Severity(severity), text, **texts, example=example)
+    return Entry(
+        code, Severity(severity), text, **texts, example=example, routine=bool(keys.get("routine"))
+    )
 
 
 def _convert(value: Any) -> Any:
