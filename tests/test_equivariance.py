@@ -46,8 +46,13 @@ def draw_readings(name: str) -> Array:
 
 
 def make_motion(robot: Mechanism, seed: int = 1) -> Array:
-    """Return a rigid motion (4, 4) that keeps the plane of a planar robot."""
+    """Return a rigid motion (4, 4) that keeps the plane of a planar robot, and the axis of one that
+    turns about a single one.
+    """
     w, v = 0.2 * np.random.default_rng(seed).standard_normal((2, 3))
+    turns = np.array([f"r{axis}" in robot.freedoms for axis in "xyz"])
+    if turns.sum() == 1:
+        w[~turns] = 0.0
     for normal, axis in enumerate("xyz"):
         across = {"rx", "ry", "rz", axis} - {"r" + axis}
         if not across & set(robot.freedoms):

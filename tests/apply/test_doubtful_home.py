@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import loopcal as lc
 from loopcal.apply.inspection import inspect_robot
 from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot
@@ -55,6 +56,16 @@ def test_a_home_whose_rods_lie_in_line_is_named_with_the_motion_that_is_free(
     robot = load_text(tmp_path, text.format(unit="mm", left=90, right=90, y=3))
     (doubt,) = (str(f) for f in inspect_robot(robot).findings if "near-sing" in f.code)
     assert "the drives hardly hold translation along y" in doubt
+
+
+def test_a_home_in_the_anchor_of_a_line_is_refused_with_the_line(tmp_path: Path) -> None:
+    text = FIVE_BAR.format(unit="mm", left=120, right=60, y=0)
+    chain = "chain: [{joint: R, name: motor, at: [-100, 0, 0], actuated: a, start: 120}]"
+    text = text.replace(f"{chain}\n    tip: [200, 0, 0]", "tip: [0, 0, 0]\n    actuated: a")
+    text = text.replace("ending: distance\n    length: 300", "ending: distance\n    length: 0", 1)
+    text = text.replace("a: {reads: angle}", "a: {reads: length}")
+    with pytest.raises(lc.MechanismError, match="the limb left has no direction"):
+        load_text(tmp_path, text)
 
 
 @pytest.mark.parametrize(("unit", "size"), [("um", "um apart"), ("m", "m apart")])

@@ -64,6 +64,14 @@ def check_mobility(robot: Mechanism) -> None:
     e = robot.slots(robot.values[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, home), home)
     scale = 1 / robot.twist_scale[list(program.freedoms)]
+    lost = [
+        robot.assembly.limbs[limb].name
+        for group, block in zip(program.groups, blocks.closure, strict=True)
+        for limb, A in zip(group.limbs, block.A[0, 0], strict=True)
+        if not np.isfinite(A).all()
+    ]
+    if lost:
+        raise MechanismError(report_finding("mechanism.no-direction", name=robot.name, limbs=lost))
     refuse_free_bodies(robot, home)
     A, Q = (rows[0, 0] for rows in reduce_to_platform(program, blocks))
     A = A * scale
