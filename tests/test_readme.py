@@ -59,11 +59,11 @@ def test_picture_is_small_and_its_numbers_are_those_of_the_demo(root) -> None:
     assert picture.startswith(b"\x89PNG")
     assert len(picture) < 150_000
     page = (root / "docs" / "getting-started.md").read_text("utf-8")
-    line = re.search(r"^position +rms +(\d+) +(\S+) +(\S+) +(\S+) +mm$", page, re.MULTILINE)
+    line = re.search(r"^position +rms +(\d+) +(\S+) +(\S+) +(\S+) +um$", page, re.MULTILINE)
     assert line
     count, before, after, floor = line.groups()
     assert f"errors at {count} held-out poses" in match[1]
-    assert f"position {before} mm and {after} mm rms, noise floor {floor} mm" in match[1]
+    assert f"position {before} um and {after} um rms, noise floor {floor} um" in match[1]
 
 
 def test_stated_speeds_are_those_of_the_committed_benchmarks() -> None:

@@ -70,21 +70,21 @@ def draw_errors_by_pose(axes: Any, validation: Validation) -> None:
     ):
         of_position = errors["position"]
         places = [names.index(validation.poses[row]) for row in of_position.rows]
-        rms = 1e3 * errors.statistics("position").rms
+        rms = 1e6 * errors.statistics("position").rms
         axes.plot(
-            places, 1e3 * of_position.size, "o", color=color, label=f"{word}: rms {rms:.3g} mm"
+            places, 1e6 * of_position.size, "o", color=color, label=f"{word}: rms {rms:.3g} um"
         )
         axes.axhline(rms, color=color, lw=1.2)
-    floor = 1e3 * validation.noise_floor.rms["position"]
-    axes.axhline(floor, color=PALE, lw=1.2, ls="--", label=f"noise floor: {floor:.3g} mm")
+    floor = 1e6 * validation.noise_floor.rms["position"]
+    axes.axhline(floor, color=PALE, lw=1.2, ls="--", label=f"noise floor: {floor:.3g} um")
     axes.set_yscale("log")
-    axes.set_yticks([0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3], minor=False)
+    axes.set_yticks([0.3, 1, 3, 10, 30, 100, 300], minor=False)
     axes.set_yticks([], minor=True)
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_ylim(2e-4, 1.2)
+    axes.set_ylim(0.2, 1200)
     axes.set_xticks(range(len(names)), names)
     axes.set_xlabel("held-out pose")
-    axes.set_ylabel("position error [mm]")
+    axes.set_ylabel("position error [um]")
     axes.set_title("errors at poses that were not used in the fit", fontsize=10)
     axes.grid(visible=True, color="#dddddd", lw=0.6)
     axes.set_axisbelow(True)

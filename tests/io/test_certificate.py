@@ -229,6 +229,7 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()  # rounding left it a covariance
 
 
+@pytest.mark.evidence  # the schema of PTB must not be copied into this repository
 @pytest.mark.skipif(
     not os.environ.get("LOOPCAL_DCC_SCHEMA"),
     reason="names the folder with PTB's dcc.xsd 3.3.0 and SI_Format.xsd 2.2",

@@ -231,6 +231,8 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         1 calibrate robot.yaml more.csv -o out --compare truth.yaml
         5 validate run more.csv
         1 validate run/robot.yaml more.csv
+        0.2 schema robot
+        0.2 schema study -o out.json
         4 budget run
         1 budget run --json
         0.3 report run -o out.html

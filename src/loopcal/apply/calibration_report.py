@@ -272,7 +272,9 @@ class CalibrationReport(TableResult):
     def __str__(self) -> str:
         """Return verdict, expected and validated errors, findings, recommendation and next step."""
         errors = self.validation or self.fitted_errors
-        lines = [self.headline, *([str(self.budget.summary)] if self.states_expected_error else [])]
+        lines = [self.headline]
+        if self.budget is not None and self.states_expected_error:
+            lines.append(str(self.budget.summary))
         lines += [] if self.volume is None else map(str, self.volume.findings)
         if errors is not None:
             lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]

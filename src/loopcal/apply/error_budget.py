@@ -415,7 +415,7 @@ class ErrorBudget(DrawnResult):
         """The errors of poses without their sources, in one sentence."""
         data = self.finding.data
         errors = tuple(data[name][0] for name in LENGTHS if data[name])
-        return report_finding("accuracy.typical", **data | {"errors": errors})
+        return report_finding("accuracy.typical", **{**data, "errors": errors})
 
     def __repr__(self) -> str:
         position, orientation = 1e3 * self.position.rms, 1e3 * self.orientation.rms

@@ -106,7 +106,7 @@ def import_file(name: str, path: Path) -> None:
         data = None if imported.measurements is None else Path("out.csv")
         robot = save_imported(path, imported, Path("out.yaml"), data)
         assert np.isfinite(robot.values).all()
-        if known.write is None:
+        if known.write is None or not known.takes_file:
             return
         exported = export_robot(ExportSource(robot), known, path)
     path.write_bytes(exported.text.encode())

@@ -19,7 +19,7 @@ from tests.io.formats.linkages.urdf_chains import make_leg, make_tilted_table
 from tests.io.formats.linkages.urdf_machines import MachineJoint, make_pose, write_machine
 
 MACHINES = {"leg": make_leg, "table": make_tilted_table}
-GAP = r"closure '.*', between '.*' and '.*', stays .* mm and .* rad apart"
+GAP = r"closure '.*', between '.*' and '.*', stays .* [mun]+m and .* [mu]?rad apart"
 
 
 def turn_frames(joints: list[MachineJoint]) -> list[MachineJoint]:
