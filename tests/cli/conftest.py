@@ -62,8 +62,8 @@ def loopcal(tmp_path, monkeypatch, capsys) -> Callable[..., Printed]:
         if found == 1:
             notes = ("loopcal: note: ", "Hint: ")
             refusals = [line for line in printed.err.splitlines() if not line.startswith(notes)]
-            said = "" if "--json" not in words else printed.out  # a document repeats it
-            assert (printed.out, len(refusals)) == (said, 1), printed.err
+            text = printed.out if "--json" in words else ""  # a document repeats the refusal
+            assert (printed.out, len(refusals)) == (text, 1), printed.err
         return printed
 
     return run
