@@ -46,7 +46,7 @@ def as_path(path: Any, what: str) -> Path:
     except TypeError:
         given = type(path).__name__
         sentence = f"the path of a {what} is of type {given}; give a text or a pathlib.Path"
-        raise DataError(f"{sentence}, after the object to save: save_..(object, path)") from None
+        raise DataError(f"{sentence} (the order of savers is save_..(object, path))") from None
     except UnicodeEncodeError:
         name = b"\0"
     if b"\0" in name:
