@@ -26,9 +26,6 @@ LINE = re.compile(r"^(?:\||[*-]) .*$", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#]+\.(?:md|rst))\)")
 """A line of a table or of a list, and a link to a page."""
 
-WHOLE_INDEX = re.compile(r"^- \[All [^]]+\]\((\w+)/README\.md\)\n", re.MULTILINE)
-"""A line that stands for the table of another index, which the site shows in its place."""
-
 API_ROW = re.compile(r"^\| `(\w+)` \|", re.MULTILINE)
 COMMAND_ROW = re.compile(r"^\| (`loopcal ([\w-]+)[^`]*`) \|", re.MULTILINE)
 """A name in a table of docs/api.md, and a command in the table of docs/commands.md."""
@@ -61,7 +58,6 @@ def add_contents(app: Any, page: str, source: list[str]) -> None:
         parts = re.split(r"^## (.*)\n", text, flags=re.MULTILINE)
         for caption, part in zip(["", *parts[1::2]], parts[::2], strict=True):
             text += format_contents(caption, list_entries(part))
-        text = WHOLE_INDEX.sub(lambda link: read_table(link[1]), text)
     source[0] = text
 
 
@@ -82,13 +78,6 @@ def list_entries(text: str) -> list[str]:
         cells = (LINK.findall(cell) for cell in line.split("|"))
         pages += next((links for links in cells if links), [])
     return list(dict.fromkeys(pages))
-
-
-def read_table(folder: str) -> str:
-    """Return the table of the index of a folder of docs/, with links from docs/."""
-    lines = (ROOT / "docs" / folder / "README.md").read_text("utf-8").splitlines()
-    rows = [line for line in lines if line.startswith("|")]
-    return "\n".join(["", *rows, ""]).replace("](", f"]({folder}/")
 
 
 def format_contents(caption: str, files: list[str]) -> str:
