@@ -26,7 +26,6 @@ OWN_TESTS = {
     "README.md": "tests/test_readme.py",
     "docs/cable-robots.md": "tests/cli/test_cable_robot_page.py",
     "docs/comparing-runs.md": "tests/cli/test_compare_runs.py",
-    "docs/delta-printers.md": "tests/cli/test_delta_page.py",
     "docs/extending.md": "tests/test_extending.py",
     "docs/hexapod-with-tracker.md": "tests/cli/test_hexapod_page.py",
     "docs/notebooks.md": "tests/report/test_notebooks_page.py",

@@ -23,7 +23,7 @@ def commands(root, tmp_path, monkeypatch) -> list[str]:
     """Work in an empty folder; return the commands of the section, without the program's name."""
     monkeypatch.chdir(tmp_path)
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
-    section = page.split("## From probe reports of Marlin")[1].split("\n## ")[0]
+    section = page.split("## Import the probe report")[1].split("\n## ")[0]
     found = re.findall(r"^loopcal (.*)$", section, re.MULTILINE)
     assert len(found) == 3
     return found
@@ -73,8 +73,8 @@ def test_commands_for_reprapfirmware_lead_to_a_recommendation(loopcal, commands)
 
 def test_lines_of_the_page_probe_its_thirteen_points(root, tmp_path) -> None:
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
-    section = page.split("### Thirteen points")[1].split("## What to type")[0]
-    marlin, reprap, klipper = re.findall(r"```text\n(.*?)```", section, re.DOTALL)
+    section = page.split("## Probe thirteen points")[1].split("\n## ")[0]
+    marlin, reprap, klipper = re.findall(r"```none\n(.*?)```", section, re.DOTALL)
     sent = re.findall(r"^G30 X(\S+) Y(\S+)$", marlin, re.MULTILINE)
     options = klipper.split("points:")[1]
     stored = re.findall(r"^ +(\S+), (\S+)$", options, re.MULTILINE)
@@ -86,7 +86,7 @@ def test_lines_of_the_page_probe_its_thirteen_points(root, tmp_path) -> None:
     read, _ = read_reports([tmp_path / "g32.txt", tmp_path / "bed.g"], "reprap", {})
     np.testing.assert_allclose([(p.x, p.y) for p in read], POINTS, atol=0.006)
     assert reprap.strip().endswith(" S-1")
-    typed = page.split("## What to type")[1].split("\n## ")[0]
+    typed = page.split("## Type the numbers")[1].split("\n## ")[0]
     assert re.findall(r"^loopcal (.*)$", typed, re.MULTILINE) == [
         f"export run --format {name}" for name in ("marlin", "reprap", "klipper")
     ]

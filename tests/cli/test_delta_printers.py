@@ -182,7 +182,7 @@ def test_import_of_distances_in_another_unit_shows_no_warnings_of_numpy(
 
 def test_page_shows_the_numbers_of_the_real_printer(loopcal, import_record, root) -> None:
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
-    quoted = page.split("compares the numbers of these lines -->\n```text\n")[1].split("```")[0]
+    quoted = page.split("compares the numbers of these lines -->\n```none\n")[1].split("```")[0]
     printed = import_record(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
     numbers = re.findall(r"\d+\.\d{4}", quoted)
     assert len(numbers) == 6

@@ -23,6 +23,7 @@ PAGES = [
     for path in [
         *(p for folder in FOLDERS for p in sorted((DOCS / folder).glob("*.md"))),
         DOCS / "controllers.md",
+        DOCS / "delta-printers.md",
         DOCS / "machines.md",
         DOCS / "production.md",
     ]
@@ -49,8 +50,6 @@ def test_page_runs_and_prints_what_it_shows(name, tmp_path, monkeypatch) -> None
     run_page(page)
     shown = [block for block in list_blocks(page) if block.language == "text"]
     assert shown, "a page shows what its commands print"
-    if name == "questions/rods-get-shorter":
-        check_table_of_rods(page)
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -64,9 +63,9 @@ def test_text_above_a_file_names_it_for_the_reader(name) -> None:
 def test_rods_of_20_mm_stay_flat_and_are_off_center_as_the_page_states(
     tmp_path, monkeypatch
 ) -> None:
-    """Check the sentences on 20 mm of docs/questions/flat-but-off-center.md."""
+    """Check the sentences on 20 mm of docs/delta-printers.md."""
     monkeypatch.chdir(tmp_path)
-    page = read_page("questions/flat-but-off-center")
+    page = read_page("delta-printers")
     files = {block.file: block.text for block in list_blocks(page) if block.file}
     Path("seven.csv").write_text(files["seven.csv"])
     machine_text = files["wrong-rods.yaml"].replace("225", "240").replace("215", "200")
@@ -90,14 +89,32 @@ def test_rods_of_20_mm_stay_flat_and_are_off_center_as_the_page_states(
     assert sentence.format(shift[0], shift.max()) in " ".join(page.split())
 
 
-def check_table_of_rods(page: str) -> None:
-    """Check that the three probings give the rods of the table, all flat within the noise."""
-    rows = re.findall(r"^\| (\w+) \| ([\d.]+) mm \| ([\d.]+) mm \| ([\d.]+) mm", page, re.MULTILINE)
+@pytest.mark.slow
+def test_probed_heights_give_the_wrong_rods_of_the_page_and_a_flat_bed(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    row = re.compile(
+        r"^\| (\w+) \| ([\d.]+) mm \| ([\d.]+) mm \| ([\d.]+) mm \| \S+ (\d+) mm \| (\S+) mm",
+        re.MULTILINE,
+    )
+    rows = row.findall(read_page("delta-printers"))
     assert len(rows) == 3
-    for run, *arms in rows:
+    run_command("loopcal example delta-printer")
+    for seed, (run, *arms, half, height) in zip((1, 2, 4), rows, strict=True):
+        run_command(
+            "loopcal simulate delta-printer/truth.yaml --poses delta-printer/points.csv --kind "
+            f"component --components z --sigma-position 0.02mm --seed {seed} -o {run}.csv"
+        )
+        printed = run_command(
+            f"loopcal calibrate linear-delta {run}.csv --method least-squares -o {run}"
+        )
         estimates = read_estimates(run)
-        found = [f"{estimates[f'arm{k}.length']:.1f}" for k in (1, 2, 3)]
-        assert found == arms
+        assert [f"{estimates[f'arm{k}.length']:.1f}" for k in (1, 2, 3)] == arms
+        assert (
+            max(re.findall(r"^arm\d.length +\S+ +\S+ +(\d+) +mm$", printed, re.MULTILINE)) == half
+        )
+        assert re.search(rf"^position z +rms .* {height} +\S+ +mm$", printed, re.MULTILINE)
 
 
 @pytest.mark.slow
