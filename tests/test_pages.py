@@ -25,7 +25,6 @@ from tests.io.test_probe_reports import REPRAP
 OWN_TESTS = {
     "README.md": "tests/test_readme.py",
     "docs/cable-robots.md": "tests/cli/test_cable_robot_page.py",
-    "docs/comparing-runs.md": "tests/cli/test_compare_runs.py",
     "docs/extending.md": "tests/test_extending.py",
     "docs/hexapod-with-tracker.md": "tests/cli/test_hexapod_page.py",
     "docs/notebooks.md": "tests/report/test_notebooks_page.py",

@@ -171,23 +171,6 @@ def test_a_run_that_states_no_units_is_shown_without_intervals(loopcal, runs, tm
     assert set(summary.plus_minus.values()) == {None}
 
 
-def test_the_page_shows_what_its_commands_print(root, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    page = (root / "docs" / "comparing-runs.md").read_text("utf-8")
-    commands = page.partition("```sh\n")[2].partition("```")[0].splitlines()
-    for command in commands:
-        capsys.readouterr()
-        assert main(command.split()[1:]) == 0, command
-    printed = capsys.readouterr().out
-    shown = page.partition("```text\n")[2].partition("```")[0]
-    assert shown.split("\n...\n")[0] in printed
-    for part in shown.split("\n...\n"):
-        assert part.strip("\n") in printed
-    code = page.partition("```python\n")[2].partition("```")[0]
-    exec(code, {})  # noqa: S102
-    assert capsys.readouterr().out.splitlines()[0] in ("True", "False")
-
-
 HOSTILE = "<script>alert(1)</script>=1+1\x1b[31m$\\frac{"
 
 

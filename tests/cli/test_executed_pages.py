@@ -22,6 +22,7 @@ PAGES = [
     name
     for path in [
         *(p for folder in FOLDERS for p in sorted((DOCS / folder).glob("*.md"))),
+        DOCS / "comparing-runs.md",
         DOCS / "controllers.md",
         DOCS / "delta-printers.md",
         DOCS / "machines.md",
