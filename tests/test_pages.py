@@ -15,12 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.delta_printers import read_records
 from tests.cli.page_commands import list_blocks, run_command, run_page
 from tests.cli.test_executed_pages import PAGES as EXECUTED_PAGES
-from tests.io.formats.linuxcnc.test_linuxcnc import format_hal, read_geometry
-from tests.io.formats.printers import format_printer_cfg
-from tests.io.test_probe_reports import REPRAP
 
 OWN_TESTS = {
     "README.md": "tests/test_readme.py",
@@ -146,24 +142,11 @@ def prepare_files(root: Path, data: Path) -> None:
         run_command(f"loopcal simulate robot.yaml {options} --kind {kind} -o {name}.csv")
 
 
-def prepare_formats(root: Path, data: Path) -> None:
-    record = next(iter(read_records(data).values()))
-    Path("printer.cfg").write_text(format_printer_cfg(record))
-    Path("config-override.g").write_text(REPRAP)
-    Path("hexapod.hal").write_text(format_hal(read_geometry(data)))
-    source = data / "urdf_closures" / "5bar_linkage"
-    shutil.copy(source / "robot.urdf", "robot.urdf")
-    shutil.copy(source / "robot.yaml", "robot.yaml")
-    copy_example(root, "cable-robot", samples_json="samples.json")
-    copy_example(root, "hexapod-tracker", machine_ini="machine.ini")
-
-
 PREPARATIONS: dict[str, Callable[[Path, Path], object]] = {
     "docs/getting-started.md": lambda root, data: None,
     "docs/calibration.md": prepare_calibration,
     "docs/exports.md": prepare_exports,
     "docs/files.md": prepare_files,
-    "docs/formats.md": prepare_formats,
     "CONTRIBUTING.md": lambda root, data: None,
     "evidence/README.md": lambda root, data: None,
     **{
@@ -173,15 +156,10 @@ PREPARATIONS: dict[str, Callable[[Path, Path], object]] = {
 }
 """From a page that runs here to the function that puts the files of its reader into the folder."""
 
-ALTERNATIVES = ("docs/exports.md", "docs/files.md", "docs/formats.md")
+ALTERNATIVES = ("docs/exports.md", "docs/files.md")
 """Pages whose commands show several ways to the same file; each replaces what is there."""
 
-OTHER_ROBOTS = {
-    "loopcal fill robot.yaml": "loopcal fill hexapod.yaml",
-    "loopcal export run --into machine.ini": "loopcal export hexapod.yaml --into machine.ini",
-    "loopcal export run --format linuxcnc": "loopcal export hexapod.yaml --format linuxcnc",
-    "loopcal export run --format urdf": "loopcal export robot-limbs.yaml --format urdf",
-}
+OTHER_ROBOTS = {"loopcal fill robot.yaml": "loopcal fill hexapod.yaml"}
 """Commands with another robot, or a run of one, than those before them: here its file."""
 
 

@@ -27,6 +27,7 @@ PAGES = [
         DOCS / "delta-printers.md",
         DOCS / "machines.md",
         DOCS / "production.md",
+        DOCS / "urdf.md",
     ]
     if (name := path.relative_to(DOCS).with_suffix("").as_posix()) not in STUDIES
     and "```sh" in path.read_text("utf-8")

@@ -193,7 +193,7 @@ def test_invalid_import_or_export_is_refused_in_one_sentence(
 
 
 def test_page_and_commands_list_every_format(root) -> None:
-    page = (root / "docs" / "formats.md").read_text()
+    page = (root / "docs" / "controllers.md").read_text()
     assert all(f"`{name}`" in page for name in FORMATS)
     for command, ability in (("import", "read"), ("export", "write")):
         found: Any = find_command(command)
