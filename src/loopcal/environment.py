@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The environment of a program: optional packages, and threads of linear algebra."""
+"""The environment of a program: optional packages, and settings of libraries."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from loopcal.errors import LoopcalError, MissingPackageError
@@ -26,6 +29,27 @@ One thread makes the last digits of results independent of the machine's setting
 fastest, because the matrices are small and threads wait for each other (5000 poses on two cores:
 0.3 s with one thread, 5 s and more with two).
 """
+
+
+def pin_settings() -> None:
+    """Let libraries of this process read settings from nowhere but their own packages.
+
+    Linear algebra gets one thread. matplotlib looks for `matplotlibrc` in the current folder
+    first, then at MATPLOTLIBRC, then in the folder of the user: it gets its own file. Where the
+    current folder has such a file, matplotlib is imported in another one.
+    """
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    os.environ.pop("MPLBACKEND", None)
+    package = find_spec("matplotlib")
+    if package is None or package.origin is None:
+        return
+    defaults = Path(package.origin).with_name("mpl-data")
+    os.environ["MATPLOTLIBRC"] = str(defaults)
+    if os.path.lexists("matplotlibrc") and "matplotlib" not in sys.modules:
+        folder = Path.cwd()
+        os.chdir(defaults)
+        import_module("matplotlib")
+        os.chdir(folder)
 
 
 @contextmanager

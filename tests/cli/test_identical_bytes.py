@@ -65,7 +65,11 @@ OTHER = {
     "OPENBLAS_NUM_THREADS": "4",
     "SOURCE_DATE_EPOCH": "86400",
     "COLUMNS": "80",
+    "MPLBACKEND": "no backend",
+    "MATPLOTLIBRC": "no file",
 }
+SETTINGS = b"text.usetex: True\nfont.family: serif\nsavefig.dpi: 30\naxes.facecolor: red\n\xff\n"
+"""Settings of matplotlib in the current folder, which no decoder of text can read to the end."""
 
 MORE = {
     "no variables": {},
@@ -77,16 +81,23 @@ MORE = {
 }
 
 
-def run_commands(folder: Path, commands: str, variables: dict[str, str]) -> dict[str, bytes]:
-    """Run commands in a process and a folder of their own; return the content of all files."""
+def run_commands(
+    folder: Path, commands: str, variables: dict[str, str], more: dict[str, bytes] | None = None
+) -> dict[str, bytes]:
+    """Run commands in a process and a folder of their own, which has `more` files; return the
+    content of all other files.
+    """
+    more = more or {}
     folder.mkdir()
     (folder / "targets.csv").write_text(TARGETS)
+    for name, content in more.items():
+        (folder / name).write_bytes(content)
     kept = {"PATH", "PYTHONPATH", "HOME", "MPLCONFIGDIR"}
     environment = {k: v for k, v in os.environ.items() if k in kept} | variables
     words = [sys.executable, "-c", WORK, commands]
     done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr.decode()
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in more)
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
@@ -106,7 +117,7 @@ def list_differences(first: dict[str, bytes], second: dict[str, bytes]) -> list[
 def test_files_and_pages_are_identical_in_another_environment(tmp_path, root) -> None:
     commands = SHORT.format(root=root)
     first = run_commands(tmp_path / "first", commands, USUAL)
-    second = run_commands(tmp_path / "second folder", commands, OTHER)
+    second = run_commands(tmp_path / "second folder", commands, OTHER, {"matplotlibrc": SETTINGS})
     names = {"robot.svg", "data.csv", "run/result.json", "run/arrays.npz", "per-leg.yaml"}
     assert names <= set(first)
     assert list_differences(first, second) == []

@@ -27,7 +27,7 @@ import click
 import loopcal
 from loopcal.cli import terminal
 from loopcal.cli.hints import find_hint, word_hint
-from loopcal.environment import THREADS
+from loopcal.environment import pin_settings
 from loopcal.errors import LoopcalError, suggest_names
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
@@ -180,7 +180,7 @@ def command_line() -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line, or these words after `loopcal`, and return its exit code."""
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    pin_settings()
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_streams()
     command = None
