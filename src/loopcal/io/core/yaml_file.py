@@ -35,6 +35,9 @@ _KNOWN_KEY = re.compile(
 )
 """A line by which a file is recognized as one of loopcal; messages only quote such files."""
 
+_DIRECTIVE = re.compile(r"(?:\s*(?:#.*)?\n)*%")
+"""A text that begins with a directive, such as `%YAML 1.1`, after empty lines and comments."""
+
 
 @dataclass(frozen=True)
 class YamlFile:
@@ -120,6 +123,9 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
     from ruamel.yaml.constructor import DuplicateKeyError
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+    if (directive := _DIRECTIVE.match(text)) is not None:
+        sentence = "YAML directives, which begin with %, are not allowed here; remove the line"
+        raise FileError(sentence, path, directive[0].count("\n") + first_line)
     try:
         return _parse_text(text) if len(text) <= KEPT_LENGTH else _parse_text.__wrapped__(text)
     except DuplicateKeyError as error:
@@ -128,15 +134,15 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
         raise FileError(f"duplicate key {quote(key)}; remove one", path, line) from None
     except _RefusedError as error:
         line = error.line + first_line
-        if error.limit is not None:
-            raise error.limit.make_error(what, path, line=line) from None
-        raise FileError("a key is a list or a mapping; write text there", path, line) from None
+        if isinstance(error.refusal, FileLimit):
+            raise error.refusal.make_error(what, path, line=line) from None
+        raise FileError(error.refusal, path, line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = _shorten(error.problem or error.context or "not YAML")
         sentence = f"not valid YAML ({problem}); check indentation, brackets and colons"
         raise FileError(sentence, path, mark.line + first_line if mark else None) from None
-    except (YAMLError, ValueError, RecursionError) as error:
+    except (YAMLError, ValueError, RecursionError, LookupError, AssertionError) as error:
         if "integer string conversion" in str(error):  # Python reads no more than 4300 digits
             raise FileError("a number has thousands of digits; write a shorter one", path) from None
         sentence = f"not valid YAML ({_shorten(error)}); correct the syntax"
@@ -230,22 +236,21 @@ def _to_plain(node: Any, file: YamlFile, location: Location, has_names: bool) ->
         return [_to_plain(item, file, (*location, i), has_names) for i, item in enumerate(node)]
     if isinstance(node, datetime.date):
         return node.isoformat()
-    sentence = f"{name_location(location)!r} has a YAML tag, which is not allowed here; remove it"
-    raise file.error(sentence, location)
+    raise file.error(
+        f"{name_location(location)!r} has no value that loopcal reads; put it in quotes", location
+    )
 
 
-# A composer of YAML that refuses deep documents, those whose aliases stand for too much, and
-# keys that are lists or mappings.
+# A composer of YAML that refuses tags, deep documents, those whose aliases stand for too much,
+# and keys that are lists or mappings.
 
 
 class _RefusedError(Exception):
-    """A document beyond a limit, or (None) a key that is a list or a mapping; the line is counted
-    from 0.
-    """
+    """A document beyond a limit, or another refusal as a sentence; the line is counted from 0."""
 
-    def __init__(self, limit: FileLimit | None, line: int) -> None:
-        super().__init__(limit, line)
-        self.limit, self.line = limit, line
+    def __init__(self, refusal: FileLimit | str, line: int) -> None:
+        super().__init__(refusal, line)
+        self.refusal, self.line = refusal, line
 
 
 def _make_bounded_composer(loader: Any) -> Any:
@@ -278,26 +283,29 @@ def _make_bounded_composer(loader: Any) -> Any:
         def compose_node(self, parent: Any, index: Any) -> Any:
             """Return the next node; check that a key is a scalar."""
             event = self.parser.peek_event()
-            line = event.start_mark.line
             node = self._compose_counted(parent, index, event)
             is_key = parent is not None and index is None
             if is_key and not isinstance(node, ScalarNode):
-                raise _RefusedError(None, line)
+                sentence = "a key is a list or a mapping; write text there"
+                raise _RefusedError(sentence, event.start_mark.line)
             return node
 
         def _compose_counted(self, parent: Any, index: Any, event: Any) -> Any:
             """Return the next node, whose event is the next one; count its values."""
+            line = event.start_mark.line
             if isinstance(event, AliasEvent):
                 if event.anchor in self.anchors and event.anchor not in self._sizes:
                     problem = f"alias {event.anchor!r} stands for a value that contains the alias"
                     raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
                 self._add(self._sizes.get(event.anchor, 1), event)
                 return super().compose_node(parent, index)
+            if event.tag is not None:
+                raise _RefusedError("YAML tags are not allowed here; remove the tag", line)
             before = self._count
             self._add(1, event)
             self._level += 1
             if self._level > YAML_DEPTH.count:
-                raise _RefusedError(YAML_DEPTH, event.start_mark.line)
+                raise _RefusedError(YAML_DEPTH, line)
             # YAML allows an anchor again, for another value; ruamel.yaml warns where it is known
             self.anchors.pop(event.anchor, None)
             self._sizes.pop(event.anchor, None)
