@@ -35,8 +35,8 @@ _KNOWN_KEY = re.compile(
 )
 """A line by which a file is recognized as one of loopcal; messages only quote such files."""
 
-_DIRECTIVE = re.compile(r"(?:\s*(?:#.*)?\n)*%")
-"""A text that begins with a directive, such as `%YAML 1.1`, after empty lines and comments."""
+_DIRECTIVE = re.compile(r"(?:\s*(?:#.*)?\n)*%(?!YAML 1\.2\s)")
+"""A text that begins with a directive other than `%YAML 1.2`, after empty lines and comments."""
 
 
 @dataclass(frozen=True)
