@@ -81,3 +81,20 @@ def test_a_value_out_of_range_is_refused_with_what_is_allowed(call, words):
     data = hexapod_data(12)
     with pytest.raises(lc.LoopcalError, match=words):
         call(lc.identify(hexapod(), data, lc.MAP()), data)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda robot, data, folder: lc.save_measurements(robot, folder / "data.csv", data),
+        lambda robot, data, folder: lc.identifiability(data, robot),
+        lambda robot, data, folder: lc.assess_repeatability(data, robot),
+        lambda robot, data, folder: lc.validate(data, robot),
+        lambda robot, data, folder: lc.identify(data, robot),
+        lambda robot, data, folder: lc.calibrate(data, robot),
+    ],
+)
+def test_robot_and_data_in_the_wrong_order_are_named(robot, data, tmp_path, call):
+    with pytest.raises(lc.DataError, match="robot: got a Measurements; give Mechanism"):
+        call(robot, data, tmp_path)
+    assert list(tmp_path.iterdir()) == []

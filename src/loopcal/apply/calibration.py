@@ -54,7 +54,7 @@ from loopcal.estimate.determinable_setup import (
 )
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import check_types, exclude_poses, identify
+from loopcal.estimate.identification import exclude_poses, identify
 from loopcal.estimate.information import count_equations, has_equations_to_spare
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import DISCREPANCY
@@ -64,7 +64,7 @@ from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import list_instrument_frames
 from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
-from loopcal.measure.data_checks import check_duplicates
+from loopcal.measure.data_checks import check_duplicates, check_types
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import check_instruments
 from loopcal.measure.readings import fill_in_reading_sigma

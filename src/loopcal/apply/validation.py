@@ -359,7 +359,6 @@ def validate(
         uncertainty = collect_uncertainty(fit) if uncertainty is None else uncertainty
         noise = NoiseKnowledge.of(fit.residual_test)
         reused = [] if are_rows_known else _report_reused(fit.posterior.fitted_rows, data)
-    assert isinstance(robot, Mechanism)
     check_actuators(data, robot)
     if nuisance_values_before is None:
         is_usual = before is None and nuisance_values is None and nuisance is not None

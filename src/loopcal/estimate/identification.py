@@ -91,7 +91,7 @@ from loopcal.estimate.unfixed_motions import (
 )
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.array_checks import check_type
-from loopcal.measure.data_checks import check_actuators
+from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
@@ -109,12 +109,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_
 
 HUGE = 1e150
 """Residuals, in units of sigma, whose squares cannot be summed."""
-
-
-def check_types(robot: object, data: object) -> None:
-    """Refuse anything but a robot and measurements, such as file names."""
-    check_type(robot, Mechanism, "robot", "as from loopcal.load_robot('hexapod-42')")
-    check_type(data, Measurements, "data", "as from load_measurements('data.csv', robot)")
 
 
 def prepare_fitted_data(fit: Identification, data: Measurements) -> Measurements:

@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import check_types, identify
+from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import INFLATION, Posterior, combine_degrees
@@ -25,6 +25,7 @@ from loopcal.estimate.prior import Prior, limb_parameters, prior_from
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
+from loopcal.measure.data_checks import check_types
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism

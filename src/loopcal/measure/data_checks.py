@@ -16,6 +16,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.findings import Quantity, report_finding
+from loopcal.measure.array_checks import check_type
 from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
@@ -63,8 +64,17 @@ def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
         raise DataError(report_finding(code, robot=robot.name, **counts))
 
 
+def check_types(robot: object, data: object) -> None:
+    """Refuse anything but a robot and measurements, such as file names."""
+    check_type(robot, Mechanism, "robot", "as from loopcal.load_robot('hexapod-42')")
+    check_type(data, Measurements, "data", "as from load_measurements('data.csv', robot)")
+
+
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
-    """Refuse readings without one column per actuator, and readings alone without information."""
+    """Refuse other types, readings without one column per actuator, and readings alone without
+    information.
+    """
+    check_types(robot, measurements)
     columns, names = measurements.readings.shape[1], tuple(a.name for a in robot.actuators)
     if columns != len(names):
         stated: dict[str, Any] = {"columns": columns, "robot": robot.name}

@@ -44,12 +44,12 @@ from loopcal.diagnose.conventions.selection import (
 )
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.identification import check_types
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.data_checks import (
     check_actuators,
     check_targets_move,
+    check_types,
     describe_outside_strokes,
     has_static_targets,
 )

@@ -93,7 +93,10 @@ def save_measurements(
     FileError : the file cannot be written, or a file of settings has its name.
     DataError : a name that a file cannot hold.
     """
+    from loopcal.measure.data_checks import check_types
+
     path = as_path(path, "measurement file")
+    check_types(robot, data)
     text = format_measurements(data, robot, remark)
     refuse_settings_beside(path)
     write_text(path, text)
