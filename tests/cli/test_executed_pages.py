@@ -16,21 +16,20 @@ import loopcal as lc
 from tests.cli.page_commands import check_shown_lines, list_blocks, run_command, run_page
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-FOLDERS = ("questions", "machines", "instruments")
-STUDIES = [f"questions/{name}" for name in ("instrument", "method", "poses")]
+FOLDERS = ("questions", "machines")
 PAGES = [
-    name
+    path.relative_to(DOCS).with_suffix("").as_posix()
     for path in [
         *(p for folder in FOLDERS for p in sorted((DOCS / folder).glob("*.md"))),
         DOCS / "comparing-runs.md",
         DOCS / "controllers.md",
         DOCS / "delta-printers.md",
+        DOCS / "instruments.md",
         DOCS / "machines.md",
         DOCS / "production.md",
         DOCS / "urdf.md",
     ]
-    if (name := path.relative_to(DOCS).with_suffix("").as_posix()) not in STUDIES
-    and "```sh" in path.read_text("utf-8")
+    if "```sh" in path.read_text("utf-8")
 ]
 
 
@@ -121,9 +120,7 @@ def test_probed_heights_give_the_wrong_rods_of_the_page_and_a_flat_bed(
 
 @pytest.mark.slow
 def test_table_of_instruments_states_the_ranks_of_the_hexapod() -> None:
-    rows = re.findall(
-        r"\| `(\w+)`(?: \((\w)\))? \| (\d+) of 42 \|", read_page("instruments/README")
-    )
+    rows = re.findall(r"\| `(\w+)`(?: \((\w)\))? \| (\d+) of 42 \|", read_page("instruments"))
     assert len(rows) == 8
     for kind, component, rank in rows:
         options = f"--kind {kind}" + (f" --components {component}" if component else "")

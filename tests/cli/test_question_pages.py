@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/questions: its commands run as printed, and its sentences are true of the evidence."""
+"""Studies of examples/studies: commands run, and pages state what is true of their evidence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from evidence.questions.example_studies import find_cell
 from loopcal.cli.entry_point import main
 from tests.cli.page_commands import list_commands
 
-PAGES = {"instrument": "instruments", "poses": "poses", "method": "methods"}
+PAGES = {"instruments": "instruments", "poses": "questions/poses", "methods": "questions/method"}
+"""From a study to the page of docs/ with its answer."""
 
 
 def read_evidence(root: Path, name: str) -> dict[str, Any]:
@@ -24,21 +25,22 @@ def read_evidence(root: Path, name: str) -> dict[str, Any]:
 
 
 def read_page(root: Path, name: str) -> str:
-    """Return the text of a page, in one line."""
-    text = (root / "docs" / "questions" / f"{name}.md").read_text("utf-8")
+    """Return the text of the page of a study, in one line."""
+    text = (root / "docs" / f"{PAGES[name]}.md").read_text("utf-8")
     return " ".join(text.split())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES)
-def test_commands_of_the_page_run(page, root, tmp_path, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize("name", PAGES)
+def test_commands_of_the_study_run(name, root, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    name = PAGES[page]
     text = (root / "examples" / "studies" / f"{name}.yaml").read_text("utf-8")
     text = re.sub(r"^ *block: \d+\n", "", text, flags=re.MULTILINE)
     text = re.sub(r"replicates: \d+", "replicates: 2", text)
     Path(f"{name}.yaml").write_text(text.replace("seed: 14", "seed: 14\nblock: 2"))
-    commands = list_commands((root / "docs" / "questions" / f"{page}.md").read_text("utf-8"))
+    page = (root / "examples" / "studies" / "README.md").read_text("utf-8")
+    commands = [words for words in list_commands(page) if words[2].startswith(name)]
+    assert len(commands) >= 3
     for words in commands:
         if words[1] == "check":  # takes some seconds; it reads what `run` reads
             continue
@@ -49,16 +51,16 @@ def test_commands_of_the_page_run(page, root, tmp_path, monkeypatch, capsys) -> 
     assert sorted(path.stem for path in Path(name).glob("*.png")) == sorted(drawn)
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_the_evidence_is_of_the_study_file_and_its_figures_are_shown(page, root) -> None:
-    document, name = read_evidence(root, PAGES[page]), PAGES[page]
+@pytest.mark.parametrize("name", PAGES)
+def test_the_evidence_is_of_the_study_file_and_its_figures_are_shown(name, root) -> None:
+    document = read_evidence(root, name)
     study = lc.load_study(root / "examples" / "studies" / f"{name}.yaml")
     assert document["replicates"] == study.replicates
     assert [cell["levels"] for cell in document["cells"]] == [dict(c.levels) for c in study.cells]
-    shown = re.findall(r"\(\.\./evidence/(study_[\w.-]+)\)", read_page(root, page))
+    shown = re.findall(r"\((?:\.\./)?evidence/(study_[\w.-]+)\)", read_page(root, name))
     assert sorted(shown) == document["figures"]
     assert all((root / "docs" / "evidence" / figure).exists() for figure in shown)
-    assert f"examples/studies/{name}.yaml" in read_page(root, page)
+    assert f"examples/studies/{name}.yaml" in read_page(root, name)
 
 
 def find_answers(document: dict[str, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -81,11 +83,12 @@ def test_page_of_instruments_is_true_of_the_evidence(root) -> None:
     for instrument in ("height gauge", "level"):
         for poses in ("20", "40"):
             assert answers[instrument, poses]["certainty"] == "none"
+        few, many = (100 * answers[instrument, n]["shares"]["1"][0] for n in ("20", "40"))
+        row = f"| {instrument} | does not suffice ({few:.0f} % of machines) | does not suffice"
+        row = row if instrument == "height gauge" else row.replace(" of machines", "")
+        assert f"{row} ({many:.0f} %) |" in read_page(root, "instruments")
     assert "base frame" in document["frame"]
-    assert "on 95 % of machines. Errors are in the base frame." in read_page(root, "instrument")
-    assert "A height gauge of 10 um and a level of 50 urad do not suffice" in read_page(
-        root, "instrument"
-    )
+    assert "on 95 % of machines, in the base frame." in read_page(root, "instruments")
 
 
 def test_page_of_poses_is_true_of_the_evidence(root) -> None:
@@ -148,11 +151,11 @@ def test_page_of_methods_is_true_of_the_evidence(root) -> None:
     narrow = find("ridge", worse, outliers, "covered_position", "mean")
     percents = [f"{100 * share:.0f}" for share in narrow]
     assert narrow[2] < 0.95
-    assert "contain {} % of the errors ({} to {} %)".format(*percents) in read_page(root, "method")
+    assert "contain {} % of the errors ({} to {} %)".format(*percents) in read_page(root, "methods")
     for errors, template in (
         (stated, "contain {} % of the errors ({} to {} %), and"),
         (worse, "and {} % ({} to {} %) where the machines are four times as bad"),
     ):
         covered = find("default", errors, "none", "covered_position", "mean")
         sentence = template.format(*(f"{100 * share:.0f}" for share in covered))
-        assert sentence in read_page(root, "method")
+        assert sentence in read_page(root, "methods")
