@@ -70,12 +70,13 @@ viewer:  ## build the script of the 3-D view from tools/viewer (needs Node.js >=
 	cd tools/viewer && sha256sum package.json package-lock.json build.js src/*.js \
 	  ../../src/loopcal/report/scene/viewer.min.js ../../src/loopcal/report/scene/three.LICENSE.txt > SHA256SUMS
 
-check: .venv/dev.stamp  ## lint, format, types, layers
+check: .venv/dev.stamp  ## lint, format, types, layers, wording
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 	$(BIN)/python -m tools.check_types
 	$(BIN)/lint-imports
+	$(BIN)/python -m tools.wording
 
 format: .venv/dev.stamp  ## let ruff sort imports and lay out the code
 	$(BIN)/ruff check --fix

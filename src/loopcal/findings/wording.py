@@ -124,7 +124,7 @@ def list_names(names: Sequence[Any], shown: int = SHOWN_NAMES) -> str:
 def fill_template(template: str, /, **data: Any) -> str:
     """Return a template filled with data."""
     words = []
-    for text, name, spec, conversion in _parse(template):
+    for text, name, spec, conversion in parse_template(template):
         words.append(text)
         if name is not None:
             value = _PYTHON.convert_field(_look_up(name, data), conversion)
@@ -135,7 +135,7 @@ def fill_template(template: str, /, **data: Any) -> str:
 def list_fields(template: str) -> frozenset[str]:
     """Return the names of the data that a template shows, those of optional parts included."""
     fields: set[str] = set()
-    for _, name, spec, _ in _parse(template):
+    for _, name, spec, _ in parse_template(template):
         if name and not name.endswith("()"):
             fields.update(part.split(".")[0].split("[")[0] for part in name.split("+"))
         if "|" in spec and not spec.startswith("each"):
@@ -147,12 +147,12 @@ def depends_on_data(template: str) -> bool:
     """Return whether the sentences of a template differ in more than names and numbers."""
     return any(
         name is not None and ("|" in spec or name.endswith("()"))
-        for _, name, spec, _ in _parse(template)
+        for _, name, spec, _ in parse_template(template)
     )
 
 
 @cache
-def _parse(template: str) -> tuple[tuple[str, str | None, str, str | None], ...]:
+def parse_template(template: str) -> tuple[tuple[str, str | None, str, str | None], ...]:
     """Return literal text, name, format and conversion of each field."""
     return tuple(
         (text, name, spec or "", conversion)
@@ -161,7 +161,7 @@ def _parse(template: str) -> tuple[tuple[str, str | None, str, str | None], ...]
 
 
 @cache
-def _split(text: str) -> tuple[str, ...]:
+def split_branches(text: str) -> tuple[str, ...]:
     """Return the branches between bars that are outside of braces."""
     branches, depth = [""], 0
     for character in text:
@@ -196,7 +196,7 @@ def _word_parts(value: Any, spec: str, data: Mapping[str, Any]) -> str:
         if joint and not joint.strip().isdigit():
             return joint.join(words)
         return list_names(words, int(joint or SHOWN_NAMES))
-    branches = _split(text)
+    branches = split_branches(text)
     if rule == "choose":
         named = dict(part.split("=", 1) for part in branches[:-1])
         return fill_template(named.get(str(value), branches[-1]), **data)
