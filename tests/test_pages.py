@@ -20,7 +20,6 @@ from tests.cli.test_executed_pages import PAGES as EXECUTED_PAGES
 
 OWN_TESTS = {
     "README.md": "tests/test_readme.py",
-    "docs/cable-robots.md": "tests/cli/test_cable_robot_page.py",
     "docs/extending.md": "tests/test_extending.py",
     "docs/hexapod-with-tracker.md": "tests/cli/test_hexapod_page.py",
     "docs/notebooks.md": "tests/report/test_notebooks_page.py",

@@ -274,7 +274,7 @@ MODELS = (
     (("ABC", "D"), 4),
     (tuple("ABCD"), 4),
 )
-"""Models of the spools, in the order of the table in docs/cable-robots.md: groups of lines that
+"""Models of the spools, in the order of the table in docs/self-calibration.md: groups of lines that
 share a build-up, and number of radii.
 """
 
@@ -290,7 +290,7 @@ def fits(samples, tmp_path_factory) -> dict[tuple[tuple[str, ...], int], Identif
 
 
 def test_fits_of_the_spool_models_give_the_numbers_of_the_page(fits, root):
-    page = (root / "docs" / "cable-robots.md").read_text("utf-8")
+    page = (root / "docs" / "self-calibration.md").read_text("utf-8")
     rows = re.findall(
         r"^\| (?:one|four) \| .*? \| (\d+) \| (\S+) \| (\d+) \+/- (\d+) \| (\S+) \|$",
         page,

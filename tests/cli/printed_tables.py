@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read printed reports and their tables, to compare pages with the output of commands."""
-
-import re
+"""Read printed tables, to compare pages with the output of commands."""
 
 
 def read_table_rows(text: str) -> list[list[str]]:
@@ -15,12 +13,3 @@ def read_table_rows(text: str) -> list[list[str]]:
         elif in_table:
             rows.append(line.split())
     return rows
-
-
-def read_report(text: str) -> str:
-    """Return a printed calibration report of a page or of a command, from the verdict on.
-
-    The number of findings that only the full report has is left out.
-    """
-    report = text[text.index("Undecided: ") :].partition("```")[0]
-    return re.sub(r"\(\d+ more findings", "(more findings", report)

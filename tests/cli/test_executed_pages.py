@@ -27,6 +27,7 @@ PAGES = [
         DOCS / "instruments.md",
         DOCS / "machines.md",
         DOCS / "production.md",
+        DOCS / "self-calibration.md",
         DOCS / "urdf.md",
     ]
     if "```sh" in path.read_text("utf-8")

@@ -334,7 +334,7 @@ def test_tape_reduces_the_uncertainty_of_the_anchors_along_their_lines_to_a_thir
 ) -> None:
     samples = load_real_samples(data_folder)
     names = ("A.anchor.y", "B.anchor.x", "C.anchor.x", "D.anchor.z")
-    page = (root / "docs" / "cable-robots.md").read_text("utf-8")
+    page = (root / "docs" / "self-calibration.md").read_text("utf-8")
     for what, found in (
         ("none", {key: value for key, value in samples.items() if key != TAPED}),
         ("5 mm", samples),
