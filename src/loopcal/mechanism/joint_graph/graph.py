@@ -29,7 +29,9 @@ class GraphJoint:
         nothing can be shifted there.
     shifts : axes of these frames along which a shift changes the mechanism.
     limits : allowed values [rad or m], or None.
-    drive : the motor that moves it, empty where it is passive. Joints of one drive have one value.
+    drive : the motor that moves it, or the passive joint that couplings make it follow, which then
+        has itself as drive; empty where nothing does. Its value is `ratio` times that of the drive
+        + `offset` [rad or m].
     """
 
     name: str
@@ -44,11 +46,18 @@ class GraphJoint:
     shifts: str = "xyz"
     limits: tuple[float, float] | None = None
     drive: str = ""
+    ratio: float = 1.0
+    offset: float = 0.0
 
     @property
     def bodies(self) -> tuple[str, str]:
         """Return both bodies."""
         return self.body_a, self.body_b
+
+    @property
+    def is_plain(self) -> bool:
+        """Return whether its value is that of its drive."""
+        return (self.ratio, self.offset) == (1.0, 0.0)
 
     @property
     def is_pin(self) -> bool:
@@ -75,11 +84,6 @@ class GraphJoint:
     def orient(self, body: str) -> GraphJoint:
         """Return the joint from one of its bodies."""
         return self if body == self.body_a else self.reverse()
-
-    def follow(self, drive: str, sign: float, offset: float) -> GraphJoint:
-        """Return the joint as one of a drive, whose value is sign * value of the drive + offset."""
-        back = geometry.invert_pose(self.T_a) @ self.move(np.array(-offset))
-        return replace(self, drive=drive, axis=sign * self.axis, T_b=self.T_b @ back)
 
     def move(self, values: FloatArray) -> FloatArray:
         """Return the frames (.., 4, 4) of the second body in the first one, at values (..)."""

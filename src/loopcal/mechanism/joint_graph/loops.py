@@ -50,7 +50,8 @@ class JointGraph:
     """A mechanism.
 
     base : the root body. tree : joints, each after the one that carries its first body.
-    closing : joints that close loops. motors : names of drives; their joints are all in the tree.
+    closing : joints that close loops. motors : names of driven joints. All joints with a `drive`
+        are in the tree.
     """
 
     base: str
@@ -76,16 +77,33 @@ class JointGraph:
     @cached_property
     def is_driven(self) -> BoolArray:
         """Which joints of the tree are driven (j,)."""
-        return np.array([bool(joint.drive) for joint in self.tree], dtype=bool)
+        return np.array([joint.drive in self.motors for joint in self.tree], dtype=bool)
 
     @cached_property
-    def shared(self) -> FloatArray:
-        """Rows (s, j) that are zero where all joints of a drive have one value."""
-        drives = [joint.drive for joint in self.tree]
-        pairs = [(drives.index(drive), i) for i, drive in enumerate(drives) if drive]
-        pairs = [(first, i) for first, i in pairs if first < i]
-        unit = np.eye(len(drives))
-        return np.reshape([unit[i] - unit[first] for first, i in pairs], (-1, len(drives)))
+    def leads(self) -> Mapping[str, GraphJoint]:
+        """The joint of each drive: its own, or else the first that follows it."""
+        driven = [joint for joint in reversed(self.tree) if joint.drive]
+        own = [joint for joint in driven if joint.drive == joint.name]
+        return {joint.drive: joint for joint in (*driven, *own)}
+
+    def find_lead(self, joint: GraphJoint) -> tuple[GraphJoint, float, float]:
+        """Return lead, factor and offset of a joint: value = factor * lead value + offset."""
+        lead = self.leads.get(joint.drive, joint)
+        factor = joint.ratio / lead.ratio
+        return lead, factor, joint.offset - factor * lead.offset
+
+    @cached_property
+    def coupled(self) -> tuple[FloatArray, FloatArray]:
+        """Rows (s, j) and values (s,) of the couplings: rows @ (q / units) = values."""
+        units, index, count = self.units, self.names.index, len(self.tree)
+        rows, values = [], []
+        for i, joint in enumerate(self.tree):
+            lead, factor, offset = self.find_lead(joint)
+            if lead is not joint:
+                k = index(lead.name)
+                rows.append(np.eye(count)[i] - factor * units[k] / units[i] * np.eye(count)[k])
+                values.append(offset / units[i])
+        return np.reshape(rows, (-1, count)), np.array(values)
 
     @cached_property
     def turns(self) -> BoolArray:
@@ -185,8 +203,9 @@ class JointGraph:
         Lengths are divided by `size`, and a slide's value is counted in it.
         """
         placement = self.place(q)
-        residual = [q / self.units @ self.shared.T]
-        rows = [np.tile(self.shared, (len(q), 1, 1))]
+        coupled, values = self.coupled
+        residual = [q / self.units @ coupled.T - values]
+        rows = [np.tile(coupled, (len(q), 1, 1))]
         for joint in self.closing:
             r, J = self._linearize_joint(placement, joint)
             residual.append(r)
@@ -357,12 +376,13 @@ def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
 
 def list_nearby(graph: JointGraph, home: FloatArray) -> FloatArray:
     """Return a pose (j,), and others (n, j) with the motors moved a little."""
-    shifts = [np.zeros(len(home))]
+    shifts, unit = [np.zeros(len(home))], dict(zip(graph.names, graph.units, strict=True))
+    laws = map(graph.find_lead, graph.tree)
+    scales = NEAR_RANGE * np.array([factor * unit[lead.name] for lead, factor, _ in laws])
     for seed in range(NEAR):
         rng = np.random.default_rng(seed)
         values = dict(zip(graph.motors, rng.uniform(-1, 1, len(graph.motors)), strict=True))
-        moved = np.array([values.get(joint.drive, 0.0) for joint in graph.tree])
-        shifts.append(NEAR_RANGE * moved * graph.units * graph.is_driven)
+        shifts.append(scales * [values.get(joint.drive, 0.0) for joint in graph.tree])
     near = graph.close(home + np.stack(shifts), graph.is_driven)
     near[0] = home
     return near[np.isfinite(near).all(axis=1)]
@@ -388,7 +408,7 @@ def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
 def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
     """Return how many closure equations repeat others at a pose (j,)."""
     rows = graph.linearize(q[None])[1][0]
-    rank = len(graph.shared) + sum({"R": 5, "P": 5, "S": 3}[j.kind] for j in graph.closing)
+    rank = len(graph.coupled[1]) + sum({"R": 5, "P": 5, "S": 3}[j.kind] for j in graph.closing)
     s = np.linalg.svd(rows, compute_uv=False) if rows.size else np.zeros(0)
     return rank - int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum())
 

@@ -73,7 +73,7 @@ def list_blocks(graph: JointGraph) -> tuple[Block, ...]:
 
 def find_blocks(graph: JointGraph, platform: str) -> tuple[Block, ...]:
     """Return the blocks from the base to a platform, with the platform of each; those between two
-    that one drive moves are one block.
+    that one drive moves, or whose joints are coupled, are one block.
     """
     carrying = {body: block for block in list_blocks(graph) for body in block.graph.bodies[1:]}
     path: list[Block] = []
@@ -81,8 +81,8 @@ def find_blocks(graph: JointGraph, platform: str) -> tuple[Block, ...]:
     while body != graph.base:
         path.insert(0, Block(carrying[body].graph, body))
         body = carrying[body].graph.base
-    for drive in graph.motors:
-        moved = [i for i, block in enumerate(path) if drive in block.graph.motors]
+    for drive in graph.leads:
+        moved = [i for i, block in enumerate(path) if drive in block.graph.leads]
         if len(moved) > 1:
             first, last = moved[0], moved[-1]
             joints = {joint for block in path[first : last + 1] for joint in block.graph.joints}
@@ -115,11 +115,6 @@ class GraphLimb:
     to: str
     joints: tuple[GraphJoint, ...]
 
-    @property
-    def drives(self) -> tuple[str, ...]:
-        """Return the motors that move its joints."""
-        return tuple(joint.drive for joint in self.joints if joint.drive)
-
     def reverse(self) -> GraphLimb:
         """Return the limb from its other end."""
         joints = tuple(joint.reverse() for joint in reversed(self.joints))
@@ -148,6 +143,12 @@ class LimbPaths:
         ends = dict.fromkeys(end for limb in self.limbs for end in (limb.on, limb.to))
         return tuple(body for body in ends if body not in (self.graph.base, self.platform))
 
+    @cached_property
+    def used(self) -> JointGraph:
+        """Return the mechanism without dead ends."""
+        names = {joint.name for limb in self.limbs for joint in limb.joints}
+        return select_joints(self.graph, {j for j in self.graph.joints if j.name in names})
+
     def locate(self, body: str) -> FloatArray:
         """Return the place (4, 4) of a body at home."""
         return self.graph.get_place(self.graph.place(self.home[None]), body)[0]
@@ -171,9 +172,13 @@ def find_limbs(graph: JointGraph, platform: str) -> tuple[GraphLimb, ...]:
         if circle is None:
             break
         inner.append(circle.joints[len(circle.joints) // 2].body_a)
-    order = graph.motors.index
-    last = len(graph.motors)  # passive limbs
-    return tuple(sorted(limbs, key=lambda limb: min(map(order, limb.drives), default=last)))
+    order = {motor: i for i, motor in enumerate(graph.motors)}
+    last = len(order)  # passive limbs
+
+    def find_first(limb: GraphLimb) -> int:
+        return min((order.get(joint.drive, last) for joint in limb.joints), default=last)
+
+    return tuple(sorted(limbs, key=find_first))
 
 
 def _walk_limbs(joints: Sequence[GraphJoint], nodes: Sequence[str]) -> Iterator[GraphLimb]:
@@ -375,7 +380,7 @@ def find_stage_paths(
     for block, mount in map(_turn_base, blocks):
         frame = locate_frame(block.platform)
         values = _select(graph, home, block)
-        if block.is_serial and len(blocks) > 1:
+        if block.is_serial and len(blocks) > 1 and block.graph.tree[0].is_plain:
             stages.append(SerialStage(block.graph.tree[0], float(values[0]), frame))
         else:
             closed = place_limbs(block, values, frame)
@@ -564,9 +569,6 @@ def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, .
     _refuse_repeated(joints)
     joints = [replace(j, drive=j.name) if j.name in motors else j for j in joints]
     tree, closing = _span_tree(base, _merge_pins(base, list(joints)))
-    lost = next((joint.name for joint in closing if joint.drive), None)
-    if lost is not None:
-        raise MechanismError(report_finding("files.motors-in-loop", motor=lost))
     return JointGraph(base, tree, closing, motors)
 
 
@@ -577,33 +579,34 @@ MIMICS = 1e-9
 def couple_joints(
     graph: JointGraph, couplings: Sequence[Coupling]
 ) -> tuple[JointGraph, tuple[Coupling, ...]]:
-    """Return the mechanism in which joints that follow a motor, or move against it, are joints of
-    its drive, and the couplings that remain. Those that the loops contain are left out.
+    """Return the mechanism in which joints follow a motor, or a passive joint, and the couplings
+    that contradict others. Those that the loops contain are left out.
     """
     joints = {joint.name: joint for joint in graph.joints}
     known = [c for c in couplings if {c.joint, c.leader} <= joints.keys()]
     if not known:
         return graph, tuple(couplings)
-    left = [c for c in couplings if c not in known]
+    left = [c for c in couplings if c not in known or not c.factor]
     near = list_nearby(graph, find_homes(graph)[0]) if graph.closing else np.zeros((0, 0))
-    known = [c for c in known if not _is_contained(graph, near, c)]
-    drives = {joint.drive: (joint.drive, 1.0, 0.0) for joint in graph.tree if joint.drive}
-    for _ in known:
-        for c in known:
-            if c.leader in drives and c.joint not in drives:
-                drive, factor, offset = drives[c.leader]
-                drives[c.joint] = drive, c.factor * factor, c.factor * offset + c.offset
-            elif c.joint in drives and c.leader not in drives and c.factor:
-                drive, factor, offset = drives[c.joint]
-                drives[c.leader] = drive, factor / c.factor, (offset - c.offset) / c.factor
-    for name, (drive, factor, offset) in drives.items():
-        if name == drive:
-            continue
-        if abs(abs(factor) - 1) < MIMICS and joints[name].kind == joints[drive].kind:
-            joints[name] = joints[name].follow(drive, float(np.sign(factor)), offset)
-        else:
-            left.append(Coupling(name, drive, factor, offset))
-    left += [c for c in known if c.joint not in drives]
+    known = [c for c in known if c.factor and not _is_contained(graph, near, c)]
+    laws = {joint.name: (joint.name, 1.0, 0.0) for joint in graph.tree if joint.drive}
+    for first in (None, *known):
+        if first is not None:  # joints that no motor moves follow the first of them
+            laws.setdefault(first.leader, (first.leader, 1.0, 0.0))
+        for c in known * len(known):
+            if c.leader in laws:
+                drive, ratio, offset = laws[c.leader]
+                laws.setdefault(c.joint, (drive, c.factor * ratio, c.factor * offset + c.offset))
+            elif c.joint in laws:
+                drive, ratio, offset = laws[c.joint]
+                laws[c.leader] = drive, ratio / c.factor, (offset - c.offset) / c.factor
+    for c in known:
+        (drive, *values), (other, ratio, offset) = laws[c.joint], laws[c.leader]
+        expected = c.factor * ratio, c.factor * offset + c.offset
+        if drive != other or not np.allclose(values, expected, rtol=MIMICS, atol=MIMICS):
+            left.append(c)
+    for name, (drive, ratio, offset) in laws.items():
+        joints[name] = replace(joints[name], drive=drive, ratio=ratio, offset=offset)
     tree, closing = _span_tree(graph.base, tuple(joints.values()))
     return JointGraph(graph.base, tree, closing, graph.motors), tuple(left)
 
@@ -669,7 +672,9 @@ def _are_coaxial(body: str, first: GraphJoint, second: GraphJoint) -> bool:
 def _span_tree(
     base: str, joints: Sequence[GraphJoint]
 ) -> tuple[tuple[GraphJoint, ...], tuple[GraphJoint, ...]]:
-    """Return the joints of a tree, each after the one that carries it, and the other joints."""
+    """Return the joints of a tree, each after the one that carries it, and the other joints; raises
+    MechanismError for a loop of driven and coupled joints only.
+    """
 
     def rank(joint: GraphJoint) -> int:
         if joint.drive:
@@ -694,4 +699,7 @@ def _span_tree(
             tree.append(oriented)
             bodies.add(oriented.body_b)
         chosen = [joint for joint in chosen if joint not in ready]
+    lost = next((joint.name for joint in closing if joint.drive), None)
+    if lost is not None:
+        raise MechanismError(report_finding("files.motors-in-loop", motor=lost))
     return tuple(tree), tuple(joint for joint in joints if joint in closing)

@@ -98,17 +98,147 @@ def test_pads_of_a_gripper_on_one_motor_move_against_each_other(tmp_path) -> Non
     np.testing.assert_allclose(np.arctan2(T[:, 1, 0], T[:, 0, 0]), -q, rtol=0, atol=1e-12)
 
 
-def test_two_cranks_of_one_motor_are_the_five_bar_with_both_readings(tmp_path) -> None:
+@pytest.mark.parametrize(("factor", "offset"), [(-1, 0.02), (1, 0), (0.5, 0.1), (-1.7, -0.05)])
+def test_two_cranks_of_one_motor_are_the_five_bar_with_both_readings(
+    tmp_path, factor, offset
+) -> None:
     both = read(tmp_path, FIVE_BAR)[1]
     crank = make_joint("mot2", "base", "arm2", "0.075 0 0", 0.84)
-    coupled = FIVE_BAR.replace(crank, make_mimic(crank, "mot1", -1, 0.02))
+    coupled = FIVE_BAR.replace(crank, make_mimic(crank, "mot1", factor, offset))
     text = coupled.replace(MOTORS, TRANSMISSION.format("mot1"))
     imported, robot = read(tmp_path, text)
     assert imported.findings[0].data["mobility"] == 1
     home = inverse(robot, robot.home[None]).q
     q = home + np.linspace(-0.1, 0.1, 5)[:, None]
-    expected = forward(both, np.column_stack([q, 0.02 - q])).T
+    expected = forward(both, np.column_stack([q, factor * q + offset])).T
     np.testing.assert_allclose(forward(robot, q).T, expected, rtol=0, atol=1e-12)
+    check_written_back(tmp_path, text, robot, q)
+
+
+def check_written_back(folder, text, robot, q, platform=None) -> None:
+    """Change all parameters, write the file, and read the machine with these values again."""
+    (folder / "r.urdf").write_text(text)
+    changes = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
+    changed = robot.with_values(robot.values + changes)
+    exported = export_robot(ExportSource(changed), urdf.FORMAT, folder / "r.urdf")
+    assert "files.not-expressed" not in {finding.code for finding in exported.findings}
+    again = read(folder, exported.text, platform=platform)[1]
+    expected = forward(changed, q).T
+    np.testing.assert_allclose(forward(again, q).T, expected, rtol=0, atol=1e-9)
+    assert np.abs(expected - forward(robot, q).T).max() > 1e-4  # [m, 1]: the changes matter
+
+
+CHAIN = '<robot name="c">' + "".join(f'<link name="{n}"/>' for n in "abcde")
+
+
+def make_chain(kinds: str, mimics: dict[int, tuple[int, float, float]], parents: str) -> str:
+    """Return a tree of joints j1, j2, .. from links `parents` to b, c, .., of kinds R and P."""
+    text = CHAIN
+    for i, (kind, parent) in enumerate(zip(kinds, parents, strict=True), 1):
+        sort = {"R": "revolute", "P": "prismatic"}[kind]
+        joint = make_joint(f"j{i}", parent, "abcde"[i], "0.3 0.1 0", 0.4 * i, sort)
+        if kind == "P":
+            joint = joint.replace('axis xyz="0 0 1"', 'axis xyz="1 0 0"')
+        if i in mimics:
+            followed, factor, offset = mimics[i]
+            joint = make_mimic(joint, f"j{followed}", factor, offset)
+        text += joint
+    text += "".join(f'<link name="{n}"/>' for n in "fghi"[: 4 - len(kinds)])
+    for link, n in zip("abcde"[len(kinds) + 1 :], "fghi", strict=False):
+        text = text.replace(f'<link name="{link}"/>', "").replace(f'<link name="{n}"/>', "")
+    return text
+
+
+def place_chain(kinds: str, values: dict[int, np.ndarray], path: tuple[int, ...]) -> np.ndarray:
+    """Return places (n, 2) and angle (n,) of the link behind joints of a plane tree."""
+    count = len(next(iter(values.values())))
+    place, angle = np.zeros(count, dtype=complex), np.zeros(count)
+    for i in path:
+        place = place + (0.3 + 0.1j) * np.exp(1j * angle)
+        angle = angle + 0.4 * i
+        if kinds[i - 1] == "R":
+            angle = angle + values[i]
+        else:
+            place = place + values[i] * np.exp(1j * angle)
+    return np.column_stack([place.real, place.imag, np.cos(angle), np.sin(angle)])
+
+
+@pytest.mark.parametrize(
+    ("kinds", "parents", "mimics", "path"),
+    [
+        ("RRR", "abc", {2: (1, -0.5, 0.1)}, (1, 2, 3)),  # a belt in an arm
+        ("RPR", "abc", {2: (1, 0.04, 0.01)}, (1, 2, 3)),  # a pinion
+        ("PRR", "abc", {2: (1, 3.0, 0.1)}, (1, 2, 3)),  # a rack
+        ("RRR", "abc", {3: (2, 2.0, 0.0), 2: (1, 1.5, 0.1)}, (1, 2, 3)),  # one after the other
+        ("RRR", "aab", {2: (1, 0.5, 0.1)}, (1, 3)),  # what follows carries nothing
+        ("RRR", "aac", {2: (1, 0.5, 0.1)}, (2, 3)),  # the motor is on another branch
+        ("RPR", "aac", {2: (1, 0.04, 0.01)}, (2, 3)),
+    ],
+)
+def test_chains_of_coupled_joints_agree_with_their_drawing(
+    tmp_path, kinds, parents, mimics, path
+) -> None:
+    motors = [i for i in range(1, len(kinds) + 1) if i not in mimics and (i in path or i == 1)]
+    text = make_chain(kinds, mimics, parents) + "".join(
+        TRANSMISSION.format(f"j{i}") for i in motors
+    )
+    text += "</robot>"
+    platform = "abcde"[path[-1]]
+    robot = read(tmp_path, text, platform=platform)[1]
+    names = [int(actuator.name[1:]) for actuator in robot.actuators]
+    q = inverse(robot, robot.home[None]).q + np.random.default_rng(1).uniform(
+        -0.2, 0.2, (5, len(names))
+    )
+    values = dict(zip(names, q.T, strict=True))
+    while left := [i for i in mimics if i not in values and mimics[i][0] in values]:
+        for i in left:
+            followed, factor, offset = mimics[i]
+            values[i] = factor * values[followed] + offset
+    T = forward(robot, q).T
+    found = np.column_stack([T[:, 0, 3], T[:, 1, 3], T[:, 0, 0], T[:, 1, 0]])
+    np.testing.assert_allclose(found, place_chain(kinds, values, path), rtol=0, atol=1e-12)
+    check_written_back(tmp_path, text, robot, q, platform)
+
+
+def test_gears_between_passive_joints_take_a_freedom(tmp_path) -> None:
+    """The elbows of a five-bar turn together: with one motor it is the one with two motors at
+    readings where this is true.
+    """
+    both = read(tmp_path, FIVE_BAR)[1]
+    elbow = make_joint("elbow2", "arm2", "rod2", "0.2 0 0", 1.2, "continuous")
+    coupled = FIVE_BAR.replace(elbow, make_mimic(elbow, "elbow1", -0.8, 0.1))
+    text = coupled.replace(MOTORS, TRANSMISSION.format("mot1"))
+    imported, robot = read(tmp_path, text)
+    assert imported.findings[0].data["mobility"] == 1
+    q = inverse(robot, robot.home[None]).q + np.linspace(-0.1, 0.1, 5)[:, None]
+    T = forward(robot, q).T
+    readings = inverse(both, T).q
+    np.testing.assert_allclose(readings[:, :1], q, rtol=0, atol=1e-9)
+    point = T[:, 0, 3] + 1j * T[:, 1, 3]
+    first, second = readings.T + np.array([[2.3], [0.84]])
+    turn1 = np.angle(point + 0.075 - 0.2 * np.exp(1j * first)) - first + 1.2
+    turn2 = np.angle(point - 0.075 - 0.2 * np.exp(1j * second)) - second - 1.2
+    np.testing.assert_allclose(turn2, -0.8 * turn1 + 0.1, rtol=0, atol=1e-9)
+    check_written_back(tmp_path, text, robot, q)
+
+
+TWO = TRANSMISSION.format("j1") + TRANSMISSION.format("j2")
+THREE = TRANSMISSION.format("j1") + TRANSMISSION.format("j3")
+REFUSED = {
+    "two motors": ("RR", {2: (1, 0.5, 0.0)}, "ab", TWO, "'j2' cannot follow 'j1' .* factor 0.5"),
+    "no factor": ("RR", {2: (1, 0.0, 0.0)}, "ab", "", "'j2' cannot follow 'j1' .* factor 0"),
+    "unknown leader": ("RR", {2: (7, 1.0, 0.0)}, "ab", "", "'j2' .* 'j7' .* does not move"),
+    "contradiction": ("RRR", {2: (3, 1, 0), 3: (2, 2, 0)}, "abc", "", "'j3' cannot follow 'j2'"),
+    "slide elsewhere": ("PRR", {2: (1, 3.0, 0.0)}, "aac", THREE, "'j2' turns with the slide 'j1'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_couplings_that_no_machine_has_are_refused(tmp_path, case) -> None:
+    kinds, mimics, parents, motors, sentence = REFUSED[case]
+    text = make_chain(kinds, mimics, parents) + (motors or TRANSMISSION.format("j1")) + "</robot>"
+    with pytest.raises(LoopcalError, match=sentence):
+        read(tmp_path, text, platform="abcd"[len(kinds)])
 
 
 def test_wrong_closure_of_several_is_named_with_its_gaps(tmp_path) -> None:

@@ -83,6 +83,65 @@ def test_machine_agrees_with_the_solver_and_is_written_back(tmp_path, machine, n
     assert np.abs(moved - found).max() > 1e-4  # [m, 1]: the changes matter
 
 
+ARM = {
+    "sdf": """\
+<sdf version="1.11"><model name="m"><link name="base"/>
+<link name="a"><pose>0.1 0 0 0 0 0</pose></link><link name="b"><pose>0.4 0 0 0 0 0</pose></link>
+<joint name="j1" type="revolute"><parent>base</parent><child>a</child>
+<axis><xyz>0 0 1</xyz></axis></joint>
+<joint name="j2" type="revolute"><parent>a</parent><child>b</child>
+<axis><xyz>0 0 1</xyz>
+<mimic joint="j1" axis="axis"><multiplier>-2.5</multiplier><offset>0.3</offset>
+<reference>0.04</reference></mimic><!-- belt --></axis></joint>
+<plugin name="p" filename="f"><joint_name>j1</joint_name></plugin>
+</model></sdf>
+""",
+    "gearbox": """\
+<sdf version="1.8"><model name="m"><link name="base"/>
+<link name="a"><pose>0.1 0 0 0 0 0</pose></link><link name="b"><pose>0.4 0 0 0 0 0</pose></link>
+<joint name="j1" type="revolute"><parent>base</parent><child>a</child>
+<axis><xyz>0 0 1</xyz></axis></joint>
+<joint name="j2" type="revolute"><parent>a</parent><child>b</child>
+<axis><xyz>0 0 1</xyz></axis></joint>
+<joint name="g" type="gearbox"><parent>a</parent><child>b</child><gearbox_ratio>2.5</gearbox_ratio>
+<gearbox_reference_body>base</gearbox_reference_body></joint>
+<plugin name="p" filename="f"><joint_name>j1</joint_name></plugin></model></sdf>
+""",
+    "mjcf": """\
+<mujoco><compiler angle="radian"/><worldbody>
+<body name="a" pos="0.1 0 0"><joint name="j1"/><!-- arm -->
+<body name="b" pos="0.3 0 0"><joint name="j2" ref="0.1"/></body></body></worldbody>
+<equality><joint joint1="j2" joint2="j1" polycoef="0.4 -2.5 0 0 0"/></equality>
+<actuator><motor joint="j1"/></actuator></mujoco>
+""",
+}  # fmt: skip
+OFFSETS = {"sdf": 0.3 + 2.5 * 0.04, "gearbox": 0.0, "mjcf": 0.4}
+"""Value of the second joint where the first one is zero [rad]."""
+
+
+@pytest.mark.parametrize("case", ARM)
+def test_coupled_joints_have_any_factor_and_are_written_back(tmp_path, case) -> None:
+    name = "mjcf" if case == "mjcf" else "sdf"
+    path = tmp_path / {"sdf": "r.sdf", "mjcf": "r.xml"}[name]
+    path.write_text(ARM[case])
+    robot = read(path, name, "b")
+    q = np.linspace(-0.3, 0.3, 5)[:, None]
+    T = forward(robot, q).T
+    place = 0.1 + 0.3 * np.exp(1j * q[:, 0])
+    np.testing.assert_allclose(T[:, 0, 3] + 1j * T[:, 1, 3], place, rtol=0, atol=1e-12)
+    turn = q[:, 0] - 2.5 * q[:, 0] + OFFSETS[case]
+    np.testing.assert_allclose(np.arctan2(T[:, 1, 0], T[:, 0, 0]), turn, rtol=0, atol=1e-12)
+    assert export(robot, path, name) == path.read_text()
+    changes = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
+    changed = robot.with_values(robot.values + changes)
+    text = export(changed, path, name)
+    assert text.count("<!--") == path.read_text().count("<!--")
+    path.write_text(text)
+    moved = forward(changed, q).T
+    np.testing.assert_allclose(forward(read(path, name, "b"), q).T, moved, rtol=0, atol=AGREES)
+    assert np.abs(moved - T).max() > 1e-4  # [m, 1]: the changes matter
+
+
 REFUSED = {
     "another root": ("<robot/>", "the root is <robot>, but <mujoco> is needed"),
     "include": (

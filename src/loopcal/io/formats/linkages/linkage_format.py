@@ -10,7 +10,7 @@ text stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -95,10 +95,10 @@ def write(
     values = zip(source.values().items(), nominal, strict=True)
     deviations = {name: value - before for (name, value), before in values}
     origins: dict[str, FloatArray] = {}
-    for place, shifts, offset in _list_origins(record, tree):
+    for place, shifts, offsets in _list_origins(record, tree):
         shift = np.array([deviations.get(parameter, 0.0) for parameter in shifts])
-        zero = deviations.get(offset, 0.0)
-        expressed |= {*shifts, offset}
+        zero = sum(share * deviations.get(offset, 0.0) for offset, share in offsets.items())
+        expressed |= {*shifts, *offsets}
         if not shift.any() and zero == 0.0:
             continue
         joint = tree.places[place]
@@ -172,9 +172,9 @@ def _draw_closed(moved: LinkTree, motors: Sequence[str]) -> LinkTree:
 
 def _list_origins(
     record: Limbs | PlacedStages, tree: LinkTree
-) -> Iterator[tuple[str, list[str], str]]:
-    """Yield URDF joint, names of the shifts along its axes, and of the offset of its motor;
-    FileError where a limb begins at another place than in the robot file.
+) -> Iterator[tuple[str, list[str], Mapping[str, float]]]:
+    """Yield URDF joint, names of the shifts along its axes, and offsets that change its zero, each
+    with the change per unit; FileError where a limb begins at another place than in the robot file.
     """
     if isinstance(record, Limbs):
         yield from _list_limb_origins(record, tree, "", np.eye(4))
@@ -189,16 +189,22 @@ def _list_origins(
                 if mount is not None:
                     _check_place(tree, drive, mount @ matrix_from_place(stage.joint.at))
                 shifts = [f"{stage.name}.{axis}" for axis in "xyz"]
-                yield drive, shifts, f"{stage.name}.offset"
+                yield drive, shifts, {f"{stage.name}.offset": 1.0}
 
 
 def _list_limb_origins(
     record: Limbs, tree: LinkTree, prefix: str, mount: FloatArray | None
-) -> Iterator[tuple[str, list[str], str]]:
+) -> Iterator[tuple[str, list[str], Mapping[str, float]]]:
     """Yield the same of one robot of limbs; `prefix` begins the names of its parameters, mount (4,
     4) is its base in the root of the URDF, None where another stage carries it.
     """
     named = [parameter.name for parameter in record.parameters]
+    coupled: dict[str, Mapping[str, float]] = {}
+    for key, coupling in record.couplings.items():
+        weights = {**coupling.sum, **getattr(coupling, "radius", {})}
+        for joint in [name for name in weights if name.endswith(f".{key}")]:
+            own = weights.pop(joint)
+            coupled[joint] = {key: 1 / own} | {name: -w / own for name, w in weights.items()}
     for limb in record.limbs:
         first = limb.chain[0] if limb.chain else None
         if first is not None and first.name in tree.joints and mount is not None:
@@ -207,11 +213,12 @@ def _list_limb_origins(
         motors = {joint.name: joint.actuated for joint in driven if joint.actuated}
         start = f"{limb.name}."
         names = [entry.name or entry.of for entry in limb.errors] + list(motors)
-        names += [n.removeprefix(start)[:-2] for n in named if n.startswith(start)]
+        names += [n.removeprefix(start)[:-2] for n in (*named, *coupled) if n.startswith(start)]
         for name in dict.fromkeys(names):
             if name in tree.places:
                 shifts = [f"{prefix}{limb.name}.{name}.{axis}" for axis in "xyz"]
-                yield name, shifts, f"{prefix}{motors.get(name) or ''}.offset"
+                laws = {motors[name]: 1.0} if name in motors else coupled.get(start + name, {})
+                yield name, shifts, {f"{prefix}{n}.offset": share for n, share in laws.items()}
 
 
 def _check_place(tree: LinkTree, name: str, stated: FloatArray) -> None:
@@ -260,8 +267,9 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
             raise MechanismError(finding)
     except MechanismError as error:
         finding = _name_links(mechanism, error.args[0])
+        _check_couplings(mechanism, finding.data.get("joints", ()))
         raise tree.error(finding, _find_origin(tree, finding.data.get("joints", ()))) from None
-    _check_couplings(mechanism, paths)
+    _check_couplings(mechanism, [joint.name for joint in paths.graph.joints])
     closing = closures.name if closures is not None else "its constraints"
     what = f"{what} with loop closures in {closing}"
     family = choose_family(paths)
@@ -343,11 +351,8 @@ def _name_links(mechanism: Linkage, finding: Finding) -> Finding:
     return replace(finding, data=data)
 
 
-def _check_couplings(mechanism: Linkage, paths: StagePaths) -> None:
-    """Refuse a joint that follows another one in a way that no drive expresses; raises
-    FileError.
-    """
-    names = {joint.name for joint in paths.graph.joints}
+def _check_couplings(mechanism: Linkage, names: Collection[str]) -> None:
+    """Refuse a joint, of those named, that cannot follow another one; raises FileError."""
     for coupling in mechanism.couplings:
         if coupling.joint in names:
             finding = report_finding(
@@ -385,7 +390,7 @@ def _report_structure(mechanism: Linkage, paths: StagePaths, frame: str) -> Iter
         )
     if len(paths.stages) > 1:
         names = list_stage_names(mechanism, paths)
-        loops = (isinstance(stage, ClosedStage) for stage in paths.stages)
+        loops = (isinstance(s, ClosedStage) and s.paths.graph.closing for s in paths.stages)
         closed = tuple(name for name, is_loop in zip(names, loops, strict=True) if is_loop)
         yield report_finding("files.urdf-stages", count=len(names), stages=names, closed=closed)
     if graph.size > LARGE:
@@ -514,8 +519,36 @@ def _describe_limb_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray)
         roll, pitch, yaw = geometry.matrix_to_euler(R, "xyz")
         return {**content, "start": _clear((yaw, pitch, roll))}
     start = get_value(paths.graph, paths.home, joint)
-    motor = {"actuated": joint.drive} if joint.drive else {}
+    motor = {"actuated": joint.drive} if _is_actuated(paths, joint) else {}
     return {**content, "axis": _clear(joint.axis), "start": start, **motor}
+
+
+def _is_actuated(paths: LimbPaths, joint: GraphJoint) -> bool:
+    """Return whether a joint has the value of a driven one."""
+    lead, *law = paths.used.find_lead(joint)
+    return joint.drive in paths.used.motors and (joint.kind, *law) == (lead.kind, 1.0, 0.0)
+
+
+def _describe_couplings(paths: LimbPaths) -> Content:
+    """Return the couplings of joints, each named after the one that follows."""
+    graph = paths.used
+    moved = [(limb.joints[0].name, joint) for limb in paths.limbs for joint in limb.joints]
+    names = {joint.name: f"{limb}.{joint.name}" for limb, joint in moved}
+    names |= {joint.name: drive for drive, joint in graph.leads.items() if drive in graph.motors}
+    couplings = {}
+    for _, joint in moved:
+        lead, factor, offset = graph.find_lead(joint)
+        if lead.name == joint.name or _is_actuated(paths, joint):
+            continue
+        scale = 1 / factor if (joint.kind, lead.kind) == ("R", "P") else 1.0
+        weights = {names[joint.name]: scale, names[lead.name]: -factor * scale}
+        kinds = dict(zip(weights, (joint.kind, lead.kind), strict=True))
+        law: Content = {"of": "length" if "P" in kinds.values() else "angle", "sum": weights}
+        if {*kinds.values()} == {"R", "P"}:
+            law["sum"] = {name: weight for name, weight in weights.items() if kinds[name] == "P"}
+            law["radius"] = {n: weight for n, weight in weights.items() if kinds[n] == "R"}
+        couplings[joint.name] = law | {"offset": offset * scale, "unknown": ["offset"]}
+    return {"couplings": couplings} if couplings else {}
 
 
 def choose_family(paths: StagePaths) -> str:
@@ -607,7 +640,11 @@ def _describe_limbs(mechanism: Linkage, stage: ClosedStage) -> Content:
     return {
         "freedoms": list(paths.freedoms),
         "controlled": _choose_coordinates(graph, paths.home, paths.platform, T_body_frame),
-        "actuators": {name: _describe_drive(joints[name]) for name in graph.motors},
+        "actuators": {
+            name: _describe_drive(mechanism.tree, joints[name], paths.used.leads[name])
+            for name in paths.used.motors
+        },
+        **_describe_couplings(paths),
         **({"bodies": homes} if homes else {}),
         "limbs": [limb for limb, _ in limbs],
         **({"parameters": parameters} if parameters else {}),
@@ -643,10 +680,15 @@ def _describe_joint(tree: LinkTree, stage: SerialStage, T_frame_body: FloatArray
     }
 
 
-def _describe_drive(joint: TreeJoint) -> Content:
-    """Return one drive of the robot file."""
-    reads = "angle" if joint.kind == "R" else "length"
-    return {"reads": reads, "unknown": ["offset"], **_describe_stroke(joint)}
+def _describe_drive(tree: LinkTree, motor: TreeJoint, lead: GraphJoint) -> Content:
+    """Return one drive of the robot file; its joint may be one that follows the motor."""
+    if (motor.kind, lead.kind) == ("P", "R"):
+        sentence = f"joint {lead.name!r} turns with the slide {motor.name!r}, which moves nothing "
+        raise tree.error(f"{sentence}else of this platform; name the joint as motor", lead.name)
+    gain = "gain" if motor.kind == lead.kind else "radius"
+    law = {} if lead.is_plain else {gain: lead.ratio, "offset": lead.offset}
+    reads = "angle" if motor.kind == "R" else "length"
+    return {"reads": reads, **law, "unknown": ["offset"], **_describe_stroke(motor)}
 
 
 def _describe_stroke(joint: TreeJoint) -> Content:

@@ -3,8 +3,9 @@
 
 The frame of a joint in its parent link is where the drawn pose puts it. A link with two parents is
 carried by the first of them, the other joint closes a loop. `<gazebo>` of a URDF contains such
-joints. A gearbox couples two links that the same body carries: theta_2 = -ratio theta_1. Source:
-the specification of SDFormat 1.4 to 1.11 (sdformat.org).
+joints. A gearbox couples two links that the same body carries: theta_2 = -ratio theta_1. A mimic
+joint is multiplier (leader - reference) + offset. Source: the specification of SDFormat 1.4 to 1.11
+(sdformat.org).
 """
 
 from __future__ import annotations
@@ -231,7 +232,8 @@ def read_tree(path: Path) -> LinkTree:
     geared = [joint for joint in joints if joint.kind == GEARBOX]
     carried, closing = _span(list(drawn), [j for j in joints if j.kind != GEARBOX])
     tree = [part for joint in carried for part in _carry(joint, drawn)]
-    followed = {name: mimic for joint in geared for name, mimic in [_read_gearbox(joint, carried)]}
+    followed = {j.name: _read_mimic(e) for j in carried if (e := j.element.find("axis", "mimic"))}
+    followed |= dict(_read_gearbox(joint, carried) for joint in geared)
     tree = [replace(joint, mimic=followed.get(joint.name)) for joint in tree]
     frame_links = [joint.child for joint in tree if joint.child not in drawn]
     constraints = [joint.close(drawn) for joint in closing]
@@ -301,6 +303,15 @@ def _read_gearbox(
     element = gear.element.find("gearbox_ratio")
     ratio = 1.0 if element is None else float(element.parse_numbers(element.text, 1, "ratio")[0])
     return driven.name, (driver.name, -ratio, 0.0)
+
+
+def _read_mimic(mimic: Element) -> tuple[str, float, float]:
+    """Return the joint that is followed, factor and offset."""
+    factor, offset, reference = (
+        float(mimic.parse_numbers(mimic.get(key) or default, 1, key)[0])
+        for key, default in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
+    )
+    return mimic.attributes.get("joint", ""), factor, offset - factor * reference
 
 
 def rewrite(tree: LinkTree, other: LinkTree) -> str:
