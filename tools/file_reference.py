@@ -34,7 +34,6 @@ from tools.markdown import fill_blocks, format_table
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
-EXAMPLES = DOCS.parent / "examples" / "exports"
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
 
@@ -235,11 +234,11 @@ BLOCKS = {
     "scores": format_scores,
     "counts": format_counts,
 }
-EXPORT_BLOCKS = {"profile": format_profile, "profile-columns": format_profile_columns} | {
-    name: format_example(EXAMPLES / f"{name}.yaml")
-    for name in ("tracker-points", "six-dof", "cmm-spheres")
+EXPORT_BLOCKS = {
+    "profile": format_profile,
+    "profile-columns": format_profile_columns,
+    "spatial-analyzer": format_example(list_shipped_profiles()["spatial-analyzer"]),
 }
-EXPORT_BLOCKS |= {name: format_example(path) for name, path in list_shipped_profiles().items()}
 
 
 def fill_page(text: str) -> str:

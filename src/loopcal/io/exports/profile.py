@@ -134,14 +134,13 @@ class ColumnSource:
 
     Parameters
     ----------
-    from_ : name in the export's header, or place counted from 1; several are joined by blanks.
-        `{target}` in a name stands for each target, where a line has the columns of all of them.
+    from_ : name in the export's header, or place counted from 1. Blanks join several.
+        `{target}` in a name stands for each target, if a line has the columns of all of them.
     unit : unit of a number.
-    factor : of a sigma: number by which it is multiplied, such as 0.5 for an expanded uncertainty
-        U(95) with k = 2.
+    factor : of a sigma: factor, such as 0.5 for an expanded uncertainty U(95) with k = 2.
     floor : of a sigma: least standard deviation with its unit, which replaces zeros.
-    match : of `pose`: pattern that finds (?P<pose>..), and (?P<target>..) where each target has a
-        line of its own.
+    match : of `pose`: pattern that finds (?P<pose>..), and (?P<target>..) if each target has a
+        line.
     format : of `time`: format of Python's strptime, such as '%d.%m.%Y %H:%M:%S'.
     """
 
@@ -187,21 +186,19 @@ class ProfileRecord:
 
     Parameters
     ----------
-    delimiter : separator of columns; `spaces` is any number of blanks and tabs.
+    delimiter : separator of columns (`spaces`: any number of blanks and tabs).
     columns : column of the measurement file -> its source.
-    settings : settings of the measurement file, see docs/files.md; `poses` names the file with the
+    settings : settings of the measurement file (docs/files.md). `poses` names the file with the
         readings of the poses. Without `kind`, the table holds readings alone.
     format : version of the format, 1.
     decimal : the decimal mark.
     comment : start of lines without data.
     skip : number of lines at the top without data.
     ignore : pattern of further lines without data, such as totals.
-    encoding : of the text; UTF-8 with or without byte order mark by default.
-    missing : cells that mean not measured, besides empty ones; numbers count by value, so that -999
-        includes -999.000.
-    readings : actuator -> source of its reading, where the export contains readings.
-    matrix : nine columns of a rotation matrix, row by row, in place of the columns of an
-        orientation.
+    encoding : of the text, by default UTF-8 with or without byte order mark.
+    missing : further cells that mean not measured, by value (-999 includes -999.000).
+    readings : actuator -> source of its reading, if the export contains readings.
+    matrix : nine columns of a rotation matrix, row by row, in place of an orientation.
     """
 
     delimiter: Literal["comma", "semicolon", "tab", "spaces"]
