@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the pictures of the shipped robots, docs/pictures/robots, and those of the machines in
-docs/building-blocks.md, docs/pictures/blocks.
+"""Draw the pictures of the shipped robots, docs/pictures/robots, and those of the building blocks
+in docs/robots.md, docs/pictures/blocks.
 
 python -m tools.robot_pictures           all of them
 python -m tools.robot_pictures tricept   these only
@@ -18,12 +18,13 @@ from loopcal.report.figures.robot_figure import draw_robot
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"
-PAGE = ROOT / "docs" / "building-blocks.md"
+PAGE = ROOT / "docs" / "robots.md"
 
 
 def read_blocks() -> dict[str, str]:
-    """Return the robot files of the page of building blocks, by the names of the robots."""
-    files = re.findall(r"```yaml\n(.*?)```", PAGE.read_text("utf-8"), flags=re.DOTALL)
+    """Return the robot files of the section of building blocks, by the names of the robots."""
+    section = PAGE.read_text("utf-8").partition("\n## Building blocks\n")[2]
+    files = re.findall(r"```yaml\n(.*?)```", section, flags=re.DOTALL)
     return {re.findall(r"^name: (.*)$", text, flags=re.MULTILINE)[0]: text for text in files}
 
 

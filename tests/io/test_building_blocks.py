@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The machines of docs/building-blocks.md are complete, and every picture of a robot exists."""
+"""The building blocks of docs/robots.md are complete, and every picture of a robot exists."""
 
 import re
 from pathlib import Path
@@ -46,17 +46,14 @@ def test_the_page_quotes_what_check_says_of_a_spinning_leg(tmp_path, capsys, roo
     (tmp_path / "robot.yaml").write_text(BLOCKS["hexapod-sps"], "utf-8")
     assert main(["check", str(tmp_path / "robot.yaml")]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    page = " ".join((root / "docs" / "building-blocks.md").read_text("utf-8").split())
+    page = " ".join((root / "docs" / "robots.md").read_text("utf-8").split())
     quoted = re.findall(r'says of each leg: "(.*?)"', page)[0]
     assert quoted in said
 
 
-def test_every_shipped_robot_and_every_block_has_a_picture_on_its_page(root) -> None:
-    for folder, page, names in (
-        ("robots", "robot-pictures.md", list_shipped_robots()),
-        ("blocks", "building-blocks.md", BLOCKS),
-    ):
-        text = (root / "docs" / page).read_text("utf-8")
+def test_every_shipped_robot_and_every_block_has_a_picture_on_the_page(root) -> None:
+    text = (root / "docs" / "robots.md").read_text("utf-8")
+    for folder, names in (("robots", list_shipped_robots()), ("blocks", BLOCKS)):
         shown = re.findall(rf"\(pictures/{folder}/([\w-]+)\.png\)", text)
         assert set(shown) == set(names)
         assert {p.stem for p in (PICTURES / folder).glob("*.png")} == set(names)
