@@ -11,7 +11,7 @@ from loopcal import geometry
 from loopcal.apply.simulated_measurements import simulate_measurements
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError
-from loopcal.io.robot.robot_file import find_robot_file
+from loopcal.io.robot.robot_file import find_robot_file, load_robot
 from loopcal.measure.data_checks import check_actuators, check_duplicates, check_strokes
 from loopcal.measure.instrument import (
     BlockStream,
@@ -21,7 +21,7 @@ from loopcal.measure.instrument import (
     Uniform,
     make_random_stream,
 )
-from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
@@ -292,3 +292,15 @@ def test_skipping_leaves_out_only_poses_that_cannot_be_measured(name):
         ]
         assert not made[1].skipped
         assert_allclose(made[1].data.readings, made[0].data.readings, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [Distance(anchor=np.zeros(3), places=np.zeros((1, 3))), Separation(places=np.zeros((1, 3)))],
+)
+def test_a_length_between_points_that_coincide_is_refused(kind):
+    robot = load_robot("agile-eye")  # all its poses have one position
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(1, 1e-5))),))
+    poses = np.random.default_rng(0).uniform(-0.2, 0.2, (8, 3))
+    with expect_refusal("data.simulated-row-impossible", DataError):
+        simulate(robot, poses, instrument, seed=1)

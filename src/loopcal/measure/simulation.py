@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from loopcal.engine import State
 from loopcal.errors import DataError
+from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_array, check_type
 from loopcal.measure.data_checks import check_closure, check_redundancy
 from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements
@@ -277,6 +278,9 @@ def simulate_trials(
         noise = np.stack([sensor.noise.draw(stream, len(rows)) for stream in streams])
         setup = nuisance.select(k, true_setup)
         columns = kind.measure(seen[:, rows], noise, setup, kind.stack_joints(joints, rows))
+        for _, problem in kind.find_invalid_rows(columns.reshape(-1, columns.shape[-1])):
+            stated = {"kind": kind.name, "robot": robot.name, "problem": problem.partition(";")[0]}
+            raise DataError(report_finding("data.simulated-row-impossible", **stated))
         if not kind.is_of_base:
             complete = np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1)
             columns = np.where(complete[..., None], columns, np.nan)
