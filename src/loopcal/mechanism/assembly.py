@@ -50,7 +50,8 @@ class Joint:
     name : unique in its limb. kind : R or P. actuator : name of its drive, None if passive.
     pitch : advance per turn angle of a screw [m/rad], R only.
     start : first guess of the home position [m or rad]; it selects the working mode.
-    limits : allowed values (low, high) [m or rad].
+    limits : allowed values (low, high) [m or rad]. is_passive : no reading states its value;
+        its `actuator` is a name in couplings and sums only.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Joint:
     pitch: float = 0.0
     start: float = 0.0
     limits: tuple[float, float] | None = None
+    is_passive: bool = False
 
     @property
     def dimension(self) -> Dimension:
@@ -262,16 +264,9 @@ class Assembly:
         pins of triangles that a linear actuator turns.
         """
         read = {name for a in self.rows if not a.is_triangle for name in a.driven_joints}
-        own = {a.name for a in self.actuators}
         pairs = ((limb, joint) for limb in self.limbs for joint in limb.joints)
         return tuple(
-            (limb, joint)
-            for limb, joint in pairs
-            if joint.actuator not in read
-            or (
-                joint.actuator not in own
-                and f".{limb.name}.{joint.name}".endswith(f".{joint.actuator}")
-            )
+            (limb, joint) for limb, joint in pairs if joint.is_passive or joint.actuator not in read
         )
 
     @cached_property

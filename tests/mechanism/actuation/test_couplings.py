@@ -130,6 +130,13 @@ def test_a_crank_that_gears_turn_agrees_with_its_drawing(tmp_path: Path) -> None
     assert_allclose(inverse(robot, solved.T).q, q, rtol=0, atol=1e-9)
 
 
+def test_a_driven_joint_with_the_name_of_its_drive_is_not_passive(tmp_path: Path) -> None:
+    text = GEARED.replace("actuated: motor", "actuated: pin").replace("{motor: 2,", "{pin: 2,")
+    text = text.replace("weight.motor", "weight.pin").replace("motor: {", "motor: {sum: {pin: 1}, ")
+    robot = load_text(tmp_path, text)
+    assert [f"{limb.name}.{j.name}" for limb, j in robot.assembly.passive_joints] == ["b.pin"]
+
+
 def test_gears_between_passive_joints_agree_with_their_drawing(tmp_path: Path) -> None:
     robot = draw_errors(load_text(tmp_path, TRAIN), 1)
     q = draw_readings(robot, 100)

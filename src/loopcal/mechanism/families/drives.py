@@ -8,14 +8,14 @@ mechanism/transmission.py. How to write it: docs/robots.md.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.mechanism.assembly import AXES, Actuator, Address, LinearMap
+from loopcal.mechanism.assembly import AXES, Actuator, Address, Joint, Limb, LinearMap
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
@@ -321,7 +321,7 @@ class DrivenJoint:
 
     stated : this name as the file states it, without the number of a copy. limb : its limb.
     turns : whether it is rotary. rotation : (3, 3) R_placed_joint, whose third column is its axis.
-    start : its value near home [rad or m].
+    start : its value near home [rad or m]. is_passive : as of `Joint`.
     """
 
     name: str
@@ -330,6 +330,7 @@ class DrivenJoint:
     turns: bool
     rotation: FloatArray
     start: float
+    is_passive: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -472,9 +473,9 @@ def couple_joints(
     drives: Mapping[str, Drive],
     stated: Mapping[str, Coupling],
     conditions: Mapping[str, Condition],
-) -> tuple[tuple[PlacedLimb, ...], tuple[PlacedCoupling, ...], frozenset[str]]:
+) -> tuple[tuple[PlacedLimb, ...], tuple[PlacedCoupling, ...]]:
     """Return the couplings of a file, and its limbs with `limb.joint` as the drive of each passive
-    joint that a coupling, or the sum of a drive, names; also these names.
+    joint that a coupling, or the sum of a drive, names.
 
     A coupling of limbs that are copied is one for each copy. Raises MechanismError: unknown joints,
     and couplings of unlike ones.
@@ -515,17 +516,18 @@ def couple_joints(
             )
     used = {joint for coupling in couplings for joint in coupling.weights}
     used |= {joint for drive in drives.values() for joint in getattr(drive, "sum", ())}
-    placed, passive = [], set[str]()
-    for limb in limbs:
-        names = [joint.actuator or f"{limb.name}.{joint.name}" for joint in limb.limb.joints]
-        joints = tuple(
-            replace(joint, actuator=name) if name in used else joint
-            for joint, name in zip(limb.limb.joints, names, strict=True)
-        )
-        own = zip(limb.limb.joints, names, strict=True)
-        passive |= {name for joint, name in own if not joint.actuator and name in used}
-        placed.append(limb._replace(limb=replace(limb.limb, joints=joints)))
-    return tuple(placed), tuple(couplings), frozenset(passive)
+
+    def name_passive(limb: Limb, joint: Joint) -> Joint:
+        own = f"{limb.name}.{joint.name}"
+        is_coupled = not joint.actuator and own in used
+        return replace(joint, actuator=own, is_passive=True) if is_coupled else joint
+
+    placed = [
+        limb._replace(limb=replace(own, joints=tuple(name_passive(own, j) for j in own.joints)))
+        for limb in limbs
+        for own in [limb.limb]
+    ]
+    return tuple(placed), tuple(couplings)
 
 
 def _place_coupling(
@@ -620,7 +622,8 @@ def list_driven_joints(limb: PlacedLimb) -> Iterator[DrivenJoint]:
     for j in placed.joints:
         if j.actuator:
             stated, turn = j.actuator.removesuffix(suffix), limb.rotations[j.name]
-            yield DrivenJoint(j.actuator, stated, placed.name, j.kind == "R", turn, j.start)
+            turns = j.kind == "R"
+            yield DrivenJoint(j.actuator, stated, placed.name, turns, turn, j.start, j.is_passive)
     if placed.actuator:
         stated = placed.actuator.removesuffix(suffix)
         yield DrivenJoint(placed.actuator, stated, placed.name, False, np.eye(3), 0.0)
@@ -631,13 +634,12 @@ def place_drives(
     stated: Mapping[str, Drive],
     own: Iterable[Actuator] = (),
     couplings: Iterable[PlacedCoupling] = (),
-    passive: Collection[str] = (),
 ) -> dict[str, PlacedDrive]:
     """Return the drives by name, in the order of the readings, with their joints.
 
     A drive that several limbs name is one drive. stated : the drives of the file; one that is not
-    listed reads the joint itself. own : what the family knows of its drives. couplings, passive :
-    of `couple_joints`.
+    listed reads the joint itself. own : what the family knows of its drives. couplings : of
+    `couple_joints`.
     Raises MechanismError: a drive without a joint, or of another kind than its joint.
     """
     joints: dict[str, DrivenJoint] = {}
@@ -667,7 +669,7 @@ def place_drives(
             drives[name] = replace(placed, weights={} if own_joint else weights)
     else:
         for name, joint in joints.items():
-            if name not in passive:
+            if not joint.is_passive:
                 drives[name] = place(name, stated.get(name) or stated.get(joint.stated), joint)
         if rows:
             check_rows({name: {name: 1.0} for name in drives} | rows, limb_of)

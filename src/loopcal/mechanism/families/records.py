@@ -190,8 +190,8 @@ class RobotRecord:
         tolerances of the errors of every link and drive, which are unknown, too, where stated.
         """
         placed = couple_joints(limbs, self.drives, self.couplings, self.conditions)
-        limbs, couplings, passive = placed
-        drives = place_drives(limbs, self.drives, own, couplings, passive)
+        limbs, couplings = placed
+        drives = place_drives(limbs, self.drives, own, couplings)
         rows = {**drives, **{coupling.name: coupling for coupling in couplings}}
         errors = join_errors(
             (
