@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from loopcal.findings.catalog import load_catalog
 from tests.cli.page_commands import run_command, run_page
 from tests.cli.test_executed_pages import PAGES as EXECUTED_PAGES
 
@@ -159,6 +160,14 @@ def adapt_commands(page: str, text: str) -> str:
     for command, other in OTHER_ROBOTS.items():
         text = text.replace(command, other)
     return re.sub(r"^pytest .*\n", "", text, flags=re.MULTILINE)
+
+
+def test_help_by_verdict_names_each_failure_and_only_findings_of_the_catalog(root) -> None:
+    page, catalog = (root / "docs" / "not-calibrated.md").read_text("utf-8"), load_catalog()
+    named = set(re.findall(r"`((?!robot)[a-z]+\.[a-z-]+)`", page))
+    failures = {c for c, e in catalog.items() if c[:4] == "fit." and e.severity.value == "failure"}
+    assert named <= catalog.keys()
+    assert failures | {"noise.residuals-too-large"} <= named
 
 
 @pytest.mark.slow

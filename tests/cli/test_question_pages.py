@@ -16,7 +16,7 @@ from evidence.questions.example_studies import find_cell
 from loopcal.cli.entry_point import main
 from tests.cli.page_commands import list_commands
 
-PAGES = {"instruments": "instruments", "poses": "planning", "methods": "questions/method"}
+PAGES = {"instruments": "instruments", "poses": "planning", "methods": "calibration"}
 """From a study to the page of docs/ with its answer."""
 
 
@@ -153,11 +153,11 @@ def test_page_of_methods_is_true_of_the_evidence(root) -> None:
     narrow = find("ridge", worse, outliers, "covered_position", "mean")
     percents = [f"{100 * share:.0f}" for share in narrow]
     assert narrow[2] < 0.95
-    assert "contain {} % of the errors ({} to {} %)".format(*percents) in read_page(root, "methods")
-    for errors, template in (
-        (stated, "contain {} % of the errors ({} to {} %), and"),
-        (worse, "and {} % ({} to {} %) where the machines are four times as bad"),
+    assert f"its limits contain {percents[0]} % of the errors" in read_page(root, "methods")
+    for method, errors, sentence in (
+        ("default", stated, "Its 95 % limits contain {} % of the errors"),
+        ("default", worse, "and {} % if machines are four times as bad"),
+        ("tolerances as stated", worse, "errors are larger by half and the limits contain {} %"),
     ):
-        covered = find("default", errors, "none", "covered_position", "mean")
-        sentence = template.format(*(f"{100 * share:.0f}" for share in covered))
-        assert sentence in read_page(root, "methods")
+        covered = 100 * find(method, errors, "none", "covered_position", "mean")[0]
+        assert sentence.format(f"{covered:.0f}") in read_page(root, "methods")
