@@ -23,7 +23,7 @@ OWN_TESTS = {
     "README.md": "tests/test_readme.py",
     "docs/extending.md": "tests/test_extending.py",
     "docs/hexapod-with-tracker.md": "tests/cli/test_hexapod_page.py",
-    "docs/notebooks.md": "tests/report/test_notebooks_page.py",
+    "docs/python.md": "tests/report/test_python_page.py",
     "docs/planning.md": "tests/cli/test_planning_page.py",
     "docs/report.md": "tests/documents/test_report_page.py",
     "docs/studies.md": "tests/cli/test_studies_page.py",

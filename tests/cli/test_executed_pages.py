@@ -21,12 +21,12 @@ PAGES = [
     path.relative_to(DOCS).with_suffix("").as_posix()
     for path in [
         *(p for folder in FOLDERS for p in sorted((DOCS / folder).glob("*.md"))),
+        DOCS / "coming-from.md",
         DOCS / "comparing-runs.md",
         DOCS / "controllers.md",
         DOCS / "delta-printers.md",
         DOCS / "instruments.md",
         DOCS / "machines.md",
-        DOCS / "production.md",
         DOCS / "robots.md",
         DOCS / "self-calibration.md",
         DOCS / "urdf.md",
