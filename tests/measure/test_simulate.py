@@ -22,6 +22,7 @@ from loopcal.measure.instrument import (
     make_random_stream,
 )
 from loopcal.measure.kinds.distance import Distance, Separation
+from loopcal.measure.kinds.joints import Closure
 from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
@@ -29,6 +30,7 @@ from loopcal.measure.observations import Observations
 from loopcal.measure.readings import solve_commanded_poses
 from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import ParameterTable
 from tests import zoo
 from tests.findings.expectations import expect_refusal
@@ -304,3 +306,10 @@ def test_a_length_between_points_that_coincide_is_refused(kind):
     poses = np.random.default_rng(0).uniform(-0.2, 0.2, (8, 3))
     with expect_refusal("data.simulated-row-impossible", DataError):
         simulate(robot, poses, instrument, seed=1)
+
+
+def test_a_kind_without_measured_columns_is_simulated():
+    robot = load_robot("belt-4")
+    poses = sample_workspace(robot, 6, seed=1).coordinates
+    data = simulate(robot, poses, Instrument((Sensor(Closure(), Gaussian(np.zeros(0))),)), seed=1)
+    assert data.readings.shape == (6, 4)

@@ -278,9 +278,15 @@ def simulate_trials(
         noise = np.stack([sensor.noise.draw(stream, len(rows)) for stream in streams])
         setup = nuisance.select(k, true_setup)
         columns = kind.measure(seen[:, rows], noise, setup, kind.stack_joints(joints, rows))
-        for _, problem in kind.find_invalid_rows(columns.reshape(-1, columns.shape[-1])):
-            stated = {"kind": kind.name, "robot": robot.name, "problem": problem.partition(";")[0]}
-            raise DataError(report_finding("data.simulated-row-impossible", **stated))
+        for _, problem in kind.find_invalid_rows(np.concatenate(columns)):
+            raise DataError(
+                report_finding(
+                    "data.simulated-row-impossible",
+                    kind=kind.name,
+                    robot=robot.name,
+                    problem=problem.partition(";")[0],
+                )
+            )
         if not kind.is_of_base:
             complete = np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1)
             columns = np.where(complete[..., None], columns, np.nan)
