@@ -4,11 +4,13 @@
 * A README.md below docs/ is an index. The pages that its tables and lists link become its table of
   contents, so that the order of pages is stated once, in a form that every reader of the repository
   sees.
+* The addresses of former pages lead to the present ones (docs/site/moved.toml).
 * Each section of docs/api.md has a page with the docstrings of its names, and each command of
   docs/commands.md has one with its help. They are written into docs/generated, which git ignores.
 """
 
 import re
+import tomllib
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,9 @@ from tools.site_docstrings import convert_docstring
 
 ROOT = Path(__file__).resolve().parent.parent
 GENERATED = ROOT / "docs" / "generated"
+
+MOVED: dict[str, str] = tomllib.loads((ROOT / "docs/site/moved.toml").read_text("utf-8"))
+"""Former page of docs/ -> present page, or a section of it."""
 
 LINE = re.compile(r"^(?:\||[*-]) .*$", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#]+\.(?:md|rst))\)")
@@ -37,6 +42,7 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("builder-inited", write_pages_of_the_code)
     app.connect("source-read", add_contents)
     app.connect("autodoc-process-docstring", rewrite_docstring)
+    app.connect("build-finished", write_redirects)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -59,6 +65,24 @@ def add_contents(app: Any, page: str, source: list[str]) -> None:
         for caption, part in zip(["", *parts[1::2]], parts[::2], strict=True):
             text += format_contents(caption, list_entries(part))
     source[0] = text
+
+
+def write_redirects(app: Any, exception: Exception | None) -> None:
+    """Write pages at the addresses of former ones, which lead to the present ones."""
+    if exception or app.builder.name != "html":
+        return
+    for old, new in MOVED.items():
+        page, mark, section = new.partition("#")
+        link = "../" * old.count("/") + f"{page}.html{mark}{section}"
+        text = f"""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<title>loopcal</title>
+<meta http-equiv="refresh" content="0; url={link}">
+<a href="{link}">This page has moved.</a>
+</html>
+"""
+        write_if_changed(Path(app.outdir, "docs", f"{old}.html"), text)
 
 
 def rewrite_docstring(

@@ -5,6 +5,8 @@
 """
 
 import inspect
+import re
+from types import SimpleNamespace
 
 import click
 import pytest
@@ -64,6 +66,21 @@ def test_each_page_of_docs_is_in_an_index(root) -> None:
         listed |= {(index.parent / entry).resolve() for entry in entries}
     pages = {path for path in docs.rglob("*.md") if "generated" not in path.parts}
     assert pages - listed == {docs / "README.md"}
+
+
+def test_addresses_of_former_pages_lead_to_present_ones(root, tmp_path) -> None:
+    app = SimpleNamespace(builder=SimpleNamespace(name="html"), outdir=tmp_path)
+    site_pages.write_redirects(app, None)
+    for old, new in site_pages.MOVED.items():
+        page, _, section = new.partition("#")
+        assert not (root / "docs" / f"{old}.md").exists()
+        text = (root / "docs" / f"{page}.md").read_text("utf-8")
+        headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+        anchors = {re.sub(r"[^\w -]", "", line.lower()).replace(" ", "-") for line in headings}
+        assert not section or section in anchors, new
+        written = tmp_path / "docs" / f"{old}.html"
+        (link,) = re.findall(r'href="([^"#]+)', written.read_text("utf-8"))
+        assert (written.parent / link).resolve() == tmp_path / "docs" / f"{page}.html"
 
 
 def test_each_public_name_has_a_page_and_a_link_to_it(root) -> None:
