@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -155,7 +156,7 @@ def test_store_of_another_format_is_refused_and_unchanged(folder) -> None:
     connection.close()
     before = (folder / NAME).read_bytes()
     for opens in (open_store, read_store):
-        with expect_refusal("store.other-format", FileError, found=7, known=1), opens(folder):
+        with expect_refusal("store.other-format", FileError, found=7, known=2), opens(folder):
             pass
     assert (folder / NAME).read_bytes() == before
 
@@ -185,11 +186,83 @@ def test_damaged_part_is_named_where_its_blocks_are_copied(folder, tmp_path) -> 
     (folder / NAME).write_bytes(raw[:middle] + bytes(8192) + raw[middle + 8192 :])
     (tmp_path / "whole").mkdir()
     make_store(tmp_path / "whole", HEADER)
-    with open_store(tmp_path / "whole") as whole, read_store(folder) as part:
+    sentence = f"^{folder / NAME}: this file is damaged"
+    with pytest.raises(FileError, match=sentence), read_store(folder):
+        pass
+    with open_store(tmp_path / "whole") as whole, open_store(folder) as part:
         with pytest.raises(FileError, match=f"^{folder / NAME}: this file is damaged"):
             part.check_pages()
         with pytest.raises(FileError, match=f"^{folder / NAME}: this file is damaged"):
             whole.copy_blocks(part, A)
+
+
+OTHER_TABLES = {
+    "trigger": "CREATE TRIGGER t AFTER INSERT ON blocks BEGIN DELETE FROM blocks; END",
+    "view": "DROP TABLE study; CREATE VIEW study AS SELECT name, value FROM other",
+    "further table": "CREATE TABLE further (x)",
+    "virtual table": "CREATE VIRTUAL TABLE further USING fts5(x)",
+    "further column": "ALTER TABLE blocks ADD COLUMN more TEXT",
+    "other name": "ALTER TABLE cells RENAME TO cell",
+    "index": "CREATE INDEX i ON blocks (abs(seconds))",
+    "no table": "DROP TABLE blocks",
+    "computed column": "ALTER TABLE blocks ADD COLUMN more AS (trials * 2)",
+    "statistics": "ANALYZE",
+}
+
+
+@pytest.mark.parametrize("change", OTHER_TABLES.values(), ids=OTHER_TABLES)
+def test_store_with_other_tables_is_refused_before_any_of_its_sql_runs(folder, change) -> None:
+    with open_store(folder) as store:
+        store.add_block("key", A, 0, make_scores(0), 0.1)
+    connection = sqlite3.connect(folder / NAME)
+    connection.executescript(change)
+    connection.close()
+    before = (folder / NAME).read_bytes()
+    for opens in (open_store, read_store):
+        with expect_refusal("store.damaged", FileError), opens(folder):
+            pass
+    assert (folder / NAME).read_bytes() == before
+
+
+WRONG_BLOCKS = {
+    **{f"{c} text": f"{c} = 'two'" for c in ("block", "trials", "seconds", "scores", "digest")},
+    **{f"{c} number": f"{c} = 1.5" for c in ("block", "trials", "scores", "digest", "key")},
+    **{f"{c} bytes": f"{c} = x'00ff'" for c in ("block", "trials", "seconds", "key", "scores")},
+    **{f"{c} negative": f"{c} = -1" for c in ("block", "trials", "seconds")},
+    **{f"{c} huge": f"{c} = 9223372036854775807" for c in ("trials", "cell", "block")},
+    "infinite": "seconds = 1e999",
+    "no UTF-8": "key = CAST(x'ff' AS TEXT)",
+    "other scores": "scores = zeroblob(length(scores))",
+    "one bit": "scores = CAST(x'01' || substr(scores, 2) AS BLOB)",
+    "other number": "block = 77",
+    "other cell": "cell = 2",
+    "other key": "key = 'a key'",
+    "other seconds": "seconds = 0.2",
+    "90 MB": "scores = zeroblob(90000000)",
+}
+"""What is wrong with a block -> its change."""
+
+
+@pytest.mark.parametrize("change", WRONG_BLOCKS.values(), ids=WRONG_BLOCKS)
+def test_damaged_block_is_named_and_its_place_becomes_free(folder, tmp_path, change) -> None:
+    with open_store(folder) as store:
+        for number in range(5):
+            store.add_block(f"key{number}", A, number, make_scores(number), 0.1)
+        store.add_block("key", B, 0, make_scores(9), 0.1)
+    with closing(sqlite3.connect(folder / NAME)) as connection, connection:
+        connection.execute(f"UPDATE blocks SET {change} WHERE key = 'key3'")
+    sentence = r"block .* of the cell .* is damaged"
+    with pytest.raises(FileError, match=sentence) as caught, read_store(folder) as store:
+        _ = list(store.read_blocks(A)), list(store.read_blocks(B))
+    assert caught.value.code == "store.block-damaged"
+    with open_store(folder) as store:
+        (name,) = store.remove_damaged()
+        assert name in str(caught.value)
+        assert store.remove_damaged() == ()
+        assert store.add_block("key3", A, 3, make_scores(3), 0.1)
+    with read_store(folder) as store:
+        for number, scores in store.read_blocks(A):
+            np.testing.assert_array_equal(scores, make_scores(number))
 
 
 def test_readers_leave_no_file_beside_a_store_that_no_driver_has(folder) -> None:
@@ -209,13 +282,17 @@ def test_readers_leave_no_file_beside_a_store_that_no_driver_has(folder) -> None
 
 FULL = """
 import sys
+from contextlib import suppress
 from pathlib import Path
 from loopcal.errors import FileError
 from loopcal.studies.files.store import make_store, open_store, read_store
 from tests.studies.test_store import A, HEADER, make_scores
-folder = Path("disk/study")
-folder.mkdir()
-make_store(folder, HEADER)
+folder, closed = Path("disk/study"), Path("disk/closed")
+for each in (folder, closed):
+    each.mkdir()
+    make_store(each, HEADER)
+with open_store(closed) as store:
+    store.add_block("key", A, 0, make_scores(0), 0.1)
 number = 0
 with open_store(folder) as store:
     try:
@@ -227,6 +304,15 @@ with open_store(folder) as store:
         print(store.count_cell(A).blocks == number)
 with read_store(folder) as store:
     print([n for n, _ in store.read_blocks(A)] == list(range(number)))
+with open("disk/other", "wb", buffering=0) as other, suppress(OSError):
+    while True:
+        other.write(bytes(512))
+with read_store(closed) as store:
+    print(store.count_cell(A).blocks == 1)
+try:
+    make_store(Path("disk"), HEADER)
+except FileError as error:
+    print(error.code)
 """
 
 
@@ -242,7 +328,9 @@ def test_full_disk_loses_only_the_block(tmp_path) -> None:
     done = subprocess.run(
         words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
     )
-    assert done.stdout.splitlines() == ["store.disk-full True", "True", "True"], done.stderr
+    assert done.stdout.splitlines() == [
+        *("store.disk-full True", "True", "True", "True", "store.not-made")
+    ], done.stderr
 
 
 @pytest.mark.parametrize(
@@ -251,6 +339,10 @@ def test_full_disk_loses_only_the_block(tmp_path) -> None:
         ("specification", "CAST(x'7ba6' AS TEXT)"),  # no UTF-8
         ("columns", "'7'"),
         ("columns", "'{'"),
+        ("columns", "'[1, 2, 3]'"),
+        ("columns", "replace(hex(zeroblob(50000)), '00', '[')"),  # deep
+        ("versions", "x'7b7d7d'"),
+        ("specification", "x'00'"),
         ("versions", "'[]'"),
         ("versions", "CAST(x'ff' AS TEXT)"),
     ],

@@ -94,6 +94,7 @@ class RunReport:
     total : blocks that were asked for. before : of these, stored when it began. computed, trials :
         stored by it. given_up : blocks that stopped every worker, and cells whose poses did.
     losses : workers that were lost, as far as is known. worker_seconds : sum over all workers.
+    damaged : stored blocks that were removed and computed again.
     """
 
     total: int
@@ -104,6 +105,7 @@ class RunReport:
     losses: int
     seconds: float
     worker_seconds: float
+    damaged: tuple[str, ...] = ()
 
     @property
     def is_complete(self) -> bool:
@@ -112,8 +114,11 @@ class RunReport:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What happened to workers."""
+        """What happened to workers and to stored blocks."""
         findings = []
+        if self.damaged:
+            named, count = self.damaged[:MOST_NAMED], len(self.damaged)
+            findings.append(report_finding("store.blocks-removed", count=count, blocks=named))
         if self.losses:
             findings.append(report_finding("workers.lost", losses=self.losses))
         if self.given_up:
@@ -138,10 +143,12 @@ def run_blocks(
     """Compute and store the blocks of a study that are missing in its store, each as soon as it is
     there; `threads` compute a block, in each worker.
 
+    Damaged blocks are removed and computed again.
+
     Raises FileError: a block cannot be stored. StudyError, LoopcalError: see `Executor.map_blocks`
     and `compute_block`.
     """
-    begin = time.perf_counter()
+    begin, damaged = time.perf_counter(), store.remove_damaged()
     total, before = count_blocks(study, share), count_stored(study, store, share)
     computed = trials = losses = 0
     seconds, given_up, poses = 0.0, list[str](), dict[str, CellPoses | None]()
@@ -164,7 +171,9 @@ def run_blocks(
                     computed, trials = computed + 1, trials + len(result)
                 progress(before + computed, total, "computing blocks")
     wall = time.perf_counter() - begin
-    return RunReport(total, before, computed, trials, tuple(given_up), losses, wall, seconds)
+    return RunReport(
+        total, before, computed, trials, tuple(given_up), losses, wall, seconds, damaged
+    )
 
 
 def count_blocks(study: Study, share: Share = WHOLE) -> int:

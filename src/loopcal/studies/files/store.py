@@ -8,11 +8,16 @@ driver that is killed (write-ahead log). The lock of a driver is one of the fold
 operating system releases when the driver ends in whatever way. Others can read meanwhile.
 
 Tables: `study` (name -> value), `cells` (levels as JSON) and `blocks` (key, cell, block, trials,
-scores as float64 of little end, seconds of computation).
+scores as float64 of little end, seconds of computation, SHA-256 digest of all this).
+
+A store may come from others, so nothing in it runs: its tables are compared with ours before
+anything else is asked, which excludes triggers and views. The types and the length of a block are
+checked before it is read, and its digest when it is.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -22,7 +27,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,11 +86,14 @@ def find_network_file_system(folder: Path) -> str | None:
 NAME = "study.sqlite"
 """File name of a store in the folder of its study."""
 
-FORMAT = 1
+FORMAT = 2
 """Version of the tables; a store of another one is refused."""
 
 APPLICATION = 0x6C6F6F70
 """By which SQLite knows a file of ours ("loop")."""
+
+LONGEST_NAME = 200
+"""Characters of the name of a block in messages."""
 
 PATIENCE = 30.0
 """Seconds to wait for another program that locks the file."""
@@ -103,6 +111,7 @@ CREATE TABLE blocks (
     trials INTEGER NOT NULL,
     scores BLOB NOT NULL,
     seconds REAL NOT NULL,
+    digest BLOB NOT NULL,
     UNIQUE (cell, block)
 );
 COMMIT;
@@ -111,6 +120,21 @@ COMMIT;
 Levels = Mapping[str, str]
 """Factor -> name of its level: what a cell is called, whatever else a study contains."""
 
+
+LONGEST = 1 << 26
+"""Bytes of a value in a store, which SQLite checks before it takes memory. A block of 2,000 trials
+with 1,000 scores has 16 million.
+"""
+
+HAS_SHAPE = """
+typeof(key) = 'text' AND typeof(block) = 'integer' AND block >= 0
+AND typeof(trials) = 'integer' AND trials > 0 AND typeof(seconds) = 'real'
+AND seconds BETWEEN 0 AND 1e12 AND typeof(scores) = 'blob' AND length(scores) = 8 * trials * ?
+AND typeof(digest) = 'blob' AND typeof(levels) = 'text'
+"""
+"""Whether a block has the types and the length of one with this number of scores."""
+
+WITH_CELLS = "FROM blocks LEFT JOIN cells ON cells.id = blocks.cell"
 
 OF_CELL = "FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?)"
 
@@ -156,8 +180,9 @@ class StudyStore:
             columns, versions = json.loads(rows["columns"]), json.loads(rows["versions"])
             if not isinstance(columns, list) or not isinstance(versions, dict):
                 raise ValueError("other types")
+            "".join((rows["specification"], *columns)).encode()  # all are text
             return StoreHeader(rows["specification"], tuple(columns), versions)
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, RecursionError):
             raise FileError(report_finding("store.damaged"), self.path) from None
 
     @cached_property
@@ -184,11 +209,13 @@ class StudyStore:
         Raises FileError: it cannot be written, as on a full disk. Then nothing of it is stored.
         """
         assert scores.shape == (len(scores), self.width), scores.shape
-        content = np.ascontiguousarray(scores, dtype="<f8").tobytes()
+        content, trials = np.ascontiguousarray(scores, dtype="<f8").tobytes(), len(scores)
+        digest = _compute_digest(_name_cell(levels), key, block, trials, seconds, content)
         with _report_errors(self.path), self.connection:
             done = self.connection.execute(
-                "INSERT INTO blocks VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (cell, block) DO NOTHING",
-                (key, self._find_cell(levels), block, len(scores), content, seconds),
+                "INSERT INTO blocks VALUES (?, ?, ?, ?, ?, ?, ?) "
+                "ON CONFLICT (cell, block) DO NOTHING",
+                (key, self._find_cell(levels), block, trials, content, float(seconds), digest),
             )
         return done.rowcount == 1
 
@@ -220,25 +247,62 @@ class StudyStore:
             yield
 
     def read_blocks(self, levels: Levels) -> Iterator[tuple[int, FloatArray]]:
-        """Yield the blocks of a cell with their numbers, in this order: (number, (B, s) scores)."""
-        question = f"SELECT block, trials, scores {OF_CELL} ORDER BY block"
-        for block, trials, content in self.ask(question, _name_cell(levels)):
-            if len(content) != 8 * trials * self.width:
-                raise FileError(report_finding("store.damaged"), self.path)
+        """Yield the blocks of a cell with their numbers, in this order: (number, (B, s) scores).
+
+        Raises FileError: a block is damaged.
+        """
+        for _, block, trials, _, content, _ in self._read_intact(levels):
             yield block, np.frombuffer(content, dtype="<f8").reshape(trials, self.width)
 
     def copy_blocks(self, other: StudyStore, levels: Levels) -> int:
-        """Store the blocks of a cell of another store, and return how many are new."""
-        question = f"SELECT key, block, trials, scores, seconds {OF_CELL}"
+        """Store the blocks of a cell of another store, and return how many are new.
+
+        Raises FileError: a block is damaged.
+        """
         with _report_errors(self.path), self.connection:
             cell = self._find_cell(levels)
             before = self.connection.total_changes
             self.connection.executemany(
-                "INSERT INTO blocks (key, block, trials, scores, seconds, cell) "
-                f"VALUES (?, ?, ?, ?, ?, {cell}) ON CONFLICT (cell, block) DO NOTHING",
-                other.ask(question, _name_cell(levels)),
+                "INSERT INTO blocks (key, block, trials, seconds, scores, digest, cell) "
+                f"VALUES (?, ?, ?, ?, ?, ?, {cell}) ON CONFLICT (cell, block) DO NOTHING",
+                other._read_intact(levels),  # another store of this class
             )
             return self.connection.total_changes - before
+
+    def _read_intact(self, levels: Levels) -> Iterator[tuple[Any, ...]]:
+        """Yield the blocks of a cell: key, number, trials, seconds, content and digest."""
+        name = _name_cell(levels)
+        question = f"SELECT key, block, trials, seconds, scores, digest {OF_CELL} ORDER BY block"
+        for row in self.ask(question, name):
+            if _compute_digest(name, *row[:-1]) != row[-1]:
+                finding = report_finding("store.block-damaged", block=_name_block(name, row[1]))
+                raise FileError(finding, self.path)
+            yield row
+
+    def find_misshapen(self) -> dict[int, str]:
+        """Return the rows of blocks with wrong types or lengths, and the names of these blocks.
+
+        Types and lengths are known without the content, which may be longer than LONGEST.
+        """
+        question = f"SELECT blocks.rowid {WITH_CELLS} WHERE NOT ({HAS_SHAPE})"
+        width, usual = self.width, self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2**31 - 1)
+        rows = [row for (row,) in self.ask(question, width)]
+        self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, usual)
+        question = f"SELECT levels, block {WITH_CELLS} WHERE blocks.rowid = ?"
+        return {row: _name_block(*next(self.ask(question, row))) for row in rows}
+
+    def remove_damaged(self) -> tuple[str, ...]:
+        """Remove all damaged blocks, which are then computed again, and return their names."""
+        damaged, columns = self.find_misshapen(), "levels, key, block, trials, seconds, scores"
+        with _report_errors(self.path), self.connection:
+            remove = "DELETE FROM blocks WHERE rowid = ?"
+            self.connection.executemany(remove, [(row,) for row in damaged])
+            question = f"SELECT blocks.rowid, digest, {columns} {WITH_CELLS}"
+            for row, digest, name, key, block, *content in self.ask(question):
+                if _compute_digest(name, key, block, *content) != digest:
+                    damaged[row] = _name_block(name, block)
+            self.connection.executemany(remove, [(row,) for row in damaged])
+        return tuple(damaged.values())
 
     def check_pages(self) -> None:
         """Read the whole store, and raise FileError where it is damaged."""
@@ -258,6 +322,19 @@ def _name_cell(levels: Levels) -> str:
     return json.dumps(dict(levels), sort_keys=True, ensure_ascii=False)
 
 
+def _name_block(levels: object, block: object) -> str:
+    """Return a name of a block for messages."""
+    return f"block {block} of the cell {levels}"[:LONGEST_NAME]
+
+
+def _compute_digest(
+    levels: str, key: str, block: int, trials: int, seconds: float, content: bytes
+) -> bytes:
+    """Return the SHA-256 digest of a block of the cell of this name."""
+    head = json.dumps((levels, key, block, trials, seconds)).encode()
+    return hashlib.sha256(head + content).digest()
+
+
 def make_store(folder: Path, header: StoreHeader) -> None:
     """Make an empty store in a folder.
 
@@ -265,7 +342,8 @@ def make_store(folder: Path, header: StoreHeader) -> None:
     """
     path = folder / NAME
     refuse_network(folder)
-    with _report_errors(path), closing(sqlite3.connect(path, PATIENCE)) as connection:
+    full = "store.not-made"
+    with _report_errors(path, full), closing(sqlite3.connect(path, PATIENCE)) as connection:
         connection.executescript(TABLES)
         StudyStore(path, connection).set_header(header)
 
@@ -284,7 +362,7 @@ def open_store(folder: Path) -> Iterator[StudyStore]:
         if descriptor is not None and lock(descriptor) is False:
             raise FileError(report_finding("store.other-driver"), folder)
         with _report_errors(path), closing(sqlite3.connect(path, PATIENCE)) as connection:
-            _refuse_format(path, connection)
+            _refuse_others(path, connection)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
             yield StudyStore(path, connection)
@@ -297,7 +375,7 @@ def open_store(folder: Path) -> Iterator[StudyStore]:
 def read_store(folder: Path) -> Iterator[StudyStore]:
     """Open the store of a folder to read it, also while a driver writes it.
 
-    Raises FileError: there is none, or it is of another format.
+    Raises FileError: there is none, it is of another format, or a block is damaged.
     """
     path = _find_store(folder)
     # a copy on a network file system can be read where no driver has left an unfinished log
@@ -306,12 +384,35 @@ def read_store(folder: Path) -> Iterator[StudyStore]:
     is_copy = is_still and find_network_file_system(folder) is not None
     # only a connection that could write removes the files of the log when it is the last one
     is_writable = os.access(path, os.W_OK) and os.access(folder, os.W_OK)
-    mode = "immutable=1" if is_copy else "mode=rw" if is_writable else "mode=ro"
-    address = f"{path.resolve().as_uri()}?{mode}"
-    with _report_errors(path), closing(sqlite3.connect(address, PATIENCE, uri=True)) as connection:
+    mode = STILL if is_copy else "mode=rw" if is_writable else "mode=ro"
+    if mode != STILL and is_still and not is_driven(folder) and _is_disk_full(path, mode):
+        mode = STILL  # other modes make files for the log
+    with _report_errors(path), closing(_connect(path, mode)) as connection:
         connection.execute("PRAGMA query_only = ON")
-        _refuse_format(path, connection)
-        yield StudyStore(path, connection)
+        _refuse_others(path, connection)
+        store = StudyStore(path, connection)
+        for block in store.find_misshapen().values():
+            raise FileError(report_finding("store.block-damaged", block=block), path)
+        yield store
+
+
+STILL = "immutable=1"
+"""The mode of reading a store that nobody writes."""
+
+
+def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    """Return a connection in a mode of SQLite's addresses."""
+    return sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", PATIENCE, uri=True)
+
+
+def _is_disk_full(path: Path, mode: str) -> bool:
+    """Return whether a store cannot be read in this mode because the disk takes no more."""
+    try:
+        with closing(_connect(path, mode)) as connection:
+            connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+    except sqlite3.Error as error:
+        return getattr(error, "sqlite_errorcode", 0) & 0xFF in FULL
+    return False
 
 
 def is_driven(folder: Path) -> bool:
@@ -340,8 +441,11 @@ def _find_store(folder: Path) -> Path:
     return path
 
 
-def _refuse_format(path: Path, connection: sqlite3.Connection) -> None:
-    """Raise FileError for a file of another program or version."""
+def _refuse_others(path: Path, connection: sqlite3.Connection) -> None:
+    """Raise FileError for a file of another program or version, or with other tables than ours."""
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
+    connection.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")
+    connection.execute("PRAGMA trusted_schema = OFF")
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (version,) = connection.execute("PRAGMA user_version").fetchone()
     if application != APPLICATION:
@@ -349,18 +453,26 @@ def _refuse_format(path: Path, connection: sqlite3.Connection) -> None:
     if version != FORMAT:
         finding = report_finding("store.other-format", found=version, known=FORMAT)
         raise FileError(finding, path)
+    question = "SELECT type, name, tbl_name, sql FROM sqlite_schema"
+    with closing(sqlite3.connect(":memory:")) as ours:
+        ours.executescript(TABLES)
+        if set(connection.execute(question)) != set(ours.execute(question)):
+            raise FileError(report_finding("store.damaged"), path)
 
 
 FULL = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR}
 """Errors of a disk that takes no more (SQLite calls a file that must not grow an error of input and
 output).
 """
-UNREADABLE = {sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_SCHEMA}
+UNREADABLE = {
+    *(sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_SCHEMA),
+    *(sqlite3.SQLITE_TOOBIG, sqlite3.SQLITE_MISMATCH),
+}
 
 
 @contextmanager
-def _report_errors(path: Path) -> Iterator[None]:
-    """Raise FileError in place of every error of SQLite."""
+def _report_errors(path: Path, full: str = "store.disk-full") -> Iterator[None]:
+    """Raise FileError in place of every error of SQLite; `full` is the code of a full disk."""
     try:
         yield
     except UnicodeDecodeError as error:
@@ -371,7 +483,7 @@ def _report_errors(path: Path) -> Iterator[None]:
         if isinstance(error, sqlite3.IntegrityError):
             raise  # a defect: two blocks of one number
         if number in FULL:
-            finding = report_finding("store.disk-full", reason=reason)
+            finding = report_finding(full, reason=reason)
         elif number in UNREADABLE or (isinstance(error, sqlite3.DatabaseError) and not number):
             finding = report_finding("store.damaged")
         else:
@@ -460,7 +572,7 @@ def load_specification(store: StudyStore) -> Study:
     try:
         if header.versions.get(NUMERICS_PART, "") == str(NUMERICS):
             return Study.from_json(header.specification)
-    except ValueError:  # it has settings that this version does not know
+    except (ValueError, RecursionError):  # it has settings that this version does not know
         part, known = PROGRAM, __version__
     found = header.versions.get(part, "")
     finding = report_finding("store.other-numbers", part=part, found=found, known=known)
