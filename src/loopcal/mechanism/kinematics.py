@@ -33,6 +33,7 @@ from loopcal.mechanism.transmission import (
     select_weights,
     turn_head,
 )
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
 # Loops closed at joint values or their sums, and along straight paths of these from a start.
@@ -144,29 +145,28 @@ def _take_steps(
 ) -> State:
     """Solve rows (r, 1) in equal steps of the joint values between the ends of a path (r, 1, a).
 
-    With `leave`, a row that fails or opens wide on the way goes to the end at once: the path leaves
-    the reach of the robot there.
+    With `leave`, a row that fails, opens wide or passes a singularity on the way goes to the end at
+    once: the path leaves the reach or the mode of the robot there.
     """
-    robot, (origin, target) = loops.robot, path
-    current, moving = begin, np.arange(len(target))
+    (origin, target), moving, done = path, np.arange(len(path[0])), begin
+    all_loops, current = loops, begin
     for step in range(1, count + 1):
-        zero = np.zeros(len(moving), int)
         q = origin[moving] + (target[moving] - origin[moving]) * (step / count)
-        begun = current.select((len(target), 1), moving, zero)
-        solved = loops.select(moving).solve(q, begun)
-        current = replace_rows(current, moving, zero, solved)
-        if leave and step < count:
-            gap, status = current.residual[moving, 0], current.status[moving, 0]
-            failed = moving[(status != Status.CONVERGED.value) | (gap > WIDE * robot.size)]
-            if len(failed):
-                zero = np.zeros(len(failed), int)
-                state = current.select((len(target), 1), failed, zero)
-                solved = loops.select(failed).solve(target[failed], state)
-                current = replace_rows(current, failed, zero, solved)
-                moving = np.setdiff1d(moving, failed)
-                if not len(moving):
-                    break
-    return current
+        begun, current = current, loops.solve(q, current)
+        if not leave or step == count:
+            continue
+        wrong = find_wrong_rows(loops.robot, current, begun)[:, 0]
+        wrong |= current.status[:, 0] != Status.CONVERGED.value
+        if wrong.any():
+            failed, last = moving[wrong], map_arrays(lambda a, wrong=wrong: a[wrong], current)
+            last = all_loops.select(failed).solve(target[failed], last)
+            done = replace_rows(done, failed, np.zeros_like(failed), last)
+            moving = moving[~wrong]
+            if not len(moving):
+                return done
+            loops = all_loops.select(moving)
+            current = map_arrays(lambda a, wrong=wrong: a[~wrong], current)
+    return replace_rows(done, moving, np.zeros_like(moving), current)
 
 
 def forward_trials(

@@ -379,9 +379,12 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
 
     Newton's method must lead to the pose of a goal from its readings, and a safe path too.
     """
-    returns, needs_path = _solve_from(robot, first, goal)
-    start, is_other = repeat_poses(first, len(returns)), np.ones(len(returns), bool)
-    rows = np.flatnonzero(returns | needs_path)
+    e, _ = robot.slots(robot.values[None])
+    back = close_at_joints(robot, e, driven_values(robot.program, goal), first, goal=goal)
+    is_other = back.status[0] != NEAR_GOAL
+    is_other &= (back.status[0] != Status.CONVERGED) | ~_is_same_pose(robot, back, goal, SAME_POSE)
+    rows = np.flatnonzero(~is_other)
+    start = repeat_poses(first, len(is_other))
     for connect in (connect_by_readings, connect_by_poses):
         if not len(rows):
             break
@@ -389,24 +392,7 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
         goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(solutions, len(rows), 1))
         is_other[rows] = ~connected
         rows = rows[~connected]
-        unsure = rows[needs_path[rows]]
-        if connect is connect_by_readings and len(unsure):
-            ends = select_poses(start, unsure), select_poses(goal, unsure)
-            returns[unsure] = _solve_from(robot, *ends, follow=True)[0]
-            rows = rows[returns[rows]]
     return goal, is_other
-
-
-def _solve_from(
-    robot: Mechanism, first: State, goal: State, follow: bool = False
-) -> tuple[BoolArray, BoolArray]:
-    """Return which readings of goals (1, k) lead to their poses from `first`, and which to none."""
-    e, _ = robot.slots(robot.values[None])
-    joints = driven_values(robot.program, goal)
-    back = close_at_joints(robot, e, joints, first, follow, goal)
-    closed = back.status[0] == Status.CONVERGED
-    is_near = back.status[0] == NEAR_GOAL
-    return is_near | closed & _is_same_pose(robot, back, goal, SAME_POSE), ~(is_near | closed)
 
 
 def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:
