@@ -37,7 +37,7 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_by_drives
-from loopcal.mechanism.states import Status, driven_values, without_poses
+from loopcal.mechanism.states import Status, driven_values, replace_rows, without_poses
 from loopcal.mechanism.transmission import (
     apply_weights,
     find_fixed_rows,
@@ -47,6 +47,7 @@ from loopcal.mechanism.transmission import (
     select_weights,
     transmit_readings,
 )
+from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -378,6 +379,10 @@ class _Rows:
         """Return the iterate at driven joints u (R, u); its gap is infinite where a loop stays
         open.
         """
+        return self.aim(self.place(u, begin))
+
+    def place(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
+        """Return the iterate at driven joints u (R, u) without its step; D is NaN of open loops."""
         R = len(u)
         loops, ok = [], np.isfinite(u).all(axis=1)
         for i, start in zip(self._list_loops(), begin, strict=True):
@@ -393,8 +398,8 @@ class _Rows:
         D[~ok] = np.nan
         none = np.zeros(R)
         status = none.astype(np.int8)
-        return self.aim(
-            _Iterate(u, tuple(loops), T, D, none, none[:, None], none, status, none.astype(int))
+        return _Iterate(
+            u, tuple(loops), T, D, none, np.zeros_like(u), none, status, none.astype(int)
         )
 
     def aim(self, now: _Iterate) -> _Iterate:
@@ -705,3 +710,104 @@ def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, sta
     return engine.solve(
         robot.program, e, driven_values(robot.program, begin), begin, command, free=True
     )
+
+
+# The reachable pose nearest to one that takes more freedoms than the robot has: Gauss-Newton steps
+# of the drives.
+
+PROJECTION_STEPS, ATTEMPTS = 20, 5
+"""Steps of a projection, and lengths that are tried for each, the shortest 1/16 of it: a row ends
+where none of them lowers its distance, as at the end of the reach."""
+SHORT_STEP, SHORT_SHARE = 1e-12, 1e-9
+"""The last step changes the distance from the target to first order by this length, relative to the
+robot's size, and this share."""
+STATIONARY = 1e-6
+"""A pose is the nearest one where a step changes the distance by at most this share to first order,
+or by this share of `REACHED`, where the target itself is reachable."""
+REACHED = 1e-3
+"""Distance below which a target counts as reachable, relative to the robot's size."""
+DEPENDENT = 1e-9
+"""Relative singular value below which a combination of drives does not move the platform."""
+
+
+class _Point(NamedTuple):
+    """Iterates of R rows, their differences (R, 6) from the targets in lengths [m], and the sums of
+    their squares (R,) [m^2], infinite where the loops are open.
+    """
+
+    now: _Iterate
+    gap: FloatArray
+    cost: FloatArray
+
+
+class _Step(NamedTuple):
+    """Changes of the drives (R, u), the squared change (R,) of the differences to first order
+    [m^2], and the share (R, 1) that is no longer than the longest step.
+    """
+
+    drives: FloatArray
+    change: FloatArray
+    share: FloatArray
+
+
+def find_nearest_reachable(
+    robot: Mechanism, values: FloatArray, T: FloatArray, start: State | None = None
+) -> State:
+    """Return states (1, n) with the reachable poses nearest to T (1, n, 4, 4), without signs; a row
+    whose search ends before the distance is stationary is `NOT_CONVERGED`.
+    """
+    wanted = read_coordinates(T, robot.controlled)
+    state = close_at_coordinates(robot, values, wanted, start)
+    closed = np.flatnonzero(state.status[0] == CONVERGED)
+    if controls_all(robot) or not len(closed):
+        return state
+    first = map_arrays(lambda a: a[0, closed, None], state)
+    if not moves_by_drives(robot):
+        first = replace(first, closure_sign=compute_closure_sign(robot, values, first))
+    rows, scale = _make_rows(robot, values, wanted[0, closed]), robot.twist_scale
+
+    def measure(now: _Iterate) -> _Point:
+        gap = geometry.pose_difference(now.T, T[0, closed]) * scale
+        cost = np.where(np.isfinite(now.D).all(axis=(1, 2)), (gap**2).sum(axis=1), np.inf)
+        return _Point(now, gap, cost)
+
+    def propose(point: _Point) -> _Step:
+        slope = point.now.D * scale[:, None] * rows.spans
+        slope = np.where(np.isfinite(point.cost)[:, None, None], slope, 0.0)[..., rows.moving]
+        inverse = np.linalg.pinv(slope, rcond=DEPENDENT)
+        step = np.matmul(inverse, -point.gap[..., None])
+        change, drives = np.matmul(slope, step)[..., 0], np.zeros_like(point.now.u)
+        drives[:, rows.moving] = step[..., 0]
+        drives *= rows.spans
+        length = np.abs(drives * rows.units).max(axis=1, keepdims=True) / robot.size
+        return _Step(drives, (change**2).sum(axis=1), LONGEST_STEP / length.clip(LONGEST_STEP))
+
+    def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
+        moving = np.flatnonzero(share[:, 0])
+        if not len(moving):
+            return point
+        begin, u = point.now.take(moving), point.now.u + share * step.drives
+        new = rows.select(moving).place(u[moving], begin.loops)
+        return measure(point.now.put(moving, new))
+
+    control = Halving(PROJECTION_STEPS, ATTEMPTS, SHORT_SHARE, SHORT_STEP * robot.size)
+    begin = _begin(rows, first)
+    point, _ = minimize_by_halving(measure(begin), propose, move, control)
+    smallest = np.maximum(point.cost, (REACHED * robot.size) ** 2)
+    ended_early = propose(point).change > STATIONARY**2 * smallest
+    moved = np.flatnonzero((point.now.u != begin.u).any(axis=1))
+    state = replace(state, status=state.status.copy())
+    if len(moved):
+        last = join_stage_states(robot, rows.list_states(point.now))
+        last = map_arrays(lambda a: a[None, moved, 0], last)
+        near = read_coordinates(last.T, robot.controlled)
+        last = close_at_coordinates(robot, values, near, last, follow=False)
+        new = map_arrays(lambda a: a[0, :, None], last)
+        state = replace_rows(state, np.zeros_like(moved), closed[moved], new)
+    state.status[0, closed[ended_early]] = Status.NOT_CONVERGED
+    return state
+
+
+def controls_all(robot: Mechanism) -> bool:
+    """Return whether the controlled coordinates state each freedom of the platform."""
+    return len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms)
