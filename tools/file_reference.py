@@ -19,7 +19,7 @@ from loopcal.io.core.limits import COUNT_LIMITS, LIMITS
 from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_settings import SETTINGS, list_kind_settings
-from loopcal.io.exports.profile import ColumnSource, ProfileRecord, list_shipped_profiles
+from loopcal.io.exports.profile import ColumnSource, ProfileRecord
 from loopcal.io.robot import robot_file as file_reference
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure.kinds import KINDS
@@ -33,6 +33,7 @@ from loopcal.units import DISPLAY_UNITS, Dimension
 from tools.markdown import fill_blocks, format_table
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
+EXAMPLES = DOCS.parent / "examples" / "exports"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
@@ -237,7 +238,7 @@ BLOCKS = {
 EXPORT_BLOCKS = {
     "profile": format_profile,
     "profile-columns": format_profile_columns,
-    "spatial-analyzer": format_example(list_shipped_profiles()["spatial-analyzer"]),
+    "tracker-points": format_example(EXAMPLES / "tracker-points.yaml"),
 }
 
 
