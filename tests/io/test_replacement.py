@@ -11,6 +11,7 @@ import pytest
 from loopcal.errors import FileError
 from loopcal.io.core.outputs import replace_folder
 from loopcal.io.core.text_file import replace_file, write_text
+from loopcal.io.example_folders import write_example
 
 
 def list_names(folder: Path) -> list[str]:
@@ -87,3 +88,13 @@ def test_names_that_file_systems_allow_are_written(tmp_path) -> None:
         with replace_folder(tmp_path / f"{name[1:]}"):
             pass
         assert (tmp_path / name[1:]).is_dir()
+
+
+def test_an_example_removes_what_a_killed_one_left_and_no_folder_of_others(tmp_path):
+    ours, other = (tmp_path / f".loopcal-new-{n * 16}-printer" for n in "ab")
+    for folder, file in ((ours, "heights.csv"), (other, "notes.txt")):
+        folder.mkdir()
+        (folder / file).write_text("half")
+    names = write_example("delta-printer", tmp_path / "printer")
+    assert sorted(path.name for path in (tmp_path / "printer").iterdir()) == sorted(names)
+    assert (ours.exists(), other.exists()) == (False, True)

@@ -60,7 +60,7 @@ def write_example(name: str, path: str | Path) -> tuple[str, ...]:
             raise FileError(report_finding("files.example-exists", name=name), path)
 
     refuse_existing(path)
-    with replace_folder(path, refuse_existing) as folder:
+    with replace_folder(path, refuse_existing, files) as folder:
         for file, source in files.items():
             (folder / file).write_bytes(source.read_bytes())
     return tuple(files)

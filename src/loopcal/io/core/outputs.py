@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -109,15 +109,24 @@ def _is_same_file(path: Path, other: Path) -> bool:
 
 
 @contextmanager
-def replace_folder(path: Path, check: Callable[[Path], None] | None = None) -> Iterator[Path]:
+def replace_folder(
+    path: Path, check: Callable[[Path], None] | None = None, names: Collection[str] = ()
+) -> Iterator[Path]:
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
 
     At every moment, `path` is the old or the new folder, complete. A symbolic link to a folder
     stays a link. `check` raises FileError where a folder must not be replaced, as every OSError
-    does.
+    does. Folders that killed commands left beside it, with no other files than `names`, are
+    removed.
     """
+
+    def is_left_of_us(left: Path) -> bool:
+        return left.is_dir() and all(file.name in names for file in left.iterdir())
+
     with report_write_errors(path):
         target = resolve_links(path)
+        if names:
+            remove_leftovers(target, is_left_of_us)
         target.parent.mkdir(parents=True, exist_ok=True)
         with create_temporary(target, is_folder=True) as temporary:
             yield temporary

@@ -38,7 +38,7 @@ from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
 from loopcal.io.core.outputs import replace_folder
-from loopcal.io.core.replacement import lock, open_folder, remove_leftovers
+from loopcal.io.core.replacement import lock, open_folder
 from loopcal.io.core.text_file import read_bytes, resolve_links
 from loopcal.studies.specification.study import NUMERICS, Study, list_conflicts
 from loopcal.typing import FloatArray, Progress, report_no_progress
@@ -584,14 +584,9 @@ def _make_folder(folder: Path, source: StudySource) -> None:
     refuse_network(folder)
     names = {STUDY_FILE, *(f"{NAME}{end}" for end in ("", "-journal", "-wal", "-shm"))}
     names |= {Path(name).parts[0] for name, _ in _list_files(source)}
-
-    def is_ours(left: Path) -> bool:
-        return left.is_dir() and all(path.name in names for path in left.iterdir())
-
-    remove_leftovers(resolve_links(folder), is_ours)
     _refuse_content(folder)
     files = {name: read_bytes(path, "file", YAML_SIZE) for name, path in _list_files(source)}
-    with replace_folder(folder, check=_refuse_content) as temporary:
+    with replace_folder(folder, _refuse_content, names) as temporary:
         for name, content in files.items():
             file = temporary / name
             file.parent.mkdir(parents=True, exist_ok=True)
