@@ -299,3 +299,10 @@ def test_kind_without_a_tool_is_refused_and_keeps_the_first_tool(kind):
 def test_arrays_of_a_kind_are_read_only(kind):
     for value in vars(kind.with_tool(T_PLATFORM_TOOL)).values():
         assert not isinstance(value, np.ndarray) or not value.flags.writeable
+
+
+@pytest.mark.parametrize("form", ["theodolite", "camera"])
+def test_bearing_of_a_target_in_the_instrument_has_no_derivative_and_no_warning(form):
+    kind = KINDS["bearing"](places=np.zeros((1, 3)), form=form)
+    parts = kind.evaluate(np.eye(4)[None, None], np.zeros((1, 2)))
+    assert not np.isfinite(parts[1]).all()

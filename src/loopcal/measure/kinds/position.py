@@ -362,15 +362,16 @@ class Bearing(TargetKind):
 
 def predict_camera_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the angles `atan2(x, z)` and `atan2(y, z)` (.., 2) of vectors (.., 3) about an optical
-    axis z, and their derivatives (.., 2, 3).
+    axis z, and their derivatives (.., 2, 3), which are not finite at the vector 0.
     """
     a, b, c = x[..., 0], x[..., 1], x[..., 2]
     zero = np.zeros_like(a)
     across, up = a * a + c * c, b * b + c * c
-    slopes = [
-        np.stack([c / across, zero, -a / across], axis=-1),
-        np.stack([zero, c / up, -b / up], axis=-1),
-    ]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slopes = [
+            np.stack([c / across, zero, -a / across], axis=-1),
+            np.stack([zero, c / up, -b / up], axis=-1),
+        ]
     return np.stack([np.arctan2(a, c), np.arctan2(b, c)], axis=-1), np.stack(slopes, axis=-2)
 
 
