@@ -164,9 +164,13 @@ def adapt_commands(page: str, text: str) -> str:
 
 def test_help_by_verdict_names_each_failure_and_only_findings_of_the_catalog(root) -> None:
     page, catalog = (root / "docs" / "not-calibrated.md").read_text("utf-8"), load_catalog()
-    named = set(re.findall(r"`((?!robot)[a-z]+\.[a-z-]+)`", page))
+    named = set(re.findall(r"`((?!robot|result)[a-z]+\.[a-z-]+)`", page))
     failures = {c for c, e in catalog.items() if c[:4] == "fit." and e.severity.value == "failure"}
     assert named <= catalog.keys()
+    phrases = re.findall(r'"([^"|]+)"[^|`]*\(`([a-z.-]+)`', page)
+    assert len(phrases) >= 18
+    for phrase, code in phrases:
+        assert phrase in " ".join(catalog[code].text.split()), code
     assert failures | {"noise.residuals-too-large"} <= named
 
 
