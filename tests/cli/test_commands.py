@@ -223,6 +223,18 @@ def test_identifiability_states_assumptions_of_suggestions_beside_these_only(loo
     assert "Measure the joint left.rail as well" in said
 
 
+def test_chosen_joints_are_measured_in_their_dimension(loopcal) -> None:
+    finger = "--kind position,joint --joints left.rail"
+    loopcal(f"identifiability gripper --draw 9 {finger}", "7 of 7 parameter combinations")
+    loopcal("simulate par4 --draw 2 --kind joint --joints hinge-front.pin -o pins.csv")
+    assert "hinge-front.pin [deg]" in Path("pins.csv").read_text()
+    loopcal(f"plan gripper --poses 6 {finger} -o plan-finger")
+    assert "left.rail [mm]" in Path("plan-finger/measurements.csv").read_text()
+    loopcal("identifiability gripper --joints left.rail", "does not belong to the kind", code=1)
+    mixed = "identifiability gripper --kind joint --joints left.rail,motor"
+    loopcal(mixed, "'motor' as length, but this joint is of angle", code=1)
+
+
 @pytest.mark.parametrize("robot", ["hexapod-42", "3-prs", "five-bar"])
 def test_identifiability_without_data_draws_poses_from_the_workspace(loopcal, robot) -> None:
     out = loopcal(f"identifiability {robot} --draw 30 --seed 3").out

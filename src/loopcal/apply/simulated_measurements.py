@@ -15,10 +15,12 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.measure.data_checks import check_strokes, find_outside_strokes
 from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Noise, Sensor, Uniform
 from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.joints import JointSensor
 from loopcal.measure.kinds.kind import name_shared_error
 from loopcal.measure.kinds.position import TargetKind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import StatedValue
+from loopcal.measure.readings import list_joint_dimensions
 from loopcal.measure.simulation import (
     reach_poses,
     replace_measured_values,
@@ -157,6 +159,7 @@ class InstrumentDescription:
 
     kinds: Sequence[str] = ("pose",)  # names of kinds of measurement
     components: Sequence[str] = ()  # coordinates that the kind `component` measures
+    joints: Sequence[str] = ()  # those that the kinds `joint` and `locked` measure
     orientation: str | None = None  # form of measured angles; None for the default of the kind
     # sigma_position, sigma_angle: standard deviations of each length [m] and angle [rad]
     sigma_position: float = SIGMA[Dimension.LENGTH]
@@ -172,9 +175,12 @@ class InstrumentDescription:
     distribution: str = "normal"
 
 
-def build_instrument(description: InstrumentDescription) -> Instrument:
-    """Return the instrument of a description."""
-    possible = {"components": tuple(description.components), "orientation": description.orientation}
+def build_instrument(
+    description: InstrumentDescription, robot: Mechanism | None = None
+) -> Instrument:
+    """Return the instrument of a description; the robot tells which joints turn."""
+    possible: dict[str, Any] = {"orientation": description.orientation}
+    possible |= {key: tuple(getattr(description, key)) for key in ("components", "joints")}
     settings = {name: value for name, value in possible.items() if value}
     sigma = {Dimension.LENGTH: description.sigma_position, Dimension.ANGLE: description.sigma_angle}
     sensors, stated = [], list[StatedValue]()
@@ -191,6 +197,10 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
             )
         fields = _setting_names(name)
         kind: Any = KINDS[name](**{k: v for k, v in settings.items() if k in fields})
+        if robot is not None and isinstance(kind, JointSensor):
+            known = list_joint_dimensions(robot)
+            dimensions = [known[joint] for joint in kind.joints if joint in known]
+            kind = replace(kind, measures=(*dimensions, kind.dimension)[0].value)
         if description.unknown_frames:
             kind = replace(kind, unknown=_name_unknown_frames(description.unknown_frames, kind))
         if description.targets and not isinstance(kind, TargetKind):

@@ -643,6 +643,11 @@ INSTRUMENT: Any = Group(
     components=option(
         "Coordinates that the kind 'component' measures, such as z or x,y,z.", type=NAMES
     ),
+    joints=option(
+        "Joints that the kinds 'joint' and 'locked' measure: drives, and passive joints as "
+        "limb.joint, such as left.rail.",
+        type=NAMES,
+    ),
     orientation=option(
         "Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...",
         metavar="FORM",
@@ -708,7 +713,8 @@ def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None
     """Return the instrument of `INSTRUMENT`, and of `UNKNOWN` and the distribution where they are
     stated: fields of the library's `InstrumentDescription`.
 
-    `robot` : gives targets of unknown place an assumed one; only needed where there are targets.
+    `robot` : gives targets of unknown place an assumed one, and joints their dimension; only needed
+    where there are any.
     """
     from loopcal.apply import simulated_measurements
 
@@ -722,7 +728,7 @@ def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None
         if {"phi", "theta", "psi"}.intersection(components):
             described = {"orientation": "tilt-torsion", **described}
     instrument = simulated_measurements.build_instrument(
-        simulated_measurements.InstrumentDescription(**described)
+        simulated_measurements.InstrumentDescription(**described), robot
     )
     _print_assumed_sigma(instrument)
     return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)

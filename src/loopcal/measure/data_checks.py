@@ -7,7 +7,7 @@ Each check raises a `DataError` made from a finding of the catalog, unless the c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -18,10 +18,11 @@ from loopcal.errors import DataError
 from loopcal.findings import Quantity, report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.kinds import CLOSURE
+from loopcal.measure.kinds.joints import JointSensor
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.readings import resolve_reading_sigma
+from loopcal.measure.readings import list_joint_dimensions, resolve_reading_sigma
 from loopcal.measure.repeats import find_copies, find_reading_tolerance
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import find_distinct
@@ -47,14 +48,16 @@ def check_closure(
     """Refuse the kind `closure` for a robot without redundant actuators, or for exact readings
     (standard deviations (n, a) [SI]; None as the robot states).
     """
-    check_redundancy(robot, kinds)
+    check_kinds(robot, kinds)
     is_closure = any(kind.name == CLOSURE for kind in kinds)
     if is_closure and resolve_reading_sigma(robot, reading_sigma, n_poses) is None:
         raise DataError(report_finding("data.closure-without-sigma", robot=robot.name))
 
 
-def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
-    """Refuse the kind `closure` for a robot that does not have more actuators than freedoms."""
+def check_kinds(robot: Mechanism, kinds: Sequence[Kind]) -> None:
+    """Refuse the kind `closure` for a robot that does not have more actuators than freedoms, and
+    sensors of another dimension than their joints.
+    """
     if robot.program.sigma is None and any(kind.name == CLOSURE for kind in kinds):
         counts: dict[str, Any] = {
             "actuators": len(robot.actuators),
@@ -62,6 +65,14 @@ def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
         }
         code = "data.closure-without-redundancy"
         raise DataError(report_finding(code, robot=robot.name, **counts))
+    known = list_joint_dimensions(robot)
+    for kind in (kind for kind in kinds if isinstance(kind, JointSensor)):
+        for joint in kind.joints:
+            if (dimension := known.get(joint, kind.dimension)) is not kind.dimension:
+                raise DataError(
+                    f"a sensor measures {joint!r} as {kind.measures}, but this joint is of "
+                    f"{dimension.value}; write `measures: {dimension.value}`, or another joint"
+                )
 
 
 def check_types(robot: object, data: object) -> None:

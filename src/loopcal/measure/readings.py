@@ -66,6 +66,12 @@ def list_sensed_joints(kinds: Iterable[Kind]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for kind in kinds for name in kind.sensed_joints))
 
 
+def list_joint_dimensions(robot: Mechanism) -> dict[str, Dimension]:
+    """Return the dimensions of the joints for a sensor, by name."""
+    passive = {f"{limb.name}.{j.name}": j.dimension for limb, j in robot.assembly.passive_joints}
+    return {actuator.name: actuator.dimension for actuator in robot.actuators} | passive
+
+
 def select_joint_values(
     robot: Mechanism, names: Iterable[str], readings: FloatArray, state: State
 ) -> dict[str, FloatArray]:

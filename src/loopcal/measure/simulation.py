@@ -18,7 +18,7 @@ from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_array, check_type
-from loopcal.measure.data_checks import check_closure, check_redundancy
+from loopcal.measure.data_checks import check_closure, check_kinds
 from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements
 from loopcal.measure.instrument import Distribution, Instrument, Seed, make_random_stream
 from loopcal.measure.kinds.surfaces import Line, Plane
@@ -246,7 +246,7 @@ def simulate_trials(
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
     kinds = [sensor.kind for sensor in instrument.sensors]
-    check_redundancy(robot, kinds)
+    check_kinds(robot, kinds)
     values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, len(robot.parameters)))
     if not len(values):
         raise DataError("truth has no row; give the parameter values of at least one machine")

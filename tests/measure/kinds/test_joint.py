@@ -49,6 +49,12 @@ def test_sensor_on_a_driven_joint_measures_the_reading(robot):
     assert_allclose(data.observations[0].measured, data.readings, atol=1e-8)
 
 
+def test_sensor_of_another_dimension_than_its_joint_is_refused(robot):
+    kind = JointSensor(joints=("q1", "limb1.pin"))
+    with pytest.raises(DataError, match=r"'limb1.pin' as length, .* write `measures: angle`"):
+        simulate(robot, COMMANDED, Instrument((build_sensor(kind),)), 1)
+
+
 def test_lock_measures_the_deviation_from_the_constant_of_its_group(robot):
     kind = Locked(joints=("q1",))
     groups = np.repeat(["a", "b"], 4)
@@ -64,7 +70,7 @@ def test_lock_measures_the_deviation_from_the_constant_of_its_group(robot):
 
 
 def test_rows_of_joints_have_the_derivatives_of_the_joints(robot):
-    kind = JointSensor(joints=("limb1.pin", "q2"), measures="angle")
+    kind = JointSensor(joints=("limb1.pin", "limb2.pin"), measures="angle")
     data = simulate(robot, COMMANDED, Instrument((build_sensor(kind),)), 1)
     state = forward_trials(robot, robot.values[None], data.readings[None])
     values = select_joint_values(robot, kind.sensed_joints, data.readings[None], state)

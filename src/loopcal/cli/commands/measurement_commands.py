@@ -183,7 +183,7 @@ def simulate(
     else:
         result = simulate_measurements(
             machine,
-            opt.make_instrument(instrument | {"distribution": distribution}),
+            opt.make_instrument(instrument | {"distribution": distribution}, machine),
             **_read_poses(poses, draw, machine),
             draw_errors=draw_errors,
             reading_sigma=opt.parse_reading_sigma(sigma_reading, machine),

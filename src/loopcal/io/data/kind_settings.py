@@ -835,7 +835,7 @@ def _read_robot_kind(
     file: YamlFile, node: Mapping[str, Any], robot: Mechanism, place: Location
 ) -> Kind:
     """Return a kind of the settings, mounted on the robot's tool; refuse what it cannot measure."""
-    from loopcal.measure.data_checks import check_redundancy
+    from loopcal.measure.data_checks import check_kinds
     from loopcal.measure.kinds.kind import BASE
 
     kind = read_kind(file, node, place).with_tool(robot.tool)
@@ -847,9 +847,9 @@ def _read_robot_kind(
         )
         raise file.error(f"{sentence}; `of` is {known}", (*place, "of"))
     try:
-        check_redundancy(robot, (kind,))
+        check_kinds(robot, (kind,))
     except DataError as error:
-        raise file.error(error.finding, (*place, "kind")) from None
+        raise file.error(error.args[0], (*place, "kind")) from None
     return kind
 
 

@@ -106,12 +106,12 @@ def format_measurements(
     data: Measurements, robot: Mechanism, remark: str = "", states_use: bool = False
 ) -> str:
     """Return the text of a measurement file; `states_use` also where no pose is held out."""
-    from loopcal.measure.data_checks import check_redundancy
+    from loopcal.measure.data_checks import check_kinds
 
     _refuse_names(data)
     observations = data.all_observations
     kinds = [rows.kind for rows in observations]
-    check_redundancy(robot, kinds)
+    check_kinds(robot, kinds)
     labels, known = _label_kinds(kinds), list_columns(robot, kinds)
     tables = [_tabulate_rows(rows, robot) for rows in observations]
     reading_noise, readings = _tabulate_readings(data, robot)
