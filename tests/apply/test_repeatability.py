@@ -194,6 +194,21 @@ def test_coarse_instruments_are_reported() -> None:
     assert {f.data["quantity"] for f in noise} == {"position", "orientation"}
 
 
+def test_expanded_uncertainty_is_compared_with_the_characteristic_of_iso_9283() -> None:
+    """With u = 0.3 S, U is 0.2 of RP = 3 S of an angle, and about 0.29 of RP_l of a position."""
+    robot = lc.load_robot("hexapod-42")
+    data = visit_poses(robot, hexapod_poses(4), 30, 10 * UM, 0.0)
+    (rows,) = data.observations
+    better = replace(data, observations=(replace(rows, covariance=0.09 * rows.covariance),))
+    (noise,) = [
+        f
+        for f in lc.assess_repeatability(robot, better).findings
+        if f.code == "repeatability.instrument-noise"
+    ]
+    assert noise.data["quantity"] == "position"
+    assert noise.data["share"] == pytest.approx(0.29, abs=0.03)  # of 120 visits
+
+
 def test_data_without_repeats_or_poses_are_refused() -> None:
     robot = lc.load_robot("hexapod-42")
     with pytest.raises(DataError, match="No pose is visited twice"):

@@ -47,8 +47,9 @@ POSITION, ORIENTATION = "position", "orientation"
 DIMENSIONS = {POSITION: Dimension.LENGTH, ORIENTATION: Dimension.ANGLE}
 TAIL = 0.025  # probability beyond each bound of an interval
 STANDARD_VISITS = 30  # visits of each pose that ISO 9283 asks for
-# Share of the scatter that the uncertainty of the instrument may be (ISO 9283, section 6.4).
+# Share of RP that the expanded uncertainty of the instrument, U = 2 u, may be (ISO 9283, 6.4).
 LARGEST_NOISE = 0.25
+EXPANSION = 2.0
 FEWEST_VISITS = 2  # visits without which there is no scatter
 NORMAL = 1.959963984540054  # quantile of the normal distribution for intervals of 95 %
 LARGE = 1e3  # square of the mean over its variance beyond which its length is normal
@@ -375,14 +376,14 @@ def _report(
             report_finding("repeatability.few-visits", visits=visits, standard=STANDARD_VISITS)
         )
     for quantity, of in poses.items():
-        variances = [sum((r.value / 3.0) ** 2 for r in p.repeatabilities) for p in of]
-        scatter = float(np.sqrt(np.mean(variances)))
-        if noise[quantity] > LARGEST_NOISE * scatter > 0.0:
+        squares = [sum(r.value**2 for r in p.list_repeatabilities()) for p in of]
+        repeatability, expanded = float(np.sqrt(np.mean(squares))), EXPANSION * noise[quantity]
+        if expanded > LARGEST_NOISE * repeatability > 0.0:
             findings.append(
                 report_finding(
                     "repeatability.instrument-noise",
                     quantity=quantity,
-                    share=noise[quantity] / scatter,
+                    share=expanded / repeatability,
                     largest=LARGEST_NOISE,
                 )
             )
