@@ -32,7 +32,7 @@ from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.readings import select_joint_values
 from loopcal.mechanism.actuation import DrivenJoints
-from loopcal.mechanism.kinematics import step_towards_closure
+from loopcal.mechanism.kinematics import close_loops
 from loopcal.mechanism.sensitivity import differentiate_pose, differentiate_sensed_values
 from loopcal.mechanism.states import Status
 from loopcal.numerics.elimination import without_rounding
@@ -220,7 +220,7 @@ def linearize_closure(
     """Linearize the loop closure at given poses T (a, n, 4, 4), without solving it."""
     robot = free.robot
     begin = replace(robot.home_state, T=T)
-    state = step_towards_closure(robot, values, readings, begin)
+    state = close_loops(robot, values, readings, begin, 1)
     step = geometry.pose_difference(state.T, T)
     given_state = replace(state, T=T, status=np.zeros_like(state.status))
     D = differentiate_pose(robot, values, readings, given_state, free.columns).parameters

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums, solve_open_sums
+from loopcal.mechanism.actuation import (
+    ITERATIONS,
+    DrivenJoints,
+    drive_joints,
+    drive_sums,
+    solve_open_sums,
+)
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
 from loopcal.mechanism.limb_rows import follow_limb
 from loopcal.mechanism.model import Mechanism
@@ -84,13 +90,20 @@ class Loops(NamedTuple):
     e: FloatArray
     weights: FloatArray | None
 
-    def solve(self, values: FloatArray, begin: State, goal: State | None = None) -> State:
+    def solve(
+        self,
+        values: FloatArray,
+        begin: State,
+        goal: State | None = None,
+        max_iterations: int = ITERATIONS,
+    ) -> State:
         """Return states (t, n) at joint values or sums (t | 1, n, a)."""
-        program = self.robot.program
+        program, e = self.robot.program, self.e
         if self.weights is not None:
-            state = solve_open_sums(program, self.e, self.weights, values, begin)
-            return clear_sign(self.robot, state)
-        return clear_sign(self.robot, engine.solve(program, self.e, values, begin, goal=goal))
+            state = solve_open_sums(program, e, self.weights, values, begin, max_iterations)
+        else:
+            state = engine.solve(program, e, values, begin, None, False, max_iterations, goal)
+        return clear_sign(self.robot, state)
 
     def read(self, state: State) -> FloatArray:
         """Return the joint values or sums (t, n, a) of a state."""
@@ -267,17 +280,29 @@ def solve_serial(
     )
 
 
-def step_towards_closure(
-    robot: Mechanism, values: FloatArray, q: FloatArray, begin: State
+def close_loops(
+    robot: Mechanism,
+    values: FloatArray,
+    q: FloatArray,
+    begin: State,
+    max_iterations: int = ITERATIONS,
 ) -> State:
-    """Return the states (t, n) one Newton step from `begin` at readings q, for robots without
-    stages.
+    """Return the states (t, n) that Newton's method alone finds at readings q from `begin`, in
+    whatever mode.
     """
+    if robot.stages:
+        states = [
+            close_loops(own.stage.robot, own.values, own.readings, own.state, max_iterations)
+            for own in each_stage(robot, values, begin, q)
+        ]
+        return join_stage_states(robot, states)
     if robot.has_open_sums:
         e, sums, weights = drive_sums(robot, values, q)
-        return solve_open_sums(robot.program, e, weights, sums, begin, 1)
+        return Loops(robot, e, weights).solve(sums, begin, None, max_iterations)
     e, _, joints = drive_joints(robot, values, q)
-    return engine.solve(robot.program, e, joints, begin, max_iterations=1)
+    if robot.is_serial:
+        return solve_serial(robot, e, joints, begin.T.shape[:2])
+    return Loops(robot, e, None).solve(joints, begin, None, max_iterations)
 
 
 def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray) -> BoolArray:
@@ -297,16 +322,10 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
         return np.multiply.reduce(signs, dtype=np.int8)
     if robot.is_serial:
         return np.ones(state.status.shape, np.int8)
-    if not is_square(robot):
-        return np.zeros(state.status.shape, np.int8)
     e, tau = robot.slots(values)
-    joints = driven_values(robot.program, state)
-    if robot.has_open_sums:
-        weights = select_weights(tau, robot.slots.constants)
-        assert weights is not None
-        sums = apply_weights(weights, joints)
-        return solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
-    return engine.solve(robot.program, e, joints, state, max_iterations=0).closure_sign
+    weights = select_weights(tau, robot.slots.constants) if robot.has_open_sums else None
+    loops = Loops(robot, e, weights)
+    return loops.solve(loops.read(state), state, max_iterations=0).closure_sign
 
 
 def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:

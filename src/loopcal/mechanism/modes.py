@@ -15,23 +15,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal import engine, geometry
+from loopcal import geometry
 from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
-from loopcal.mechanism.actuation import solve_open_sums
 from loopcal.mechanism.assembly import BASE
-from loopcal.mechanism.chains import each_stage, has_spare_drives, join_stage_states
+from loopcal.mechanism.chains import has_spare_drives, join_stage_states
 from loopcal.mechanism.inverse import inverse_trials
-from loopcal.mechanism.kinematics import (
-    clear_sign,
-    compute_closure_sign,
-    compute_readings,
-    solve_serial,
-)
+from loopcal.mechanism.kinematics import close_loops, compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
-from loopcal.mechanism.transmission import evaluate_sums, joints_from_readings, select_weights
+from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -122,7 +116,7 @@ def find_assembly_modes(
     values = robot.values[None]
 
     def solve(start: State) -> State:
-        return _close(robot, values, readings[None, None], start)
+        return close_loops(robot, values, readings[None, None], start)
 
     def measure(state: State) -> FloatArray:
         home = np.broadcast_to(robot.home, state.T[0].shape)
@@ -166,7 +160,7 @@ def find_working_modes(
 
     def solve(start: State) -> State:
         if robot.stages:  # a chain moves from a closed start
-            start = _close(robot, values, read(start)[None], start)
+            start = close_loops(robot, values, read(start)[None], start)
         reached = begun.status[0, 0] == Status.CONVERGED
         T = np.broadcast_to(begun.T, start.T.shape) if reached else start.T
         everywhere = np.broadcast_to(wanted, (1, T.shape[1], len(wanted)))
@@ -187,26 +181,6 @@ def find_working_modes(
         )
 
     return _search(robot, _Problem(solve, identify, measure, read), patience, max_starts, seed)
-
-
-def _close(robot: Mechanism, values: FloatArray, q: FloatArray, start: State | None) -> State:
-    """Return the states (1, n) at readings (1, n | 1, a), in whatever mode the start leads to."""
-    if robot.stages:
-        parts = each_stage(robot, values, start or robot.home_state, q)
-        states = [_close(own.stage.robot, own.values, own.readings, own.state) for own in parts]
-        return join_stage_states(robot, states)
-    e, tau = robot.slots(values)
-    begin, w = start or robot.home_state, robot.slots.constants
-    if robot.has_open_sums:
-        weights = select_weights(tau, robot.slots.constants)
-        assert weights is not None
-        sums = evaluate_sums(q, tau, w)
-        return clear_sign(robot, solve_open_sums(robot.program, e, weights, sums, begin))
-    joints = joints_from_readings(q, tau, w)
-    if robot.is_serial:
-        return solve_serial(robot, e, joints, begin.T.shape[:2])
-    state = engine.solve(robot.program, e, joints, begin)
-    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
 
 def _flatten_poses(robot: Mechanism, state: State) -> FloatArray:
