@@ -173,10 +173,12 @@ def reduce_to_platform(
     A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
     if not program.others:
         return A, Q
-    m = len(program.freedoms)
-    orthogonal, _ = np.linalg.qr(A[..., m:], mode="complete")
-    free = np.swapaxes(orthogonal[..., A.shape[-1] - m :], -1, -2)
-    return np.matmul(free, A[..., :m]), np.matmul(free, Q)
+    m, eliminated = len(program.freedoms), A.shape[-1] - len(program.freedoms)
+    whole = np.concatenate([A[..., m:], A[..., :m], Q], axis=-1)
+    rows = np.linalg.qr(whole, mode="r")[..., eliminated:, eliminated:]
+    out = np.zeros((*A.shape[:2], A.shape[2] - eliminated, rows.shape[-1]))
+    out[:, :, : rows.shape[2]] = rows
+    return out[..., :m], out[..., m:]
 
 
 def stack_driven_columns(program: Program, blocks: engine.ClosureBlocks) -> FloatArray:

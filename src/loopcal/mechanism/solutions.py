@@ -142,9 +142,10 @@ def measure_distance(robot: Mechanism, a: State, b: State) -> FloatArray:
     """
     largest = np.zeros(b.T.shape[1])
     for T, other in zip((a.T, *a.others), (b.T, *b.others), strict=True):
-        twist = np.abs(geometry.pose_difference(*np.broadcast_arrays(T[0], other[0])))
-        turned, moved = twist[:, :3].max(axis=1), twist[:, 3:].max(axis=1) / robot.size
-        largest = np.maximum(largest, np.maximum(turned, moved))
+        gap = (T - other)[0]
+        chord = np.linalg.norm(gap[:, :3, :3], axis=(1, 2)) / np.sqrt(8.0)  # sine of half the angle
+        moved = np.abs(gap[:, :3, 3]).max(axis=1) / robot.size
+        largest = np.maximum(largest, np.maximum(2.0 * np.arcsin(chord.clip(max=1.0)), moved))
     for group, mine, other in zip(robot.program.groups, a.joints, b.joints, strict=True):
         unit = np.array([1.0 if kind == "R" else robot.size for kind in f"{group.joints}P"])
         gap = np.abs(mine - other)[0] / unit
