@@ -120,7 +120,7 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
         evaluation = "A"
     names, members = _number_sources(linear)
     sources = [Source(kind, name, evaluation, of_noise) for kind, name in names]
-    factors = list(fold_sources(linear.problem, linear.linearization, members, len(names)))
+    factors = fold_sources(linear.problem, linear.linearization, members, len(names))
     U = factors[0].shape[1] - len(fit.names)
     common = list_common_errors(linear.problem)
     for (kind, name), rows in _list_further_rows(linear, U, common):
@@ -300,8 +300,9 @@ def _separate_setup(
     e, motion = (np.concatenate([of[i] for i in kept], axis=1) for of in (errors, moved))
     setup = done.slope[0][is_setup] @ e + done.joint_root()[0][is_setup] @ motion
     length = np.linalg.norm(setup, axis=1, keepdims=True)
-    _, s, vt = np.linalg.svd(setup / np.where(length > 0.0, length, 1.0), full_matrices=False)
-    basis = vt[are_nonzero(s)].T if s.size and s[0] > 0.0 else np.zeros((e.shape[1], 0))
+    Q, R = np.linalg.qr((setup / np.where(length > 0.0, length, 1.0)).T)
+    u, s, _ = np.linalg.svd(R)
+    basis = Q @ u[:, are_nonzero(s)] if s.size and s[0] > 0.0 else np.zeros((e.shape[1], 0))
     of_setup = e @ basis
     rest = e - of_setup @ basis.T
     ends = np.cumsum([errors[i].shape[1] for i in kept])[:-1]

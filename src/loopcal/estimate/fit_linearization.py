@@ -254,12 +254,14 @@ def uncertainty_from_arrays(
 
 def fold_sources(
     problem: Problem, linearization: Linearization, sources: Sequence[IntArray], count: int
-) -> FloatArray:
-    """Return triangular factors (count, U + p, U + p) of the rows of each source (one machine).
+) -> list[FloatArray]:
+    """Return triangular factors (m, U + p) of the rows of each of `count` sources (one machine).
 
     `sources` are, of every kind, the number (r,) of the source of each row. The first U columns are
     in units of the standard deviations of the nuisance parameters, those of the machine follow
-    them.
+    them. A factor has a row for each column in which its source has values: a session has none in
+    the columns of other sessions, so that time and memory grow with the sessions, not with their
+    cube.
     """
     z, p = linearization.deviation, problem.parameters
     estimate, poses = linearization.nuisance, problem.poses
@@ -267,7 +269,7 @@ def fold_sources(
     at_nodes = None if estimate is None else estimate.elimination.at_nodes
     solution = poses.solve(z, problem.trials, linearization.next_start, problem.control, fixed)
     wide = 0 if problem.nuisance is None else len(problem.nuisance)
-    factor = np.zeros((count, wide + p + 1, wide + p + 1))
+    factors = [np.zeros((0, wide + p + 1))] * count
     for block, linearized in poses.iterate_poses(solution, z):
         kinds = poses.linearize_kinds(block, linearized, problem.trials, fixed)
         for source in range(count):
@@ -275,11 +277,24 @@ def fold_sources(
                 of[numbers] == source
                 for of, numbers in zip(sources, block.row_numbers, strict=True)
             ]
+            if not any(rows.any() for rows in own):
+                continue
             node_rows = _select_rows(poses, block, kinds, own)
             for part in spread_rows(poses, block, node_rows, p, at_nodes):
-                rows = part.rows.reshape(1, -1, wide + p + 1)
-                factor[source] = engine.fold(factor[source : source + 1], rows)[0]
-    return factor[:, :-1, :-1]
+                rows = part.rows.reshape(-1, wide + p + 1)
+                factors[source] = _fold_used(factors[source], rows)
+    return [factor[:, :-1][factor[:, :-1].any(axis=1)] for factor in factors]
+
+
+def _fold_used(factor: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return the factor (m, c) of a factor and further rows (n, c), by the columns of either that
+    have values.
+    """
+    used = np.flatnonzero(factor.any(axis=0) | rows.any(axis=0))
+    triangle = np.zeros((1, len(used), len(used)))
+    folded = np.zeros((len(used), factor.shape[1]))
+    folded[:, used] = engine.fold(triangle, np.concatenate([factor, rows])[None, :, used])[0]
+    return folded
 
 
 def _select_rows(
