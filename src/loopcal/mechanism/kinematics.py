@@ -90,6 +90,13 @@ class Loops(NamedTuple):
     e: FloatArray
     weights: FloatArray | None
 
+    @classmethod
+    def place(cls, robot: Mechanism, values: FloatArray) -> Loops:
+        """Return the loops for parameter values (t | 1, p), of a robot without stages."""
+        e, tau = robot.slots(values)
+        open_sums = select_weights(tau, robot.slots.constants) if robot.has_open_sums else None
+        return cls(robot, e, open_sums)
+
     def solve(
         self,
         values: FloatArray,
@@ -322,9 +329,7 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
         return np.multiply.reduce(signs, dtype=np.int8)
     if robot.is_serial:
         return np.ones(state.status.shape, np.int8)
-    e, tau = robot.slots(values)
-    weights = select_weights(tau, robot.slots.constants) if robot.has_open_sums else None
-    loops = Loops(robot, e, weights)
+    loops = Loops.place(robot, values)
     return loops.solve(loops.read(state), state, max_iterations=0).closure_sign
 
 

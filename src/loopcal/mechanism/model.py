@@ -355,7 +355,7 @@ class Mechanism(DrawnResult):
         """T_base_platform (4, 4) of the home pose."""
         return self.home_state.T[0, 0]
 
-    @property
+    @cached_property
     def blocks(self) -> tuple[Stage, ...]:
         """The stages of a chain; any other robot is the only stage of its own."""
         counts = len(self.parameters), len(self.actuators), len(self.program.groups)

@@ -29,6 +29,7 @@ from loopcal.mechanism.inverse import (
     moves_by_drives,
 )
 from loopcal.mechanism.kinematics import (
+    Loops,
     clear_sign,
     close_at_joints,
     compute_closure_sign,
@@ -76,24 +77,6 @@ Step = Callable[[IntArray, FloatArray, State], State]
 """Returns states (1, j) at shares (j,) of the paths of rows (j,), from states on these paths."""
 
 
-def connect_by_readings(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
-    """Follow the straight paths of joint values from states `first` (1, k | 1) to `last` (1, k).
-
-    Return the last states, with the passive joints at the end of a path, and which rows (k,) a safe
-    step or path leads to.
-    """
-    return _connect(robot, first, last, contracts(robot, first, last), _move_readings)
-
-
-def connect_by_poses(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
-    """Follow the straight paths of poses, and return what `connect_by_readings` returns."""
-
-    def path(robot: Mechanism, first: State, last: State) -> Step:
-        return _move_poses(robot, first, last.T[0])
-
-    return _connect(robot, first, last, np.zeros(last.T.shape[1], bool), path)
-
-
 def _connect(
     robot: Mechanism,
     first: State,
@@ -101,12 +84,15 @@ def _connect(
     connected: BoolArray,
     path: Callable[[Mechanism, State, State], Step],
 ) -> tuple[State, BoolArray]:
-    """Return the last states and which are connected by a kind of path, if not already."""
+    """Follow a kind of straight path from states `first` to `last` (1, k), but for rows that are
+    known to be connected.
+
+    Return the last states, with the passive joints at the end of a path, and which are connected.
+    """
     rows = np.flatnonzero(~connected)
     if not len(rows):
         return last, connected
-    start = select_poses(repeat_poses(first, len(connected)), rows)
-    goal = select_poses(last, rows)
+    start, goal = select_poses(first, rows), select_poses(last, rows)
     end, arrived = _follow_path(robot, start, path(robot, start, goal))
     arrived &= _is_same_pose(robot, end, goal, SAME_JOINTS)
     connected = connected.copy()
@@ -170,10 +156,10 @@ def _move_readings(robot: Mechanism, first: State, last: State) -> Step:
     return step
 
 
-def _move_poses(robot: Mechanism, first: State, last: FloatArray) -> Step:
-    """Return the steps along straight paths from states (1, k) to poses (k, 4, 4)."""
+def _move_poses(robot: Mechanism, first: State, last: State) -> Step:
+    """Return the steps along straight paths of poses between states (1, k)."""
     values = robot.values[None]
-    twist = geometry.pose_difference(last, first.T[0])
+    twist = geometry.pose_difference(last.T[0], first.T[0])
 
     def step(rows: IntArray, share: FloatArray, current: State) -> State:
         via = geometry.apply_twist(first.T[0, rows], share[:, None] * twist[rows])
@@ -243,7 +229,7 @@ def solve_in_mode(
     if has_one_solution(robot):
         return state
     first = select_poses(repeat_poses(begin, len(is_other)), rows)
-    near, arrived = _follow_poses(robot, first, state.T[0, rows])
+    near, arrived = _follow_poses(robot, first, select_poses(state, rows))
     near, rows = _select_new(robot, near, state, rows[arrived])
     if not len(rows):
         return state
@@ -321,15 +307,15 @@ def judge_modes(
         return _judge_stages(robot, state, begin)
     if robot.is_serial:
         return state, np.zeros(state.T.shape[1], bool)
-    if robot.has_open_sums:
-        return _judge_by_readings(robot, state, begin)
     begin, n = clear_sign(robot, begin), state.T.shape[1]
     closed = state.status[0] == Status.CONVERGED
     if arrives is not None:
         sign, is_sure = state.closure_sign[0], arrives
     else:
-        e, _ = robot.slots(robot.values[None])
-        sign = engine.certify(robot.program, e, begin, state)[0]
+        sign = np.zeros(n, np.int8)
+        if not robot.has_open_sums:
+            e, _ = robot.slots(robot.values[None])
+            sign = engine.certify(robot.program, e, begin, state)[0]
         is_sure = sign != 0
         if not is_sure.all():
             unsure = select_poses(state, ~is_sure)
@@ -360,52 +346,38 @@ def _judge_stages(robot: Mechanism, state: State, begin: State) -> tuple[State, 
     return replace(state, closure_sign=whole, signs=tuple(signs)), is_other
 
 
-def _judge_by_readings(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
-    """Return what `judge_modes` returns, by forward kinematics from `begin` at the readings."""
-    values = robot.values[None]
-    if not state.T.shape[1]:
-        return state, np.zeros(0, bool)
-    state = replace(state, closure_sign=compute_closure_sign(robot, values, state))
-    closed = state.status[0] == Status.CONVERGED
-    is_other = closed & (state.closure_sign[0] != begin.closure_sign[0])
-    rows = np.flatnonzero(closed & ~is_other)
-    if not len(rows):
-        return state, is_other
-    goal = select_poses(state, rows)
-    start = select_poses(begin, rows) if begin.T.shape[1] == len(closed) > 1 else begin
-    back = forward_trials(robot, values, compute_readings(robot, values, goal), start)
-    is_other[rows] = ~(
-        (back.status[0] == Status.CONVERGED) & _is_same_pose(robot, back, goal, SAME_POSE)
-    )
-    return state, is_other
-
-
 def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
     """Return goals (1, k) of the right sign, and which of them `first` (1, k | 1) does not lead to.
 
-    Newton's method must lead to the pose of a goal from its readings, and a safe path too.
+    Newton's method must lead to the pose of a goal from its readings, and a safe path too, where
+    readings determine the joints.
     """
-    e, _ = robot.slots(robot.values[None])
-    back = close_at_joints(robot, e, driven_values(robot.program, goal), first, goal=goal)
+    loops = Loops.place(robot, robot.values[None])
+    back = close_at_joints(robot, loops.e, loops.read(goal), first, True, goal, loops.weights)
     is_other = back.status[0] != NEAR_GOAL
     is_other &= (back.status[0] != Status.CONVERGED) | ~_is_same_pose(robot, back, goal, SAME_POSE)
-    rows = np.flatnonzero(~is_other)
+    rows = np.flatnonzero(~is_other & (loops.weights is None))
     start = repeat_poses(first, len(is_other))
-    for connect in (connect_by_readings, connect_by_poses):
+    for path in (_move_readings, _move_poses):
         if not len(rows):
             break
-        solutions, connected = connect(robot, select_poses(start, rows), select_poses(goal, rows))
+        begin, end = select_poses(start, rows), select_poses(goal, rows)
+        known = np.zeros(len(rows), bool)
+        if path is _move_readings:
+            known = contracts(robot, begin, end)
+        solutions, connected = _connect(robot, begin, end, known, path)
         goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(solutions, len(rows), 1))
         is_other[rows] = ~connected
         rows = rows[~connected]
     return goal, is_other
 
 
-def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:
-    """Return solutions (1, k) close to poses T (n, 4, 4), reached from the start (1, n) in equal
-    steps, and which of these rows arrived (k,).
+def _follow_poses(robot: Mechanism, first: State, goal: State) -> tuple[State, IntArray]:
+    """Return solutions (1, k) close to the poses of goals (1, n), reached from the start (1, n) in
+    equal steps, and which of these rows arrived (k,).
     """
-    alive, current, step = np.arange(len(T)), first, _move_poses(robot, first, T)
+    alive, current = np.arange(goal.T.shape[1]), first
+    step = _move_poses(robot, first, goal)
     for i in range(1, STEPS + 1):
         current = step(alive, np.full(len(alive), i / STEPS), current)
         closed = current.status[0] == Status.CONVERGED
