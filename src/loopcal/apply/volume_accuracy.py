@@ -151,7 +151,7 @@ class Volume:
             raise DataError(f"the volume has more than {MOST_POINTS:,} points; give fewer values")
         for count in counts[1:] if len(counts) > 2 else counts:
             points, reasons = self.list_points(robot, count), Counter[str]()
-            reached = find_reachable(robot, points, reasons)
+            reached, _ = find_reachable(robot, points, reasons)
             reason = reasons.most_common(1)[0][0]
             if reached.any():
                 spacing = {n: (high - low) / (count - 1) for n, (low, high) in spans.items()}

@@ -17,7 +17,8 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import Solution, inverse
+from loopcal.mechanism.solutions import Solution, inverse, make_solution
+from loopcal.mechanism.states import join_states, select_poses
 from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -158,12 +159,12 @@ def sample_workspace(
     rng = np.random.default_rng(seed)
     wanted = workspace_ranges(robot)
     rejected: Counter[str] = Counter()
-    batches: list[FloatArray] = []
+    batches: list[tuple[FloatArray, Solution]] = []
     kept = tried = 0
     while kept < n or not tried:
         coordinates = draw_coordinates(rng, robot.controlled, wanted, max(n, MIN_DRAWS // 8))
-        good = find_reachable(robot, coordinates, rejected)
-        batches.append(coordinates[good])
+        good, solution = find_reachable(robot, coordinates, rejected)
+        batches.append((coordinates[good], solution.take(good)))
         kept, tried = kept + int(good.sum()), tried + len(coordinates)
         if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
             reason, count = rejected.most_common(1)[0]
@@ -172,10 +173,12 @@ def sample_workspace(
                 f"positions (at least {MIN_REACHABLE_SHARE:.0%} are needed); most frequent reason: "
                 f"{reason} ({count} positions); correct `workspace:`, the strokes or the limits"
             )
-    coordinates = np.concatenate(batches)[:n]
-    return WorkspaceSample(
-        coordinates, inverse(robot, coordinates), kept / tried, dict((+rejected).most_common())
-    )
+    drawn, solutions = zip(*batches, strict=True)
+    coordinates = np.concatenate(drawn)[:n]
+    state = join_states(*(solution.state for solution in solutions))
+    q = np.concatenate([solution.q for solution in solutions])[:n]
+    solution = make_solution(robot, select_poses(state, np.arange(n)), q)
+    return WorkspaceSample(coordinates, solution, kept / tried, dict((+rejected).most_common()))
 
 
 class ReachableShare(NamedTuple):
@@ -204,7 +207,7 @@ def measure_reachable_share(robot: Mechanism, n: int, seed: int = 0) -> Reachabl
         return None
     rejected: Counter[str] = Counter()
     drawn = draw_coordinates(np.random.default_rng(seed), robot.controlled, ranges, n)
-    k = int(find_reachable(robot, drawn, rejected).sum())
+    k = int(find_reachable(robot, drawn, rejected)[0].sum())
     z = 1.96  # of the normal distribution at 95 %
     middle, half = k + z * z / 2, z * np.sqrt(k * (n - k) / n + z * z / 4)
     low, high = ((middle + sign * half) / (n + z * z) for sign in (-1.0, 1.0))
@@ -240,7 +243,7 @@ def list_tilt_rings(robot: Mechanism, n: int) -> FloatArray:
         given["z"] = np.linspace(*ranges["z"], 3)[(ring + i) % 3]
     coordinates = np.column_stack([given[name] for name in robot.controlled])
     rejected: Counter[str] = Counter()
-    if not find_reachable(robot, coordinates, rejected).all():
+    if not find_reachable(robot, coordinates, rejected)[0].all():
         reason, count = rejected.most_common(1)[0]
         raise MechanismError(
             f"{robot.name} does not reach {count} of {n} poses on rings of equal tilt ({reason}); "
@@ -288,8 +291,12 @@ def draw_coordinates(
     return np.stack(columns, axis=-1)
 
 
-def find_reachable(robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]) -> BoolArray:
-    """Return which rows the machine reaches (n,); count the reasons of the others."""
+def find_reachable(
+    robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]
+) -> tuple[BoolArray, Solution]:
+    """Return which rows the machine reaches (n,), and all of them solved; count the reasons of the
+    others.
+    """
     values, solution = robot.values[None], inverse(robot, coordinates)
     good = np.array(solution.closed)
     rejected["the loops cannot be closed"] += int((~good).sum())
@@ -298,4 +305,4 @@ def find_reachable(robot: Mechanism, coordinates: FloatArray, rejected: Counter[
         rejected[f"{limit.name} is exceeded"] += int(outside.sum())
         good &= ~outside
     rejected["in another mode than home"] += int((good & ~solution.converged).sum())
-    return good & solution.converged
+    return good & solution.converged, solution
