@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from loopcal.apply.base_motion import choose_base
 from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.apply.height_errors import restore_heights
 from loopcal.apply.run_comparison import RunComparison
@@ -70,6 +71,7 @@ def load_record(
     stated = Administration() if facts is None else load_administration(facts, is_complete=False)
     robot, arrays, content = run.identified_robot, run.arrays, restore_numbers(run.result)
     stored = content.get("validation")
+    moved = choose_base(content, run.initial_robot, run.robot, keep_frame=False)[1]
     return CalibrationRecord(
         result=content,
         arrays=arrays,
@@ -79,7 +81,9 @@ def load_record(
         validation=None if stored is None else restore_validation(stored, arrays, robot),
         heights=restore_heights(arrays, robot),
         residuals=residuals_from_arrays(arrays),
-        controllers=list_controllers(replace(build_source(run), is_for_people=True)),
+        controllers=list_controllers(
+            replace(build_source(run), is_for_people=True, findings=moved)
+        ),
         facts=stated.list_rows(),
     )
 

@@ -278,11 +278,11 @@ def test_interval_that_is_not_centered_is_stated_by_its_bounds(held_out) -> None
         units, poses = {"position": find_unit("mm")}, data.labels
         return str(report_conformity({"position": judged}, limits, errors, units, poses)[0])
 
-    low, high = (f"{1e3 * bound:.4f} mm" for bound in (skewed.low, skewed.high))
+    low, high = (f"{1e6 * bound:.1f} um" for bound in (skewed.low, skewed.high))
     assert f"(95 % interval {low} to {high})" in state(skewed)
     assert "+/-" not in state(skewed)
     centered = judge_estimate(12 * UM, 1.5 * UM, limit)
-    assert "0.0120 mm +/- 0.0029 mm (95 %)" in state(centered)
+    assert "12.0 um +/- 2.9 um (95 %)" in state(centered)
 
 
 def test_limit_that_noise_leaves_open_is_a_warning(held_out) -> None:

@@ -152,6 +152,16 @@ def test_page_passes_axe_in_both_color_schemes(browser, written_page) -> None:
     context.close()
 
 
+def test_result_table_fits_a_phone(browser, page) -> None:
+    tab = browser.new_page(viewport={"width": 390, "height": 844})
+    tab.goto(page.as_uri())
+    widths = "e => [e.scrollWidth, e.clientWidth]"
+    for selector in ("html", "[aria-labelledby='summary'] .table"):
+        needed, given = tab.locator(selector).evaluate(widths)
+        assert needed <= given, selector
+    tab.close()
+
+
 def test_page_can_be_used_with_the_keyboard_alone(browser, page) -> None:
     context = browser.new_context(offline=True)
     tab = context.new_page()

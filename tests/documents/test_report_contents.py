@@ -73,7 +73,7 @@ def write_text(section: Section) -> str:
 CONTENTS = [
     ("summary", r"machine: five-bar\nserial number: 0017\n.*certificate D-K-15123-01"),
     ("summary", r"environment: \n"),  # a line to fill in
-    ("summary", r"position, upper bound in the working volume.* mm +0.06 mm +conforms"),
+    ("summary", r"position, upper bound in the working volume.* [\d.]+ um +60 um +conforms"),
     ("summary", r"position, largest at \d+ held-out poses"),
     ("summary", r"Decision rule: ISO 14253-1, JCGM 106.*at least 95 %"),
     ("summary", r"Working volume: box x -20 mm to 20 mm, y 250 mm"),
@@ -119,6 +119,38 @@ CONTENTS = [
 @pytest.mark.parametrize(("name", "pattern"), CONTENTS, ids=[f"{n}: {p}" for n, p in CONTENTS])
 def test_section_has_its_content(document, name, pattern) -> None:
     assert re.search(pattern, write_text(get_section(document, name)), re.DOTALL)
+
+
+def test_missed_limit_is_not_called_a_gate_that_is_met(report) -> None:
+    record = load_record(report)
+    missed = {**record.result, "verdict": "reservations", "passed": False}
+    said = build_sections(replace(record, result=missed), ["verdict"])[0].elements[0]
+    assert "a stated limit is not kept" in said
+    kept = {**missed, "passed": True}
+    said = build_sections(replace(record, result=kept), ["verdict"])[0].elements[0]
+    assert said.startswith("All quality gates are met")
+
+
+def test_combinations_that_only_move_frames_are_counted_and_the_first_others_listed(report) -> None:
+    record = load_record(report)
+
+    def state(i: int, meaning: str) -> dict[str, object]:
+        stated = {"names": [f"p{i}"], "meaning": meaning}
+        return {
+            "code": "fit.unidentifiable",
+            "severity": "info",
+            "text": f"open p{i}",
+            "data": stated,
+        }
+
+    findings = [state(i, "" if i % 2 else "shifting the base frame") for i in range(40)]
+    remedies = [{"names": [f"p{i}"], "finding": {"text": f"cure p{i}"}} for i in range(40)]
+    result = {**record.result, "findings": findings, "remedies": remedies}
+    (section,) = build_sections(replace(record, result=result), ["determined"])
+    text = write_text(section)
+    assert re.findall(r"open p(\d+)", text) == [str(i) for i in range(1, 16, 2)]
+    assert re.findall(r"cure p(\d+)", text) == [str(i) for i in range(1, 16, 2)]
+    assert "leaves out 32 combinations" in text
 
 
 def test_a_note_is_in_one_section_only(document, report) -> None:

@@ -347,7 +347,11 @@ def test_values_that_turn_the_base_frame_are_named_and_others_keep_it(capsys) ->
     write_points(POINTS, heights, "bed.g", "{}", BED)
     line = "--probes report.txt --probes bed.g -o printer.yaml --data heights.csv"
     assert run(f"import config.g {line}") == 0
+    assert run(f"import config.g {line} --corrected written.g --force") in (0, 2)
+    assert "These values turn all of a program by 1." in " ".join(capsys.readouterr().out.split())
     assert run("calibrate printer.yaml heights.csv -o run --noise estimated") in (0, 2)
+    lc.save_report(lc.load_run("run"), "run.html")
+    assert "These values turn all of a program by 1." in Path("run.json").read_text()
     assert run("export run --format reprap -o new.g --force") in (0, 2)
     assert "These values turn all of a program by 1." in " ".join(capsys.readouterr().out.split())
     assert run("export run --format reprap -o kept.g --keep-frame --force") in (0, 2)

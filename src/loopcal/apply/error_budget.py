@@ -11,8 +11,9 @@ weights changed, not from the part of the source. See docs/theory/uncertainty.md
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -28,23 +29,30 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.errors import MechanismError
-from loopcal.estimate.fit_linearization import FitLinearization, fold_sources, linearize_fit
+from loopcal.estimate.fit_linearization import (
+    FitLinearization,
+    RowSources,
+    find_share,
+    fold_sources,
+    linearize_fit,
+)
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.posterior import DISCREPANCY, INFLATION, NOISE, TOLERANCES
+from loopcal.estimate.posterior import DISCREPANCY, INFLATION, NOISE, TOLERANCES, combine_degrees
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import Observations
+from loopcal.measure.observations import Observations, StatedSize, find_size
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import are_nonzero, substitute_backward
 from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import OTHER, Field, fields, label_axes
 from loopcal.results.result import DrawnResult
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 # Kinds of sources; others are the codes of the findings with which a covariance was added.
@@ -92,6 +100,9 @@ class Source(NamedTuple):
     # corrected by statistics
     evaluation: str
     degrees: float  # degrees of freedom; infinite where the size counts as known
+    size: StatedSize | None = None  # as stated, where one number states it
+    # standard uncertainty in its unit, with the factor on all stated sigmas that the residuals gave
+    u: float | None = None
 
     @property
     def words(self) -> str:
@@ -119,12 +130,19 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
     if test.noise == "estimated" or test.failed:
         evaluation = "A"
     names, members = _number_sources(linear)
-    sources = [Source(kind, name, evaluation, of_noise) for kind, name in names]
+    noise = float(np.sqrt(linear.sources.noise))
+
+    def state(kind: str, name: str, size: StatedSize | None, of: str, nu: float) -> Source:
+        u = None if size is None else noise * size.value / size.divisor
+        return Source(kind, name, of, nu, size, u)
+
+    sources = [state(*key, size, evaluation, of_noise) for key, size in names.items()]
     factors = fold_sources(linear.problem, linear.linearization, members, len(names))
     U = factors[0].shape[1] - len(fit.names)
     common = list_common_errors(linear.problem)
     for (kind, name), rows in _list_further_rows(linear, U, common):
-        sources.append(Source(kind, name, "B", np.inf))
+        size = _find_common_size(linear, common, name) if kind == COMMON else None
+        sources.append(state(kind, name, size, "B", np.inf))
         factors.append(rows)
     own, moved = _propagate(linear, factors, U)
     evaluation_of_size = "B (assumed)" if fit.free_parameters.assumed.any() else "B"
@@ -167,10 +185,15 @@ def _halve_sigma(
     if source.kind == TOLERANCES:
         weight = 4.0
     elif (named := (source.kind, source.name)) in of_rows:
-        chosen = (member == of_rows.index(named) for member in members)
-        factors = (np.where(rows, 2.0, 1.0)[:, None, None] for rows in chosen)
-        pairs = zip(problem.rows, factors, strict=True)
-        problem = problem.with_rows(replace(r, whitener=factor * r.whitener) for r, factor in pairs)
+        number, rows = list(of_rows).index(named), []
+        for of_kind, own in zip(problem.rows, members, strict=True):
+            root = find_share(own, number)
+            left, axes = np.linalg.eigh(np.eye(root.shape[1]) - 0.75 * root.mT @ root)
+            factor = axes / np.sqrt(left)[:, None, :] @ axes.mT
+            whitener = of_kind.whitener
+            whitener = factor * whitener if root.shape[1] == 1 else factor @ whitener
+            rows.append(replace(of_kind, whitener=whitener))
+        problem = problem.with_rows(rows)
     elif source.kind in (SETUP, COMMON) and nuisance is not None and nuisance.has_prior.any():
         local = nuisance.local
         for entry, name in zip(local.table.entries, list_common_errors(problem), strict=True):
@@ -200,20 +223,48 @@ def _name(rows: Observations, session: str, data: Measurements) -> str:
     return f"{name}, {session}" if session else name
 
 
-def _number_sources(linear: FitLinearization) -> tuple[list[tuple[str, str]], list[IntArray]]:
-    """Return kind and name of the sources of rows, and the number of the source of each row of
-    every kind.
+def _number_sources(
+    linear: FitLinearization,
+) -> tuple[dict[tuple[str, str], StatedSize | None], list[RowSources]]:
+    """Return the stated size of the sources of rows by kind and name, and those of the rows of
+    every kind by number.
     """
     data, problem = linear.data, linear.problem
     numbers: dict[tuple[str, str], int] = {}
-    members = []
+    sizes: dict[tuple[str, str], StatedSize | None] = {}
+    members: list[RowSources] = []
     for rows in (o for o in data.all_observations if len(o)):
-        labels = [(INSTRUMENT, _name(rows, session, data)) for session in rows.session.tolist()]
-        members.append(np.array([numbers.setdefault(label, len(numbers)) for label in labels]))
+        parts = []
+        for name, size, root in rows.split_noise():
+            labels = [(_name(rows, session, data), name) for session in rows.session.tolist()]
+            keys = [(INSTRUMENT, ", ".join(filter(None, label))) for label in labels]
+            sizes |= {k: size if sizes.get(k, size) == size else None for k in keys}
+            parts.append((np.array([numbers.setdefault(k, len(numbers)) for k in keys]), root))
+        members.append(parts)
     if problem.is_uncertain:
         number = numbers.setdefault((READINGS, ""), len(numbers))
-        members.append(np.full(len(problem.rows[-1].poses), number))
-    return list(numbers), members
+        members.append([(np.full(len(problem.rows[-1].poses), number), None)])
+        sizes[READINGS, ""] = _find_drive_size(linear.fit.robot, data.reading_sigma)
+    return sizes, members
+
+
+def _find_drive_size(robot: Mechanism, sd: FloatArray | None) -> StatedSize | None:
+    """Return the size that the robot file states for the errors of all readings; None where the
+    `sd` in use is another, such as one that residuals gave.
+    """
+    known = robot.stated_sigma
+    is_stated = sd is not None and np.array_equal(sd, np.broadcast_to(known, np.shape(sd)))
+    return find_size(known, {a.dimension for a in robot.actuators}) if is_stated else None
+
+
+def _find_common_size(linear: FitLinearization, common: list[str], name: str) -> StatedSize | None:
+    """Return the size of a common error of an instrument; None where its components differ."""
+    stated = (v for v in linear.data.stated_values if v.size is not None)
+    of_name = {v.size for v in stated if v.name == name or v.name.endswith(f".{name}")}
+    if of_name or linear.problem.nuisance is None:
+        return of_name.pop() if len(of_name) == 1 else None
+    table, chosen = linear.problem.nuisance.local.table, [owner == name for owner in common]
+    return find_size(table.tolerance[chosen], itertools.compress(table.dimensions, chosen))
 
 
 def list_common_errors(problem: Problem) -> list[str]:
@@ -383,8 +434,8 @@ class ErrorBudget(DrawnResult):
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(
-            position=lambda b: {"rms": b.position.rms, "variances": b.position._asdict()},
-            orientation=lambda b: {"rms": b.orientation.rms, "variances": b.orientation._asdict()},
+            position=lambda b: b._describe("position"),
+            orientation=lambda b: b._describe("orientation"),
             parameters=lambda b: dict(zip(b.names, b.sd.tolist(), strict=True)),
             worst_parameter="worst",
             sources=lambda b: [b._list_line(line) for line in b.lines],
@@ -425,6 +476,23 @@ class ErrorBudget(DrawnResult):
             f"orientation {round_to_digits(orientation)} mrad>"
         )
 
+    def _describe(self, kind: str) -> dict[str, Any]:
+        """Return the errors of a kind for JSON, with their effective degrees of freedom.
+
+        Sources that the residuals scale together are one part, as their size is estimated once.
+        """
+        parts: dict[str, tuple[float, float]] = {}
+        for line in self.lines:
+            source, square = line.source, getattr(line, kind)
+            shared = NOISE if source.kind in (INSTRUMENT, READINGS, SETUP) else source.words
+            before, nu = parts.get(shared, (0.0, source.degrees))
+            parts[shared] = (before + square, min(nu, source.degrees))
+        errors = getattr(self, kind)
+        squares = [(np.array(square), nu) for square, nu in parts.values()]
+        degrees = float(combine_degrees(np.array(errors.rms**2), squares))
+        finite = degrees if np.isfinite(degrees) else None
+        return {"rms": errors.rms, "degrees": finite, "variances": errors._asdict()}
+
     def _list_line(self, line: SourceBudget) -> dict[str, Any]:
         """Return a source by name for JSON."""
         halved = None
@@ -436,8 +504,13 @@ class ErrorBudget(DrawnResult):
                 "worst_parameter_sd": sd.get(self.worst),
             }
         degrees = line.source.degrees if np.isfinite(line.source.degrees) else None
+        size = line.source.size
+        stated = None if size is None else {**asdict(size), "u": line.source.u}
+        identity = line.source._asdict()
         return {
-            **line.source._asdict(),
+            **{key: identity[key] for key in ("kind", "name", "evaluation")},
+            "words": line.source.words,
+            "stated": stated,
             "degrees": degrees,
             "position": line.position,
             "orientation": line.orientation,
@@ -512,7 +585,8 @@ def _list_sources(
     if repeated.any():
         angle, position = compute_mean_squares(repeated)
         nothing = np.where(split.undetermined, np.nan, 0.0)
-        source = Source(REPEATABILITY, "", "B", np.inf)
+        size = _find_drive_size(fit.robot, fit.posterior.repeatability)
+        source = Source(REPEATABILITY, "", "B", np.inf, size, size and size.value)
         lines.append(SourceBudget(source, position, angle, nothing, None))
     return lines
 

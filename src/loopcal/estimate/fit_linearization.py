@@ -252,16 +252,29 @@ def uncertainty_from_arrays(
     return FitUncertainty(posterior, names, arrays[SLOPE], arrays[ROOT], noise_scale, noise)
 
 
+# The sources of the noise of a kind: the number (r,) of the source of each row, and the root
+# (r, m, m) that multiplies whitened rows; None where the source is that of the whole row.
+RowSources = Sequence[tuple[IntArray, FloatArray | None]]
+
+
+def find_share(parts: RowSources, source: int, rows: IntArray | slice = slice(None)) -> FloatArray:
+    """Return the roots (k, m, m) of a source in rows of a kind; (k, 1, 1) of whole rows."""
+    share = np.zeros((1, 1, 1))
+    for numbers, root in parts:
+        chosen = (numbers[rows] == source)[:, None, None]
+        share = share + (chosen if root is None else chosen * root[rows])
+    return np.asarray(share)
+
+
 def fold_sources(
-    problem: Problem, linearization: Linearization, sources: Sequence[IntArray], count: int
+    problem: Problem, linearization: Linearization, sources: Sequence[RowSources], count: int
 ) -> list[FloatArray]:
     """Return triangular factors (m, U + p) of the rows of each of `count` sources (one machine).
 
-    `sources` are, of every kind, the number (r,) of the source of each row. The first U columns are
-    in units of the standard deviations of the nuisance parameters, those of the machine follow
-    them. A factor has a row for each column in which its source has values: a session has none in
-    the columns of other sessions, so that time and memory grow with the sessions, not with their
-    cube.
+    `sources` are those of every kind. The first U columns are in units of the standard deviations
+    of the nuisance parameters, those of the machine follow them. A factor has a row for each column
+    in which its source has values: a session has none in the columns of other sessions, so that
+    time and memory grow with the sessions, not with their cube.
     """
     z, p = linearization.deviation, problem.parameters
     estimate, poses = linearization.nuisance, problem.poses
@@ -274,7 +287,7 @@ def fold_sources(
         kinds = poses.linearize_kinds(block, linearized, problem.trials, fixed)
         for source in range(count):
             own = [
-                of[numbers] == source
+                find_share(of, source, numbers)
                 for of, numbers in zip(sources, block.row_numbers, strict=True)
             ]
             if not any(rows.any() for rows in own):
@@ -298,20 +311,20 @@ def _fold_used(factor: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def _select_rows(
-    poses: PoseRows, block: PoseBlock, kinds: Sequence[KindRows | None], own: Sequence[BoolArray]
+    poses: PoseRows, block: PoseBlock, kinds: Sequence[KindRows | None], own: Sequence[FloatArray]
 ) -> list[NodeRows]:
-    """Return the rows of one source, `own` (r,) of every kind, projected along all rows of poses
-    that have coordinates.
+    """Return the rows of one source, with roots `own` (r, ..) of every kind, projected along all
+    rows of poses that have coordinates.
     """
     tree = None if poses.nuisance is None else poses.nuisance.tree
     chosen = []
-    for part in divide_among_nodes(kinds, block.members, tree):
-        kept = own[part.kind][part.numbers]
+    masked = [kind and _weigh(kind, roots) for kind, roots in zip(kinds, own, strict=True)]
+    for part in divide_among_nodes(masked, block.members, tree):
+        kept = np.any(own[part.kind], axis=(1, 2))[part.numbers]
         nodes, numbers, rows = part.nodes[kept], part.numbers[kept], part.rows[:, kept]
         if kept.any():
             chosen.append(part._replace(nodes=nodes, numbers=numbers, rows=rows))
     k = poses.coordinates.count
-    masked = [kind and _mask(kind, kept) for kind, kept in zip(kinds, own, strict=True)]
     for group in block.groups:
         all_rows, own_rows = (stack_rows(block, group, rows, k, tree) for rows in (kinds, masked))
         width = group.poses.shape[1] * k
@@ -321,15 +334,16 @@ def _select_rows(
     return chosen
 
 
-def _mask(kind: KindRows, kept: BoolArray) -> KindRows:
-    """Return the rows of a kind with zeros for those that are not kept."""
+def _weigh(kind: KindRows, root: FloatArray) -> KindRows:
+    """Return the rows of a kind times roots (r, m, m) or numbers (r, 1, 1)."""
 
-    def mask(array: FloatArray) -> FloatArray:
-        return array * kept.reshape(-1, *[1] * (array.ndim - 2))
+    def weigh(array: FloatArray) -> FloatArray:
+        of_rows = root.reshape(len(root), *[1] * (array.ndim - 4), *root.shape[1:])
+        return array * of_rows if root.shape[1] == 1 else of_rows @ array
 
     by_nuisance, by_coordinates = kind.by_nuisance, kind.by_coordinates
     return KindRows(
-        mask(kind.machine),
-        None if by_nuisance is None else mask(by_nuisance),
-        None if by_coordinates is None else mask(by_coordinates),
+        weigh(kind.machine),
+        None if by_nuisance is None else weigh(by_nuisance),
+        None if by_coordinates is None else weigh(by_coordinates),
     )

@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds.kind import Kind
-from loopcal.measure.observations import Observations
+from loopcal.measure.observations import Observations, StatedSize
 from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray, IntArray
@@ -42,6 +42,7 @@ class StatedValue:
     is_undetermined : whether it is fixed because no motion of the machine determines it.
     scope : "all" where all sessions share one value of an offset or another common error of an
         instrument, such as `tracker.scale`; by default every session has its own.
+    size : how a certificate states `sd`, for the uncertainty budget.
 
     Raises
     ------
@@ -53,6 +54,7 @@ class StatedValue:
     nominal: float | None = None
     is_undetermined: bool = False
     scope: Literal["session", "all"] = "session"
+    size: StatedSize | None = None
 
     def __post_init__(self) -> None:
         if self.scope not in ("session", "all"):

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,13 +23,48 @@ from loopcal.measure.array_checks import (
 from loopcal.measure.kinds.kind import Evaluation, Kind, measure_progress
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import SD_RANGE, is_sd
+from loopcal.units import SD_RANGE, Dimension, is_sd
 
 # Smallest pivot of a correlation matrix. Below it a component equals a combination of the others
 # to seven digits, and the inverse has fewer digits than a measurement.
 SMALLEST_PIVOT = 1e-7
+ROUNDING = 1e-9  # relative differences of variances and standard deviations that are rounding
+SIZE_UNITS = {  # of standard deviations that a program stated
+    Dimension.LENGTH: ("um", 1e-6),
+    Dimension.ANGLE: ("urad", 1e-6),
+    Dimension.RATIO: ("ppm", 1e-6),
+}
 DATES = ("calibrated", "due", "measured")  # fields of an instrument that hold a date
 TextArray = NDArray[np.str_]  # names of sessions or groups
+
+
+@dataclass(frozen=True)
+class StatedSize:
+    """The size of an error as a certificate or data sheet states it (JCGM 100, 4.3): a value with
+    its unit, and the divisor that makes it a standard uncertainty, by the distribution.
+    """
+
+    value: float
+    unit: str
+    distribution: str = "normal"  # or "uniform", from -value to value
+    divisor: float = 1.0
+
+
+def find_size(sd: FloatArray, dimensions: Iterable[Dimension]) -> StatedSize | None:
+    """Return the standard deviation [SI] that all values have; None where they differ."""
+    units, first = {SIZE_UNITS[dimension] for dimension in dimensions}, sd[:1]
+    if len(units) != 1 or not first.size or np.any(np.abs(sd - first) > ROUNDING * first):
+        return None
+    symbol, factor = units.pop()
+    return StatedSize(float(f"{float(first[0]) / factor:.12g}"), symbol)
+
+
+class NoisePart(NamedTuple):
+    """What one source adds to the noise of rows."""
+
+    name: str  # such as "range"
+    covariance: FloatArray  # (r, m, m) [SI]
+    size: StatedSize | None = None  # as stated, where one number states it
 
 
 def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatArray) -> FloatArray:
@@ -197,6 +232,8 @@ class Observations:
     is_noise_assumed : whether nobody stated the covariance: a program that wrote the rows assumed
         it. It then decides no quality gate.
     instrument : what measured the rows, and how that is traceable; for certificates.
+    noise_parts : the covariance by source, for the uncertainty budget. What they leave of it is a
+        part without a name.
 
     Attributes
     ----------
@@ -222,6 +259,7 @@ class Observations:
     source: str = ""
     is_noise_assumed: bool = False
     instrument: InstrumentRecord | None = None
+    noise_parts: tuple[NoisePart, ...] = ()
     present: BoolArray = field(init=False)
     whitener: FloatArray = field(init=False)
 
@@ -344,7 +382,31 @@ class Observations:
         context = {name: values[chosen] for name, values in self.context.items()}
         if self.kind.is_drift.any():
             arrays["progress"] = self.drift_part[chosen]
-        return replace(self, context=context, **arrays)
+        parts = tuple(
+            part._replace(covariance=part.covariance[chosen]) for part in self.noise_parts
+        )
+        return replace(self, context=context, noise_parts=parts, **arrays)
+
+    def split_noise(self) -> list[tuple[str, StatedSize | None, FloatArray | None]]:
+        """Return name, stated size and root (r, m, m) of each part of the noise. Whitened rows
+        times the roots have unit noise in sum; the root is None where one part is all.
+        """
+        rest = self.covariance - sum(part.covariance for part in self.noise_parts)
+        variance = np.einsum("rii->ri", self.covariance)[:, :, None]
+        if not self.noise_parts:
+            sd = np.sqrt(np.einsum("rii->ri", self.covariance)[self.present])
+            return [("", find_size(sd, {c.dimension for c in self.kind.noise_columns}), None)]
+        parts = list(self.noise_parts)
+        if np.any(np.abs(rest) > ROUNDING * np.where(self.present[:, :, None], variance, np.inf)):
+            parts.append(NoisePart("", rest))
+        weight = np.where(self.weight > 0.0, self.weight, np.inf)[:, None, None]
+        split = []
+        for part in parts:
+            inner = np.where(self.present[:, :, None], part.covariance, 0.0)
+            share, axes = np.linalg.eigh(self.whitener @ inner @ self.whitener.mT / weight)
+            root = np.sqrt(np.maximum(share, 0.0))[:, :, None] * axes.mT
+            split.append((part.name, part.size, root))
+        return split
 
     def with_weights(self, weight: ArrayLike) -> Self:
         """Return the same rows with other weights (r,)."""

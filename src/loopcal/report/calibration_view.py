@@ -318,6 +318,13 @@ MEANING = (
 )
 
 
+GUM_MEANING = (
+    "Budget of the {kind} by source (JCGM 100): value as stated, u = value / divisor times what "
+    "residuals say of all stated sigmas, sensitivity = contribution / u. Degrees of freedom of the "
+    "sum by Welch and Satterthwaite"
+)
+
+
 def view_budget(
     budget: Mapping[str, Any], robot: Mechanism, volume: Mapping[str, Any] | None = None
 ) -> list[Block]:
@@ -326,7 +333,8 @@ def view_budget(
     robot : for its units. volume : of a run.
     """
     stated = [finding["text"] for finding in (volume or {}).get("findings", ())]
-    return [str(budget["finding"]["text"]), "", build_budget_table(budget, robot), *stated]
+    tables = [build_budget_table(budget, robot), *build_gum_tables(budget, robot)]
+    return [str(budget["finding"]["text"]), "", *tables, *stated]
 
 
 def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
@@ -370,6 +378,35 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     over = "poses of the workspace" if budget["over"] == "workspace" else "measured poses"
     caption = MEANING.format(poses=budget["poses"], over=over)
     return make_table(caption, ("source", "type", Column("degrees of freedom"), *columns), rows)
+
+
+def build_gum_tables(budget: Mapping[str, Any], robot: Mechanism) -> list[Table]:
+    """Return the budget of positions, and of orientations, as JCGM 100 arranges one."""
+    return [_build_gum_table(budget, robot, kind) for kind in _list_kinds(budget)]
+
+
+def _build_gum_table(budget: Mapping[str, Any], robot: Mechanism, kind: str) -> Table:
+    """Return one line for each source: its stated value, what it contributes, and their ratio."""
+    unit = choose_unit(robot.shown_units[LENGTHS[kind]], [0.1 * (budget[kind]["rms"] or 0.0)])
+    rows = []
+    for line in budget["sources"]:
+        stated, error = line.get("stated"), math.sqrt(line[kind] or 0.0)
+        cells = [ABSENT] * 5
+        if stated:
+            symbol, u = stated["unit"], stated["u"]
+            value, sensitivity = f"{stated['value']:.6g} {symbol}", format_in(unit, error / u, 3)
+            per = f"{sensitivity} {unit} per {symbol}" if error else "0"
+            divisor = format_number(stated["divisor"], 3)
+            cells = [value, stated["distribution"], divisor, f"{format_number(u, 3)} {symbol}", per]
+        shown = [*cells, format_in(unit, error, 3), _format_degrees(line["degrees"] or math.inf)]
+        rows.append((_name_source(line), line["evaluation"], *shown))
+    total = format_in(unit, budget[kind]["rms"] or 0.0, 3)
+    degrees = _format_degrees(budget[kind].get("degrees") or math.inf)
+    rows.append(("all sources", "", *[""] * 5, total, degrees))
+    numbers = (Column(title) for title in ("divisor", "u", "sensitivity"))
+    columns = ("source", "type", Column("value"), "distribution", *numbers)
+    ends = (Column("contribution", unit.symbol), Column("degrees of freedom"))
+    return make_table(GUM_MEANING.format(kind=kind), (*columns, *ends), rows)
 
 
 def build_share_table(budget: Mapping[str, Any]) -> Table:

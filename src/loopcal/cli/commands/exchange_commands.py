@@ -303,6 +303,7 @@ def import_(
       loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """
+    from loopcal.apply.base_motion import choose_base
     from loopcal.diagnose.fit_examination import compare_stored_geometry
     from loopcal.findings import report_finding
     from loopcal.io.core.limits import make_name
@@ -355,13 +356,16 @@ def import_(
             opt.print_convention_note(report.conventions, [data])
             is_written = force or not report.has_failed
             if report.has_failed:
-                facts = {"reasons": list_reasons(report.failures), "is_written": is_written}
                 failure = report_finding(
-                    "gates.correction-not-written", file=str(corrected), **facts
+                    "gates.correction-not-written",
+                    file=str(corrected),
+                    reasons=list_reasons(report.failures),
+                    is_written=is_written,
                 )
                 failures.append(with_hint(failure))
             if is_written:
-                exported = export_robot(ExportSource(report.robot), source, file)
+                moved = choose_base(report.to_dict(), robot, report.robot, keep_frame=False)[1]
+                exported = export_robot(ExportSource(report.robot, findings=moved), source, file)
                 write_text(corrected, exported.text)
                 changes = [str(finding) for finding in exported.findings]
             else:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopcal.findings.catalog import find_entry, word_phrase
-from loopcal.findings.wording import fill_template, list_names, name_count
+from loopcal.findings.wording import choose_symbol, fill_template, list_names, name_count
 
 Data = Mapping[str, Any]
 
@@ -298,18 +298,18 @@ def largest_error(data: Data) -> str:
     An interval that is not centered on the estimate is stated by its bounds: an error has no values
     below zero, and estimate plus half the interval would be below its upper bound.
     """
-    estimate, expanded = data["estimate"], data["expanded"]
-    value, unit = f"{estimate.value:.3g}", estimate.unit
-    uncertainty, places = f"{expanded.value:.2g}", 0
-    if expanded.value > 0.0:
-        places = max(0, 1 - math.floor(math.log10(expanded.value)))
-        value, uncertainty = (f"{x.value:.{places}f}" for x in (estimate, expanded))
+    stated = [data[name] for name in ("estimate", "expanded", "low", "high")]
+    unit, factor = choose_symbol(stated[1].value or stated[0].value, stated[0].unit)
+    estimate, expanded, low, high = (factor * quantity.value for quantity in stated)
+    value, uncertainty, places = f"{estimate:.3g}", f"{expanded:.2g}", 0
+    if expanded > 0.0:
+        places = max(0, 1 - math.floor(math.log10(expanded)))
+        value, uncertainty = (f"{x:.{places}f}" for x in (estimate, expanded))
     template = (
         "Largest {quantity} error {is_volume:if|in the volume|of {count}, without the noise of the "
         "measurement}: "
     )
     subject = f"{fill_template(template, **data)}{value} {unit}"
-    low, high = data["low"].value, data["high"].value
-    if abs(high + low - 2.0 * estimate.value) <= LARGEST_SKEW * (high - low):
+    if abs(high + low - 2.0 * estimate) <= LARGEST_SKEW * (high - low):
         return f"{subject} +/- {uncertainty} {unit} (95 %)"
     return f"{subject} (95 % interval {low:.{places}f} {unit} to {high:.{places}f} {unit})"

@@ -17,6 +17,7 @@ numbers, too, unless they state another dimension, as Annotated[float, Dimension
 from __future__ import annotations
 
 import dataclasses
+import math
 import operator
 import types
 import typing
@@ -82,8 +83,9 @@ from loopcal.units import (
 
 if TYPE_CHECKING:
     from loopcal.measure.kinds.kind import Kind
+    from loopcal.measure.kinds.position import Position
     from loopcal.measure.nuisance import StatedValue
-    from loopcal.measure.observations import InstrumentRecord, Observations
+    from loopcal.measure.observations import InstrumentRecord, NoisePart, Observations, StatedSize
     from loopcal.parameters import Parameter
 
 DIRECTIONS = ("along", "axis", "normal", "up")
@@ -97,6 +99,19 @@ ASSUMED = "assumed"
 
 MANY_SIGMAS = 3
 """Number of columns above which an equal noise is written once."""
+
+SQRT_3 = math.sqrt(3.0)
+FORMS: Mapping[str, tuple[str, float | None]] = {
+    "sd": ("normal", 1.0),
+    "limit": ("uniform", SQRT_3),
+    "U": ("normal", None),
+}
+"""Key that states an uncertainty -> distribution and divisor; None where `k` is the divisor."""
+
+MOST_K = 10.0
+"""Largest coverage factor."""
+
+StatedSd = tuple[float, "StatedSize"]  # standard deviation [SI], and how it is stated
 
 LENGTHS = Annotated[list[Any], Dimension.LENGTH]
 NUMBERS = Annotated[list[Any], Dimension.RATIO]
@@ -153,20 +168,24 @@ def list_kind_settings(kind: type[Kind]) -> dict[str, Any]:
 
 def read_noise(
     file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Location
-) -> dict[str, float]:
-    """Return noise column -> standard deviation [SI], of the columns for which one is stated;
-    FileError for an unknown column or a bad number.
+) -> dict[str, StatedSd]:
+    """Return noise column -> standard deviation [SI] with its statement, of the columns for which
+    one is stated; FileError for an unknown column or a bad number.
     """
     stated, place = node.get("noise", {}), (*location, "noise")
     dimensions = {column.name: column.dimension for column in kind.noise_columns}
+    sight = kind.sight_noise
     if not isinstance(stated, dict):
         example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in dimensions.items())
         sentence = "'noise' must state a standard deviation for each column"
         raise file.error(f"{sentence}; write 'noise: {{{example}}}'", place)
     return {
-        column: _read_sd(file, text, dimensions[column], at, f"the noise of {at[-1]!r}")
-        for text, names, at in match_names(file, stated, list(dimensions), place)
+        column: _read_size(
+            file, text, {**dimensions, **sight}[column], at, f"the noise of {at[-1]!r}"
+        )
+        for text, names, at in match_names(file, stated, [*dimensions, *sight], place)
         for column in names
+        if column in dimensions or column == at[-1]  # a pattern is of columns
     }
 
 
@@ -190,6 +209,46 @@ def _read_sd(
     if fault := find_sd_fault(sd):
         raise file.error(f"{what} is {text}; {fault}{act}", place)
     return sd
+
+
+def _read_size(
+    file: YamlFile, node: Any, dimension: Dimension, place: Location, what: str
+) -> StatedSd:
+    """Return a standard deviation [SI] with its statement: a text `8 um`, a limit, or an expanded
+    uncertainty. FileError where it is none of these.
+    """
+    stated = node if isinstance(node, dict) else {"sd": node}
+    refuse_unknown_keys(file, list(stated), [*FORMS, "k"], place)
+    form, distribution, divisor = _choose_form(file, stated, place)
+    sd = _read_sd(file, stated[form], dimension, place, what) / divisor
+    return sd, _state_size(stated[form], distribution, divisor)
+
+
+def _choose_form(
+    file: YamlFile, stated: Mapping[str, Any], place: Location
+) -> tuple[str, str, float]:
+    """Return the key that states an uncertainty, its distribution, and its divisor."""
+    forms = [name for name in FORMS if name in stated]
+    if len(forms) != 1:
+        sentence = (
+            "an uncertainty is stated once: as 'sd', as 'limit' (uniform within it), or as 'U'"
+        )
+        raise file.error(f"{sentence} with its 'k'; write one of them", place)
+    form, k = forms[0], stated.get("k", 2.0)
+    if not (isinstance(k, int | float) and 1.0 <= k <= MOST_K) or ("k" in stated and form != "U"):
+        sentence = f"'k' is {k!r}; write the coverage factor of 'U', from 1 to {MOST_K:g}"
+        raise file.error(sentence, (*place, "k") if "k" in stated else place)
+    distribution, divisor = FORMS[form]
+    return form, distribution, divisor or float(k)
+
+
+def _state_size(text: Any, distribution: str = "normal", divisor: float = 1.0) -> StatedSize:
+    """Return a number with its unit as a file states it."""
+    from loopcal.measure.observations import StatedSize
+
+    match = NUMBER.match(text := str(text).strip())
+    assert match is not None, "the number was read before"
+    return StatedSize(float(match[0]), text[match.end() :].strip(), distribution, divisor)
 
 
 def describe_kind(
@@ -543,16 +602,16 @@ EXPANSION_UNITS = {
     for degree, (of_degree, _) in DIFFERENCE_UNITS.items()
 }
 SCALED: Mapping[str, ScaleRule] = {
-    "scale": ScaleRule({"sd": RATIO_UNITS, "mean": RATIO_UNITS}, ("sd",), "sd: 2 ppm"),
+    "scale": ScaleRule({**dict.fromkeys(FORMS, RATIO_UNITS), "mean": RATIO_UNITS}, (), "sd: 2 ppm"),
     "temperature": ScaleRule(
         {
             "value": TEMPERATURE_UNITS,
-            "sd": DIFFERENCE_UNITS,
+            **dict.fromkeys(FORMS, DIFFERENCE_UNITS),
             "expansion": EXPANSION_UNITS,
             "expansion_sd": EXPANSION_UNITS,
             "reference": TEMPERATURE_UNITS,
         },
-        ("value", "sd", "expansion"),
+        ("value", "expansion"),
         "value: 23 degC, sd: 1 K, expansion: 11.5 ppm/K",
     ),
     MPE: ScaleRule(
@@ -561,14 +620,14 @@ SCALED: Mapping[str, ScaleRule] = {
         "constant: 15 um, per_length: 6 um/m",
     ),
 }
-NOT_NEGATIVE = ("sd", "expansion_sd", "constant", "per_length")
+NOT_NEGATIVE = (*FORMS, "expansion_sd", "constant", "per_length")
 REFERENCE = 20.0  # [degC], of ISO 1
 ITEMS: Mapping[str, str] = {"session_bias": "bias", "session_drift": "drift"}
 
 
 def read_shared_errors(
     file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Location
-) -> tuple[Kind, dict[str, float], list[StatedValue]]:
+) -> tuple[Kind, dict[str, StatedSd], list[StatedValue]]:
     """Return a kind with the common errors of its instrument as unknowns, the noise [SI] of columns
     that an MPE states, and the priors, of 0 where a component has no such error. FileError : an
     unknown component or key, or no number.
@@ -576,7 +635,7 @@ def read_shared_errors(
     from loopcal.measure.kinds.kind import list_components, name_shared_error
     from loopcal.measure.nuisance import StatedValue
 
-    noise: dict[str, float] = {}
+    noise: dict[str, StatedSd] = {}
     priors: dict[str, StatedValue] = {}
     for key in (key for key in SHARED_ERRORS if key in node):
         place, stated = (*location, key), node[key]
@@ -588,14 +647,14 @@ def read_shared_errors(
         if key in SCALED:
             lengths, factors, scope = _read_scales(file, key, stated, place)
             columns = [c.name for c in kind.noise_columns if c.dimension is Dimension.LENGTH]
-            noise |= dict.fromkeys(columns, lengths) if lengths else {}
+            noise |= {} if lengths is None else dict.fromkeys(columns, lengths)
             if key == MPE and "scale" in node:
                 sentence = f"{MPE!r} and 'scale' both state the scale of the instrument"
                 raise file.error(f"{sentence}; remove one of them", place)
             kind = _add_unknown(kind, tuple(factors))
-            for item, (mean, sd) in factors.items():
+            for item, (mean, sd, size) in factors.items():
                 name = name_shared_error(kind, item, "")
-                priors[name] = StatedValue(name, sd, mean or None, scope=scope)
+                priors[name] = StatedValue(name, sd, mean or None, scope=scope, size=size)
             continue
         if stated != UNKNOWN and not (isinstance(stated, dict) and stated):
             example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in components.items())
@@ -625,15 +684,16 @@ def _add_unknown(kind: Kind, items: tuple[str, ...]) -> Kind:
 
 def _read_scales(
     file: YamlFile, key: str, node: Any, place: Location
-) -> tuple[float, dict[str, tuple[float, float]], Literal["session", "all"]]:
-    """Return what one of the settings `SCALED` states: the standard deviation [m] of each length, 0
-    where it states none; setup item -> mean and standard deviation of a factor minus 1; and whether
-    one value holds for a session or for all.
+) -> tuple[StatedSd | None, dict[str, tuple[float, float, StatedSize]], Literal["session", "all"]]:
+    """Return what one of the settings `SCALED` states: the standard deviation [m] of each length,
+    where it states one; setup item -> mean, standard deviation and its statement, of a factor minus
+    1; and whether one value holds for a session or for all.
     """
     rule = SCALED[key]
     if not isinstance(node, dict) or not node:
         raise file.error(f"{key!r} is {node!r}; write '{key}: {{{rule.example}}}'", place)
-    refuse_unknown_keys(file, list(node), [*rule.units, "scope"], place)
+    has_forms = "sd" in rule.units
+    refuse_unknown_keys(file, list(node), [*rule.units, "scope", *["k"] * has_forms], place)
     if missing := [name for name in rule.required if name not in node]:
         sentence = f"{key!r} has no key {missing[0]!r}; add it"
         raise file.error(f"{sentence}, as in '{key}: {{{rule.example}}}'", place)
@@ -650,18 +710,23 @@ def _read_scales(
         if fault := find_sd_fault(stated[name]):
             raise file.error(f"{name!r} of {key!r} is {node[name]}; {fault}", (*place, name))
     if key == MPE:  # its values are uniform within it
-        of_length, per_length = (
-            stated.get(name, 0.0) / np.sqrt(3.0) for name in ("constant", "per_length")
-        )
-        return float(of_length), {"scale": (0.0, float(per_length))} if per_length else {}, scope
+        limits = {
+            name: (stated[name] / SQRT_3, _state_size(node[name], "uniform", SQRT_3))
+            for name in ("constant", "per_length")
+            if stated.get(name)
+        }
+        scaled = {"scale": (0.0, *limits["per_length"])} if "per_length" in limits else {}
+        return limits.get("constant"), scaled, scope
+    form, distribution, divisor = _choose_form(file, node, place)
+    sd, size = stated[form] / divisor, _state_size(node[form], distribution, divisor)
     if key == "scale":
-        return 0.0, {"scale": (stated.get("mean", 0.0), stated["sd"])}, scope
-    rise = stated["value"] - stated.get("reference", REFERENCE)
-    factors = {
-        "temperature": (rise * stated["expansion"], abs(stated["expansion"]) * stated["sd"]),
-        "expansion": (0.0, stated.get("expansion_sd", 0.0) * float(np.hypot(rise, stated["sd"]))),
-    }
-    return 0.0, {item: of for item, of in factors.items() if any(of)}, scope
+        return None, {"scale": (stated.get("mean", 0.0), sd, size)}, scope
+    rise, slope = stated["value"] - stated.get("reference", REFERENCE), stated["expansion"]
+    factors = {"temperature": (rise * slope, abs(slope) * sd, size)}
+    if of_slope := stated.get("expansion_sd", 0.0):
+        size = _state_size(node["expansion_sd"])
+        factors["expansion"] = (0.0, of_slope * float(np.hypot(rise, sd)), size)
+    return None, {item: of for item, of in factors.items() if any(of[:2])}, scope
 
 
 def _read_in_units(file: YamlFile, node: Any, units: Scales, place: Location) -> float:
@@ -691,7 +756,8 @@ SETTINGS: Mapping[str, str] = {
     "kind": "the kind of all rows, followed by its own settings and noise",
     "kinds": "label -> kind, settings and noise, in files with several kinds",
     "noise": "standard deviation of each noise column, with its unit; by name or pattern, such as "
-    '`"*.x": 5 um`',
+    '`"*.x": 5 um`; of a position also `range`, `angle` and `centering`, as of a tracker. In place '
+    "of a standard deviation `{limit: 15 um}` (uniform within it) or `{U: 10 um, k: 2}`",
     "noise_source": "`assumed` where nobody stated the noise, as in imported files; by default "
     "`stated`. Assumed noise decides no quality gate",
     **SHARED_ERRORS,
@@ -715,7 +781,7 @@ class KindRows:
     """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
 
     `is_noise_assumed` where nobody stated the noise; `shared_errors` are the priors of
-    `read_shared_errors`.
+    `read_shared_errors`; `sizes` are the statements of the noise.
     """
 
     kind: Kind
@@ -725,6 +791,7 @@ class KindRows:
     is_noise_assumed: bool = False
     shared_errors: Sequence[StatedValue] = ()
     instrument: InstrumentRecord | None = None
+    sizes: Mapping[str, StatedSize] = dataclasses.field(default_factory=dict)
 
 
 def has_measured_values(table: Table) -> bool:
@@ -784,7 +851,7 @@ def read_observations(
 
     entry = _select_rows(table, entry, members)
     links, rows = entry.kind.poses_per_row, entry.rows
-    measured, covariance = _read_values(table, robot, entry)
+    measured, covariance, parts = _read_values(table, robot, entry)
     if entry.kind.is_of_base:
         poses, pose_context = np.zeros((len(rows), 1), dtype=np.intp), {}
     else:
@@ -808,6 +875,7 @@ def read_observations(
             source=str(table.path),
             is_noise_assumed=entry.is_noise_assumed,
             instrument=entry.instrument,
+            noise_parts=parts,
         )
     return observations, table.places(rows.tolist())
 
@@ -820,7 +888,9 @@ def _read_entry(
     allowed = ["kind", *KIND_SETTINGS] if place else SETTINGS
     refuse_unknown_keys(file, list(node), [*allowed, *list_kind_settings(type(kind))], place)
     kind, of_mpe, shared = read_shared_errors(file, node, kind, place)
-    noise = of_mpe | read_noise(file, node, kind, place)
+    stated = of_mpe | read_noise(file, node, kind, place)
+    noise = {name: sd for name, (sd, _) in stated.items()}
+    sizes = {name: size for name, (_, size) in stated.items()}
     source = node.get("noise_source", "stated")
     if source not in (ASSUMED, "stated"):
         sentence = f"noise_source is {source!r}; write {ASSUMED} where nobody stated the noise"
@@ -828,7 +898,8 @@ def _read_entry(
     instrument = read_instrument(file, node, place)
     if instrument is None and place:
         instrument = read_instrument(file, file.content, ())
-    return KindRows(kind, noise, rows, place, bool(source == ASSUMED), shared, instrument)
+    assumed = bool(source == ASSUMED)
+    return KindRows(kind, noise, rows, place, assumed, shared, instrument, sizes)
 
 
 def _read_robot_kind(
@@ -867,8 +938,14 @@ def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...
     return entry
 
 
-def _read_values(table: Table, robot: Mechanism, entry: KindRows) -> tuple[FloatArray, FloatArray]:
-    """Return measured values (r, c) and the covariance (r, m, m) of their residuals [SI]."""
+def _read_values(
+    table: Table, robot: Mechanism, entry: KindRows
+) -> tuple[FloatArray, FloatArray, tuple[NoisePart, ...]]:
+    """Return measured values (r, c), the covariance (r, m, m) of their residuals [SI], and its
+    parts where the file states them.
+    """
+    from loopcal.measure.observations import NoisePart
+
     kind, rows = entry.kind, entry.rows
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]
@@ -891,7 +968,17 @@ def _read_values(table: Table, robot: Mechanism, entry: KindRows) -> tuple[Float
             if i != j and name in table.units:
                 covariance[:, i, j] = covariance[:, j, i] = known[name].parse(table)[rows]
     N = kind.linearize_noise(measured)
-    return measured, N @ covariance @ np.swapaxes(N, -1, -2)
+    covariance = N @ covariance @ np.swapaxes(N, -1, -2)
+    of_columns = {entry.sizes.get(column.name) for column in kind.noise_columns}
+    is_alike = len(of_columns) == 1 and all(SIGMA + name not in table.units for name in names)
+    parts = [NoisePart("", covariance, of_columns.pop() if is_alike else None)]
+    if sight := [name for name in kind.sight_noise if name in entry.noise]:
+        parts = parts if covariance.any() else []
+        with name_files(table.path):
+            spread = cast("Position", kind).spread_sight_noise(measured)
+        parts += [NoisePart(n, entry.noise[n] ** 2 * spread[n], entry.sizes[n]) for n in sight]
+        covariance = np.sum([part.covariance for part in parts], axis=0)
+    return measured, covariance, tuple(parts)
 
 
 def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:
@@ -918,6 +1005,8 @@ def _read_sigma(
     column = entry.kind.noise_columns[place]
     name = SIGMA + name_measured(column.name, robot)
     if name not in table.units:
+        if column.name not in entry.noise and entry.kind.sight_noise.keys() & entry.noise.keys():
+            return np.zeros(len(entry.rows))
         if column.name not in entry.noise:
             raise table.settings.error(
                 report_finding(

@@ -415,6 +415,7 @@ def _list_results(run: Run) -> Iterator[Content]:
         ]
         name = f"Position error in the working volume, {volume['frame']}"
         yield {"name": name, "data": {"quantity": bounds}}
+    yield from _list_budgets(content.get("expected_error") or {})
     errors = content.get("validation")
     if not errors:
         return
@@ -428,6 +429,24 @@ def _list_results(run: Run) -> Iterator[Content]:
     if quantities:
         name = f"Errors at held-out poses, {errors['frame']}"
         yield {"name": name, "data": {"quantity": quantities}}
+
+
+def _list_budgets(budget: Mapping[str, Any]) -> Iterator[Content]:
+    """Yield the standard uncertainty that each source contributes, as stated and in sum."""
+    for kind, unit in (("position", r"\metre"), ("orientation", r"\radian")):
+        quantities = []
+        for line in budget.get("sources") or ():
+            facts = [line.get("words") or line["kind"], f"type {line['evaluation']}"]
+            if stated := line.get("stated"):
+                how = f"{stated['distribution']}, divisor {stated['divisor']:.3g}"
+                facts.append(f"stated {stated['value']:.6g} {stated['unit']}, {how}")
+            if line["degrees"] is not None and math.isfinite(line["degrees"]):
+                facts.append(f"degrees of freedom {line['degrees']:.0f}")
+            quantities.append(_quantity("; ".join(facts), unit, math.sqrt(line[kind] or 0.0)))
+        if quantities and budget[kind]["rms"]:
+            quantities.append(_quantity("all sources", unit, budget[kind]["rms"]))
+            name = f"Uncertainty budget of the {kind}, k = 1, root mean square over the workspace"
+            yield {"name": name, "data": {"quantity": quantities}}
 
 
 def _describe_covariance(

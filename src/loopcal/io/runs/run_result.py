@@ -50,6 +50,7 @@ SOURCE: dict[str, Any] = {
     "name": str,
     "evaluation": str,
     "degrees": Number,
+    "stated?": ({"value": float, "unit": str, "distribution": str, "divisor": float, "u": float},),
     "position": Number,
     "orientation": Number,
     "parameters": {"*": Number},

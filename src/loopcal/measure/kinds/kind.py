@@ -359,6 +359,11 @@ class Kind(ABC):
             items[item] = SetupItem(tuple(shared))
         return items
 
+    @property
+    def sight_noise(self) -> Mapping[str, Dimension]:
+        """What the noise may consist of beside that of columns, as a tracker has it."""
+        return {}
+
     @cached_property
     def common_errors(self) -> Mapping[int, str]:
         """Place among the u parameters -> common error of the instrument, such as `tracker.bias`

@@ -35,6 +35,7 @@ from loopcal.measure.kinds.kind import (
     make_angles,
 )
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
 
 # The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in the
 # frame, and (.., k, g, w) by the setup items that only this kind has.
@@ -219,11 +220,20 @@ class Position(TargetKind):
     Parameters
     ----------
     Those of `TargetKind`; "frame" and "targets" may be unknown.
+    station : (3,) [m], place of the instrument in the frame, from which noise by range and angle
+        counts; default: its origin.
     """
+
+    station: FloatArray | None = None
 
     name: ClassVar[str] = "position"
     length_error: ClassVar[str] = "position"
     per_target: ClassVar[tuple[Column, ...]] = POSITION_COLUMNS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.station is not None:
+            set_fields(self, station=check_array(self.station, "the station", (3,)))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -235,6 +245,35 @@ class Position(TargetKind):
             cls(targets=("a", "b", "c"), places=corners),
             cls(targets=("a", "b", "c"), places=corners, unknown=("targets", "frame")),
         )
+
+    @property
+    def sight_noise(self) -> Mapping[str, Dimension]:
+        """Noise of the range, of the angle across the line of sight, and of the reflector."""
+        angle, length = Dimension.ANGLE, Dimension.LENGTH
+        return {"range": length, "angle": angle, "centering": length}
+
+    def spread_sight_noise(self, measured: FloatArray) -> dict[str, FloatArray]:
+        """Return the covariances (r, 3 k, 3 k) of measured points (r, 3 k) per variance of each
+        `sight_noise`, as an instrument at the station measures them. DataError where nothing says
+        where it stands.
+        """
+        is_base = "frame" not in self.unknown and np.array_equal(self.T_base_frame, np.eye(4))
+        if self.station is None and is_base:
+            raise DataError(
+                "noise by range and angle needs the place of the instrument, but the frame is the "
+                "base; state `station`, as [1200 mm, 0 mm, 900 mm]"
+            )
+        station = np.zeros(3) if self.station is None else self.station
+        lever = np.nan_to_num(measured).reshape(len(measured), -1, 3) - station
+        length = np.maximum(np.linalg.norm(lever, axis=-1), FLATNESS)[..., None]
+        along = (lever / length)[..., None] * (lever / length)[..., None, :]
+        spread = {"range": along, "angle": length[..., None] ** 2 * (np.eye(3) - along)}
+        spread["centering"] = np.broadcast_to(np.eye(3), along.shape)
+        shape, apart = (len(measured), measured.shape[1], measured.shape[1]), np.eye(lever.shape[1])
+        return {
+            name: np.einsum("rkij,kl->rkilj", block, apart).reshape(shape)
+            for name, block in spread.items()
+        }
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return the points themselves."""

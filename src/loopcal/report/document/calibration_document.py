@@ -13,7 +13,10 @@ from loopcal.apply.verdict import Verdict
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings.wording import list_names, name_count
 from loopcal.report.calibration_view import (
+    COMBINATIONS,
+    MOST_COMBINATIONS,
     build_budget_table,
+    build_gum_tables,
     build_height_map,
     build_height_summary,
     build_last_value_table,
@@ -47,7 +50,7 @@ from loopcal.results.tables import (
     make_table,
     word_column,
 )
-from loopcal.units import Dimension
+from loopcal.units import Dimension, Unit
 
 Describe = Callable[[CalibrationRecord], Iterator[Element | None]]
 SECTIONS: dict[str, tuple[str, Describe]] = {}
@@ -158,40 +161,48 @@ def _name_instrument(facts: Mapping[str, str]) -> str:
 
 
 def _list_results(record: CalibrationRecord) -> Iterator[tuple[str, ...]]:
-    """Yield error, before, after, limit and decision, in the order of what they tell of the use."""
+    """Yield error, before, after, limit and decision, in the order of what they tell of the use.
 
-    def write(value: float | None, quantity: str = "position") -> str:
-        if value is None or not math.isfinite(value):
-            return ABSENT
-        return str(record.robot.to_quantity(value, LENGTHS[quantity]))
-
-    def judge(stated: Mapping[str, Any] | None, quantity: str = "position") -> tuple[str, str]:
-        return (
-            (write(stated["limit"], quantity), stated["decision"]) if stated else (ABSENT, ABSENT)
+    Numbers of a quantity have one unit, which suits the smallest error after calibration.
+    """
+    stated = list(_list_errors(record))
+    units: dict[str, Unit] = {}
+    for quantity, dimension in LENGTHS.items():
+        after = [abs(x) for _, of, _, x, _ in stated if of == quantity and x]
+        units[quantity] = choose_unit(record.robot.get_unit(dimension), [min(after, default=0.0)])
+    for words, quantity, before, after, judged in stated:
+        limit = judged["limit"] if judged else None
+        numbers = (
+            ABSENT if x is None or not math.isfinite(x) else f"{format_in(unit, x, 3)} {unit}"
+            for unit in [units[quantity]]
+            for x in (before, after, limit)
         )
+        yield words, *numbers, judged["decision"] if judged else ABSENT
 
+
+def _list_errors(
+    record: CalibrationRecord,
+) -> Iterator[tuple[str, str, float | None, float | None, Mapping[str, Any] | None]]:
+    """Yield words, quantity, error before and after [SI], and statement on a limit."""
     if volume := record.result.get("volume"):
         words = "position, upper bound in the working volume (95 % confidence)"
-        yield words, ABSENT, write(volume["simultaneous"]), *judge(volume.get("conformity"))
+        yield words, "position", None, volume["simultaneous"], volume.get("conformity")
     errors = record.result.get("validation") or {}
     poses = name_count(len(record.held_out_labels), "held-out pose")
-    for quantity in LENGTHS:
-        if quantity in errors.get("after", ()):
-            before, after = (errors[when][quantity] for when in ("before", "after"))
-            decision = judge((errors.get("conformity") or {}).get(quantity), quantity)
-            for key, words, judged in (
-                ("max", "largest", decision),
-                ("rms", "root mean square", (ABSENT, ABSENT)),
-            ):
-                shown = (write(each[key], quantity) for each in (before, after))
-                yield f"{quantity}, {words} at {poses}", *shown, *judged
+    for quantity in (name for name in LENGTHS if name in errors.get("after", ())):
+        before, after = (errors[when][quantity] for when in ("before", "after"))
+        decision = (errors.get("conformity") or {}).get(quantity)
+        words = f"{quantity}, largest at {poses}"
+        yield words, quantity, before["max"], after["max"], decision
+        words = f"{quantity}, root mean square at {poses}"
+        yield words, quantity, before["rms"], after["rms"], None
     repeated = record.result.get("repeatability") or {}
     for symbol, words in ISO_9283.items():
         poses_visited = repeated.get("position") or ()
         values = [pose[symbol]["value"] for pose in poses_visited if symbol in pose]
         if values:
             name = f"{words}, largest of {len(values)} (ISO 9283)"
-            yield name, ABSENT, write(max(values)), *judge(None)
+            yield name, "position", None, max(values), None
 
 
 ISO_9283 = {"AP_p": "pose accuracy AP of positions", "RP_l": "pose repeatability RP of positions"}
@@ -210,6 +221,12 @@ MEANING = {
     Verdict.NOT_CALIBRATED: "A quality gate is not met. Do not write these values to a machine.",
 }
 """What each verdict means for the user."""
+
+LIMIT_MISSED = (
+    "The fit meets its quality gates, but a stated limit is not kept: see the statement below. The "
+    "recommendation states whether to use the corrected values."
+)
+"""What the same verdict means where it is due to a limit."""
 
 SCOPE = (
     "Scope: the verdict concerns the geometry of {robot} in the region and under the conditions of "
@@ -240,7 +257,8 @@ def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
     """Yield verdict, scope, expected error with its sources, limits, findings and next step."""
     result = record.result
     fitted, held_out = len(record.fitted_labels), len(record.held_out_labels)
-    yield MEANING[record.verdict]
+    is_missed = record.verdict is Verdict.RESERVATIONS and result.get("passed") is False
+    yield LIMIT_MISSED if is_missed else MEANING[record.verdict]
     yield SCOPE.format(
         robot=record.robot.name, fitted=fitted or "an unknown number", held_out=held_out
     )
@@ -321,7 +339,6 @@ def describe_errors(record: CalibrationRecord) -> Iterator[Element | None]:
     yield f"{explained} {READING_NOISE}" if record.result.get("reading_errors") else explained
     yield from view_errors(errors, "held-out")
     yield from filter(None, [" ".join(describe_improvements(errors))])
-    yield None
     yield from (table for table in view_error_statistics(errors) if not isinstance(table, str))
 
 
@@ -378,7 +395,7 @@ TERMS = (
 BUDGET_TERMS = (
     "Evaluation of type A uses the scatter of these data, type B uses stated values such as the "
     "sigma of the instrument and the tolerances. A position or orientation error is the length of "
-    "a vector, so the table states no coverage factor for it. The parameters above have one."
+    "a vector, so the table states no coverage factor for it. The parameters below have one."
 )
 NOT_TRACEABLE = (
     "The data state no serial number, certificate or date of calibration of the instrument, so "
@@ -400,6 +417,7 @@ def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
                 "The residuals exceed the stated noise, so these numbers are not the expected "
                 "error of the machine."
             )
+        yield from build_gum_tables(budget, record.robot)
         yield build_budget_table(budget, record.robot)
     stated = (record.result.get("volume") or {}).get("findings", ())
     yield from (f["text"] for f in stated if not f["code"].startswith(CONFORMITY))
@@ -428,7 +446,6 @@ def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
             yield fit["interval_note"]
         if fit.get("local"):
             yield build_parameter_table("Setup parameters", fit["local"])
-    yield None
     yield from select_findings(record, OF_PARAMETERS)
 
 
@@ -446,13 +463,26 @@ def _describe_undetermined(record: CalibrationRecord) -> str:
     return f"The data determine {rank} of {count} combinations of the parameters."
 
 
+OTHERS = (
+    "The report leaves out {others} that only move frames or bodies, or are beyond the first few; "
+    "result.json of the run states each."
+)
+
+
 @describes_section("determined", "What the data do not determine")
 def describe_open_combinations(record: CalibrationRecord) -> Iterator[Element]:
     """Yield what the data do not determine, and which measurement would determine it."""
     yield _describe_undetermined(record)
-    yield from select_findings(record, OPEN)
+    stated = [finding for finding in record.findings if finding["code"].startswith(OPEN)]
+    found = [finding for finding in stated if finding["code"] in COMBINATIONS]
+    shown = [f for f in found if not f["data"].get("meaning")][:MOST_COMBINATIONS]
+    yield from list_findings(f for f in stated if f in shown or f not in found)
+    if others := len(found) - len(shown):
+        yield OTHERS.format(others=name_count(others, "combination"))
+    named = [set(finding["data"]["names"]) for finding in shown]
     for suggestion in record.result.get("remedies") or ():
-        yield f"Suggested measurement: {suggestion['finding']['text']}"
+        if set(suggestion["names"]) in named:
+            yield f"Suggested measurement: {suggestion['finding']['text']}"
 
 
 @describes_section("outliers", "Outlying rows")
@@ -474,7 +504,6 @@ def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
         square, degrees = (format_number(fit[key], 4) for key in ("chi_square", "degrees"))
         p_value = format_number(fit["p_value"], 2)
         yield f"Chi-square is {square} with {degrees} degrees of freedom (p = {p_value})."
-    yield None
     of_residuals = (f for f in record.findings if not f["code"].startswith(OF_PARAMETERS))
     yield from list_findings(f for f in of_residuals if f["code"].startswith(OF_RESIDUALS))
 
@@ -489,7 +518,8 @@ MOST = 3000
 
 EVERYWHERE = (
     "The command loopcal export writes the parameters to a file: of every robot as csv or json, "
-    "and in the formats of controllers that can express it."
+    "and in the formats of controllers that can express it. Where values move the base frame, its "
+    "option --keep-frame writes those that leave programs where they are, if there are any."
 )
 NO_CONTROLLER = "No format of a controller that loopcal writes can express this robot."
 FAILED = "The calibration failed, so the report states no values for a controller."
