@@ -518,8 +518,8 @@ MOST = 3000
 
 EVERYWHERE = (
     "The command loopcal export writes the parameters to a file: of every robot as csv or json, "
-    "and in the formats of controllers that can express it. Where values move the base frame, its "
-    "option --keep-frame writes those that leave programs where they are, if there are any."
+    "and in the formats of controllers that can express it. Where a note says that these values "
+    "move programs, it also writes others that leave them where they are, if there are any."
 )
 NO_CONTROLLER = "No format of a controller that loopcal writes can express this robot."
 FAILED = "The calibration failed, so the report states no values for a controller."
